@@ -77,12 +77,8 @@ def main(args: Sequence[str]) -> None:
     names = joint_names(model)
     topics = Topics(**command.topics.model_dump())
     console = Console(soft_wrap=True, highlight=False)
-    read = [read_log(path, model, topics, command.joint_names) for path in command.logs]
-    log = join([log for log, _ in read])
-    for warning in [
-        *(said for _, warnings in read for said in warnings),
-        *describe_gaps(log, names),
-    ]:
+    log = join([read_log(path, model, topics, command.joint_names) for path in command.logs])
+    for warning in (*log.notes, *describe_gaps(log, names)):
         console.print(f"warning: {warning}", markup=False)
     set_up_jax(config)
     found = identify(

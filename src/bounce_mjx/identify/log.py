@@ -91,14 +91,9 @@ def make_log(source: str, angles: Rows, targets: Rows, balls: Rows) -> Log:
     """
     said: list[str] = []
     in_order = balls.select(np.argsort(balls.times, kind="stable"))
-    angles, targets, balls = (
-        _without(source, rows, rules, said)
-        for rows, rules in (
-            (angles, _RULES_OF_ANGLES),
-            (targets, _RULES_OF_TARGETS),
-            (in_order, _RULES_OF_PICTURES),
-        )
-    )
+    angles = _apply_rules(source, angles, _ANGLE_RULES, said)
+    targets = _apply_rules(source, targets, _TARGET_RULES, said)
+    balls = _apply_rules(source, in_order, _PICTURE_RULES, said)
     return Log(
         source, angles.times, angles.values, targets.times, targets.values,
         balls.times, balls.values, balls.arrivals, tuple(said),
@@ -118,7 +113,7 @@ class _Rule(NamedTuple):
     """What to do then."""
 
 
-def _without(source: str, rows: Rows, rules: Sequence[_Rule], said: list[str]) -> Rows:
+def _apply_rules(source: str, rows: Rows, rules: Sequence[_Rule], said: list[str]) -> Rows:
     """The rows that no rule leaves out; the others are counted in `said`."""
     for rule in rules:
         if not len(rows.times) or not np.any(wrong := rule.find(rows)):
@@ -135,12 +130,12 @@ def _without(source: str, rows: Rows, rules: Sequence[_Rule], said: list[str]) -
     return rows
 
 
-def _repeated(rows: np.ndarray) -> np.ndarray:
+def _find_repeats(rows: np.ndarray) -> np.ndarray:
     """Which rows [R] of [R, k] are equal to the one before."""
     return np.all(np.diff(rows, axis=0, prepend=np.nan) == 0.0, axis=1)
 
 
-def _spikes(rows: Rows) -> np.ndarray:
+def _find_spikes(rows: Rows) -> np.ndarray:
     """Which angles [R] are off a line through their neighbours as no arm can be."""
     found, q = np.zeros(len(rows.times), bool), rows.values
     if len(found) < 5:
@@ -156,7 +151,7 @@ def _spikes(rows: Rows) -> np.ndarray:
     return found
 
 
-def _out_of_order(rows: Rows) -> np.ndarray:
+def _find_disorder(rows: Rows) -> np.ndarray:
     """Which rows [R] are not of the longest part with increasing times (patience sorting)."""
     ends: list[float] = []
     last: list[int] = []
@@ -177,21 +172,21 @@ _FAR = _Rule(
     "has a time far from the others",
     *_ONE_CLOCK,
 )
-_RULES_OF_TARGETS = (
+_TARGET_RULES = (
     _Rule(lambda rows: rows.faults != "", refused=1.0),
     _Rule(
-        lambda rows: _repeated(np.column_stack([rows.times, rows.values])),
+        lambda rows: _find_repeats(np.column_stack([rows.times, rows.values])),
         "repeats the one before",
     ),
     _FAR,
-    _Rule(_out_of_order, "has a time out of order", *_ONE_CLOCK),
+    _Rule(_find_disorder, "has a time out of order", *_ONE_CLOCK),
 )
-_RULES_OF_ANGLES = (*_RULES_OF_TARGETS, _Rule(_spikes, "is a jump there and back"))
-_RULES_OF_PICTURES = (
+_ANGLE_RULES = (*_TARGET_RULES, _Rule(_find_spikes, "is a jump there and back"))
+_PICTURE_RULES = (
     # An arm may have been recorded alone, with a tracker that saw no ball.
     _Rule(lambda rows: rows.faults != ""),
     # Trackers, and logs of control steps, hold the last picture until the next.
-    _Rule(lambda rows: _repeated(rows.values), "repeats the one before"),
+    _Rule(lambda rows: _find_repeats(rows.values), "repeats the one before"),
     _FAR,
     _Rule(
         lambda rows: np.any(np.abs(rows.values) > _FARTHEST_BALL, axis=1),
@@ -206,7 +201,7 @@ _RULES_OF_PICTURES = (
 )
 
 
-def in_one_clock(log: Log) -> Log:
+def align_clocks(log: Log) -> Log:
     """The log with the pictures' time stamps in the clock of their arrivals.
 
     A camera with its own clock is off by a constant and drifts by some parts in 1e5. The drift is
@@ -262,14 +257,11 @@ def least_age(log: Log) -> float:
     return max(0.0, float(np.quantile(log.arrivals - log.picture_times, 0.02)))
 
 
-def check(log: Log, joint_names: Sequence[str], joint_ranges: np.ndarray) -> list[str]:
+def check(log: Log, joint_names: Sequence[str], joint_ranges: np.ndarray) -> None:
     """Checks that a log can be the robot's.
 
     Args:
       joint_ranges: lower and upper limit [n, 2] of each joint, rad; both 0 for none.
-
-    Returns:
-      Warnings, a sentence each.
 
     Raises:
       UserError: it is too short, its times are not seconds or of two clocks, or a joint is far
@@ -305,8 +297,6 @@ def check(log: Log, joint_names: Sequence[str], joint_ranges: np.ndarray) -> lis
             f"s, and the servo targets at {begins[1]:.6g} and {ends[1]:.6g} s; give stamps of one "
             "clock, simulated time or the computer's"
         )
-    unseen = log.times[-1] - log.arrivals[-1] if len(log.arrivals) else 0.0
-    return [f"{log.source} shows no ball in its last {unseen:.1f} s"] if unseen > 2.0 else []
 
 
 def describe_gaps(log: Log, joint_names: Sequence[str]) -> list[str]:

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.errors import UserError, needed, reason_of, shorten
-from bounce_mjx.identify.log import Log, Rows, check, in_one_clock, make_log
+from bounce_mjx.identify.log import Log, Rows, align_clocks, check, make_log
 from bounce_mjx.robot.model import find_addresses, joint_names
 
 UNITS = {
@@ -39,20 +39,15 @@ class Topics(NamedTuple):
 _TYPES = Topics("JointState", "JointState or Float64MultiArray", "PointStamped or PoseStamped")
 
 
-def read_log(
-    path: Path, model: mujoco.MjModel, topics: Topics, names: Sequence[str] = ()
-) -> tuple[Log, list[str]]:
-    """Reads and checks the CSV file or the ROS bag of a robot's run.
+def read_log(path: Path, model: mujoco.MjModel, topics: Topics, names: Sequence[str] = ()) -> Log:
+    """Reads and checks the CSV file or the ROS bag of a robot's run; its times are of one clock.
 
     Args:
       model: the robot.
       names: the log's names of the robot's joints, in the robot's order; by default the model's.
 
-    Returns:
-      The log in one clock, and warnings for an identification, a sentence each.
-
     Raises:
-      UserError: as `read_csv`, `read_bag`, `check` and `in_one_clock`, or the names do not fit.
+      UserError: as `read_csv`, `read_bag`, `check` and `align_clocks`, or the names do not fit.
     """
     own = joint_names(model)
     names = tuple(names) or own
@@ -63,9 +58,8 @@ def read_log(
             "in this order"
         )
     log = read_bag(path, names, topics) if is_bag(path) else read_csv(path, names)
-    warnings = check(log, names, model.jnt_range[list(find_addresses(model).arm_joints)])
-    log = in_one_clock(log)
-    return log, [*log.notes, *warnings]
+    check(log, names, model.jnt_range[list(find_addresses(model).arm_joints)])
+    return align_clocks(log)
 
 
 def read_csv(path: Path, joint_names: Sequence[str]) -> Log:

@@ -1,7 +1,7 @@
 """Simulation of a log's windows in many candidate worlds side by side, on the engine of the
 training."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from typing import NamedTuple
@@ -112,6 +112,11 @@ def make_simulator(run: Run, layout: Layout, log: Log, windows: Windows) -> Simu
         times.T.astype(np.float32) for times in (windows.angle_times, windows.picture_times)
     )
 
+    # A log without a ball lacks these terms; the compiled simulation has them.
+    absent = {name: np.zeros(_LANES) for name in ("air_drag", "ball_latency")}
+    absent |= {name: np.zeros((_LANES, 3)) for name in ("ball_position_bias", CAMERA_ROTATION)}
+    absent["encoder_bias"] = np.zeros((_LANES, n))
+
     def simulate_block(
         vectors: np.ndarray, starts: np.ndarray, c: np.ndarray, s: np.ndarray
     ) -> list[np.ndarray]:
@@ -119,7 +124,7 @@ def make_simulator(run: Run, layout: Layout, log: Log, windows: Windows) -> Simu
         count, fill = len(c), np.minimum(np.arange(_LANES), len(c) - 1)
         # Another size would be compiled again.
         c, s = c[fill], s[fill]
-        world = _fill_world(layout.world(vectors[c]), n)
+        world = absent | layout.world(vectors[c])
         targets = np.empty((windows.steps, n, _LANES), np.float32)
         for i in np.unique(c):
             pair = layout.world(vectors[i])
@@ -152,19 +157,6 @@ def make_simulator(run: Run, layout: Layout, log: Log, windows: Windows) -> Simu
         return Predicted(*results)
 
     return simulate
-
-
-def _fill_world(world: Mapping[str, np.ndarray], num_joints: int) -> dict[str, np.ndarray]:
-    """The world of candidates with the terms that a log without a ball lacks."""
-    count = len(world["action_latency"])
-    absent = {
-        "encoder_bias": np.zeros((count, num_joints)),
-        "air_drag": np.zeros(count),
-        "ball_latency": np.zeros(count),
-        "ball_position_bias": np.zeros((count, 3)),
-        CAMERA_ROTATION: np.zeros((count, 3)),
-    }
-    return absent | dict(world)
 
 
 def make_targets(log: Log, windows: Windows, dt: float) -> Callable[[float, float], np.ndarray]:
