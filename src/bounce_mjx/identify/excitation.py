@@ -72,7 +72,7 @@ def excite(
     room = np.where(limited, np.min(np.abs(ranges - centre[:, None]), axis=1) - 0.02, np.inf)
     amplitudes = np.minimum(_LARGEST_AMPLITUDE, room)
     contacts = ContactChecker(config, MARGIN, table_height)
-    # Parts of one arm that overlap or pass each other closely in its start pose are drawn so.
+    # Parts of the arm that overlap or nearly touch in its start pose are modelled so.
     near = ContactChecker(config, 2.0 * MARGIN).touching(home)
     allowed = {pair for pair in near if min(pair) >= 0}
     if below := sorted(contacts.touching(home) - allowed):

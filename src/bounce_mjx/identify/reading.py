@@ -73,23 +73,22 @@ def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
       UserError: the file cannot be read, a column is missing or states an unknown unit, or as
         `make_log`.
     """
-    header, lines, rows = _read_cells(path)
-    found = _find_columns(path, header)
+    lines, columns = _read_columns(path)
 
     def column(name: str, unit: str) -> np.ndarray:
-        if name not in found:
+        if name not in columns:
             raise UserError(
                 f"{path} has no column {name} [{unit}]; its columns are "
-                f"{', '.join(map(shorten, list(found)[:30]))}; if the joints have other names, "
+                f"{', '.join(map(shorten, list(columns)[:30]))}; if the joints have other names, "
                 "give the log's robot with --robot, or the names in this order with --joint-names"
             )
-        index, given = found[name]
+        given, cells = columns[name]
         if given not in UNITS[unit]:
             raise UserError(
-                f"{path} has the column {shorten(header[index])}, whose unit must be one of "
+                f"{path} has the column {name} [{shorten(given)}], whose unit must be one of "
                 f"{', '.join(UNITS[unit])}; write {name} [{unit}]"
             )
-        return np.array([_read_number(row[index]) for row in rows]) * UNITS[unit][given]
+        return np.array([_read_number(cell) for cell in cells]) * UNITS[unit][given]
 
     times = column("time", "s")
 
@@ -108,21 +107,22 @@ def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
         for what in ("joint angles", "servo targets")
     )
     what, ball = "pictures of the ball", [f"ball_position.{axis}" for axis in "xyz"]
-    if any(name in found for name in (*ball, "ball_time")):
-        balls = group(what, ball, "m", "ball_time" if "ball_time" in found else "time")
+    if any(name in columns for name in (*ball, "ball_time")):
+        balls = group(what, ball, "m", "ball_time" if "ball_time" in columns else "time")
     else:
         balls = Rows(what, "row {}", *np.zeros((3, 0)), np.zeros((0, 3)), np.zeros(0, str))
     return make_log(str(path), angles, targets, balls)
 
 
-def _read_cells(path: Path) -> tuple[list[str], np.ndarray, Sequence[list[str]]]:
-    """Header, and line number [R] and cells of each row, of a CSV file."""
+def _read_columns(path: Path) -> tuple[np.ndarray, dict[str, tuple[str, Sequence[str]]]]:
+    """Line numbers [R] of a CSV file's rows, and the stated unit and the cells [R] of each column
+    by its name."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             delimiter = max(",;\t", key=file.readline().count)
             file.seek(0)
             reader = csv.reader(file, delimiter=delimiter)
-            header = [name.strip() for name in next(reader, [])]
+            header = next(reader, [])
             numbered = [(reader.line_num, row) for row in reader if any(row)]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise UserError(
@@ -140,7 +140,13 @@ def _read_cells(path: Path) -> tuple[list[str], np.ndarray, Sequence[list[str]]]
         if delimiter != ",":
             row[:] = [cell.replace(",", ".") for cell in row]
     lines, rows = zip(*numbered, strict=True)
-    return header, np.array(lines), rows
+    columns: dict[str, tuple[str, Sequence[str]]] = {}
+    for title, cells in zip(header, zip(*rows, strict=True), strict=True):
+        name, unit = re.fullmatch(r"\s*(.*?)\s*(?:\[([^\[\]]*)\])?\s*", title).groups()
+        if name in columns:
+            raise UserError(f"{path} has two columns {shorten(name)}; leave one")
+        columns[name] = (unit or "").strip(), cells
+    return np.array(lines), columns
 
 
 def _read_number(text: str) -> float:
@@ -149,17 +155,6 @@ def _read_number(text: str) -> float:
         return float(text) if np.isfinite(float(text)) else np.nan
     except ValueError:
         return np.nan
-
-
-def _find_columns(path: Path, header: Sequence[str]) -> dict[str, tuple[int, str]]:
-    """Index and stated unit of each column by its name."""
-    found: dict[str, tuple[int, str]] = {}
-    for i, title in enumerate(header):
-        name, unit = re.fullmatch(r"(.*?)\s*(?:\[([^\[\]]*)\])?", title).groups()
-        if name in found:
-            raise UserError(f"{path} has two columns {shorten(name)}; leave one")
-        found[name] = i, (unit or "").strip()
-    return found
 
 
 def is_bag(path: Path) -> bool:

@@ -160,8 +160,25 @@ def identify(
     fit = search.run(stages, fit, pictures, 3, states)
     unseen = search.fit_held_out(fit, pictures, states)
     fit = search.run(stages, unseen, pictures, 3, states, np.ones_like(search.training))
-    found = _summarise(search.problem, fit, _measure_errors(search.problem, unseen))
-    return found._replace(stamp_age=least_age(log))
+    problem, windows = search.problem, search.problem.windows
+    layout = problem.layout
+    nominal = {name: TERMS[name].nominal for name in layout.terms() if name in TERMS}
+    own = layout.vector({name: value for name, value in nominal.items() if value is not None})
+    before = fit._replace(predicted=problem.predict(own, fit.starts))
+    counts = np.any(fit.weights[:, -3 * windows.balls.shape[1] :] > 0.0, axis=1)
+    known = certainty(problem, fit)
+    return Identified(
+        layout,
+        windows,
+        noise,
+        fit._replace(information=known.information),
+        known.covariance,
+        _measure_errors(problem, before),
+        _measure_errors(problem, fit),
+        _measure_errors(problem, unseen),
+        int(np.sum(windows.has_ball & ~counts)),
+        least_age(log),
+    )
 
 
 class _Search(NamedTuple):
@@ -287,27 +304,6 @@ def _fit_ball(search: _Search, fit: Fit) -> tuple[Fit, np.ndarray]:
     fit = search.fit_held_out(fit, 1.0, ball_state)
     pictures = picture_weights(search.problem, search.problem.predict(fit.vector, fit.starts))
     return search.run(["flight", "bounce"], fit, pictures, 6, ball_state), pictures
-
-
-def _summarise(problem: Problem, fit: Fit, held_out: dict[str, float]) -> Identified:
-    layout, windows = problem.layout, problem.windows
-    nominal = {name: TERMS[name].nominal for name in layout.terms() if name in TERMS}
-    own = layout.vector({name: value for name, value in nominal.items() if value is not None})
-    before = fit._replace(predicted=problem.predict(own, fit.starts))
-    weights = fit.weights[:, -3 * windows.balls.shape[1] :]
-    dropped = windows.has_ball & np.all(weights == 0.0, axis=1)
-    known = certainty(problem, fit)
-    return Identified(
-        layout,
-        windows,
-        problem.noise,
-        fit._replace(information=known.information),
-        known.covariance,
-        _measure_errors(problem, before),
-        _measure_errors(problem, fit),
-        held_out,
-        int(np.sum(dropped)),
-    )
 
 
 def _pick_first(problem: Problem, mask: np.ndarray) -> Fit:

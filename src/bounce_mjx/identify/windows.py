@@ -25,8 +25,8 @@ _MOST = 240
 _PADDING = 8
 _PICTURE_GAP = 0.06
 _JOINT_GAP = 0.1
-# Time after the begin of a log, or a gap, until the arm has forgotten the targets before it, which
-# nobody knows: the longest latency and a few of the longest lags, s.
+# Time after the start of a log, or a gap, until the arm has forgotten the unknown targets before
+# it, s: the longest latency and a few of the longest lags.
 _SETTLING = 0.3
 # Speed that the ball must have before and after a bounce, m/s.
 _BOUNCING = 0.5
