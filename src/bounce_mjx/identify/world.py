@@ -56,7 +56,9 @@ _ARM = (
     "angles, the clock of the servo targets, or the frame of the ball"
 )
 _MISTAKES = dict.fromkeys(BALL, _FRAME) | {CAMERA_ROTATION: _FRAME, "gravity_tilt": _FRAME}
-_MISTAKES |= dict.fromkeys(("air_drag", "ball_latency", "restitution"), _PICTURES)
+_MISTAKES |= dict.fromkeys(
+    ("air_drag", "ball_latency", "restitution", "contact_friction"), _PICTURES
+)
 
 
 class Estimate(NamedTuple):
@@ -90,14 +92,9 @@ def estimates(found: Identified, joint_names: Sequence[str]) -> list[Estimate]:
     for array in (values, low, high):
         array[late] += found.stamp_age
     seen = found.deviation < _UNSEEN * layout.deviation
-    units = layout.units()
-    labels = layout.labels(joint_names)
-    return [
-        Estimate(label, unit, float(x), float(a), float(b), bool(s), float(w))
-        for label, unit, x, a, b, s, w in zip(
-            labels, units, values, low, high, seen, alone, strict=True
-        )
-    ]
+    columns = (values, low, high, seen, alone)
+    words = layout.labels(joint_names), layout.units()
+    return list(map(Estimate, *words, *(column.tolist() for column in columns)))
 
 
 def _estimate_delays(found: Identified) -> dict[str, tuple[float, float]]:
