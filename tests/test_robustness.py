@@ -250,8 +250,8 @@ MISTAKES = {
         [dict(name="late", settings={"randomization.action_latency": [0, 1]})],
         "randomization.action_latency is not a setting to perturb",
     ),
-    "no list": (3, "perturbations is 3, but must be a list"),
-    "empty": ([], "perturbations is [], but must have at least 1 item"),
+    "no list": (3, "perturbations is 3, but must be a valid tuple"),
+    "empty": ([], "perturbations is [], but tuple should have at least 1 item"),
 }
 
 
@@ -271,7 +271,7 @@ def test_a_suite_that_is_no_file(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="the suite .* cannot be read"):
         load_suite(tmp_path / "none.yaml", EnvConfig())
     (tmp_path / "list.yaml").write_text("[1, 2]", encoding="utf-8")
-    with pytest.raises(UserError, match="holds a list, .*write it like configs/robustness.yaml"):
+    with pytest.raises(UserError, match="holds a list, not a mapping; give .*robustness.yaml"):
         load_suite(tmp_path / "list.yaml", EnvConfig())
 
 

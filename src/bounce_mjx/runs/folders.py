@@ -77,6 +77,16 @@ MIRROR_LAW = Checkpoint(Path("mirror law"), Path("mirror law"), 0)
 """In place of a checkpoint, the baseline `baselines.mirror`."""
 
 
+def refuse_brackets(folder: Path) -> None:
+    """UserError if orbax would lose arrays in this folder: its search takes brackets for a
+    pattern."""
+    if "[" in str(folder.absolute()):
+        raise UserError(
+            f"{folder.absolute()} has a square bracket, and orbax loses the arrays of checkpoints "
+            "in such a folder; give --log-dir, or move the run to, a folder without one"
+        )
+
+
 def create_run(config: TrainConfig) -> Path:
     """Creates a new run's folder, named after the current time (UTC), with the config in it.
 
@@ -84,6 +94,7 @@ def create_run(config: TrainConfig) -> Path:
       UserError: the folder cannot be written, or the robot cannot be copied into it.
     """
     check_name(config.log_dir.absolute())
+    refuse_brackets(config.log_dir)
     # Not the local time, which is another one on another machine, and in autumn goes back.
     stamp = datetime.datetime.now(datetime.UTC).strftime(_STAMP)
     try:
