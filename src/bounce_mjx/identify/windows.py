@@ -154,7 +154,7 @@ def _find_bounces(log: Log) -> list[tuple[float, float, float]]:
 
 
 def _share_flight(flight: float) -> float:
-    """Time of a flight that belongs to the bounce at its begin, s: enough for the next window to
+    """Time of a flight that belongs to the bounce at its start, s: enough for the next window to
     start in the air."""
     return float(np.clip(_AFTER_SHARE * flight, min(1.25 * MAX_DELAY, 0.5 * flight), _AFTER))
 
