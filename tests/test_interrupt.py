@@ -79,7 +79,7 @@ with stdout().status("compiling"):
 
 
 COMMANDS = {
-    "eval": ("bounce_mjx.eval --physics mjx --episodes 4", "go_on"),
+    "eval": ("bounce_mjx.eval --physics mjx --episodes 4", "run"),
     "play": ("bounce_mjx play --physics mjx --viewer browser --port 8321", "_advance"),
 }
 

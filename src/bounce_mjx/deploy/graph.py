@@ -25,7 +25,7 @@ _INLINED |= {"custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr"}
 # Operations that only move numbers, and which of their operands are indices.
 _MOVES = frozenset(
     "broadcast_in_dim concatenate copy dynamic_slice dynamic_update_slice gather pad reshape rev "
-    "scatter slice split squeeze stack stop_gradient tile transpose".split()
+    "scatter slice split squeeze stack stop_gradient tile transpose unstack".split()
 )
 _INDICES = {
     "dynamic_slice": range(1, 9),
