@@ -101,8 +101,6 @@ class Parts(NamedTuple):
     """The arm with the paddle's box; link i has joint i - 1."""
     links: list[str]
     """Names of the links, in the order of the joints [J]."""
-    paddle: int
-    """Index of the paddle's joint in `links`."""
     stiffness: np.ndarray
     """Of the servos [J], N m / rad."""
     damping: np.ndarray
@@ -195,7 +193,6 @@ def make_parts(model: mujoco.MjModel) -> Parts:
     return Parts(
         urdf=ET.tostring(robot, encoding="unicode"),
         links=[f"link{body}" for body in links],
-        paddle=links.index(model.geom_bodyid[paddle]),
         stiffness=model.actuator_gainprm[:, 0],
         damping=-model.actuator_biasprm[:, 2],
         torque=np.where(model.actuator_forcelimited > 0, limits, 1e4),
@@ -412,6 +409,41 @@ def dart(parts: Parts, world: World, tuning: Tuning) -> Simulator:
     )
 
 
+def own_engine(model: mujoco.MjModel) -> Simulator:
+    """MuJoCo itself, in whose servos' time a step is measured for the others."""
+    addresses, data = find_addresses(model), mujoco.MjData(model)
+    qpos, qvel = list(addresses.arm_qpos), list(addresses.arm_qvel)
+
+    def reset(angles, positions, velocities):
+        mujoco.mj_resetData(model, data)
+        data.qpos[qpos] = angles
+        servo_targets(angles)
+        for ball, position, velocity in zip(addresses.balls, positions, velocities, strict=True):
+            data.qpos[list(ball.qpos[:3])] = position
+            data.qvel[list(ball.qvel[:3])] = velocity
+
+    def ball_state():
+        rows, spin_and_velocity = [], np.zeros(6)
+        for ball in addresses.balls:
+            kind = mujoco.mjtObj.mjOBJ_BODY
+            mujoco.mj_objectVelocity(model, data, kind, ball.body, spin_and_velocity, 0)
+            spin, velocity = np.split(spin_and_velocity, 2)
+            rows.append(np.concatenate([data.qpos[list(ball.qpos[:3])], velocity, spin]))
+        return np.array(rows)
+
+    def servo_targets(angles):
+        data.ctrl[list(addresses.actuators)] = angles
+
+    return Simulator(
+        reset,
+        lambda: (data.qpos[qpos], data.qvel[qvel]),
+        ball_state,
+        servo_targets,
+        lambda: mujoco.mj_step(model, data),
+        lambda: None,
+    )
+
+
 SIMULATORS = {"bullet": bullet, "physx": physx, "dart": dart}
 
 
@@ -453,31 +485,11 @@ def lag(simulator: Simulator, parts: Parts, angles: np.ndarray, timestep: float)
     return float(np.mean(times))
 
 
-def mujoco_lag(model: mujoco.MjModel, angles: np.ndarray) -> float:
-    """What `lag` finds in MuJoCo, without the ball."""
-    addresses, data, times = find_addresses(model), mujoco.MjData(model), []
-    for j in range(len(angles)):
-        mujoco.mj_resetData(model, data)
-        data.qpos[list(addresses.arm_qpos)] = angles
-        for i, ball in enumerate(addresses.balls):
-            data.qpos[list(ball.qpos[:3])] = (0.0, 10.0 + i, 10.0)
-        data.ctrl[list(addresses.actuators)] = angles + STEP * (np.arange(len(angles)) == j)
-        before, level = 0.0, (1.0 - np.exp(-1.0)) * STEP
-        while data.time < 1.0:
-            mujoco.mj_step(model, data)
-            moved = data.qpos[addresses.arm_qpos[j]] - angles[j]
-            if moved >= level:
-                share = (level - before) / (moved - before)
-                times.append(data.time - model.opt.timestep * (1.0 - share))
-                break
-            before = moved
-    return float(np.mean(times))
-
-
 def tune(name: str, model: mujoco.MjModel, world: World, angles: np.ndarray) -> Tuning:
     """The coefficient and the time constant with which a simulator shows the world's restitution
     and MuJoCo's time of a step, by bisection."""
-    parts, wanted = make_parts(model), mujoco_lag(model, angles)
+    parts = make_parts(model)
+    wanted = lag(own_engine(model), parts, angles, model.opt.timestep)
     addresses, data = find_addresses(model), mujoco.MjData(model)
     data.qpos[list(addresses.arm_qpos)] = angles
     mujoco.mj_forward(model, data)

@@ -2,6 +2,7 @@
 
 import base64
 import dataclasses
+import errno
 import importlib.util
 import io
 import json
@@ -525,6 +526,23 @@ def test_weights_and_biases_gets_the_scalars_of_tensorboard(tmp_path: Path, monk
     # A resumed training continues the same run.
     WandbLog(tmp_path, "bounce", config)
     assert fake.settings["id"] == first["id"] and fake.settings["resume"] == "allow"
+
+
+def test_a_full_disk_costs_points_with_weights_and_biases_too(tmp_path: Path, monkeypatch) -> None:
+    def fail(_: object) -> None:
+        raise OSError(errno.ENOSPC, "no space")
+
+    monkeypatch.setitem(sys.modules, "wandb", fake := FakeWandb())
+    log = open_log(tmp_path, config=TrainConfig(), wandb="bounce")
+    monkeypatch.setattr(log._writer, "write_event", fail)
+    log.add_scalar("episode/return", 2.5, 64)
+    log.flush()
+    log.add_scalar("episode/return", 3.5, 128)
+    log.close()
+    (lost,) = [path for path in tmp_path.glob("events*") if not path.name.endswith(".1")]
+    lost.unlink()
+    assert logged(tmp_path, "episode/return") == {128: 3.5}
+    assert len(fake.logged) == 2 and fake.finished
 
 
 @pytest.mark.slow

@@ -504,11 +504,15 @@ def test_a_warm_start_takes_the_next_checkpoint_where_a_training_replaces_one(ru
 # Paths
 
 
-def test_a_path_with_a_square_bracket_is_refused(tmp_path: Path, capsys) -> None:
+def test_a_path_with_a_square_bracket_is_refused(tmp_path: Path, straight: Path, capsys) -> None:
     with pytest.raises(SystemExit):
         train(tmp_path / "exp[lr]", STEPS)
     assert "exp[lr] has a square bracket" in capsys.readouterr().err
     assert not (tmp_path / "exp[lr]").exists()
+    moved = shutil.copytree(straight, tmp_path / "moved[1]")
+    with pytest.raises(SystemExit):
+        resume(moved, "--total-steps", str(2 * STEPS))
+    assert "moved[1] has a square bracket" in capsys.readouterr().err
 
 
 # Evaluations and logs

@@ -194,13 +194,18 @@ class EditedModel:
         return self
 
     def _own(self, field: str) -> np.ndarray:
-        owner, _, name = field.rpartition(".")
-        return np.asarray(getattr(self.model.opt if owner == "opt" else self.model, name))
+        return _field(self.model, field)
 
     def _set(self, field: str, values: dict[int, Scalar]) -> None:
         entries = self.fields.setdefault(field, self._own(field).ravel().tolist())
         for place, value in values.items():
             entries[place] = value
+
+
+def _field(mj_model: mujoco.MjModel, name: str) -> np.ndarray:
+    """A view of a model's field, or of one in its options."""
+    owner, _, name = name.rpartition(".")
+    return np.asarray(getattr(mj_model.opt if owner == "opt" else mj_model, name))
 
 
 def edited(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> EditedModel:
@@ -291,8 +296,7 @@ def edited_model(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> muj
     numbers = jax.tree.map(lambda x: np.asarray(x, np.float64).tolist(), parameters)
     m, model = edited(mj_model, numbers).derive(), copy.copy(mj_model)
     for field in m.fields:
-        owner, _, name = field.rpartition(".")
-        getattr(model.opt if owner else model, name)[...] = m.array(field)
+        _field(model, field)[...] = m.array(field)
     if m.rows("dof_frictionloss"):
         raise_solver_limits(model.opt)
     return model
@@ -303,8 +307,7 @@ def own_parameters(mj_model: mujoco.MjModel) -> PhysicsParameters:
     has an infinite one."""
     m, own = mj_model, {}
     for edit in edits(m):
-        owner, _, name = edit.field.rpartition(".")
-        values = getattr(m.opt if owner else m, name)[edit.index] / edit.scale
+        values = _field(m, edit.field)[edit.index] / edit.scale
         own.setdefault(edit.parameter, np.array(values))
     servos = list(find_addresses(m).actuators)
     least = np.min(np.abs(m.actuator_forcerange[servos]), axis=1)

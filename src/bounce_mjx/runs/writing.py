@@ -20,7 +20,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig
 from bounce_mjx.runs.files import seal, to_json, to_plain, writable, write_atomically
-from bounce_mjx.runs.folders import CHECKPOINTS, create_run, refuse_brackets, save_config
+from bounce_mjx.runs.folders import CHECKPOINTS, create_run, save_config
 from bounce_mjx.runs.progress import RESULTS_FILE
 from bounce_mjx.runs.reading import POLICY, RECORD
 
@@ -137,14 +137,12 @@ def save_checkpoint(
       score: quality of the policy (`Report.score`); empty if it was not evaluated.
 
     Raises:
-      UserError: the folder's path has a square bracket.
       OSError: the checkpoint could not be written.
     """
     import orbax.checkpoint as ocp
     from orbax.checkpoint.checkpoint_managers import preservation_policy as keep
 
     folder = (run / CHECKPOINTS).absolute()
-    refuse_brackets(folder)
     folder.mkdir(exist_ok=True)
     alone = {jax.process_index()}
     options = ocp.CheckpointManagerOptions(

@@ -257,6 +257,7 @@ class _Job:
 
     def _resume(self) -> None:
         folders.check_links(self.run)
+        folders.refuse_brackets(self.run)
         if hosts.is_leader():
             # What a process that was killed was writing.
             for path in self.run.rglob(f"{UNFINISHED}*"):

@@ -119,7 +119,7 @@ class WandbLog(TensorBoardLog):
         import wandb
 
         try:
-            self._run = wandb.init(
+            self._tracker = wandb.init(
                 project=project,
                 name=run.name,
                 id=hashlib.sha256(str(run.absolute()).encode()).hexdigest()[:16],
@@ -137,8 +137,8 @@ class WandbLog(TensorBoardLog):
 
     def add_scalar(self, name: str, value: float, steps: int) -> None:
         super().add_scalar(name, value, steps)
-        self._run.log({name: value}, step=steps)
+        self._tracker.log({name: value}, step=steps)
 
     def close(self) -> None:
         super().close()
-        self._run.finish()
+        self._tracker.finish()
