@@ -284,7 +284,7 @@ def _introduction(run: Path, log_dir: Path) -> Iterator[str]:
 
 def stored_checkpoints(run: Path) -> list[Checkpoint]:
     """Checkpoints of a run."""
-    folder, paths = (run / CHECKPOINTS).absolute(), []
+    folder, paths = Path(os.path.abspath(run / CHECKPOINTS)), []
     with contextlib.suppress(OSError), os.scandir(folder) as entries:
         # One look, as a training may remove them meanwhile.
         paths = [folder / entry.name for entry in entries if entry.name.isdecimal()]

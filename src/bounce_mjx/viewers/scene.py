@@ -52,8 +52,9 @@ class Scene:
         self._env = env
         self._names = names
         self._display = Display(env)
-        server.on_client_connect(self._welcome)
         self.show(num_envs)
+        # After the scene is built: a page that is there already is welcomed at once.
+        server.on_client_connect(self._welcome)
 
     def show(self, num_envs: int) -> None:
         """Builds the scene for the first `num_envs` environments of the next frames."""
