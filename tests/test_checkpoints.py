@@ -141,8 +141,6 @@ def test_orbax_alone_reads_a_checkpoint(written: Path, state: TrainingState) -> 
 @pytest.mark.parametrize("name", POLICIES)
 def test_orbax_alone_reads_a_policy_of_the_package(name: str) -> None:
     checkpoint = pretrained_checkpoint(name)
-    if is_old(checkpoint.folder):
-        pytest.skip("written by version 0.1")
     policy = read_policy(checkpoint, load_run_config(checkpoint.run))
     assert_read_by_orbax(checkpoint.folder, policy)
 

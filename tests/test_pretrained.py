@@ -104,7 +104,7 @@ def test_it_is_small_and_holds_only_the_policy() -> None:
     files = [path for path in FOLDER.rglob("*") if path.is_file() and not others & set(path.parts)]
     assert sum(path.stat().st_size for path in files) < 1_000_000
     items = {path.name for path in pretrained_checkpoint().folder.iterdir() if path.is_dir()}
-    assert items == {"policy"}
+    assert items == {"policy", "record", "metrics"}
 
 
 @pytest.mark.parametrize("task", TASK_POLICIES)
