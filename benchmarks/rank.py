@@ -1,4 +1,4 @@
-"""Figures that rank policies beyond the five results (docs/benchmark.md).
+"""Figures that rank policies beyond the five results (docs/evaluation.md).
 
     python benchmarks/rank.py pretrained robust mirror
 

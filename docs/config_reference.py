@@ -14,7 +14,7 @@ from bounce_mjx.world.randomization import Term
 
 _HEAD = """# Config reference
 
-Every setting of a training run for the task bounce; [other tasks](write-a-task.md) have other
+Every setting of a training run for the task bounce; [other tasks](tasks.md#write-a-task) have other
 keys in `env`. In a YAML file (`--config FILE`, see [training](training.md#a-file-of-your-own)) the
 keys are nested groups. A preset overrides the defaults, a file of yours the preset, a robot
 (`--robot`) the file, and a command-line flag all of them. Unknown keys and values out of range are

@@ -1,4 +1,4 @@
-"""Dribbling as a task of one's own (docs/write-a-task.md): many low bounces."""
+"""Dribbling as a task of one's own (docs/tasks.md): many low bounces."""
 
 import math
 from typing import Annotated, NamedTuple

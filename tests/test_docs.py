@@ -411,7 +411,7 @@ def examples(page: str, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", content(page), re.MULTILINE | re.DOTALL)
 
 
-@pytest.mark.parametrize("page", ["rewards.md", "sensors.md", "training.md"])
+@pytest.mark.parametrize("page", ["task.md", "other-robots.md", "training.md"])
 def test_files_on_pages_are_configs(page: str, tmp_path: Path) -> None:
     files = examples(page, "yaml")
     assert files
@@ -422,7 +422,7 @@ def test_files_on_pages_are_configs(page: str, tmp_path: Path) -> None:
 
 def test_new_term_of_the_rewards_page_is_a_term(tmp_path: Path) -> None:
     """The page's code, as a file of the user's."""
-    (example,) = examples("rewards.md", "python")
+    (example,) = examples("task.md", "python")
     (tmp_path / "straight.py").write_text(example)
     task = find_task(f"{tmp_path}/straight.py:Straight")
     config = task.Config(reward={"sideways_velocity": {"weight": 2.0}}).reward
@@ -440,10 +440,10 @@ def test_new_term_of_the_rewards_page_is_a_term(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "page",
     [
-        "load-a-policy.md",
-        "sensors.md",
+        "real-robot.md",
+        "other-robots.md",
         "algorithms.md",
-        pytest.param("jax.md", marks=pytest.mark.slow),
+        pytest.param("libraries.md", marks=pytest.mark.slow),
     ],
 )
 def test_examples_on_jax_run(page: str, capsys) -> None:
@@ -484,12 +484,10 @@ def test_figures_are_those_of_the_measurements() -> None:
     )
     assert f"| {cold} | {cold_on_cpu} |" in readme
     assert f"| {second} | {second_on_cpu} |" in readme
-    quick_start, front = (
-        " ".join(content(page).split()) for page in ("quick-start.md", "README.md")
-    )
-    assert f"takes {cold_on_cpu} on 2 cores" in quick_start
-    assert f"compilation ({second_on_cpu})" in quick_start
-    assert f"({cold} on an H200, {second} from the second start on)" in quick_start
+    front = " ".join(content("README.md").split())
+    assert f"takes {cold_on_cpu} on 2 cores" in front
+    assert f"compilation ({second_on_cpu})" in front
+    assert f"({cold} on an H200, {second} from the second start on)" in front
     assert f"takes {cold} on one H200 and {cold_on_cpu} on 2 CPU cores" in front
 
     measured = table_after(results, "## Against other trainers")
@@ -513,8 +511,7 @@ def test_robot_page_has_every_term_of_the_randomisation_and_every_entry_of_the_f
 
 
 def test_robot_page_example_runs() -> None:
-    page = content("real-robot.md")
-    (example,) = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    example = examples("real-robot.md", "python")[0]
     names: dict = {}
     exec(compile(example, "real-robot.md", "exec"), names)
     # The arm is in its posture, and no target is farther than the action scale.

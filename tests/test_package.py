@@ -334,7 +334,7 @@ print(len(load_deployed("pretrained").needs))
             marks=pytest.mark.slow,
         ),
         ("docs/libraries.md", 1, "torch.Size([64, 29]) ", "torch_libraries"),
-        ("docs/jax.md", 0, "(64, 29) 0", None),
+        ("docs/libraries.md", 2, "(64, 29) 0", None),
     ],
     ids=["jax", "gymnasium", "torch", "brax"],
 )
