@@ -1,7 +1,6 @@
 """A log of a robot's run, its checks and its clocks."""
 
-import bisect
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -62,7 +61,7 @@ class Rows(NamedTuple):
     """Rows of one measurement, in the order of the file."""
 
     name: str
-    """What they are, for messages."""
+    """What they are and where they are from, for messages."""
     place: str
     """Place of a row in the file, with {} for its number."""
     numbers: np.ndarray
@@ -72,67 +71,96 @@ class Rows(NamedTuple):
     arrivals: np.ndarray
     """When each arrived [R], s."""
     values: np.ndarray
-    """[R, k]."""
-    faults: np.ndarray
-    """Why each holds no measurement [R]; empty if it holds one."""
+    """[R, k]; NaN for what was not measured."""
 
-    def select(self, kept: np.ndarray) -> "Rows":
-        """The rows of a mask [R], or at indices."""
-        return Rows(*self[:2], *(array[kept] for array in self[2:]))
+    def without(
+        self, wrong: np.ndarray, why: str, notes: list[str], refused: float = np.inf, advice=""
+    ) -> "Rows":
+        """The rows outside a mask [R], whose number goes to the notes.
+
+        Args:
+          why: what is wrong with them.
+          refused: share of the rows from which the log is refused, if there are two.
+          advice: what to do then.
+
+        Raises:
+          UserError: the log is refused.
+        """
+        if not (count := int(np.sum(wrong))):
+            return self
+        sentence = (
+            f"{count} of the {len(wrong)} {self.name} do not count: "
+            f"{self.place.format(self.numbers[np.argmax(wrong)])} {why}"
+        )
+        if count >= max(refused * len(wrong), 2.0):
+            raise UserError(sentence + advice)
+        notes.append(sentence)
+        return Rows(*self[:2], *(array[~wrong] for array in self[2:]))
+
+    def without_gaps(self, notes: list[str], refused: float = np.inf) -> "Rows":
+        """The rows in which every number is finite."""
+        wrong = ~np.isfinite(np.column_stack(self[3:])).all(axis=1)
+        return self.without(
+            wrong, f"lacks one of its {self.values.shape[1]} numbers", notes, refused
+        )
+
+    def without_repeats(self, columns: np.ndarray, notes: list[str]) -> "Rows":
+        """The rows whose columns [R, k] differ from those of the row before."""
+        same = np.all(np.diff(columns, axis=0, prepend=np.nan) == 0.0, axis=1)
+        return self.without(same, "repeats the one before", notes)
+
+    def without_far_times(self, notes: list[str]) -> "Rows":
+        """The rows whose times are near the log's middle."""
+        middle = np.median(self.times) if len(self.times) else 0.0
+        far = np.abs(self.times - middle) > _FAR_IN_TIME
+        return self.without(far, "has a time far from the others", notes, *_ONE_CLOCK)
+
+
+_ONE_CLOCK = _WRONG_ROWS, "; give each its own time, of one clock"
 
 
 def make_log(source: str, angles: Rows, targets: Rows, balls: Rows) -> Log:
-    """The log of three measurements, without the rows that are faulty, repeat others or have wrong
-    times, which its notes count.
+    """The log of three measurements, without the rows that lack a number, repeat others or have
+    wrong times, which its notes count.
 
     Raises:
       UserError: no joint angle or target is left, or a twentieth of the times or of the balls
         cannot be.
     """
-    said: list[str] = []
-    in_order = balls.select(np.argsort(balls.times, kind="stable"))
-    angles = _apply_rules(source, angles, _ANGLE_RULES, said)
-    targets = _apply_rules(source, targets, _TARGET_RULES, said)
-    balls = _apply_rules(source, in_order, _PICTURE_RULES, said)
+    notes: list[str] = []
+    angles, targets = (_in_order(rows, notes) for rows in (angles, targets))
+    angles = angles.without(_find_spikes(angles), "is a jump there and back", notes)
+    order = np.argsort(balls.times, kind="stable")
+    balls = Rows(*balls[:2], *(array[order] for array in balls[2:]))
+    # An arm may have been recorded alone, with a tracker that saw no ball. Trackers, and logs of
+    # control steps, hold the last picture until the next.
+    balls = balls.without_gaps(notes)
+    balls = balls.without_repeats(balls.values, notes).without_far_times(notes)
+    balls = balls.without(
+        np.any(np.abs(balls.values) > _FARTHEST_BALL, axis=1),
+        f"is farther away than {_FARTHEST_BALL:g} m",
+        notes,
+        _WRONG_ROWS,
+        "; if these are millimetres, write ball_position.x [mm]",
+    )
+    again = np.diff(balls.times, prepend=-np.inf) < _SAME_PICTURE
+    balls = balls.without(again, "has the time stamp of another", notes)
     return Log(
         source, angles.times, angles.values, targets.times, targets.values,
-        balls.times, balls.values, balls.arrivals, tuple(said),
+        balls.times, balls.values, balls.arrivals, tuple(notes),
     )  # fmt: skip
 
 
-class _Rule(NamedTuple):
-    """What leaves out rows of a measurement."""
-
-    find: Callable[[Rows], np.ndarray]
-    """Which rows [R] it leaves out."""
-    why: str = ""
-    """What is wrong with them; by default, their fault."""
-    refused: float = np.inf
-    """Share of the rows from which the log is refused, if there are two."""
-    remedy: str = ""
-    """What to do then."""
-
-
-def _apply_rules(source: str, rows: Rows, rules: Sequence[_Rule], said: list[str]) -> Rows:
-    """The rows that no rule leaves out; the others are counted in `said`."""
-    for rule in rules:
-        if not len(rows.times) or not np.any(wrong := rule.find(rows)):
-            continue
-        first, count = int(np.argmax(wrong)), int(np.sum(wrong))
-        sentence = (
-            f"{count} of the {len(wrong)} {rows.name} in {source} do not count: "
-            f"{rows.place.format(rows.numbers[first])} {rule.why or rows.faults[first]}"
-        )
-        if count >= max(rule.refused * len(wrong), 2.0):
-            raise UserError(sentence + rule.remedy)
-        said.append(sentence)
-        rows = rows.select(~wrong)
-    return rows
-
-
-def _find_repeats(rows: np.ndarray) -> np.ndarray:
-    """Which rows [R] of [R, k] are equal to the one before."""
-    return np.all(np.diff(rows, axis=0, prepend=np.nan) == 0.0, axis=1)
+def _in_order(rows: Rows, notes: list[str]) -> Rows:
+    """The rows of a measurement of every control step: whole, once each, with increasing times."""
+    rows = rows.without_gaps(notes, 1.0)
+    rows = rows.without_repeats(np.column_stack([rows.times, rows.values]), notes)
+    rows = rows.without_far_times(notes)
+    early = np.diff(np.maximum.accumulate(rows.times), prepend=-np.inf) <= 0.0
+    late = np.append(rows.times[:-1] >= np.minimum.accumulate(rows.times[::-1])[-2::-1], False)
+    # A time that is too late makes all that follow early, and one too early all before it late.
+    wrong = min(early, late[: len(early)], key=np.sum)
+    return rows.without(wrong, "has a time out of order", notes, *_ONE_CLOCK)
 
 
 def _find_spikes(rows: Rows) -> np.ndarray:
@@ -149,56 +177,6 @@ def _find_spikes(rows: Rows) -> np.ndarray:
     beside = np.convolve(off, [0.5, 0.0, 0.5], "same")
     found[1:-1] = large & (off > 1.5 * beside)
     return found
-
-
-def _find_disorder(rows: Rows) -> np.ndarray:
-    """Which rows [R] are not of the longest part with increasing times (patience sorting)."""
-    ends: list[float] = []
-    last: list[int] = []
-    before = np.full(len(rows.times), -1)
-    for i, time in enumerate(rows.times.tolist()):
-        k = bisect.bisect_left(ends, time)
-        ends[k : k + 1], last[k : k + 1] = [time], [i]
-        before[i] = last[k - 1] if k else -1
-    found, i = np.ones(len(rows.times), bool), last[-1]
-    while i >= 0:
-        found[i], i = False, before[i]
-    return found
-
-
-_ONE_CLOCK = _WRONG_ROWS, "; give each its own time, of one clock"
-_FAR = _Rule(
-    lambda rows: np.abs(rows.times - np.median(rows.times)) > _FAR_IN_TIME,
-    "has a time far from the others",
-    *_ONE_CLOCK,
-)
-_TARGET_RULES = (
-    _Rule(lambda rows: rows.faults != "", refused=1.0),
-    _Rule(
-        lambda rows: _find_repeats(np.column_stack([rows.times, rows.values])),
-        "repeats the one before",
-    ),
-    _FAR,
-    _Rule(_find_disorder, "has a time out of order", *_ONE_CLOCK),
-)
-_ANGLE_RULES = (*_TARGET_RULES, _Rule(_find_spikes, "is a jump there and back"))
-_PICTURE_RULES = (
-    # An arm may have been recorded alone, with a tracker that saw no ball.
-    _Rule(lambda rows: rows.faults != ""),
-    # Trackers, and logs of control steps, hold the last picture until the next.
-    _Rule(lambda rows: _find_repeats(rows.values), "repeats the one before"),
-    _FAR,
-    _Rule(
-        lambda rows: np.any(np.abs(rows.values) > _FARTHEST_BALL, axis=1),
-        f"is farther away than {_FARTHEST_BALL:g} m",
-        _WRONG_ROWS,
-        "; if these are millimetres, write ball_position.x [mm]",
-    ),
-    _Rule(
-        lambda rows: np.diff(rows.times, prepend=-np.inf) < _SAME_PICTURE,
-        "has the time stamp of another",
-    ),
-)
 
 
 def align_clocks(log: Log) -> Log:
@@ -220,24 +198,20 @@ def align_clocks(log: Log) -> Log:
     slope = float(theilslopes(ages[youngest], since[youngest])[0])
     offset = float(np.median(ages[youngest] - slope * since[youngest]))
     total, notes = abs(slope) * float(np.max(since)), list(log.notes)
-    if abs(slope) > _FASTEST_DRIFT:
-        if total > _NO_CLOCK:
-            raise UserError(
-                f"the time stamps of the pictures in {log.source} advance by {1.0 - slope:.4g} s "
-                "each second, and 1 s is expected; if they are milliseconds, write ball_time [ms]"
-            )
-        if total > 5.0 * _DRIFT:
-            notes.append(
-                f"the pictures in {log.source} grow older by {1e3 * total:.1f} ms over the log, "
-                "faster than clocks drift; this counts as latency"
-            )
-        slope = 0.0
-    elif total < _DRIFT:
-        slope = 0.0
-    else:
+    if drifts := total >= _DRIFT and abs(slope) <= _FASTEST_DRIFT:
         notes.append(
             f"the camera's clock drifts by {1e6 * slope:.0f} parts in 1e6 in {log.source}, "
             f"{1e3 * total:.1f} ms over the log; the pictures' time stamps are corrected"
+        )
+    elif total > _NO_CLOCK:
+        raise UserError(
+            f"the time stamps of the pictures in {log.source} advance by {1.0 - slope:.4g} s each "
+            "second, and 1 s is expected; if they are milliseconds, write ball_time [ms]"
+        )
+    elif total > 5.0 * _DRIFT:
+        notes.append(
+            f"the pictures in {log.source} grow older by {1e3 * total:.1f} ms over the log, faster "
+            "than clocks drift; this counts as latency"
         )
     offset *= abs(offset) > _LARGEST_AGE
     if offset:
@@ -245,7 +219,7 @@ def align_clocks(log: Log) -> Log:
             f"the camera's clock is {offset:.6g} s behind the robot's in {log.source}; the "
             "pictures' time stamps are corrected, and the youngest counts as of no age"
         )
-    stamps = log.picture_times + slope * since + offset
+    stamps = log.picture_times + drifts * slope * since + offset
     return log._replace(picture_times=stamps, notes=tuple(notes))
 
 

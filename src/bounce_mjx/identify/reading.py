@@ -93,14 +93,11 @@ def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
     times = column("time", "s")
 
     def group(what: str, names: Sequence[str], unit: str, stamp: str = "time") -> Rows:
-        """The rows with any cell of a measurement; those that lack another are faulty."""
+        """The rows with any cell of a measurement."""
         values = np.stack([column(name, unit) for name in names], axis=1)
-        stamps = column(stamp, "s")
-        empty = np.isnan(np.column_stack([values, times, stamps]))
-        why = np.array([f"has no number in the column {x}" for x in (*names, "time", stamp)])
-        faults = np.where(np.any(empty, axis=1), why[np.argmax(empty, axis=1)], "")
-        measured = ~np.all(np.isnan(values), axis=1)
-        return Rows(what, "row {}", lines, stamps, times, values, faults).select(measured)
+        used = ~np.all(np.isnan(values), axis=1)
+        arrays = lines, column(stamp, "s"), times, values
+        return Rows(f"{what} in {path}", "row {}", *(array[used] for array in arrays))
 
     angles, targets = (
         group(what, [f"{what.replace(' ', '_')}.{joint}" for joint in joint_names], "rad")
@@ -110,7 +107,7 @@ def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
     if any(name in columns for name in (*ball, "ball_time")):
         balls = group(what, ball, "m", "ball_time" if "ball_time" in columns else "time")
     else:
-        balls = Rows(what, "row {}", *np.zeros((3, 0)), np.zeros((0, 3)), np.zeros(0, str))
+        balls = Rows(what, "row {}", *np.zeros((3, 0)), np.zeros((0, 3)))
     return make_log(str(path), angles, targets, balls)
 
 
@@ -164,34 +161,46 @@ def is_bag(path: Path) -> bool:
 
 def read_bag(path: Path, joint_names: Sequence[str], topics: Topics) -> Log:
     """Reads a bag. Times are the header's stamps, or the bag's where a topic has none. Messages
-    that hold no measurement are left out and counted.
+    without a number for each joint are left out and counted.
 
     Raises:
       MissingPackage: rosbags is missing.
-      UserError: the bag cannot be read, a topic is missing or of another type, the ball is in two
-        frames, or as `make_log`.
+      UserError: the bag cannot be read, a topic is missing or of another type, no message has a
+        joint, the ball is in two frames, or as `make_log`.
     """
     found, num_joints = _read_messages(path, topics), len(joint_names)
     angles, targets = (
         _make_rows(
-            f"{name} of {topic}", found[topic], num_joints, lambda m: _read_angles(m, joint_names)
+            f"{name} of {topic} in {path}",
+            found[topic],
+            num_joints,
+            lambda message: _read_angles(message, joint_names),
         )
         for name, topic in (("joint angles", topics.joints), ("servo targets", topics.targets))
     )
-    balls = _make_rows(
-        f"pictures of the ball of {topics.ball}", found[topics.ball], 3, _read_position
-    )
-    seen = zip(found[topics.ball], balls.faults, strict=True)
-    frames = sorted({message.header.frame_id for (_, message), fault in seen if not fault})
+    for topic in topics[:2]:
+        given = {joint for _, message in found[topic] for joint in getattr(message, "name", ())}
+        missing = [joint for joint in joint_names if joint not in given]
+        if given and missing:
+            raise UserError(
+                f"{topic} in {path} has the joints {', '.join(map(shorten, sorted(given)[:20]))}, "
+                f"and {missing[0]} is missing; give the log's robot with --robot, or the driver's "
+                "names with --joint-names"
+            )
+    name = f"pictures of the ball of {topics.ball} in {path}"
+    balls = _make_rows(name, found[topics.ball], 3, _read_position)
+    seen = np.flatnonzero(np.isfinite(balls.values).all(axis=1))
+    frames = sorted({found[topics.ball][i][1].header.frame_id for i in seen})
     if len(frames) > 1:
         named = ", ".join(shorten(frame) or "none" for frame in frames)
         raise UserError(
             f"the messages of {topics.ball} in {path} are in the frames {named}; record the ball "
             "in one, that of the robot's base"
         )
-    if len(angles.times) > 1 and abs(np.median(angles.arrivals - angles.times)) > _TWO_CLOCKS:
+    own = np.isfinite(angles.times)
+    if np.any(own) and abs(np.median((angles.arrivals - angles.times)[own])) > _TWO_CLOCKS:
         # Such as simulated time: pictures arrived when the angles of the same moment did.
-        arrivals = np.interp(balls.arrivals, angles.arrivals, angles.times)
+        arrivals = np.interp(balls.arrivals, angles.arrivals[own], angles.times[own])
         balls = balls._replace(arrivals=arrivals)
     return make_log(str(path), angles, targets, balls)
 
@@ -236,45 +245,32 @@ def _make_rows(
     name: str,
     messages: Sequence[tuple[float, Any]],
     size: int,
-    read: Callable[[Any], tuple[Any, str]],
+    read: Callable[[Any], Sequence[float]],
 ) -> Rows:
-    """The measurements [size] of a topic, or why a message holds none."""
+    """The measurements [size] of a topic; NaN where a message holds another number of them, or has
+    no time stamp although others have one."""
     arrivals, times = np.array([arrival for arrival, _ in messages]), np.zeros(len(messages))
-    values, faults = np.full((len(messages), size), np.nan), []
+    values = np.full((len(messages), size), np.nan)
     for i, (_, message) in enumerate(messages):
         if hasattr(message, "header"):
             times[i] = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
-        given, fault = read(message)
-        if not fault:
+        if len(given := read(message)) == size:
             values[i] = given
-            fault = "" if np.all(np.isfinite(values[i])) else f"holds {values[i]}"
-        faults.append(fault)
     # Drivers that start before the clock, of a simulation say, stamp 0.
-    if np.any(times) and np.median(times) > 0.0:
-        why = np.where(times == 0.0, "has no time stamp", faults)
-    else:
-        times, why = arrivals, np.array(faults, str)
-    return Rows(name, "message {}", 1 + np.arange(len(why)), times, arrivals, values, why)
+    stamped = np.any(times) and np.median(times) > 0.0
+    times = np.where(times == 0.0, np.nan, times) if stamped else arrivals
+    return Rows(name, "message {}", 1 + np.arange(len(times)), times, arrivals, values)
 
 
-def _read_angles(message: Any, joint_names: Sequence[str]) -> tuple[Any, str]:
-    """Angles in the robot's order, or why there are none."""
+def _read_angles(message: Any, joint_names: Sequence[str]) -> Sequence[float]:
+    """Angles in the robot's order; fewer if some are missing."""
     if hasattr(message, "data"):
-        wrong = len(message.data) != len(joint_names)
-        fault = f"has {len(message.data)} numbers for {len(joint_names)} joints" if wrong else ""
-        return message.data, fault
+        return message.data
     given = dict(zip(message.name, message.position, strict=False))
-    missing = [joint for joint in joint_names if joint not in given]
-    if not missing:
-        return [given[joint] for joint in joint_names], ""
-    return None, (
-        f"has positions of the joints {', '.join(map(shorten, list(given)[:20])) or 'none'}, "
-        f"and {missing[0]} is missing; give a message with all joints, the log's robot with "
-        "--robot, or the driver's names with --joint-names"
-    )
+    return [given[joint] for joint in joint_names if joint in given]
 
 
-def _read_position(message: Any) -> tuple[Any, str]:
+def _read_position(message: Any) -> Sequence[float]:
     """Position of the ball; NaN, as trackers publish it, if it was not seen."""
     point = message.point if hasattr(message, "point") else message.pose.position
-    return [point.x, point.y, point.z], ""
+    return [point.x, point.y, point.z]
