@@ -7,48 +7,37 @@ from collections.abc import Iterator
 from typing import Any
 
 from bounce_mjx.config.settings import StrictModel
-from bounce_mjx.config.validation import unit_of
 from bounce_mjx.runs.config import train_config
 from bounce_mjx.tasks.registry import DEFAULT, find_task
 from bounce_mjx.world.randomization import Term
 
 _HEAD = """# Config reference
 
-Every setting of a training run for the task bounce; [other tasks](tasks.md#write-a-task) have other
-keys in `env`. In a YAML file (`--config FILE`, see [training](training.md#a-file-of-your-own)) the
-keys are nested groups. A preset overrides the defaults, a file of yours the preset, a robot
-(`--robot`) the file, and a command-line flag all of them. Unknown keys and values out of range are
-refused.
+Look up any setting of a training: its key, default, meaning and range. In a YAML file (`--config
+FILE`, see [training](training.md#a-file-of-your-own)) the keys are nested groups, one per section
+here. A flag is the full name without `env.` or `ppo.`, with hyphens: `--num-envs` for
+`ppo.num_envs`, `--reward.height.weight` for `env.reward.height.weight`. [Other
+tasks](tasks.md#write-a-task) have other keys in `env`.
 
-Each section lists the keys of one group. A key's flag is its full name without `env.` or `ppo.`
-and with hyphens: `--num-envs` for `ppo.num_envs`, and `--reward.height.weight` for
-`env.reward.height.weight`.
+Later wins: the defaults, a preset, your file, a robot (`--robot`), the flags. Unknown keys,
+values out of range and settings without effect are refused. Numbers are finite; whole numbers are
+below 2^31, steps at most 10^12, and may have an exponent (`1e6`). On the command line, a list is
+`256 256` or `256,256`, and a switch `--stop-when-solved`, `--no-stop-when-solved` or
+`--stop-when-solved=false`.
 
-A whole number may have an exponent (`1e6`). On the command line, the items of a list are separated
-by spaces or commas (`256 256` or `256,256`), and a switch has three forms, such as
-`--stop-when-solved`, `--no-stop-when-solved` and `--stop-when-solved=false`.
+Rules across keys:
 
-This page is generated from the types of the settings (`TrainConfig` in
-`src/bounce_mjx/runs/config.py`, and the groups in it):
-
-    python docs/config_reference.py > docs/config.md
-
-These rules apply across keys:
-
-- `env.control_dt` is a multiple of `env.physics_dt`, and `env.episode_seconds` is at least as long;
-- a range is [low, high] with low ≤ high;
-- an episode does not end where it starts: `env.ball_init_pos` is over `env.min_ball_height`, less
-  than `env.max_height_above_target` over the lowest target, and within
-  `env.max_horizontal_distance`;
-- the model's joint ranges contain `env.default_joint_angles`, and the ball's start and the target
-  heights are over the paddle there;
-- a setting that would have no effect is refused: `env.robot.*` but its limits without
-  `env.robot.site`, `env.action.max_lead` without `env.action.base: target`,
-  `env.randomization.push_interval` without `push_speed`;
+- `env.control_dt` is a multiple of `env.physics_dt`, and at most `env.episode_seconds`.
+- An episode does not end where it starts: `env.ball_init_pos` is above `env.min_ball_height`,
+  less than `env.max_height_above_target` over the lowest target, and within
+  `env.max_horizontal_distance`.
+- The joint ranges contain `env.default_joint_angles`; ball and targets are above the paddle
+  there.
 - `ppo.num_minibatches` divides `ppo.num_envs` × `ppo.rollout_length`, and a rollout is at most as
-  long as an episode;
-- `ppo.min_learning_rate` is at most the two upper limits;
-- `ppo.critic_metrics` names metrics of the environment.
+  long as an episode. `ppo.min_learning_rate` is at most the two upper limits.
+
+`python docs/config_reference.py > docs/config.md` writes this page from the types of the
+settings.
 """
 
 _CONFIG = train_config(find_task(DEFAULT))
@@ -73,45 +62,38 @@ def _groups(model: type[StrictModel], prefix: str) -> Iterator[tuple[type[Strict
 
 
 def _section(model: type[StrictModel], prefix: str) -> str:
-    rows = []
+    entries = []
     schema = model.model_json_schema()
     for name, field in model.model_fields.items():
         plain = schema["properties"][name]
         if "$ref" in plain:
             continue
         text = " ".join((field.description or "").split())
-        unit = unit_of(text)
-        kind = "" if "enum" in plain else _type(plain)
-        is_list = "array" in {option.get("type") for option in plain.get("anyOf", [plain])}
         terms = [mark for mark in field.metadata if isinstance(mark, Term)]
-        span = "each {:g} to {:g}".format(*terms[0].bounds) if terms else _range(plain)
-        value = (", " if is_list else " ").join(part for part in (kind, span) if part)
-        value += f" ({unit})" if unit else ""
-        cells = f"`{name}`", value, _default(plain.get("default")), text
-        rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n")
+        span = "{:g} to {:g}".format(*terms[0].bounds) if terms else _range(plain)
+        kind = "" if terms or "enum" in plain else _type(plain, plain.get("default") is None)
+        value = (", " if kind == "list" else " ").join(part for part in (kind, span) if part)
+        default = _default(plain.get("default"))
+        entries.append(f"- `{name}: {default}` {text}" + (f" ({value})\n" if value else "\n"))
     title = f"`{prefix.removesuffix('.')}`" if prefix else "The run"
     text = " ".join((model.__doc__ or "").split())
-    return (
-        f"\n## {title}\n\n{text}\n\n"
-        "| key | value | default | meaning |\n|---|---|---|---|\n" + "".join(rows)
-    )
+    return f"\n## {title}\n\n{text}\n\n" + "".join(entries)
 
 
-def _type(plain: dict[str, Any]) -> str:
-    """The type of a JSON schema in a word or two."""
+def _type(plain: dict[str, Any], in_full: bool) -> str:
+    """The type of a JSON schema in words; unless in full, what its default does not show."""
     if "anyOf" in plain:
-        return " or ".join(_type(option) for option in plain["anyOf"])
-    if "enum" in plain:
-        return "word"
+        return _type(plain["anyOf"][0], in_full)
+    if plain["type"] == "integer":
+        return "whole"
+    if not in_full:
+        return ""
     if plain.get("format") == "path":
         return "path"
     if plain["type"] == "array":
         items = plain.get("prefixItems")
-        first, *rest = _type(items[0] if items else plain["items"]).split(" or ")
-        each = " or ".join((f"{first}s", *rest))
-        return f"{len(items)} {each}" if items else f"list of {each}"
-    names = {"integer": "whole number", "string": "word", "boolean": "switch", "null": "nothing"}
-    return names.get(plain["type"], plain["type"])
+        return f"{len(items)} items" if items else "list"
+    return {"string": "word"}.get(plain["type"], plain["type"])
 
 
 def _default(value: Any) -> str:
@@ -140,17 +122,16 @@ def _range(plain: dict[str, Any]) -> str:
     if plain.get("type") == "array":
         items = plain.get("prefixItems")
         each = _range(items[0] if items else plain["items"])
-        least = f"at least {plain['minItems']}" if not items and plain.get("minItems") else ""
+        least = f"at least {plain['minItems']} item" if not items and plain.get("minItems") else ""
         return ", ".join(text for text in (least, f"each {each}" if each else "") if text)
+    if "minimum" in plain and plain.get("maximum", 10**12) < 10**12:
+        return f"{plain['minimum']:g} to {plain['maximum']:g}"
     signs = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
     # pydantic keeps its own names for the bounds behind a validator.
     signs |= {"gt": ">", "ge": "≥", "lt": "<", "le": "≤"}
-    limits = [f"{sign} {_bound(plain[key])}" for key, sign in signs.items() if key in plain]
-    return ", ".join(limits) or ("finite" if plain.get("type") == "number" else "")
-
-
-def _bound(value: float) -> str:
-    return {2**31: "2^31", 10**12: "10^12"}.get(value, f"{value:g}")
+    limits = {sign: plain[key] for key, sign in signs.items() if key in plain}
+    # The head of the page has the bounds of all whole numbers.
+    return ", ".join(f"{s} {x:g}" for s, x in limits.items() if x not in (2**31, 10**12))
 
 
 if __name__ == "__main__":
