@@ -1,0 +1,441 @@
+"""The live page: what its controls do, and that no client can do more."""
+
+import contextlib
+import io
+import re
+import socket
+import threading
+import time
+import urllib.error
+import urllib.parse
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+import viser
+from rich.console import Console
+
+import viewing
+from bounce_mjx import BounceBall
+from bounce_mjx.commands import train
+from bounce_mjx.env.env import Env
+from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation.results import Report
+from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.folders import latest_checkpoint
+from bounce_mjx.runs.reading import read_policy
+from bounce_mjx.viewers import browser
+from bounce_mjx.viewers.guard import open_server
+from bounce_mjx.viewers.scene import Scene, camera_pose
+from bounce_mjx.viewers.simulation import (
+    EnvFrame,
+    Simulation,
+    make_zero_controller,
+)
+from bounce_mjx.viewers.watch import TrainingPage, _Panel
+from tiny_runs import TINY
+from viewing import CAMERA, INFINITY, NAN, Client, LeanConfig, evaluated, served, wait_until, watch
+
+
+@pytest.fixture(scope="module")
+def mirrored() -> Simulation:
+    return viewing.mirrored()
+
+
+@pytest.fixture
+def page(mirrored: Simulation, monkeypatch) -> Iterator[tuple[Client, dict[str, list]]]:
+    """A client of a served simulation of two environments, and a record of the page's actions: the
+    numbers of environments shown, the speeds, the target heights and the pushes."""
+    did: dict[str, list] = {"shown": [], "speed": [], "target": [], "push": []}
+    for owner, method, record in (
+        (Scene, "show", lambda _, number: did["shown"].append(number)),
+        (Simulation, "step", lambda one: did["target"].append(one.command.get("target_height"))),
+        (Simulation, "push", lambda _, velocity: did["push"].append(velocity)),
+    ):
+        watch(monkeypatch, owner, method, record)
+    mirrored.command = {}
+    make_clock = browser.in_real_time
+
+    def clock(simulation, seconds, speed):
+        def watched() -> float:
+            did["speed"].append(speed())
+            return did["speed"][-1]
+
+        return make_clock(simulation, seconds, watched)
+
+    monkeypatch.setattr(browser, "in_real_time", clock)
+    with served(mirrored, monkeypatch) as client:
+        yield client, did
+    mirrored.command = {}
+
+
+def stands_still(did: dict[str, list]) -> bool:
+    """Whether the page makes no steps."""
+    before = len(did["target"])
+    time.sleep(0.3)
+    return len(did["target"]) == before
+
+
+# Values that the controls do not offer; the last item of each row is one that it offers.
+HOSTILE = {
+    "robots": (1e308, -1e308, 40, NAN, INFINITY, "many", [1], None, True, 10**18, 2),
+    "speed": (1e9, -1e9, 1e308, NAN, INFINITY, -INFINITY, "fast", {}, b"", 0.5),
+    "height, m": (1e9, -1.0, NAN, -INFINITY, "high", [0.5, 0.6], 0.6),
+    "speed, m/s": (1e9, NAN, INFINITY, None, 1.0),
+    "pause": (1, 0.0, "yes", None, [], NAN, False),
+    "drawn at each reset": (1, "no", {}, True),
+    "reset": ("", 3, None, [], True),
+    "towards": ("sideways", "", 3, None, [], "x" * 2000, "up"),
+}
+
+
+# Messages that a page never sends; most of them are valid for viser.
+FOREIGN = (
+    [1, 2, 3],
+    None,
+    {},
+    {"type": "NoSuchMessage"},
+    {"type": ["GuiUpdateMessage"], "uuid": "a", "updates": {}},
+    {"type": "GuiUpdateMessage", "uuid": ["a"], "updates": {"value": 1}},
+    {"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": 1}},
+    {"type": "GuiUpdateMessage", "uuid": "a"},
+    {"type": "CommandTriggerMessage", "uuid": 3},
+    {"type": "CommandTriggerMessage", "uuid": "a", "more": 1},
+    {"type": "GuiButtonHoldMessage", "uuid": "a", "frequency": "x"},
+    {"type": "GuiFormDirtyMessage", "uuid": "a"},
+    {"type": "FileTransferPart", "transfer_uuid": "a", "part_index": 0, "content": b"a"},
+    {"type": "GetRenderResponseMessage", "payload": b"", "render_uuid": "a"},
+    {"type": "ScenePointerMessage", "event_type": "click"},
+    *(CAMERA | {name: value} for name in list(CAMERA)[1:] for value in (NAN, 1e300, "a", [0, "a"])),
+)
+
+
+@pytest.mark.slow
+def test_no_client_can_end_or_stall_the_server(page, capfd) -> None:
+    """Whatever a client sends, the simulation keeps within what the controls offer, other clients
+    read on, and nothing is printed."""
+    client, did = page
+    controls = {label: client.control(label) for label in HOSTILE}
+    capfd.readouterr()
+    for label, (*values, _) in HOSTILE.items():
+        for value in values:
+            client.set(controls[label], value)
+        for name in ("update_cb", "disabled", "min", "uuid", "nonsense"):
+            client.set(controls[label], [], name=name)
+    for message in FOREIGN:
+        client.send(message)
+    client.send_bytes(b"\xc1")
+    client.send_bytes(b"\x91" * 2000)
+    client.send_bytes("text")
+    client.set(controls["pause"], False)
+    steps = len(did["target"])
+    wait_until(lambda: len(did["target"]) > steps)
+    assert set(did["shown"]) <= {1, 2}
+    assert all(speed == 0.0 or 0.1 <= speed <= 4.0 for speed in did["speed"])
+    assert all(target is None or 0.3 <= target <= 0.8 for target in did["target"])
+    assert not did["push"]
+
+    with contextlib.closing(Client(client.address)) as other:
+        assert other.control("robots") == controls["robots"]
+        for label, (*_, value) in HOSTILE.items():
+            client.set(controls[label], value)
+        wait_until(lambda: did["push"] and did["shown"][-1] == 2 and did["speed"][-1] == 0.5)
+        np.testing.assert_allclose(did["push"], [(0.0, 0.0, 1.0)])
+        client.press("faster")
+        while other.values.get(controls["speed"]) != 0.6:
+            other.receive()
+        # The values that the other client was told, in the server's own number of decimals.
+        told = [other.values[controls[label]] for label in ("robots", "height, m", "speed, m/s")]
+        assert told == [2, 0.6, 1.0]
+    assert capfd.readouterr() == ("", "")
+
+
+def test_an_invalid_camera_is_ignored(page) -> None:
+    """One camera position is not a number, and one is the point that the camera looks at."""
+    client, did = page
+    for position, number in ((NAN, 2), (0.0, 1)):
+        client.look(position=[position, 0.0, 0.0])
+        client.set(client.control("robots"), number)
+        wait_until(lambda number=number: did["shown"][-1] == number)
+
+
+def handshake(address: str, host: str | None, origin: str | None) -> int:
+    """The status of the answer to a page that opens a WebSocket."""
+    where = urllib.parse.urlsplit(address)
+    lines = ["GET / HTTP/1.1", "Upgrade: websocket", "Connection: Upgrade"]
+    lines += ["Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==", "Sec-WebSocket-Version: 13"]
+    lines += [f"Sec-WebSocket-Protocol: viser-v{viser.__version__}"]
+    lines += [f"{name}: {x}" for name, x in (("Host", host), ("Origin", origin)) if x is not None]
+    with socket.create_connection((where.hostname, where.port)) as client:
+        client.sendall("\r\n".join([*lines, "", ""]).encode())
+        return int(client.recv(12)[-3:])
+
+
+LOOPBACK = "http://127.0.0.1:PORT http://localhost:PORT http://[::1]:9 https://LocalHost"
+STRANGE = "http://evil.test:PORT http://192.0.2.1:PORT http://localhost.evil.test http://"
+HOSTS = {
+    "local": ("127.0.0.1", (), LOOPBACK, STRANGE),
+    "everywhere": (
+        "0.0.0.0",
+        (),
+        f"http://192.0.2.1:PORT http://[2001:db8::1]:PORT http://{socket.gethostname()}",
+        "http://evil.test:PORT http://127.0.0.1.evil.test:PORT",
+    ),
+    "allowed": (
+        "127.0.0.1",
+        ("gpu.lab",),
+        "http://gpu.lab:PORT https://GPU.lab http://localhost:PORT",
+        "http://evil.test:PORT http://agpu.lab",
+    ),
+}
+
+
+@pytest.mark.parametrize(("host", "allowed", "pages", "strangers"), HOSTS.values(), ids=HOSTS)
+def test_only_its_own_page_may_connect(host, allowed, pages, strangers, capfd) -> None:
+    with open_server(host, 0, allowed) as server:
+        port = str(server.get_port())
+        pages, strangers = (text.replace("PORT", port).split() for text in (pages, strangers))
+        address = f"http://127.0.0.1:{port}"
+        for page in pages:
+            name = page.partition("://")[2]
+            assert handshake(address, name, page) == 101, page
+            # A program other than a browser sends no origin.
+            assert handshake(address, name, None) == 101, page
+            for stranger in [*strangers, "null", "http://localhost:1", "file://", "http://[", ""]:
+                assert handshake(address, name, stranger) == 403, (page, stranger)
+        for stranger in strangers:
+            name = stranger.partition("://")[2]
+            assert handshake(address, name, stranger) == 403, stranger
+            assert handshake(address, name, None) == 403, stranger
+        assert handshake(address, None, None) == 403
+        # A proxy replaces the name.
+        for name in allowed:
+            assert handshake(address, "127.0.0.1", f"https://{name}") == 101
+        request = urllib.request.Request(address, headers={"Host": "evil.test"})
+        with pytest.raises(urllib.error.HTTPError) as refusal:
+            urllib.request.urlopen(request)
+        assert refusal.value.code == 403 and b"--allow-host" in refusal.value.read()
+        with urllib.request.urlopen(address) as answer:
+            assert b"<html" in answer.read(2000)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_viser_that_cannot_be_guarded_is_refused(monkeypatch) -> None:
+    """As a version would be that starts its server in another way."""
+
+    class Other:
+        def __init__(self, **options):
+            self.stop = lambda: stopped.append(True)
+
+    stopped = []
+    monkeypatch.setattr(viser, "ViserServer", Other)
+    with pytest.raises(UserError, match="would admit every website.*; install"):
+        with open_server("127.0.0.1", 0):
+            pass
+    assert stopped
+
+
+def test_keys_act(page) -> None:
+    client, did = page
+    client.control("push the ball right")
+    assert client.sliders["height, m"] == (0.3, 0.8, 0.01)
+    assert client.lines == ["s", "ball", "target", "paddle"]
+    client.press("target height up")
+    wait_until(lambda: did["target"][-1] == pytest.approx(0.55))
+    client.press("slower")
+    wait_until(lambda: did["speed"][-1] == pytest.approx(0.9))
+    client.press("push the ball up")
+    wait_until(lambda: did["push"])
+    np.testing.assert_allclose(did["push"][-1], (0.0, 0.0, 0.2))
+    client.press("pause")
+    wait_until(lambda: stands_still(did))
+    client.press("pause")
+
+
+@pytest.mark.slow
+def test_pushes_follow_the_camera_and_the_camera_follows_the_ball(
+    page, mirrored: Simulation
+) -> None:
+    client, did = page
+    up = np.array([0.0, 0.0, 1.0])
+    position, gaze = camera_pose(np.zeros((1, 3)), np.array(mirrored.env.task.focus()))
+    for forward in (gaze - position, np.array([-1.0, 0.0, 0.0])):
+        pushes = len(did["push"])
+        client.set(client.control("towards"), "left")
+        wait_until(lambda pushes=pushes: len(did["push"]) > pushes)
+        left = np.cross(up, forward)
+        np.testing.assert_allclose(did["push"][-1], 0.2 * left / np.linalg.norm(left), atol=1e-6)
+        client.look(position=[1.0, 0.0, 0.0])
+    client.press("pause")
+    client.set(client.control("follow the ball"), True)
+
+    def has_arrived() -> bool:
+        client.receive()
+        return np.allclose(client.camera.get("look_at"), mirrored.frame.ball[0], atol=1e-3)
+
+    wait_until(has_arrived)
+    forward = np.subtract(client.camera["look_at"], client.camera["position"])
+    np.testing.assert_allclose(forward, (-1.0, 0.0, 0.0), atol=1e-6)
+    client.press("pause")
+
+
+def test_the_last_seconds_are_saved_as_they_were_seen(
+    page, mirrored: Simulation, monkeypatch
+) -> None:
+    client, did = page
+    saved = []
+
+    def replay(env: BounceBall, recording: EnvFrame, names) -> str:
+        saved.append(recording)
+        return "<html>"
+
+    monkeypatch.setattr(browser, "replay", replay)
+    wait_until(lambda: len(did["target"]) > 20)
+    client.press("pause")
+    wait_until(lambda: stands_still(did))
+    client.set(client.control("save the last 10 s"), True)
+    while not client.download:
+        client.receive()
+    assert client.download == b"<html>"
+    (recording,) = saved
+    assert len(recording.ball) == len(did["target"]) and recording.ball.shape[1:] == (1, 3)
+    np.testing.assert_array_equal(recording.ball[-1, 0], mirrored.frame.ball[0])
+    client.press("pause")
+
+
+def test_the_panel_names_the_policy_the_markers_and_the_keys(page) -> None:
+    client, _ = page
+    client.control("push the ball right")
+    (legend,) = {text for text in client.texts if "path of the ball" in text}
+    assert "target height" in legend and "paddle home" in legend and "Ctrl-K" in legend
+    assert "".join(client.keys) == "spaceRTGMNIKJL"
+    # A title is no markup.
+    assert any("exp[lr] &lt;b&gt;" in text for text in client.texts)
+
+
+def test_the_page_shows_the_commands_of_any_task(monkeypatch) -> None:
+    env = Env(LeanConfig(physics="fused"))
+    leaning = Simulation(env, make_zero_controller(env), 2, seed=0)
+    with served(leaning, monkeypatch) as client:
+        client.control("push the ball right")
+        sliders = {"angle, rad": (-0.2, 0.2, 0.02), "pace": (1.0, 3.0, 0.2)}
+        assert {label: client.sliders[label] for label in sliders} == sliders
+        assert client.sliders.keys() == {"speed", "robots", "speed, m/s", *sliders}
+        assert client.lines == ["s", "ball", "shelf", "wall", "paddle"]
+        (legend,) = {text for text in client.texts if "path of the ball" in text}
+        assert 'rgb(230,26,26)">&#9632;</b> high wall<' in legend
+        assert legend.count("dot") == 1
+        assert any(">calm<" in text for text in client.texts)
+        client.press("lean angle up")
+        wait_until(lambda: leaning.command == {"lean_angle": 0.1})
+        wait_until(lambda: "twice 0.2   pace 2" in client.labels())
+        for _ in range(2):
+            client.press("lean angle up")
+        wait_until(lambda: leaning.command == {"lean_angle": 0.2})
+        client.set(client.control("pace"), 3.0)
+        wait_until(lambda: leaning.command == {"lean_angle": 0.2, "pace": 3.0})
+
+
+@pytest.fixture
+def exchangeable() -> Simulation:
+    return viewing.exchangeable()
+
+
+def test_the_page_of_a_training_shows_its_newest_policy(
+    exchangeable: Simulation, monkeypatch
+) -> None:
+    """The training only puts the news into a queue. The address is printed before the simulation is
+    compiled."""
+    printed, stop = io.StringIO(), threading.Event()
+
+    def simulate(page: TrainingPage) -> Simulation:
+        assert "watch: " in printed.getvalue()
+        return exchangeable
+
+    monkeypatch.setattr(TrainingPage, "_simulate", simulate)
+
+    def step(simulation) -> None:
+        if stop.is_set():
+            raise RuntimeError("the\nend")
+
+    watch(monkeypatch, Simulation, "step", step)
+    points: list[tuple[float, ...]] = []
+    watch(monkeypatch, _Panel, "draw", lambda panel: points.extend(panel._points))
+    training = TrainingPage(TrainConfig(), "127.0.0.1", 8500, Console(file=printed, width=200))
+    wait_until(lambda: "watch: " in printed.getvalue())
+    client = Client(re.search(r"http://\S+", printed.getvalue())[0])
+    means = {"episode/return": 1.0, "episode/bounces": NAN, "task/apex_error": 0.02}
+    training.block(500_000, means | {"speed/steps_per_second": 2e6})
+    training.evaluation(500_000, evaluated(True, False), np.float32(0.5))
+    wait_until(lambda: exchangeable.policy == 0.5)
+    for told in ("500,000 of 50,000,000 steps", "1 of 2 results met"):
+        while not any(told in text for text in client.texts):
+            client.receive()
+    np.testing.assert_allclose(points[0], (0.5, 1.0, NAN, 2.0))
+    titles = ("return of an episode", "bounces in a row at its end", "|apex − target height|, cm")
+    assert [line for line in client.lines if line in titles] == list(titles)
+    # A page that fails leaves the training alone.
+    stop.set()
+    wait_until(lambda: "the page is not served (the end); training continues" in printed.getvalue())
+    training.wait()
+
+
+@pytest.mark.slow
+def test_a_watched_training_tells_the_page(tmp_path: Path, monkeypatch, capsys) -> None:
+    """The last line of a training names the command that shows its policy."""
+    told, shown = [], []
+
+    class Page:
+        def __init__(self, config: TrainConfig, host: str, port: int, console: Console, allowed):
+            told.append(("served", host, port, allowed))
+
+        def block(self, steps: int, means: dict[str, float]) -> None:
+            told.append(("block", steps, means["speed/steps_per_second"] > 0.0))
+
+        def evaluation(self, steps: int, report: Report, policy) -> None:
+            told.append(("evaluation", steps, len(report.results)))
+            shown.append(policy)
+
+        def wait(self) -> None:
+            told.append(("ended",))
+
+    monkeypatch.setattr("bounce_mjx.viewers.watch.TrainingPage", Page)
+    # The process would end there.
+    monkeypatch.setattr(train, "leave", lambda status: None)
+    flags = ["--total-steps", "128", "--log-dir", str(tmp_path), "--no-report"]
+    train.main([*TINY, *flags, "--watch", "--watch-port", "8123", "--watch-allow-host", "gpu.lab"])
+    assert told == [
+        ("served", "127.0.0.1", 8123, ("gpu.lab",)),
+        ("block", 64, True),
+        ("block", 128, True),
+        ("evaluation", 128, 5),
+        ("ended",),
+    ]
+    (folder,) = tmp_path.iterdir()
+    saved = read_policy(latest_checkpoint(folder), load_run_config(folder))
+    jax.tree.map(np.testing.assert_array_equal, *shown, saved)
+    assert capsys.readouterr().out.endswith(f"\nwatch it: bounce-mjx play {folder}\n")
+
+
+def test_a_client_that_does_not_answer_does_not_delay_the_end(capfd) -> None:
+    """A page that is stopped in a debugger never answers when the server closes the connection."""
+    with contextlib.ExitStack() as servers, contextlib.ExitStack() as stack:
+        server = servers.enter_context(open_server("127.0.0.1", 0))
+        client = stack.enter_context(
+            socket.create_connection((server.get_host(), server.get_port()))
+        )
+        client.sendall(
+            b"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n"
+            + f"Sec-WebSocket-Protocol: viser-v{viser.__version__}\r\n\r\n".encode()
+        )
+        assert client.recv(12) == b"HTTP/1.1 101"
+        ending = threading.Thread(target=servers.close)
+        ending.start()
+        ending.join(4.0)
+        assert not ending.is_alive()
+    wait_until(lambda: not server._websock_server._server_thread.is_alive())
+    assert capfd.readouterr() == ("", "")

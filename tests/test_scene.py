@@ -1,0 +1,214 @@
+"""What the viewers draw: shapes, markers, labels, the page's camera and its texts."""
+
+import itertools
+import re
+from pathlib import Path
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+import viewing
+from bounce_mjx import BounceBall, EnvConfig
+from bounce_mjx.env.env import Env
+from bounce_mjx.resources import resource_path
+from bounce_mjx.task import term_names
+from bounce_mjx.tasks.bounce_rewards import BounceReward
+from bounce_mjx.viewers.browser import reward_bars
+from bounce_mjx.viewers.controls import direction
+from bounce_mjx.viewers.display import Display, _primitive, body_scenes, marker_body
+from bounce_mjx.viewers.guard import open_server
+from bounce_mjx.viewers.page import write_page
+from bounce_mjx.viewers.scene import Scene, camera_pose
+from bounce_mjx.viewers.scene import _grid as scene_grid
+from bounce_mjx.viewers.simulation import (
+    Simulation,
+    make_zero_controller,
+)
+from bounce_mjx.viewers.watch import results_list
+from bounce_mjx.world.config import WorldConfig
+from viewing import NAN, LeanConfig, StillConfig, at_height, evaluated, watch
+
+
+@pytest.fixture(scope="module")
+def env() -> BounceBall:
+    return viewing.mirrored().env
+
+
+def simulated(config: WorldConfig, number: int) -> Simulation:
+    env = Env(config)
+    return Simulation(env, make_zero_controller(env), number, seed=0)
+
+
+SHAPES = """<mujoco><worldbody>
+  <geom type="sphere" size=".1"/><geom type="capsule" size=".1 .3"/>
+  <geom type="cylinder" size=".1 .3"/><geom type="box" size=".1 .3 .2"/>
+  <geom type="ellipsoid" size=".1 .3 .2"/>
+</worldbody></mujoco>"""
+
+
+def test_shapes_have_the_sizes_of_mujoco() -> None:
+    model = mujoco.MjModel.from_xml_string(SHAPES)
+    for geom in range(model.ngeom):
+        mesh = _primitive(model.geom_type[geom], model.geom_size[geom])
+        center, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+        bounds = [center - half, center + half]
+        np.testing.assert_allclose(mesh.bounds, bounds, rtol=0.01, atol=1e-9)
+        # The faces look outward.
+        assert np.all(np.einsum("ij,ij->i", mesh.face_normals, mesh.triangles_center) > 0.0)
+
+
+def test_every_shown_geom_is_in_the_meshes(env: BounceBall) -> None:
+    model = Display(env).model
+    shapes = {model.body(body).name: len(s.geometry) for body, s in body_scenes(model)}
+    shown = {model.body(body).name: int(model.body_geomnum[body]) for body in range(model.nbody)}
+    shown["world"] -= 1  # the floor
+    assert shapes == shown
+
+
+def marker_position(display: Display, name: str) -> np.ndarray:
+    return display.data.body(marker_body(name)).xpos
+
+
+def test_markers_are_at_the_positions_of_the_task() -> None:
+    config = EnvConfig(reward=BounceReward(paddle_home_height=0.15))
+    display = Display(env := BounceBall(config))
+    display.pose(env.mj_model.qpos0, at_height(0.61))
+    x, y = config.reward.target_x, config.reward.target_y
+    np.testing.assert_allclose(marker_position(display, "target_height"), (x, y, 0.61))
+    np.testing.assert_allclose(marker_position(display, "paddle_home"), (x, y, 0.15))
+
+
+def test_a_model_without_markers_gets_them(tmp_path: Path) -> None:
+    text = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
+    bare = tmp_path / "bare.xml"
+    bare.write_text(re.sub(r"<site [^>]*/>", "", text), encoding="utf-8")
+    env = BounceBall(EnvConfig(mjcf=bare))
+    assert env.mj_model.nsite == 0
+    display = Display(env)
+    display.pose(env.mj_model.qpos0, at_height(0.5))
+    assert marker_position(display, "target_height")[2] == 0.5
+    home_height = env.config.reward.paddle_home_height
+    assert marker_position(display, "paddle_home")[2] == pytest.approx(home_height)
+
+
+def projected(points: np.ndarray, focus, aspect: float, offsets) -> np.ndarray:
+    """Points [N, 3] in the picture [N, 2]: -1 to 1 from left to right and from below."""
+    position, gaze = camera_pose(offsets, focus, aspect)
+    forward = (gaze - position) / np.linalg.norm(gaze - position)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    seen = (points - position) @ np.stack([right, np.cross(right, forward), forward]).T
+    return seen[:, :2] / seen[:, 2:] / np.tan(np.radians(20.0)) / (aspect, 1.0)
+
+
+ASPECTS = (0.46, 0.85, 2.0)
+"""Width / height of a picture."""
+
+
+HOMES = ((0.58856, 0.0, 0.05), (0.67, 0.0, 0.4), (0.0, 0.55, 0.25), (-0.6, 0.0, 0.3))
+
+
+@pytest.mark.parametrize("home", HOMES, ids=["default", "raised", "turned", "behind"])
+def test_the_camera_sees_every_robot(home) -> None:
+    """Base, paddle, and the ball at the highest target."""
+    x, y, z = home
+    paddle = np.array([x, y, 0.0]) * (1.0 + 0.05 / np.hypot(x, y)) + (0.0, 0.0, z)
+    parts = np.array([(-0.1, 0.0, 0.0), paddle, (x, y, z + 0.8)])
+    for number, aspect in itertools.product((1, 2, 4, 16), ASPECTS):
+        offsets = scene_grid(number)
+        points = (offsets[:, None] + parts).reshape(-1, 3)
+        assert np.all(np.abs(projected(points, np.array(home), aspect, offsets)) < 1.0)
+
+
+@pytest.mark.parametrize(
+    ("number", "names", "text"),
+    [
+        (1, None, "bounces 0   target 0.80 m"),
+        (2, ["A", "B"], "B:  bounces 0   target 0.80 m"),
+        (16, None, "16:  0"),
+    ],
+)
+def test_labels_are_above_the_highest_target_and_in_the_picture(env, number, names, text) -> None:
+    frame = jax.tree.map(
+        lambda values: np.resize(values, (number, *values.shape[1:])), viewing.mirrored().frame
+    )
+    with open_server("127.0.0.1", 0) as server:
+        scene = Scene(server, env, number, names)
+        scene.update([frame._replace(command=at_height(np.full(number, 0.8)))])
+        labels = np.array([label.position for label in scene._labels])
+        body = scene._display.model.body(marker_body("target_height")).id
+        targets = scene._bodies[body].batched_positions
+        assert scene._labels[-1].text == text
+    np.testing.assert_allclose(labels - targets, [(0.0, 0.0, 0.14)] * number, atol=1e-6)
+    for aspect in ASPECTS:
+        offsets = scene_grid(number)
+        across, up = projected(labels, np.array(env.task.focus()), aspect, offsets).T
+        # Room for the text of a label.
+        assert np.all(np.abs(across) < 0.9) and np.all((-1.0 < up) & (up < 0.93))
+
+
+VIEWS = {
+    # From the default camera, the arm's side (-x, +y) is away.
+    "default": ((-1.06, 1.17, -0.42), "right", (1.17, 1.06, 0.0)),
+    "from behind the arm": ((1.0, 0.0, -0.3), "left", (0.0, 1.0, 0.0)),
+    "from the front": ((-1.0, 0.0, -0.3), "left", (0.0, -1.0, 0.0)),
+    "from above": ((0.0, 0.0, -1.0), "away", (1.0, 0.0, 0.0)),
+    "any": ((0.0, 2.0, 0.0), "back", (0.0, -1.0, 0.0)),
+    "no number": ((NAN, 0.0, 0.0), "up", (0.0, 0.0, 1.0)),
+}
+
+
+@pytest.mark.parametrize("case", VIEWS.values(), ids=VIEWS)
+def test_pushes_follow_the_camera(case) -> None:
+    view, towards, expected = case
+    expected = np.array(expected) / np.linalg.norm(expected)
+    np.testing.assert_allclose(direction(towards, np.array(view)), expected, atol=1e-12)
+
+
+def test_results_are_shown_as_they_are_met() -> None:
+    """Each with the step since which it is met without a break."""
+    met_at: dict[str, int] = {}
+    for steps, *passed in (
+        (1_000_000, True, True, None),
+        (2_000_000, True, False, None),
+        (3_000_000, True, True, None),
+    ):
+        text = results_list(evaluated(*passed), steps, met_at)
+    assert met_at == {"r0": 1_000_000, "r1": 3_000_000}
+    assert "evaluation at 3,000,000 steps" in text and "2 of 2 judged results met" in text
+    assert re.findall(r"since ([\d,]+)", text) == ["1,000,000", "3,000,000"]
+
+
+def test_reward_bars_show_every_term() -> None:
+    """The bars show all terms, however many there are."""
+    terms = dict.fromkeys(term_names(BounceReward), 0.0) | {"position": 2.0, "alignment": -1.25}
+    terms["sixteenth_term"] = 0.5
+    text = reward_bars(terms)
+    for name in terms:
+        assert text.count(f">{name.replace('_', ' ')}<") == 1
+    assert ">2.00<" in text and ">-1.25<" in text and "sum 1.25" in text
+    assert "-0.00" not in reward_bars({"a": -0.001})
+
+
+def test_a_label_without_readings_is_not_shown() -> None:
+    """It would be a white stroke."""
+    still = simulated(StillConfig(physics="fused"), 1)
+    for simulation, is_shown in ((still, False), (viewing.mirrored(), True)):
+        with open_server("127.0.0.1", 0) as server:
+            scene = Scene(server, simulation.env, 1)
+            scene.update([simulation.frame])
+            assert [label.visible for label in scene._labels] == [is_shown]
+
+
+def test_a_replay_shows_the_commands_of_any_task(tmp_path: Path, monkeypatch) -> None:
+    leaning = simulated(LeanConfig(physics="fused"), 2)
+    shown = []
+    watch(monkeypatch, Scene, "update", lambda _, frames: shown.extend(frames))
+    leaning.command = {"lean_angle": 0.1, "pace": 1.5}
+    write_page(tmp_path / "a.html", leaning.env, leaning.record(0.2), fps=20)
+    assert (tmp_path / "a.html").exists() and len(shown) == 4
+    for frame in shown:
+        np.testing.assert_allclose(frame.command["lean_angle"], [0.1, 0.1])
+        np.testing.assert_array_equal(frame.command["pace"], [1.5, 1.5])

@@ -1,0 +1,332 @@
+"""The viewers' simulation: its frames, commands, pushes, worlds and clock."""
+
+import time
+
+import jax
+import numpy as np
+import pytest
+from rich.console import Console
+
+import viewing
+from bounce_mjx import BounceBall, EnvConfig
+from bounce_mjx.errors import UserError
+from bounce_mjx.learning.policy import make_networks
+from bounce_mjx.resources import resource_path
+from bounce_mjx.runs.config import load_run_config
+from bounce_mjx.runs.folders import pretrained_checkpoint
+from bounce_mjx.runs.reading import read_policy
+from bounce_mjx.viewers import show
+from bounce_mjx.viewers.display import Display
+from bounce_mjx.viewers.options import ViewerOptions
+from bounce_mjx.viewers.simulation import (
+    EnvFrame,
+    SideBySide,
+    Simulation,
+    at_index,
+    frame_at,
+    in_real_time,
+    make_policy_controller,
+    make_random_controller,
+    make_zero_controller,
+    resample,
+)
+from bounce_mjx.viewers.world import SLIDERS, reset_ranges, sliders_for, with_sliders
+from bounce_mjx.world.randomization import RandomizationConfig
+from viewing import (
+    GRAVITY,
+    INFINITY,
+    NAN,
+    SECONDS,
+    LeanConfig,
+    StillConfig,
+    at_height,
+    served,
+    target_of,
+    wait_until,
+    watch,
+)
+
+
+@pytest.fixture(scope="module")
+def mirrored() -> Simulation:
+    return viewing.mirrored()
+
+
+@pytest.fixture(scope="module")
+def env(mirrored: Simulation) -> BounceBall:
+    return mirrored.env
+
+
+@pytest.fixture(scope="module")
+def recording(mirrored: Simulation) -> EnvFrame:
+    """A recording that is one step longer than an episode."""
+    return mirrored.record(SECONDS + mirrored.env.dt)
+
+
+def test_frames_describe_one_state(env: BounceBall, recording: EnvFrame) -> None:
+    """MuJoCo's kinematics find the ball and the paddle where the frame has them."""
+    display = Display(env)
+    for step in (0, 57, 123):
+        for i in range(2):
+            display.pose(recording.qpos[step, i], at_index(frame_at(recording, step).command, i))
+            geom = display.data.geom
+            np.testing.assert_allclose(geom("ball").xpos, recording.ball[step, i], atol=1e-6)
+            np.testing.assert_allclose(geom("blocker").xpos, recording.paddle[step, i], atol=1e-5)
+    assert np.all(recording.qpos[0, 0, :6] != recording.qpos[0, 1, :6])
+
+
+def test_ball_falls_freely(recording: EnvFrame, env: BounceBall) -> None:
+    """High above the paddle the ball only falls: z'' = -g."""
+    z = recording.ball[:-2, 0, 2]
+    high = z[1:-1] > 0.2
+    assert high.sum() > 100
+    acceleration = (z[2:] - 2.0 * z[1:-1] + z[:-2]) / env.dt**2
+    np.testing.assert_allclose(acceleration[high], -GRAVITY, atol=0.02)
+
+
+def test_time_runs_until_the_episode_ends(recording: EnvFrame, env: BounceBall) -> None:
+    steps = round(SECONDS / env.dt)
+    np.testing.assert_allclose(recording.time[: steps + 1, 0], np.arange(steps + 1) * env.dt)
+    np.testing.assert_array_equal(np.flatnonzero(recording.over[:, 0]), [steps])
+    np.testing.assert_allclose(recording.time[steps + 1], env.dt)
+    start = np.asarray(env.config.ball_init_pos)
+    distance = np.abs(recording.ball[steps + 1] - start)
+    assert np.all(distance < env.config.reset.ball_position + 0.001)
+    assert np.all(recording.metrics["n_bounces"][steps + 1] == 0)
+
+
+def test_zero_actions_hold_the_arm_and_lose_the_ball(env: BounceBall, recording: EnvFrame) -> None:
+    held = Simulation(env, make_zero_controller(env), 2, seed=0).record(SECONDS)
+    moved = np.abs(held.qpos[20, :, :6] - held.qpos[0, :, :6])
+    assert np.all(moved < 0.01)
+    # The mirror law keeps both balls up from the same start.
+    np.testing.assert_array_equal(held.qpos[0], recording.qpos[0])
+    assert np.all(held.over[:-1].any(axis=0))
+    assert not recording.over[: len(held.over) - 1].any()
+
+
+def test_random_actions_are_uniform(env: BounceBall) -> None:
+    states = jax.vmap(env.reset, out_axes=-1)(jax.random.split(jax.random.PRNGKey(0), 500))
+    control = make_random_controller(env)
+    actions = control(None, states, jax.random.PRNGKey(1))
+    assert actions.shape == (env.action_size, 500)
+    np.testing.assert_allclose(
+        np.quantile(actions, (0.0, 0.25, 0.75, 1.0)), (-1, -0.5, 0.5, 1), atol=0.05
+    )
+    assert np.all(control(None, states, jax.random.PRNGKey(2)) != actions)
+
+
+def test_the_target_height_can_be_set_and_stays(mirrored: Simulation) -> None:
+    """It is seen before the next step, as while the page is paused, and after a reset."""
+    mirrored.reset()
+    drawn = target_of(mirrored.frame)
+    mirrored.command = at_height(0.77)
+    assert np.all(drawn != np.float32(0.77))
+    for advance in (lambda: None, mirrored.step, mirrored.reset, mirrored.step):
+        advance()
+        np.testing.assert_allclose(target_of(mirrored.frame), 0.77)
+    mirrored.command = {}
+    mirrored.reset()
+    low, high = mirrored.env.config.target_height_range
+    target = target_of(mirrored.step())
+    assert np.all((target >= low) & (target <= high))
+
+
+def test_only_an_episode_that_was_not_timed_out_is_lost(
+    env: BounceBall, mirrored: Simulation, recording: EnvFrame
+) -> None:
+    assert recording.over.any() and not recording.lost.any()
+    mirrored.reset()
+    mirrored.push((2.0, 0.0, 0.0))
+    frames = mirrored.record(1.0)
+    assert frames.lost.any(axis=0).all() and frames.over.any(axis=0).all()
+    mirrored.reset()
+
+
+def test_policies_side_by_side_are_shown_as_one(mirrored: Simulation) -> None:
+    both = SideBySide([mirrored, mirrored])
+    both.command = at_height(0.7)
+    both.reset()
+    frame = both.step()
+    assert both.num_envs == len(frame.ball) == len(both.frame.metrics["n_bounces"]) == 4
+    np.testing.assert_allclose(target_of(both.frame), 0.7)
+    assert both.record(0.05).qpos.shape[:2] == (6, 4)
+    both.command = {}
+
+
+def test_an_exchanged_policy_acts(env: BounceBall) -> None:
+    exchangeable = viewing.exchangeable()
+    before = exchangeable.frame.qpos[0, :6]
+    np.testing.assert_allclose(exchangeable.record(0.1).qpos[-1, 0, :6], before, atol=0.01)
+    exchangeable.policy = np.float32(1.0)
+    moved = exchangeable.record(0.1).qpos[-1, 0, :6] - before
+    # The target of a servo is ahead of its joint by the scale of an action.
+    assert np.all(moved > 0.5 * env.config.action_scale)
+
+
+def test_a_push_adds_its_velocity_to_the_ball_once(mirrored: Simulation) -> None:
+    steps, push = 5, np.array([0.2, -0.1, 0.3])
+    mirrored.reset()
+    start = mirrored.frame.ball
+    mirrored.push(tuple(push))
+    for _ in range(steps):
+        mirrored.step()
+    flight = steps * mirrored.env.dt
+    # The sum of a semi-implicit integrator's steps, in place of g t^2 / 2.
+    fall = 0.5 * GRAVITY * flight * (flight + mirrored.env.config.physics_dt)
+    expected = start + push * flight - np.array([0.0, 0.0, fall])
+    np.testing.assert_allclose(mirrored.frame.ball, expected, atol=1e-5)
+
+
+def ramp(over: tuple[int, ...] = ()) -> EnvFrame:
+    """Eleven frames of one environment, 0.01 s apart; every value is the frame's time in steps."""
+    value = np.arange(11.0)[:, None]
+    wide = np.repeat(value[..., None], 3, axis=-1)
+    ended = np.zeros((11, 1), bool)
+    ended[list(over)] = True
+    command, metrics = {"height": value}, {"count": value}
+    return EnvFrame(value * 0.01, wide, wide[:, :, None], wide, command, metrics, ended, ended)
+
+
+def test_resampling_interpolates_positions() -> None:
+    frames = resample(ramp(), dt=0.01, fps=60)
+    assert len(frames.time) == 6
+    times = np.arange(6) / 60
+    np.testing.assert_allclose(frames.time[:, 0], times)
+    for positions in (frames.qpos, frames.balls[:, 0], frames.paddle):
+        np.testing.assert_allclose(positions[:, 0, 0], 100 * times)
+    # Commands and metrics come from the last step.
+    for values in (frames.command["height"], frames.metrics["count"]):
+        np.testing.assert_array_equal(values[:, 0], np.floor(100 * times + 1e-9))
+
+
+def test_resampling_does_not_blend_two_episodes() -> None:
+    frames = resample(ramp(over=(3,)), dt=0.01, fps=60)
+    expected = 100 * np.arange(6) / 60
+    expected[2] = 3.0  # at 3.33 steps
+    np.testing.assert_allclose(frames.ball[:, 0, 0], expected)
+
+
+def test_steps_become_due_with_the_clock(mirrored: Simulation, monkeypatch) -> None:
+    now, speed = 0.0, 0.5
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    monkeypatch.setattr(time, "sleep", lambda _: None)
+    clock = in_real_time(mirrored, 0.65, lambda: speed)
+    assert not next(clock)
+    steps = []
+    for _ in range(60):
+        now += 1.0 / 60.0
+        steps.append(len(next(clock)))
+    assert sum(steps) in (49, 50)
+    assert max(steps) == 1
+    now, speed = now + 100.0, 0.0
+    assert not next(clock)
+    now, speed = now + 100.0, 1.0  # a machine that slept
+    steps.append(len(next(clock)))
+    assert 9 <= steps[-1] <= 11
+    now += 100.0
+    steps.append(len(next(clock)))
+    assert sum(steps) == 65 and next(clock, None) is None
+
+
+def test_policies_of_different_tasks_are_not_shown_together() -> None:
+    shown = [show.Shown(config(), None, "") for config in (LeanConfig, StillConfig)]
+    options = ViewerOptions(viewer="browser")
+    with pytest.raises(UserError, match="different tasks; show one at a time"):
+        show.show(shown, options, commands={}, console=Console())
+
+
+NOMINAL = {slider.term: slider.world_value(slider.nominal) for slider in SLIDERS}
+
+
+@pytest.fixture(scope="module")
+def played() -> Simulation:
+    """The nominal policy in worlds whose ball mass is drawn, under the sliders."""
+    checkpoint = pretrained_checkpoint()
+    run = load_run_config(checkpoint.run)
+    config = run.env.model_copy(
+        update={"randomization": RandomizationConfig(ball_mass=(0.8, 0.95))}
+    )
+    env = BounceBall(with_sliders(config))
+    networks = make_networks(run.ppo, env.observation_size, env.action_size)
+    controller, policy = make_policy_controller(networks), read_policy(checkpoint, run)
+    return Simulation(env, controller, 2, 0, reset_ranges(config), policy)
+
+
+def recorded(simulation: Simulation, seconds: float, **world: tuple[float, ...]) -> EnvFrame:
+    """An episode whose world changes after its first second, which is nominal."""
+    simulation.world = {}
+    simulation.reset()
+    simulation.record(1.0)
+    simulation.world = world
+    return simulation.record(seconds)
+
+
+WORSE = {"action_latency": (0.03,), "ball_latency": (0.03,), "paddle_tilt": (np.radians(3.0), 0.0)}
+
+
+def test_the_nominal_policy_loses_the_ball_in_another_world(played: Simulation) -> None:
+    assert not recorded(played, 6.0).over.any()
+    for term, value in WORSE.items():
+        assert recorded(played, 6.0, **{term: value}).over.any(axis=0).all(), term
+
+
+def test_bounces_get_lower_with_the_restitution(played: Simulation) -> None:
+    """The policy was trained for one restitution only."""
+    highest = [
+        recorded(played, 4.0, restitution=(e,)).ball[-200:, :, 2].max() for e in (0.6, 0.85, 0.98)
+    ]
+    assert highest[0] < highest[1] - 0.05 < highest[2] - 0.1
+
+
+def test_only_the_worlds_own_terms_are_drawn(played: Simulation) -> None:
+    """The sliders' terms are nominal where they are not drawn, and all terms where nothing is."""
+    played.world = None
+    played.reset()
+    played.step()
+    world = played._states.pipeline_state.world
+    mass = np.asarray(world["ball_mass"])
+    assert np.all((mass >= 0.8) & (mass <= 0.95)) and mass[0] != mass[1]
+    np.testing.assert_allclose(world["restitution"], 0.85)
+    np.testing.assert_array_equal(world["action_latency"], 0.0)
+    played.world = {}
+    played.step()
+    np.testing.assert_array_equal(played._states.pipeline_state.world["ball_mass"], 1.0)
+
+
+def test_sliders_extend_the_ranges_of_a_task() -> None:
+    """Of all axes; another robot's own restitution is unknown."""
+    tilt = (-0.08, 0.01), (-0.07, 0.2)
+    drawn = {"action_latency": (0.01, 0.2), "restitution": (0.7, 0.8), "paddle_tilt": tilt}
+    config = EnvConfig(randomization=RandomizationConfig(**drawn))
+    widened = with_sliders(config).randomization
+    assert (widened.action_latency, widened.restitution) == ((0.0, 0.2), (0.6, 0.98))
+    assert widened.paddle_tilt == (-0.08, 0.2)
+    assert sliders_for(widened) == SLIDERS and not sliders_for(config.randomization)
+    ranges = reset_ranges(config)
+    assert set(ranges) == set(widened.terms)
+    np.testing.assert_allclose(ranges["restitution"], (0.7, 0.8))
+    np.testing.assert_allclose(ranges["paddle_tilt"], tilt)
+    np.testing.assert_array_equal(ranges["ball_latency"], np.zeros(2))
+    other = EnvConfig(mjcf=resource_path("mjcf/bounce_ball.xml"))
+    labels = [slider.term for slider in sliders_for(with_sliders(other).randomization)]
+    assert labels == [slider.term for slider in SLIDERS if slider.term != "restitution"]
+
+
+def test_a_moved_slider_changes_the_world_at_once(played: Simulation, monkeypatch) -> None:
+    frames, worlds = [], []
+    watch(monkeypatch, Simulation, "step", lambda simulation: frames.append(simulation.frame))
+    watch(monkeypatch, Simulation, "step", lambda simulation: worlds.append(simulation.world))
+    played.world = None
+    played.reset()
+    with served(played, monkeypatch) as client:
+        wait_until(lambda: len(frames) > 100)
+        assert worlds[-1] is None and not any(frame.over.any() for frame in frames)
+        client.set(client.control("action latency, ms"), 30)
+        wait_until(lambda: worlds[-1] == NOMINAL | {"action_latency": (0.03,)})
+        wait_until(lambda: any(frame.over.any() for frame in frames))
+        for value in (1e9, -1e9, NAN, INFINITY, "much", [1], None):
+            client.set(client.control("restitution"), value)
+        assert {world["restitution"] for world in worlds if world} == {(0.85,)}
+        client.set(client.control("nominal world"), True)
+        wait_until(lambda: worlds[-1] == NOMINAL)

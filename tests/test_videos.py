@@ -1,0 +1,242 @@
+"""The commands play and view: videos, the native window, their flags and mistakes."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+
+from bounce_mjx.commands import play, view
+from bounce_mjx.errors import UserError
+from bounce_mjx.runs.config import load_run_config
+from bounce_mjx.runs.folders import pretrained_checkpoint
+from bounce_mjx.viewers import native, offscreen, show
+from bounce_mjx.viewers.browser import LivePage
+from bounce_mjx.viewers.offscreen import choose_backend
+from bounce_mjx.viewers.simulation import (
+    Simulation,
+)
+from bounce_mjx.viewers.video import VideoWriter, find_ffmpeg
+
+
+@pytest.fixture(autouse=True)
+def no_opengl_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """MuJoCo stores the chosen OpenGL library in an environment variable, which a child process
+    would inherit."""
+    monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
+    offscreen.choose_opengl.cache_clear()
+
+
+def test_a_video_needs_ffmpeg_of_the_extra_or_of_the_system(monkeypatch, tmp_path) -> None:
+    assert Path(find_ffmpeg()) == Path(imageio_ffmpeg.get_ffmpeg_exe())
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(UserError, match=r"ffmpeg, which is not found; install it, or the extra"):
+        VideoWriter(tmp_path / "a.mp4", (64, 64), None)
+    (tmp_path / "ffmpeg").touch(mode=0o755)
+    assert Path(find_ffmpeg()) == tmp_path / "ffmpeg"
+
+
+def run(command: list[str], cwd: Path, **variables: str) -> subprocess.CompletedProcess:
+    """Runs `python -m bounce_mjx COMMAND` in a folder, without a display."""
+    env = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    return subprocess.run(
+        [sys.executable, "-m", "bounce_mjx", *command], cwd=cwd, env=env | variables,
+        capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+
+
+def read_video(path: Path) -> tuple[float, np.ndarray]:
+    """The rate that ffmpeg finds in a video, and its frames [F, height, width, 3]."""
+    ffmpeg = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(path)]
+    raw = "-f rawvideo -pix_fmt rgb24 -fps_mode passthrough -".split()
+    done = subprocess.run([*ffmpeg, *raw], capture_output=True, check=True)
+    stream = re.search(r"Stream .* (\d+)x(\d+).* ([\d.]+) fps", done.stderr.decode())
+    width, height = int(stream[1]), int(stream[2])
+    return float(stream[3]), np.frombuffer(done.stdout, np.uint8).reshape(-1, height, width, 3)
+
+
+VIDEOS = {
+    "mp4 by EGL": ("egl", "a.mp4", "play", 60),
+    "gif by OSMesa": ("osmesa", "a.gif", "view --actions mirror", 25),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="EGL and OSMesa are of Linux")
+@pytest.mark.parametrize("case", VIDEOS.values(), ids=VIDEOS)
+def test_video_shows_the_arm_and_a_moving_ball(tmp_path: Path, case: tuple) -> None:
+    backend, name, command, fps = case
+    if "CI" not in os.environ and not offscreen.works(backend):
+        pytest.skip(f"{backend} is not installed")
+    flags = f"--video {name} --size 320 240 --seconds 0.6".split()
+    mine, planted = tmp_path / "mine", tmp_path / f".unfinished-{name}"
+    mine.write_text("mine")
+    planted.symlink_to(mine)
+    done = run([*command.split(), *flags], tmp_path, MUJOCO_GL=backend)
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    assert mine.read_text() == "mine"
+    assert set(os.listdir(tmp_path)) == {name, mine.name, planted.name}
+    rate, frames = read_video(tmp_path / name)
+    assert rate == fps
+    assert frames.shape == (round(0.6 * fps), 240, 320, 3)
+    red, green, blue = np.moveaxis(frames[0].astype(int), -1, 0)
+    orange = (red > 140) & (green < 140) & (blue < 90)
+    assert 0.01 < orange.mean() < 0.2
+    # The white ball falls: the centre of the white pixels outside the caption moves down.
+    rows = []
+    for frame in (frames[0], frames[len(frames) // 3]):
+        white = np.all(frame[:, 150:] > 215, axis=-1)
+        assert white.any()
+        rows.append(np.nonzero(white)[0].mean())
+    assert rows[1] > rows[0] + 10
+    # The caption is bright on dark.
+    assert frames[0][10:60, 10:110].max() > 230
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    "CI" not in os.environ and shutil.which("Xvfb") is None, reason="Xvfb is not installed"
+)
+def test_native_viewer_shows_the_arm(tmp_path: Path) -> None:
+    """On a virtual screen; the window fills it with floor, sky and an orange arm."""
+    from PIL import ImageGrab
+
+    log = (tmp_path / "xvfb").open("wb")
+    screen = subprocess.Popen(
+        ["Xvfb", "-displayfd", "1", "-screen", "0", "800x600x24"],
+        stdout=subprocess.PIPE,
+        stderr=log,
+    )
+    try:
+        display = f":{int(screen.stdout.readline())}"
+        viewer = subprocess.Popen(
+            [sys.executable, "-m", "bounce_mjx", "play", "--seconds", "60"],
+            cwd=tmp_path,
+            env=os.environ | {"DISPLAY": display},
+            stdout=log,
+            stderr=log,
+        )
+        try:
+            for _ in range(240):
+                picture = np.asarray(ImageGrab.grab(xdisplay=display)).astype(int)
+                red, green, blue = np.moveaxis(picture[..., :3], -1, 0)
+                orange = (red > 140) & (green < 140) & (blue < 90)
+                assert viewer.poll() is None, (tmp_path / "xvfb").read_text()
+                if orange.mean() > 0.003:
+                    break
+                time.sleep(0.25)
+            assert 0.003 < orange.mean() < 0.2
+        finally:
+            viewer.kill()
+            viewer.wait()
+    finally:
+        screen.kill()
+        screen.wait()
+        log.close()
+
+
+MISTAKES = {
+    "suffix of a video": ("play --video a.avi", "--video a.avi", ".mp4 or .gif", "rename"),
+    "suffix of a page": ("view --html a.txt", "--html a.txt", ".html", "rename"),
+    "no folder": ("play --video no/a.mp4", "no/a.mp4", "does not exist", "make it"),
+    "a folder": ("view --html folder.html", "folder.html is a folder", "give a file"),
+    "odd size": ("play --video a.mp4 --size 321 240", "--size 321 240", "even"),
+    "small size": ("view --video a.mp4 --size 2 2", "--size is 2", "64"),
+    "rate of a gif": ("play --video a.gif --fps 60", "--fps 60", "GIF", "25 or 50"),
+    "too many robots": ("view --num-envs 17", "--num-envs is 17", "16"),
+    "two ways": ("play --viewer browser --video a.mp4", "--viewer browser", "give only one"),
+    "no screen": ("view --viewer native", "--viewer native", "display", "--viewer browser"),
+    "unknown viewer": ("play --viewer vr", "--viewer", "vr", "native"),
+    "foreign address": ("view --viewer browser --host 192.0.2.1", "--host 192.0.2.1", "127.0.0.1"),
+    "speed": ("play --speed 0", "--speed is 0", "0.1"),
+    "no host": ("view --allow-host http://a", "'http://a' is not the name of a host", "without"),
+    "two policies": ("play pretrained pretrained --video a.mp4", "shows one policy", "browser"),
+}
+
+
+@pytest.fixture
+def fails(tmp_path: Path, monkeypatch, capfd):
+    """A function (main, arguments) -> the sentence with which a command refuses them; it leaves an
+    empty directory as it is."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"):
+        monkeypatch.delenv(name, raising=False)
+    (tmp_path / "folder.html").mkdir()
+
+    def call(main, args: list[str]) -> str:
+        with pytest.raises(SystemExit) as exit_info:
+            main(args)
+        err = capfd.readouterr().err
+        assert exit_info.value.code == 2
+        assert re.fullmatch(r"error: .+\n", err), err
+        assert os.listdir(tmp_path) == ["folder.html"]
+        return err
+
+    return call
+
+
+def test_a_dead_display_is_not_used(monkeypatch) -> None:
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setenv("DISPLAY", ":987")
+    assert sys.platform != "linux" or not native.has_display()
+
+
+def test_policies_given_together_are_named_and_have_one_world(monkeypatch) -> None:
+    """Only the task of robust draws its worlds, unless the command draws them."""
+
+    class Named:
+        def __init__(self, env, controller, num_envs, seed, ranges, policy):
+            self.env, self.num_envs = env, num_envs
+
+    shown = []
+    monkeypatch.setattr(show, "Simulation", Named)
+    monkeypatch.setattr(LivePage, "__init__", lambda _, server, *given: shown.append(given))
+    monkeypatch.setattr(LivePage, "run", lambda *_: None)
+    both_play = "pretrained robust --viewer browser --num-envs 4".split()
+    play.main(both_play)
+    play.main([*both_play, "--randomization.action-latency", "0.0", "0.02"])
+    (both, start), (drawn, _) = shown
+    assert [one.world for one in both._simulations] == [{}, {}]
+    assert [one.world for one in drawn._simulations] == [None, None]
+    assert start.names == ["A", "A", "B", "B"] and start.num_shown == both.num_envs == 4
+    assert re.fullmatch(r"A: pretrained, .* steps, B: robust, .* steps", start.title)
+    for simulation, name in zip(both._simulations, ("pretrained", "robust"), strict=True):
+        observation = load_run_config(pretrained_checkpoint(name).run).env.observation
+        assert simulation.env.config.observation == observation
+
+
+@pytest.mark.parametrize("case", MISTAKES.values(), ids=MISTAKES)
+def test_mistakes_give_one_sentence(fails, case: tuple, monkeypatch) -> None:
+    # The compilation is not tested here, and every mistake must be found before it.
+    if "192" not in case[0]:
+        monkeypatch.setattr(Simulation, "__init__", None)
+    command, *words = case
+    command, *flags = command.split()
+    sentence = fails({"play": play, "view": view}[command].main, flags)
+    assert not [word for word in words if word not in sentence], sentence
+
+
+def test_without_opengl_the_package_is_named(fails, monkeypatch) -> None:
+    monkeypatch.setattr(offscreen.sys, "executable", "/bin/false")
+    sentence = fails(view.main, ["--video", "a.mp4"])
+    assert "libosmesa6" in sentence and "libegl1" in sentence
+    monkeypatch.setenv("MUJOCO_GL", "vulkan")
+    assert "MUJOCO_GL is 'vulkan'" in fails(view.main, ["--video", "a.mp4"])
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="EGL and OSMesa are of Linux")
+def test_the_working_backend_is_chosen(tmp_path: Path, monkeypatch) -> None:
+    """EGL looks for its drivers in a folder that the environment may name."""
+    if "CI" not in os.environ and not offscreen.works("osmesa"):
+        pytest.skip("OSMesa is not installed")
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setenv("__EGL_VENDOR_LIBRARY_DIRS", str(tmp_path))
+    assert choose_backend() == "osmesa"

@@ -1,0 +1,250 @@
+"""A simulation for the tests of the viewers, a client of their page, and two other tasks."""
+
+import contextlib
+import functools
+import io
+import re
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import jax.numpy as jnp
+import msgspec
+import numpy as np
+import pytest
+import viser
+import zstandard
+from rich.console import Console
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
+
+from bounce_mjx import BounceBall, EnvConfig, task
+from bounce_mjx.baselines.mirror import MirrorLaw
+from bounce_mjx.evaluation.results import Report, Result
+from bounce_mjx.viewers import show
+from bounce_mjx.viewers.options import PageStart, ViewerOptions
+from bounce_mjx.viewers.simulation import (
+    EnvFrame,
+    Simulation,
+    make_policy_controller,
+)
+from bounce_mjx.world.config import WorldConfig
+
+GRAVITY = 9.81
+NAN, INFINITY = float("nan"), float("inf")
+SECONDS = 3.0
+PATIENCE = 60.0
+
+
+def at_height(target: float) -> dict[str, float]:
+    return {"target_height": target}
+
+
+def target_of(frame: EnvFrame) -> np.ndarray:
+    return frame.command["target_height"]
+
+
+@functools.cache
+def mirrored() -> Simulation:
+    """Two robots under the mirror law, which keeps both balls up."""
+    env = BounceBall(EnvConfig(physics="fused", episode_seconds=SECONDS))
+    return Simulation(env, make_policy_controller(MirrorLaw(env)), 2, seed=0)
+
+
+@functools.cache
+def exchangeable() -> Simulation:
+    """One robot under a policy that is one constant action for all joints."""
+    env = mirrored().env
+
+    def controller(policy, states, key):
+        return policy + jnp.zeros_like(states.obs[: env.action_size])
+
+    return Simulation(env, controller, 1, seed=0, policy=np.float32(0.0))
+
+
+class Client:
+    """A client of the page that speaks viser's protocol but is not a browser."""
+
+    def __init__(self, address: str):
+        protocol = Subprotocol(f"viser-v{viser.__version__}")
+        self.address = address
+        self._socket = connect(
+            address.replace("http", "ws"), subprotocols=[protocol], compression=None, max_size=None,
+            ping_interval=None,
+        )  # fmt: skip
+        self.look(position=[1.0, 0.0, 0.0])
+        self._controls: dict[str, str] = {}
+        self._labels: list[str] = []
+        self.texts: list[str] = []
+        self.values: dict[str, object] = {}
+        self.sliders: dict[str, tuple[float, float, float]] = {}
+        self.lines: list[str] = []
+        self.keys: list[str] = []
+        self.camera: dict[str, list[float]] = {}
+        self.download = b""
+
+    def control(self, label: str) -> str:
+        """The identifier of a control or of a key's command, by its label."""
+        while label not in self._controls:
+            self.receive()
+        return self._controls[label]
+
+    def press(self, label: str) -> None:
+        """Triggers the command of a key."""
+        self.send({"type": "CommandTriggerMessage", "uuid": self.control(label)})
+
+    def labels(self) -> list[str]:
+        """All texts of labels in the scene so far."""
+        self.receive()
+        return self._labels
+
+    def receive(self) -> None:
+        """Reads the next messages of the server."""
+        window = self._socket.recv(timeout=PATIENCE)
+        length = int.from_bytes(window[8:16], "little")
+        text = zstandard.ZstdDecompressor().decompress(window[16 : 16 + length])
+        for message in msgspec.msgpack.decode(text)["messages"]:
+            props = message.get("props", {})
+            if "label" in props:
+                self._controls[props["label"]] = message["uuid"]
+            if message["type"] == "GuiSliderMessage":
+                self.sliders[props["label"]] = props["min"], props["max"], props["step"]
+            if message["type"] == "GuiUplotMessage":
+                self.lines += [line["label"] for line in props["series"]]
+            if "hotkey" in props:
+                self.keys.append(props["hotkey"])
+            if message["type"].startswith("SetCamera"):
+                self.camera |= message
+            if message["type"] == "FileTransferPart":
+                self.download += message["content"]
+            updates = message.get("updates", {})
+            self.texts += [part["content"] for part in (props, updates) if "content" in part]
+            if "value" in updates:
+                self.values[message["uuid"]] = updates["value"]
+            if "text" in updates:
+                self._labels.append(updates["text"])
+
+    def set(self, label: str, value: object, name: str = "value") -> None:
+        """Sets a control, and gives the page time to read it."""
+        self.send({"type": "GuiUpdateMessage", "uuid": label, "updates": {name: value}})
+
+    def look(self, position: list[float]) -> None:
+        """Reports the client's camera."""
+        self.send(CAMERA | {"position": position})
+
+    def send(self, message: object) -> None:
+        self.send_bytes(msgspec.msgpack.encode(message))
+
+    def send_bytes(self, data: bytes | str) -> None:
+        self._socket.send(data)
+        time.sleep(0.1)
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+def watch(
+    monkeypatch: pytest.MonkeyPatch, owner: type, method: str, record: Callable[..., None]
+) -> None:
+    """Calls `record` with the arguments of every call of a method."""
+    original = getattr(owner, method)
+
+    def watched(self, *args):
+        record(self, *args)
+        return original(self, *args)
+
+    monkeypatch.setattr(owner, method, watched)
+
+
+@contextlib.contextmanager
+def served(simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> Iterator[Client]:
+    """A client of a simulation's page."""
+    failures, printed, ended = [], io.StringIO(), threading.Event()
+    options = ViewerOptions(viewer="browser", port=8400)
+
+    def step(simulation) -> None:
+        if ended.is_set():
+            raise KeyboardInterrupt
+
+    watch(monkeypatch, Simulation, "step", step)
+
+    def serve() -> None:
+        try:
+            show._page(options, Console(file=printed))(simulation, PageStart("exp[lr] <b>"))
+        except BaseException as error:
+            failures.append(error)
+
+    server = threading.Thread(target=serve)
+    server.start()
+    while "viewer" not in printed.getvalue():
+        assert server.is_alive(), failures
+        time.sleep(0.05)
+    yield Client(re.search(r"http://\S+", printed.getvalue())[0])
+    assert server.is_alive(), failures
+    ended.set()
+    server.join(PATIENCE)
+    assert [type(failure) for failure in failures] == [KeyboardInterrupt], failures
+
+
+def wait_until(holds: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE
+    while not holds():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+CAMERA = {
+    "type": "ViewerCameraMessage",
+    "wxyz": [1.0, 0.0, 0.0, 0.0],
+    "position": [1.0, 0.0, 0.0],
+    "look_at": [0.0, 0.0, 0.0],
+    "up_direction": [0.0, 0.0, 1.0],
+} | {"fov": 1.0, "near": 0.01, "far": 9.0, "image_height": 9, "image_width": 9}
+
+
+class StillConfig(WorldConfig):
+    """A task without commands."""
+
+
+class Still(task.Task):
+    Config = StillConfig
+
+    def reset(self, start: task.Start) -> tuple:
+        return ()
+
+    def step(self, state: tuple, step: task.Step) -> task.TaskStep:
+        reward = {"calm": -jnp.sum(jnp.square(step.action))}
+        return task.TaskStep((), reward, jnp.array(False), {})
+
+
+class LeanConfig(WorldConfig):
+    """A command that may be negative, and a fixed one without a unit."""
+
+    @property
+    def commands(self) -> dict[str, task.Command]:
+        angle = task.Command(-0.2, 0.2, "rad", least=-0.3, greatest=0.3, step=0.1)
+        return {"lean_angle": angle, "pace": task.Command(2.0, 2.0, span=(1.0, 3.0), step=1.0)}
+
+
+class Lean(Still):
+    Config = LeanConfig
+
+    def step(self, state: tuple, step: task.Step) -> task.TaskStep:
+        twice = 2.0 * step.command["lean_angle"]
+        return super().step(state, step)._replace(metrics={"twice": twice})
+
+    def markers(self, command: dict, metrics: dict) -> tuple[task.Marker, ...]:
+        place, size = (0.5, 0.0, 0.2 + command["lean_angle"]), (0.1, 0.1, 0.01)
+        wall = task.Marker("high_wall", place, size, (0.9, 0.1, 0.1, 1.0))
+        dots = (task.Marker(f"dot {i}", (0.1 * i, 0.0, 0.5), size, (0, 0, 1, 1)) for i in range(3))
+        return wall, *dots
+
+    def levels(self, command: dict[str, float]) -> dict[str, float]:
+        return {"shelf": 0.3, "wall": 0.2 + command["lean_angle"]}
+
+    def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
+        return {"twice": f"{metrics['twice']:.1f}", "pace": f"{command['pace']:.0f}"}
+
+
+def evaluated(*passed: bool | None) -> Report:
+    return Report(tuple(Result(f"r{i}", "%", 1.0, ">= 1", p) for i, p in enumerate(passed)), {})
