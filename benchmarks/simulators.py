@@ -575,7 +575,7 @@ def evaluate(
     positions [T, nq] of the first episode."""
     config = load_run_config(resource_path(POLICIES[policy])).env
     env = Env(config.model_copy(update={"randomization": RandomizationConfig()}))
-    addresses, parts = find_addresses(env.mj_model), make_parts(env.mj_model)
+    addresses, parts = env.addresses, make_parts(env.mj_model)
     arm_qpos, arm_qvel = list(addresses.arm_qpos), list(addresses.arm_qvel)
     ball_qpos = np.array([ball.qpos[:3] for ball in addresses.balls])
     ball_qvel = np.array([ball.qvel[:3] for ball in addresses.balls])

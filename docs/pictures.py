@@ -403,7 +403,6 @@ def arms():
     import yaml
 
     from bounce_mjx import BounceBall, EnvConfig
-    from bounce_mjx.robot.model import find_addresses
     from bounce_mjx.viewers.offscreen import Renderer
 
     names = {"peitian": "AIR4-560", "ur5e": "UR5e", "panda": "Panda", "iiwa": "iiwa"}
@@ -412,7 +411,7 @@ def arms():
         file = CHECKOUT / "configs/robots" / f"{name}.yaml"
         config = EnvConfig.model_validate(yaml.safe_load(file.read_text())["env"])
         env = BounceBall(config)
-        qpos, addresses = env.mj_model.qpos0.copy(), find_addresses(env.mj_model)
+        qpos, addresses = env.mj_model.qpos0.copy(), env.addresses
         qpos[addresses.arm_qpos,] = config.default_joint_angles
         qpos[addresses.ball_qpos[:3],] = config.ball_init_pos
         with Renderer(env, 480, 520) as renderer:

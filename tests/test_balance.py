@@ -10,7 +10,6 @@ from bounce_mjx import task
 from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.c_episodes import episode_models
 from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState
-from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.tasks.balance import Balance, Config
 from bounce_mjx.world.randomization import RandomizationConfig
 
@@ -78,7 +77,7 @@ def test_the_ball_is_laid_on_the_paddle(env: Env) -> None:
 @pytest.mark.slow
 def test_a_ball_slides_and_rolls_on_fused_as_on_c(env: Env) -> None:
     """A ball at 0.1 m/s without spin, and one on a paddle with a slope of 0.1 rad."""
-    model, at = env.mj_model, find_addresses(env.mj_model)
+    model, at = env.mj_model, env.addresses
     assert env.engine.name == "fused"
     angles = np.array([Config().default_joint_angles] * 2)
     angles[1, 4] += 0.1

@@ -336,7 +336,7 @@ def test_c_moves_several_balls_as_the_engine_does():
     keys = jax.random.split(jax.random.PRNGKey(0), count)
     states = jax.vmap(env.reset, out_axes=-1)(keys)
     physics = states.pipeline_state.physics
-    spins = [i for ball in find_addresses(env.mj_model).balls for i in ball.qvel[3:]]
+    spins = [i for ball in env.addresses.balls for i in ball.qvel[3:]]
     physics = physics._replace(qvel=physics.qvel.at[np.array(spins)].set(30.0))
     push = jnp.arange(6.0).reshape(2, 3, 1) * jnp.ones(count)
     air = {"air_drag": jnp.full(count, 0.5), "air_lift": jnp.full(count, 0.02)}

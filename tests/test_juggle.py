@@ -181,7 +181,7 @@ def test_the_picture_shows_all_balls_and_the_next_landing() -> None:
     display, qpos = Display(env), np.asarray(state.physics.qpos)
     display.pose(qpos, {"target_height": 0.5}, {"landing_x": 0.6, "landing_y": 0.02})
     data = display.data
-    for ball, name in zip(find_addresses(env.mj_model).balls, ("ball", "ball2"), strict=True):
+    for ball, name in zip(env.addresses.balls, ("ball", "ball2"), strict=True):
         np.testing.assert_allclose(data.geom(name).xpos, qpos[list(ball.qpos[:3])], atol=1e-9)
     np.testing.assert_allclose(data.body("marker next ball").xpos[:2], (0.6, 0.02))
     tops = [data.body(f"marker target height {i}").xpos for i in (1, 2)]

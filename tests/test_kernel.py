@@ -45,7 +45,7 @@ def moving(env: BounceBall, batch: int) -> tuple[PhysicsState, jax.Array]:
     """States that move, the batch last, and servo targets; in some the ball is in the paddle."""
     keys = jax.random.split(jax.random.PRNGKey(0), batch)
     physics = jax.vmap(env.reset, out_axes=-1)(keys).pipeline_state.physics
-    at = env._addresses
+    at = env.addresses
     paddle = jax.vmap(partial(env.engine.paddle_position, MODEL), in_axes=-1, out_axes=-1)(
         physics.qpos
     )

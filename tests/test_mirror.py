@@ -15,7 +15,6 @@ from bounce_mjx.commands import play
 from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import judge
-from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.runs.config import read_preset
 
 GRAVITY = 9.81
@@ -30,7 +29,7 @@ def env(request: pytest.FixtureRequest) -> Env:
 
 
 def test_the_inverse_kinematics_are_those_of_mujoco(env: Env) -> None:
-    law, data, at = MirrorLaw(env), mujoco.MjData(env.mj_model), find_addresses(env.mj_model)
+    law, data, at = MirrorLaw(env), mujoco.MjData(env.mj_model), env.addresses
     home = np.array(law._pose(jnp.asarray(env.config.default_joint_angles)))
     for change in ([0.05, -0.04, 0.03, 0.1, -0.05], [-0.1, 0.05, -0.03, -0.05, 0.15]):
         wished = home + change

@@ -10,9 +10,9 @@ import pytest
 
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.errors import UserError
-from bounce_mjx.physics import PhysicsState, make_engine
+from bounce_mjx.physics import PhysicsState
 from bounce_mjx.robot.model import find_addresses, load_model
-from test_physics import XML, edited
+from test_physics import XML
 
 SERVO_2 = '<position name="act2" joint="Joint2"/>'
 REFUSED = {
@@ -141,29 +141,6 @@ def test_with_a_gear_the_target_is_the_actuators_length(tmp_path):
         mujoco.mj_step(env.mj_model, data, nstep=10)
         after.append(data.qpos[:6].copy())
     np.testing.assert_allclose(*after, atol=1e-7)
-
-
-SOLVER = 'iterations="4" ls_iterations="8"'
-UNCONVERGED = {
-    "no iteration": ('iterations="0"', ['iterations="0"'], ["solver="]),
-    "one iteration": ('iterations="1"', ['iterations="1"'], ["solver="]),
-    "few of CG": ('solver="CG" iterations="2"', ['solver="CG"', 'iterations="2"'], ["ls_"]),
-    "loose": ('iterations="4" ls_iterations="8" tolerance="1"', ['tolerance="1"'], ["iterations"]),
-}
-
-
-@pytest.mark.parametrize("name", UNCONVERGED)
-def test_a_solver_that_stops_early_is_named(name):
-    """The fused engine warns of this setting and of no other."""
-    settings, named, innocent = UNCONVERGED[name]
-    (warning,) = make_engine(edited(SOLVER, settings), "auto").warnings
-    assert all(text in warning for text in named)
-    assert not any(text in warning for text in innocent)
-
-
-@pytest.mark.parametrize("settings", [SOLVER, "", 'solver="PGS"', 'solver="CG" iterations="50"'])
-def test_a_solver_that_converges_gives_no_warning(settings):
-    assert make_engine(edited(SOLVER, settings), "auto").warnings == ()
 
 
 def dropped(mj_model: mujoco.MjModel, *positions: tuple[float, float, float]):

@@ -128,20 +128,6 @@ def test_entries_act_as_in_mujoco(mj_model):
     assert_same_step(fused_steps(mj_model, parameters, states), expected)
 
 
-def test_friction_of_the_geoms_is_that_of_their_contact(mj_model, base):
-    """A contact has the larger friction of its two geoms; that of the other geoms, which do not
-    collide, has no effect, as without a pair."""
-    friction = np.array([base.geom_friction] * BATCH)
-    friction[:, :, 0] = np.array([0.0, 0.3, 0.5])[:, None]
-    friction[2, mj_model.geom("blocker").id, 0] = 0.2
-    result = read(mj_model, base, geom_friction=friction)
-    models = [edited_model(mj_model, one_of(result, i)) for i in range(BATCH)]
-    np.testing.assert_allclose(
-        [m.pair_friction[0, :2] for m in models], [[x] * 2 for x in (0.0, 0.3, 0.5)]
-    )
-    assert all(model.pair_dim[0] == 3 for model in models)
-
-
 def test_equal_values_change_nothing(mj_model, base):
     """A function that only gives every field a batch axis is not a randomisation."""
     fields = {
@@ -164,6 +150,7 @@ REFUSED = {
     "ball": ("dof_damping", r"dof_damping\[6\]"),
     "inertia of the ball": ("body_inertia", r"body_inertia\[7, 0\]"),
     "bound": ("geom_rbound", "geom_rbound"),
+    "friction of geoms": ("geom_friction", r"geom_friction\[0, 0\]"),
     "solref of geoms": ("geom_solref", "geom_solref"),
     "colour": ("geom_rgba", "geom_rgba"),
 }
@@ -173,15 +160,15 @@ REFUSED = {
 def test_changes_without_an_effect_are_refused_by_name(field, word, mj_model, base):
     one = np.asarray(getattr(base, field))
     with pytest.raises(UserError, match=word):
-        read(mj_model, base, **{field: np.stack([one, 1.1 * one + 0.1 * (field == "dof_damping")])})
-
-
-def test_friction_of_the_floor_is_refused(mj_model, base):
-    """Only the paddle touches the ball, so another geom's friction would change nothing."""
-    friction = np.stack([base.geom_friction] * 2)
-    friction[1, mj_model.geom("floor").id, 0] = 1.0
-    with pytest.raises(UserError, match="geom_friction"):
-        read(mj_model, base, geom_friction=friction)
+        read(
+            mj_model,
+            base,
+            **{
+                field: np.stack(
+                    [one, 1.1 * one + 0.1 * (field in ("dof_damping", "geom_friction"))]
+                )
+            },
+        )
 
 
 def test_an_entry_of_no_model_is_refused(mj_model):

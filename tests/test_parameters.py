@@ -30,7 +30,7 @@ from bounce_mjx.physics import (
     make_engine,
 )
 from bounce_mjx.physics.parameters import shapes
-from bounce_mjx.robot.model import find_addresses, load_model, resting_activations
+from bounce_mjx.robot.model import load_model, resting_activations
 from random_worlds import own_parameters, random_parameters
 from test_impact import push_by_air
 from test_physics import (
@@ -308,7 +308,7 @@ def test_each_environment_of_a_batch_has_its_own_ball():
         state = jax.vmap(env.reset)(keys)
         parameters = state.pipeline_state.parameters
         assert abs(np.log(parameters.ball_mass[0] / parameters.ball_mass[1])) > 0.5
-        at = find_addresses(env.mj_model)
+        at = env.addresses
         action = jnp.zeros((2, 6))
         start = state.pipeline_state.physics
         reference = [

@@ -686,13 +686,6 @@ print(len(lines))
     assert lines
 
 
-def test_mjx_names_features_in_words():
-    """Not with MuJoCo's enumerations."""
-    old, new, _ = UNSUPPORTED["ellipsoid ball"]
-    with pytest.raises(UserError, match=r"MJCF \(ellipsoid, box collisions not implemented\)"):
-        make_engine(edited(old, new), "mjx")
-
-
 def test_auto_takes_fused_for_the_shipped_model(mj_model):
     """An explicit choice has priority."""
     assert make_engine(mj_model, "auto").name == "fused"

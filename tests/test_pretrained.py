@@ -217,7 +217,7 @@ def measure(monkeypatch, ship, measured: Report):
     """A function (report) that makes `ship` measure this report."""
 
     def replace(report: Report) -> None:
-        evaluation = PolicyEvaluation(report, "fused", ())
+        evaluation = PolicyEvaluation(report, "fused")
         monkeypatch.setattr(ship, "evaluate_policy", lambda *_, **__: evaluation)
 
     replace(measured)

@@ -302,7 +302,7 @@ def env(request, written) -> BounceBall:
 
 def test_the_start_pose_holds_the_paddle_level_at_the_target_point(env) -> None:
     config, data = env.config, mujoco.MjData(env.mj_model)
-    data.qpos[list(find_addresses(env.mj_model).arm_qpos)] = config.default_joint_angles
+    data.qpos[list(env.addresses.arm_qpos)] = config.default_joint_angles
     mujoco.mj_forward(env.mj_model, data)
     paddle = data.geom("blocker")
     np.testing.assert_allclose(paddle.xmat.reshape(3, 3)[:, 2], [0.0, 0.0, 1.0], atol=1e-4)
@@ -315,7 +315,7 @@ def test_the_start_pose_holds_the_paddle_level_at_the_target_point(env) -> None:
     assert np.allclose(
         np.array(config.target_height_range) - paddle.xpos[2], [0.35, 0.55], atol=1e-3
     )
-    low, high = env.mj_model.jnt_range[list(find_addresses(env.mj_model).arm_joints)].T
+    low, high = env.mj_model.jnt_range[list(env.addresses.arm_joints)].T
     assert np.all(low < config.default_joint_angles) and np.all(config.default_joint_angles < high)
 
 
@@ -331,7 +331,7 @@ def test_only_the_arm_is_left(env) -> None:
 
 @pytest.mark.usefixtures("float64")
 def test_one_step_in_random_worlds_is_mujocos(env) -> None:
-    model, at = env.mj_model, find_addresses(env.mj_model)
+    model, at = env.mj_model, env.addresses
     count, rng = 32, np.random.default_rng(1)
     qpos = np.tile(model.qpos0, (count, 1))
     angles = env.config.default_joint_angles + rng.uniform(-0.5, 0.5, (count, 6))

@@ -74,7 +74,7 @@ def domain_randomize(
     def draw(key: jax.Array) -> Fields:
         world = draw_world(config.ranges(), key, jnp.result_type(float), num_joints)
         drawn = scalars_of(physics_parameters(world, mj_model), jnp.result_type(float))
-        m = edited(mj_model, drawn).derive()
+        m = edited(mj_model, drawn)
         fields = {name: m.array(name) for name in m.fields}
         return {name: x for name, x in fields.items() if jnp.issubdtype(x.dtype, jnp.floating)}
 
@@ -120,7 +120,7 @@ def parameters_of(mj_model: mujoco.MjModel, base: Any, model: Any) -> PhysicsPar
     for i in range(max(map(len, batches.values()), default=0)):
         one = {name: batch[min(i, len(batch) - 1)] for name, batch in batches.items()}
         entries = {key: float(one[name][index]) for key, (name, index) in own.items()}
-        derived = edited(mj_model, PhysicsParameters(entries=entries)).derive()
+        derived = edited(mj_model, PhysicsParameters(entries=entries))
         following = {
             name
             for name in following

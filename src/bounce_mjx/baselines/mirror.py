@@ -71,7 +71,7 @@ class MirrorLaw:
                 f"the mirror law needs {', '.join(missing)} in the observation; set "
                 f"env.observation.{missing[0]} to 1"
             )
-        self._env, at = env, find_addresses(model)
+        self._env, at = env, env.addresses
         self._arm, self._servos = list(at.arm_qpos), list(at.actuators)
         self._home = np.array(config.default_joint_angles)
         normal, height = upper_face(model, self._home)

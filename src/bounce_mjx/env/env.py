@@ -114,7 +114,7 @@ class Env:
         self.mj_model: mujoco.MjModel = world_model(config)
         self.engine: Engine = make_engine(self.mj_model, config.physics)
         self.layout = config.layout
-        self._addresses = find_addresses(self.mj_model)
+        self.addresses = find_addresses(self.mj_model)
         self._check_start()
         self._actuators = Actuators(config, self.mj_model)
         self._sensors = Sensors(config, self.mj_model, self.engine, self.task)
@@ -128,7 +128,7 @@ class Env:
     def _check_start(self) -> None:
         """Checks that the joint angles of a reset, and the heights over the paddle, fit the arm."""
         config, model, acting = self.config, self.mj_model, joint_names(self.mj_model)
-        angles, ranges = config.default_joint_angles, model.jnt_range[[*self._addresses.arm_joints]]
+        angles, ranges = config.default_joint_angles, model.jnt_range[[*self.addresses.arm_joints]]
         if len(angles) != len(acting):
             name = f"the MJCF file {config.mjcf}" if config.mjcf else "the model"
             raise UserError(
@@ -144,9 +144,9 @@ class Env:
                     f"{high:.4g}; give radians, or metres for a slide, within the range"
                 )
         data = mujoco.MjData(model)
-        data.qpos[list(self._addresses.arm_qpos)] = angles
+        data.qpos[list(self.addresses.arm_qpos)] = angles
         mujoco.mj_kinematics(model, data)
-        paddle = data.geom_xpos[self._addresses.paddle_geom, 2]
+        paddle = data.geom_xpos[self.addresses.paddle_geom, 2]
         for name, height in config.heights.items():
             if height <= paddle:
                 raise UserError(
@@ -335,7 +335,7 @@ class Env:
             balls' positions [2 n + 3 B].
           thrown: the task's position and velocity of the ball [3], or of the balls [B, 3].
         """
-        config, addresses, model = self.config, self._addresses, self.mj_model
+        config, addresses, model = self.config, self.addresses, self.mj_model
         dtype, n, count = draws.dtype, self.action_size, config.num_balls
         if thrown is None:
             above = np.array([[0.0, 0.0, BALLS_APART * i] for i in range(count)])
@@ -426,7 +426,7 @@ class Env:
 
     def kinematics(self, state: EnvState) -> Kinematics:
         """True positions and velocities of one environment's state, read from its physics."""
-        addresses, (qpos, qvel) = self._addresses, (state.physics.qpos, state.physics.qvel)
+        addresses, (qpos, qvel) = self.addresses, (state.physics.qpos, state.physics.qvel)
 
         def of_balls(coordinates: jax.Array, entries: list[tuple[int, ...]]) -> jax.Array:
             rows = [jnp.stack([coordinates[i] for i in row]) for row in entries]

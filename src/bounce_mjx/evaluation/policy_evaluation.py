@@ -28,8 +28,6 @@ class PolicyEvaluation(NamedTuple):
     report: Report
     engine: str
     """fused, mjx or mujoco."""
-    warnings: tuple[str, ...]
-    """Reasons to doubt the engine's physics, one sentence each."""
 
 
 def evaluate_policy(
@@ -58,13 +56,7 @@ def evaluate_policy(
     make = make_mujoco_evaluator if on_c else make_evaluator
     evaluate = make(env, actor(env), options.episodes, progress)
     statistics = evaluate(policy, jax.random.PRNGKey(options.seed), ranges)
-    return PolicyEvaluation(
-        judge(env, statistics, commands),
-        engine,
-        # The warnings concern models on which MuJoCo's solver does not converge, unlike the fused
-        # physics.
-        warnings=env.engine.warnings if on_c else (),
-    )
+    return PolicyEvaluation(judge(env, statistics, commands), engine)
 
 
 def recorded_episodes(

@@ -8,7 +8,6 @@ import numpy as np
 from bounce_mjx.env.env import Env
 from bounce_mjx.env.state import State
 from bounce_mjx.evaluation.statistics import moment
-from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.task.shown import Recording
 
 RECORDED_EPISODES = 32
@@ -71,7 +70,7 @@ def paddle_points(env: Env, recording: Recording, steps: np.ndarray) -> np.ndarr
     Args:
       steps: whether each step is one to measure [T, K]; N are true.
     """
-    model, addresses = env.mj_model, find_addresses(env.mj_model)
+    model, addresses = env.mj_model, env.addresses
     data = mujoco.MjData(model)
     joint_angles, offsets = (
         np.moveaxis(np.asarray(values), 1, 2)[steps]

@@ -65,7 +65,7 @@ def step(
             force = model.body_mass[ball.body] * _by_air(control, ball, data)
             applied = data.xfrc_applied.at[ball.body, :3].set(force)
             data = data.replace(xfrc_applied=applied)
-        return mjx.step(_with_saturated_servos(model, constants, data), data)
+        return _step(model, data)
 
     with _full_precision():
         model = world_model(constants, parameters)
@@ -91,47 +91,19 @@ def _by_air(control: Control, ball: BallAddresses, data: mjx.Data) -> jax.Array:
     return acceleration
 
 
-def _with_saturated_servos(model: mjx.Model, constants: MjxModel, data: mjx.Data) -> mjx.Model:
-    """Model of one step, with a constant force in place of each servo at its force limit.
-
-    MJX's implicit integrator still damps a saturated servo; MuJoCo's C engine does not.
-    """
-    m = constants.mj_model
-    servos = np.array(constants.addresses.actuators)
-    affine = (m.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED) & (
-        m.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
-    )
-    servos = servos[(model.actuator_forcelimited & affine)[servos]]
-    if m.opt.integrator != mujoco.mjtIntegrator.mjINT_IMPLICITFAST or not len(servos):
-        return model
-    joints = m.actuator_trnid[servos, 0]
-    gear = m.actuator_gear[servos, 0]
-    gain, bias = model.actuator_gainprm, model.actuator_biasprm
-    limited = m.actuator_ctrllimited.astype(bool)[:, None]
-    limits = np.where(limited, m.actuator_ctrlrange, [-np.inf, np.inf])
-    inputs = jnp.clip(data.ctrl, *limits.T)[servos]
-    if m.na:
-        filtered = m.actuator_dyntype[servos] != mujoco.mjtDyn.mjDYN_NONE
-        inputs = jnp.where(filtered, data.act[m.actuator_actadr[servos]], inputs)
-    force = (
-        gain[servos, 0] * inputs
-        + bias[servos, 0]
-        + bias[servos, 1] * gear * data.qpos[m.jnt_qposadr[joints]]
-        + bias[servos, 2] * gear * data.qvel[m.jnt_dofadr[joints]]
-    )
-    least, most = jnp.asarray(model.actuator_forcerange)[servos].T
-    saturated = (force <= least) | (force >= most)
-    constant = jnp.zeros((len(servos), 3)).at[:, 0].set(jnp.clip(force, least, most))
-    return model.tree_replace(
-        {
-            "actuator_gainprm": jnp.asarray(gain)
-            .at[servos, 0]
-            .set(jnp.where(saturated, 0.0, gain[servos, 0])),
-            "actuator_biasprm": jnp.asarray(bias)
-            .at[servos, :3]
-            .set(jnp.where(saturated[:, None], constant, bias[servos, :3])),
-        }
-    )
+def _step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """`mjx.step`, except that the integrator implicitfast is not implicit in the damping of a servo
+    at its force limit: MuJoCo's C engine damps no such servo, and MJX does."""
+    if int(model.opt.integrator) != int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST):
+        return mjx.step(model, data)
+    data = mjx.forward(model, data)
+    limits, force = jnp.asarray(model.actuator_forcerange), data.actuator_force
+    free = (limits[:, 0] < force) & (force < limits[:, 1]) | ~model.actuator_forcelimited
+    damping = {
+        name: jnp.asarray(getattr(model, name)).at[:, 2].multiply(free)
+        for name in ("actuator_biasprm", "actuator_gainprm")
+    }
+    return mjx.implicit(model.tree_replace(damping), data)
 
 
 def paddle_position(
@@ -147,7 +119,7 @@ def paddle_position(
 def world_model(constants: MjxModel, parameters: PhysicsParameters) -> mjx.Model:
     """Model with the parameters of one environment."""
     numbers = scalars_of(parameters, jnp.result_type(float))
-    m = edited(constants.mj_model, numbers).derive()
+    m = edited(constants.mj_model, numbers)
     # MJX transforms every geom, even one flagged as sharing its body's frame.
     fields = {x: m.array(x) for x in m.fields if x not in ("geom_sameframe", "pair_dim")}
     if "pair_friction" in fields:

@@ -20,7 +20,6 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.recording import paddle_points
 from bounce_mjx.reports.curves import Group, mean_and_band
-from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.task.shown import Curve, Histogram, Hits, Recording
 
 RETURN = "episode/return"
@@ -219,7 +218,7 @@ def _draw_histogram(axes: Axes, plot: Histogram) -> None:
 
 def _draw_hits(axes: Axes, env: Env, plot: Hits, points: np.ndarray) -> None:
     """The paddle's outline with a dot for each hit."""
-    outline = env.mj_model.geom_size[find_addresses(env.mj_model).paddle_geom, :2]
+    outline = env.mj_model.geom_size[env.addresses.paddle_geom, :2]
     half_x, half_y = 100.0 * outline
     axes.add_patch(
         Rectangle(

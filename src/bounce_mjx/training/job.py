@@ -186,8 +186,6 @@ class _Job:
         if mesh.size > 1:
             self.device = f"{mesh.size} x {self.device}"
         say(self.console, f"physics: {self.env.engine.name} ({self.env.engine.reason})")
-        for warning in self.env.engine.warnings:
-            say(self.console, f"warning: {warning}")
         for term in config.env.unseen_noise:
             say(self.console, f"warning: the policy does not see what {term} changes")
         say(self.console, f"device: {self.device}  run: {self.run}")

@@ -12,7 +12,6 @@ import numpy as np
 from bounce_mjx.env.env import Env, EnvState
 from bounce_mjx.env.state import State
 from bounce_mjx.learning.policy import Actor, Policy
-from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.world.randomization import TERMS, Ranges, World
 
 _PICTURES_PER_SECOND = 50.0
@@ -316,7 +315,7 @@ def _apply(env: Env, states: State, changes: _Changes) -> State:
     """States [..., N] with the changes of a user."""
     before = states.pipeline_state
     qvel = before.physics.qvel
-    for ball in find_addresses(env.mj_model).balls:
+    for ball in env.addresses.balls:
         qvel = qvel.at[jnp.array(ball.qvel[:3])].add(changes.push[:, None])
     changed = before._replace(
         physics=before.physics._replace(qvel=qvel),
@@ -343,7 +342,7 @@ def _view(env: Env, states: State, steps: jax.Array, over: jax.Array) -> EnvFram
     """The frame of states (batch last) `steps` control steps after their resets."""
     now = states.pipeline_state
     kinematics = jax.vmap(env.kinematics, in_axes=-1, out_axes=-1)(now)
-    places = [ball.qpos[:3] for ball in find_addresses(env.mj_model).balls]
+    places = [ball.qpos[:3] for ball in env.addresses.balls]
     return EnvFrame(
         time=steps * env.dt,
         qpos=now.physics.qpos.T,

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.physics import Engine, PhysicsParameters
-from bounce_mjx.physics.edited import ball_radius, direct_solref
+from bounce_mjx.physics.edited import direct_solref
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.world.observation import Kinematics
 from bounce_mjx.world.randomization import IMPACT_SPEED, World, contact_damping
@@ -58,7 +58,9 @@ def next_impact(
         moving[address] = truth.joint_velocities[i]
     paddle_position = lambda qpos: engine.paddle_position(parameters, qpos)  # noqa: E731
     _, paddle_velocity = jax.jvp(paddle_position, (qpos,), (jnp.stack(moving),))
-    radius = ball_radius(mj_model, parameters)
+    geom, radius = addresses.ball_geom, parameters.ball_radius
+    radius = mj_model.geom_size[geom, 0] if radius is None else radius
+    radius = (parameters.entries or {}).get(f"geom_size[{geom}, 0]", radius)
     height = radius + np.min(mj_model.geom_size[addresses.paddle_geom])
     gap = truth.ball_position[..., 2] - truth.paddle_position[2] - height
     # The lowest ball counts.

@@ -17,9 +17,10 @@ from bounce_mjx.physics.control import Control, drag, servo_target
 from bounce_mjx.physics.fused import chain, joint_friction
 from bounce_mjx.physics.fused.model import FusedModel, Servo, read_model
 from bounce_mjx.physics.fused.response import contact_response, paddle_origin
-from bounce_mjx.physics.fused.turning import Turning, spin_in_ball, turn, turned, turning_of
+from bounce_mjx.physics.fused.turning import Turning, spin_in_ball, turned, turning_of
 from bounce_mjx.physics.parameters import PhysicsParameters
 from bounce_mjx.physics.scalars import (
+    ZERO3,
     Scalar,
     Vec3,
     add,
@@ -71,14 +72,16 @@ def step(
     qpos, qvel = _entries(state.qpos, range(model.nq)), _entries(state.qvel, range(model.nv))
     world = _in_any_world(model, parameters)
     turns = world.contacts[0].friction is not None or control.air_lift is not None
-    spinning = [(_entries(qpos, x.qpos[3:]), _entries(qvel, x.qvel[3:])) for x in at.balls]
+    turnings = [
+        turning_of(_entries(qpos, x.qpos[3:]), _entries(qvel, x.qvel[3:])) for x in at.balls
+    ]
     velocities = [_entries(qvel, x.qvel[:3]) for x in at.balls]
     if control.ball_push is not None:
         pushes = jnp.reshape(control.ball_push, (-1, 3))
         velocities = [vadd(v, _entries(pushes[k], range(3))) for k, v in enumerate(velocities)]
     balls = [
-        Ball(_entries(qpos, x.qpos[:3]), velocity, turning_of(*spin) if turns else None)
-        for x, velocity, spin in zip(at.balls, velocities, spinning, strict=True)
+        Ball(_entries(qpos, x.qpos[:3]), velocity, turning if turns else None)
+        for x, velocity, turning in zip(at.balls, velocities, turnings, strict=True)
     ]
     motion = Motion(_entries(qpos, at.arm_qpos), _entries(qvel, at.arm_qvel), tuple(balls))
     leaves, tree = jax.tree.flatten(motion)
@@ -90,13 +93,12 @@ def step(
     qpos, qvel = list(qpos), list(qvel)
     _put(qpos, at.arm_qpos, motion.q)
     _put(qvel, at.arm_qvel, motion.v)
-    for x, ball, spin in zip(at.balls, motion.balls, spinning, strict=True):
-        if ball.turning is None:
-            spin = turn(*spin, num_substeps * model.dt), spin[1]
-        else:
-            spin = ball.turning.orientation, spin_in_ball(ball.turning)
-        _put(qpos, x.qpos, (*ball.position, *spin[0]))
-        _put(qvel, x.qvel, (*ball.velocity, *spin[1]))
+    for x, ball, before in zip(at.balls, motion.balls, turnings, strict=True):
+        after = ball.turning or turned(before, ZERO3, num_substeps * model.dt)
+        _put(qpos, x.qpos, (*ball.position, *after.orientation))
+        _put(qvel, x.qvel[:3], ball.velocity)
+        if turns:
+            _put(qvel, x.qvel[3:], spin_in_ball(after))
     return PhysicsState(jnp.stack(qpos), jnp.stack(qvel))
 
 

@@ -239,14 +239,8 @@ def _with_body(m: EditedModel, link: chain.Link, body: int, frame: Frame) -> cha
         tuple(sub(lever if i == j else 0.0, mul(centre[i], centre[j])) for j in range(3))
         for i in range(3)
     )
-    if m.inertia_follows(body):
-        # One product for each entry, as only the mass is no constant.
-        own = m.model.body_mass[body]
-        per_mass = congruence(principal, diagonal(floats(m.model.body_inertia[body] / own)))
-        inertia = symmetric(lambda i, j: mul(add(per_mass[i][j], shift[i][j]), mass))
-    else:
-        about_centre = congruence(principal, diagonal(m["body_inertia", body]))
-        inertia = symmetric(lambda i, j: add(about_centre[i][j], mul(shift[i][j], mass)))
+    about_centre = congruence(principal, diagonal(m["body_inertia", body]))
+    inertia = symmetric(lambda i, j: add(about_centre[i][j], mul(shift[i][j], mass)))
     moment, floating = scale(centre, mass), _gravity_compensation(m.model)[body].item()
     return dataclasses.replace(
         link,
@@ -330,7 +324,8 @@ def _read_ball(m: EditedModel, ball: BallAddresses) -> BallModel:
     return BallModel(
         radius=m["geom_size", ball.geom, 0],
         mass=m["body_mass", ball.body],
-        inertia=m.inertia(ball.body)[0],
+        # Not recorded: the ball stays homogeneous, so that its inertia cannot be edited alone.
+        inertia=m.peek("body_inertia", ball.body, 0),
         weight=1.0 - _gravity_compensation(m.model)[ball.body].item(),
     )
 
@@ -365,7 +360,7 @@ def _read_contact(m: EditedModel, pair: int, balls: tuple[int, ...]) -> ContactM
             midpoint,
             int(power) if power.is_integer() else power,
         ),
-        inverse_weights=tuple(map(m.inverse_weight, bodies)),
+        inverse_weights=tuple(m["body_invweight0", body, 0] for body in bodies),
         friction=tuple(maximum(x, MIN_FRICTION) for x in m["pair_friction", pair][:2])
         if frictional
         else None,

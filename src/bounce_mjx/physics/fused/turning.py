@@ -42,7 +42,7 @@ def spin_in_ball(turning: Turning) -> Vec3:
 
 
 def turned(turning: Turning, acceleration: Vec3, dt: float) -> Turning:
-    """Spin and orientation one step later; the new spin turns the orientation."""
+    """Spin and orientation after a time dt, in which the new spin turns the orientation."""
     spin = vadd(turning.spin, scale(acceleration, dt))
     squared = dot(spin, spin)
     still = squared < float(jnp.finfo(squared.dtype).tiny)
@@ -50,18 +50,6 @@ def turned(turning: Turning, acceleration: Vec3, dt: float) -> Turning:
     sine, cosine = sine_cosine(0.5 * dt * (squared * inverse_speed))
     rotation = (cosine, *scale(spin, sine * inverse_speed))
     return Turning(spin, quaternion_product(rotation, turning.orientation))
-
-
-def turn(quaternion: Quaternion, spin: Vec3, duration: float) -> Quaternion:
-    """Quaternion [w, x, y, z] after turning at a constant spin (rad/s, body frame): the axis-angle
-    product of MuJoCo's mju_quatIntegrate."""
-    squared_speed = dot(spin, spin)
-    still = squared_speed == 0.0
-    speed = jnp.sqrt(jnp.where(still, 1.0, squared_speed))
-    half_angle = 0.5 * duration * speed
-    sine = jnp.where(still, 0.0, jnp.sin(half_angle) / speed)
-    cosine = jnp.where(still, 1.0, jnp.cos(half_angle))
-    return quaternion_product(_normalised(quaternion), (cosine, *scale(spin, sine)))
 
 
 def _normalised(quaternion: Quaternion) -> Quaternion:
