@@ -29,7 +29,7 @@ from bounce_mjx.robot.model import find_addresses, joint_names
 from bounce_mjx.runs.config import load_config
 from bounce_mjx.training.setup import set_up_jax
 from bounce_mjx.world.config import WorldConfig
-from bounce_mjx.world.randomization import RandomizationConfig, draw_world, physics_parameters
+from bounce_mjx.world.randomization import RandomizationConfig, physics_parameters, sample_world
 
 # Terms of the sensors, which are the same for all robots, and disturbances.
 _FIXED = (
@@ -59,7 +59,7 @@ def hidden_robot(seed: int) -> Hidden:
     wide = load_config(resource_path("configs/transfer.yaml")).env.randomization
     ranges = {k: v for k, v in wide.ranges().items() if k not in _FIXED}
     key, rare, always = jax.random.split(jax.random.PRNGKey(seed), 3)
-    world = draw_world(ranges, rare, np.dtype("float32"), 6, 0.3)
+    world = sample_world(ranges, rare, np.dtype("float32"), 6, 0.3)
     servos = RandomizationConfig(
         action_latency=(0.0, 0.04),
         ball_latency=(0.0, 0.02),
@@ -67,7 +67,7 @@ def hidden_robot(seed: int) -> Hidden:
         servo_damping=(0.8, 1.2),
         joint_frictionloss=(0.0, 5.0),
     )
-    world |= draw_world(servos.ranges(), always, np.dtype("float32"), 6, 1.0)
+    world |= sample_world(servos.ranges(), always, np.dtype("float32"), 6, 1.0)
     world = {name: np.asarray(value, np.float32) for name, value in world.items()}
     flaw = ("nothing", "backlash", "nothing", "asymmetric friction")[seed % 4]
     return Hidden(world, flaw)

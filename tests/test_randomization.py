@@ -35,8 +35,8 @@ from bounce_mjx.world.actuation import add_delay, start_actuation
 from bounce_mjx.world.randomization import (
     TERMS,
     RandomizationConfig,
-    draw_world,
     physics_parameters,
+    sample_world,
 )
 from test_friction import converged
 from test_physics import XML, difference
@@ -54,7 +54,9 @@ RANGES |= {"restitution_slope": (0.02, 0.05)}
 def test_draws_are_uniform_in_their_ranges() -> None:
     config = RandomizationConfig(**RANGES)
     keys = jax.random.split(jax.random.PRNGKey(0), 2000)
-    draw = functools.partial(draw_world, config.ranges(), dtype=jnp.dtype("float32"), num_joints=6)
+    draw = functools.partial(
+        sample_world, config.ranges(), dtype=jnp.dtype("float32"), num_joints=6
+    )
     worlds = jax.jit(jax.vmap(draw))(keys)
     assert tuple(worlds) == tuple(sorted(TERMS)) and set(config.terms) == set(TERMS)
     shares = []
@@ -78,7 +80,7 @@ OWN = {"paddle_tilt": ((-0.08, 0.01), (-0.07, 0.03)), "servo_gain": GAINS}
 def test_each_entry_is_drawn_in_its_own_range() -> None:
     config = RandomizationConfig(**OWN, armature=(0.9, 1.1))
     keys = jax.random.split(jax.random.PRNGKey(0), 2000)
-    draw = functools.partial(draw_world, dtype=jnp.dtype("float32"), num_joints=6)
+    draw = functools.partial(sample_world, dtype=jnp.dtype("float32"), num_joints=6)
     worlds = jax.jit(jax.vmap(functools.partial(draw, config.ranges())))(keys)
     for name, (low, high) in OWN.items():
         shares = (np.asarray(worlds[name], float) - low) / np.subtract(high, low)
@@ -142,7 +144,7 @@ def test_draws_do_not_depend_on_the_order_of_the_ranges() -> None:
     """JAX sorts the keys of a traced dictionary."""
     ranges = RandomizationConfig(restitution=(0.7, 0.9), air_drag=(0.0, 0.2)).ranges()
     draw = functools.partial(
-        draw_world, key=jax.random.PRNGKey(1), dtype=jnp.dtype("float32"), num_joints=6
+        sample_world, key=jax.random.PRNGKey(1), dtype=jnp.dtype("float32"), num_joints=6
     )
     expected = draw(ranges)
     for world in (jax.jit(draw)(ranges), draw(dict(reversed(ranges.items())))):
@@ -200,7 +202,12 @@ def test_a_share_of_the_terms_is_drawn() -> None:
     keys = jax.random.split(jax.random.PRNGKey(2), 2000)
     own = {"action_latency": 0.8, "air_drag": 0.0}
     draw = functools.partial(
-        draw_world, config.ranges(), dtype=jnp.dtype("float32"), num_joints=6, share=0.3, shares=own
+        sample_world,
+        config.ranges(),
+        dtype=jnp.dtype("float32"),
+        num_joints=6,
+        share=0.3,
+        shares=own,
     )
     worlds = jax.jit(jax.vmap(draw))(keys)
     drawn, expected = [], []

@@ -103,7 +103,7 @@ def test_a_world_with_ranges_of_axes_trains_and_is_doubled(tmp_path: Path) -> No
     trained = TrainConfig()
     there, named = in_world(trained, world)
     conditions = load_suite(
-        resource_path("configs/robustness.yaml"), there.env, there.env, named.doubled()
+        resource_path("configs/robustness.yaml"), there.env, there.env, named.double_assumed()
     )
     nominal, twice = (c for c in conditions if c.perturbation.group in ("nominal", TWICE))
     np.testing.assert_allclose(nominal.ranges["paddle_tilt"], TILT)
@@ -173,7 +173,7 @@ def test_robustness_starts_from_the_world_and_doubles_what_is_assumed() -> None:
     trained = TrainConfig(env=EnvConfig(randomization={"servo_lag": (0.0, 0.1)}))
     there, named = in_world(trained, Path("fast_servo"))
     suite = resource_path("configs/robustness.yaml")
-    conditions = load_suite(suite, trained.env, there.env, named.doubled())
+    conditions = load_suite(suite, trained.env, there.env, named.double_assumed())
     nominal, *rest = conditions
     in_the_world = {name: (low, high) for name, (low, high) in nominal.ranges.items()}
     assert set(in_the_world) == set(there.env.randomization.terms)

@@ -20,7 +20,7 @@ from bounce_mjx.physics.edited import edited
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS, PhysicsParameters
 from bounce_mjx.physics.scalars import scalars_of
 from bounce_mjx.robot.model import find_addresses
-from bounce_mjx.world.randomization import RandomizationConfig, draw_world, physics_parameters
+from bounce_mjx.world.randomization import RandomizationConfig, physics_parameters, sample_world
 
 # Fields that MuJoCo's compiler can compute from others.
 _DERIVED_FIELDS = frozenset(
@@ -57,7 +57,7 @@ def domain_randomize(
     rng: jax.Array,
     config: RandomizationConfig = DEFAULT,
 ) -> tuple[Any, Any]:
-    """A `randomization_fn` of brax and Playground that draws terms of `env.randomization`.
+    """A `randomization_fn` of brax and Playground that samples terms of `env.randomization`.
 
     Args:
       mj_model: the environment's model.
@@ -71,14 +71,14 @@ def domain_randomize(
 
     num_joints = len(find_addresses(mj_model).arm_joints)
 
-    def draw(key: jax.Array) -> Fields:
-        world = draw_world(config.ranges(), key, jnp.result_type(float), num_joints)
-        drawn = scalars_of(physics_parameters(world, mj_model), jnp.result_type(float))
-        m = edited(mj_model, drawn)
+    def sample(key: jax.Array) -> Fields:
+        world = sample_world(config.ranges(), key, jnp.result_type(float), num_joints)
+        given = scalars_of(physics_parameters(world, mj_model), jnp.result_type(float))
+        m = edited(mj_model, given)
         fields = {name: m.array(name) for name in m.fields}
         return {name: x for name, x in fields.items() if jnp.issubdtype(x.dtype, jnp.floating)}
 
-    fields = jax.jit(jax.vmap(draw))(rng)
+    fields = jax.jit(jax.vmap(sample))(rng)
     axes = jax.tree.map(lambda _: None, model)
     return model.tree_replace(fields), axes.tree_replace(dict.fromkeys(fields, 0))
 

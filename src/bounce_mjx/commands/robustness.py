@@ -74,7 +74,7 @@ def main(args: Sequence[str]) -> None:
     world, assumed = None, {}
     if command.world is not None:
         there, named = in_world(config, command.world)
-        world, assumed = there.env, named.doubled()
+        world, assumed = there.env, named.double_assumed()
     conditions = load_suite(suite, config.env, world, assumed)
     version = read_suite(suite).version
     if command.assumed:

@@ -32,12 +32,12 @@ from bounce_mjx.robot.setpoints import Setpoint
 from bounce_mjx.task.rewards import check_names
 from bounce_mjx.task.task import Start, Step, Task, TaskStep
 from bounce_mjx.world import noise
-from bounce_mjx.world.actuation import Actuation, Actuators, passes
+from bounce_mjx.world.actuation import Actuation, Actuators, recurs
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.impact import Impact, damping, first_impact, next_impact
 from bounce_mjx.world.noise import Clock
 from bounce_mjx.world.observation import Kinematics
-from bounce_mjx.world.randomization import TERMS, Ranges, World, draw_world, physics_parameters
+from bounce_mjx.world.randomization import TERMS, Ranges, World, physics_parameters, sample_world
 from bounce_mjx.world.sensing import Sensing, Sensors
 
 # MuJoCo's mjMAXVAL: a coordinate beyond it has diverged and counts as non-finite.
@@ -49,10 +49,10 @@ _ROUNDING = 1e-3
 
 
 class Redraw(NamedTuple):
-    """What later draws of the commands within an episode need."""
+    """What later samples of the commands within an episode need."""
 
     age: jax.Array
-    """Time since the commands were drawn [], s."""
+    """Time since the commands were sampled [], s."""
     ranges: dict[str, tuple[jax.Array, jax.Array]]
     """The range of each command."""
 
@@ -70,7 +70,7 @@ class EnvState(NamedTuple):
     parameters: PhysicsParameters = PhysicsParameters()
     """The physics of the next step."""
     world: World = {}
-    """The values that the reset drew for the active randomisation terms."""
+    """The values that the reset sampled for the active randomisation terms."""
     clock: Clock | None = None
     """For a randomised world, or an observation with a history."""
     redraw: Redraw | None = None
@@ -97,8 +97,8 @@ class Env:
         """Compiles the model and chooses the physics engine.
 
         Args:
-          randomize: key -> the physics parameters of one episode, drawn at each reset; None for the
-            model's own parameters.
+          randomize: key -> the physics parameters of one episode, which each reset samples; None
+            for the model's own.
 
         Raises:
           UserError: the MJCF file or the engine does not fit the task.
@@ -197,8 +197,8 @@ class Env:
         Args:
           rng: key; consumed.
           ranges: ranges for the active terms, within the config's ranges, which are the default.
-            The queues of late actions and pictures are only as long as the config's ranges need.
-          share: probability that each term is drawn; by default, the config's.
+            The queues of delayed actions and images are only as long as the config's ranges need.
+          share: probability that each term is sampled; by default, the config's.
         """
         check_unedited(self.mj_model, self._fingerprint)
         given = self.ranges() if ranges is None else ranges
@@ -207,24 +207,23 @@ class Env:
         if self._randomize is not None:
             rng, own_rng = jax.random.split(rng)
             own_parameters = self._randomize(own_rng)
-        # One draw for all numbers: splitting keys for separate draws would cost more than the
-        # draws.
+        # One sample for all numbers: splitting keys for several would cost more than they do.
         commands, size = self.config.commands, 2 * self.action_size + 3 * self.config.num_balls
         count = size + len(commands) + self.task.num_draws
         draws = jax.random.uniform(rng, (count,), minval=-1.0, maxval=1.0)
-        noises, of_commands, of_task = jnp.split(draws, [size, size + len(commands)])
-        of_task = 0.5 * (of_task + 1.0)
+        noises, command_draws, task_draws = jnp.split(draws, [size, size + len(commands)])
+        task_draws = 0.5 * (task_draws + 1.0)
         ends = {name: given.get(name, (c.low, c.high)) for name, c in commands.items()}
         command = {
             name: low + (high - low) * 0.5 * (draw + 1.0)
-            for draw, (name, (low, high)) in zip(of_commands, ends.items(), strict=True)
+            for draw, (name, (low, high)) in zip(command_draws, ends.items(), strict=True)
         }
         redraw = None
         if "command_interval" in world:
             age = jnp.zeros((), draws.dtype)
             redraw = Redraw(age, jax.tree.map(lambda end: jnp.asarray(end, draws.dtype), ends))
 
-        physics = self._first_physics(noises, world, self.task.throw(of_task, command))
+        physics = self._first_physics(noises, world, self.task.throw(task_draws, command))
         state = EnvState(
             physics=physics,
             command=command,
@@ -236,13 +235,13 @@ class Env:
             actuation=self._actuators.first(physics.qpos),
         )
         truth = self.kinematics(state)
-        task = self.task.reset(Start(truth, command, of_task))
-        state = state._replace(task=task, command=self._moved(task, command))
+        task = self.task.reset(Start(truth, command, task_draws))
+        state = state._replace(task=task, command=self._next_command(task, command))
         if not gives(own_parameters, "contact_damping", "pair_solref"):
             impact = first_impact(world, self.mj_model)
-            state = self._before_impact(state._replace(impact=impact), truth)
+            state = self._with_impact(state._replace(impact=impact), truth)
         if self._sensors.are_needed:
-            state = state._replace(sensing=self._sensors.first(truth, *self._of_sensors(state)))
+            state = state._replace(sensing=self._sensors.first(truth, *self._sensor_inputs(state)))
         return State(
             pipeline_state=state,
             obs=self.observe(state, truth),
@@ -263,7 +262,7 @@ class Env:
     def control(self, now: EnvState, action: jax.Array) -> tuple[Control, Actuation]:
         """The part of a step before the physics: its inputs under the action [n] of `step`, and
         the memory of the actuation after the step."""
-        action, _ = _acting(action)
+        action, _ = _clip_action(action)
         return self._actuators.next(now.actuation, now.physics.qpos, action, now.world, now.clock)
 
     def finish_step(
@@ -281,8 +280,8 @@ class Env:
           physics: after the step, from any engine.
         """
         before = state.pipeline_state
-        physics, finite = _finite(physics, before.physics)
-        action, is_number = _acting(action)
+        physics, finite = _keep_finite(physics, before.physics)
+        action, is_number = _clip_action(action)
         action = jnp.where(finite, action, before.last_action)
         now = self._pass_time(
             before._replace(physics=physics, last_action=action, actuation=actuation)
@@ -290,15 +289,15 @@ class Env:
         truth = self.kinematics(now)
 
         done = self.task.step(before.task, Step(truth, now.command, action, before.last_action))
-        now = now._replace(task=done.state, command=self._moved(done.state, now.command))
+        now = now._replace(task=done.state, command=self._next_command(done.state, now.command))
         ends = {
             "non_finite": ~(finite & is_number),
             "too_fast": jnp.any(jnp.abs(truth.joint_velocities) > self.config.max_joint_velocity),
         }
 
-        now = self._before_impact(now, truth)
+        now = self._with_impact(now, truth)
         if now.sensing is not None:
-            sensing = self._sensors.next(now.sensing, truth, *self._of_sensors(now))
+            sensing = self._sensors.next(now.sensing, truth, *self._sensor_inputs(now))
             now = now._replace(sensing=sensing)
         dtype = truth.ball_position.dtype
         metrics = _metrics(done, dtype) | {name: end.astype(dtype) for name, end in ends.items()}
@@ -308,7 +307,7 @@ class Env:
             reward=sum(done.reward.values()),
             done=(done.ended | ends["non_finite"] | ends["too_fast"]).astype(dtype),
             # Wrappers add their own metrics, which a step must keep.
-            metrics=state.metrics | metrics | self._privileged(now.world, truth),
+            metrics=state.metrics | metrics | self._privileged_metrics(now.world, truth),
         )
 
     def _draw_world(
@@ -322,7 +321,7 @@ class Env:
         terms, dtype = self.config.randomization, jnp.result_type(float)
         rng, world_rng, clock_rng = jax.random.split(rng, 3)
         share, shares = (terms.share, terms.shares or {}) if share is None else (share, {})
-        world = draw_world(ranges, world_rng, dtype, self.action_size, share, shares)
+        world = sample_world(ranges, world_rng, dtype, self.action_size, share, shares)
         return rng, world, noise.first_clock(clock_rng, dtype)
 
     def _first_physics(
@@ -365,7 +364,7 @@ class Env:
         step = Step(truth, state.command, state.last_action, state.last_action)
         names = jax.eval_shape(lambda: _metrics(self.task.step(state.task, step), zero.dtype))
         metrics = dict.fromkeys([*names, "non_finite", "too_fast"], zero)
-        metrics |= self._privileged(state.world, truth)
+        metrics |= self._privileged_metrics(state.world, truth)
         for curve in self.task.curves:
             shown = {curve.metric, *({curve.over} - {"steps", "episodes"})}
             check_names(f"the curve {curve.tag}", "metric", {*metrics} | shown, metrics)
@@ -381,7 +380,7 @@ class Env:
             return state._replace(clock=clock)
         (age, ranges), command = state.redraw, {}
         interval, phase = state.world["command_interval"], clock.phases[2]
-        now = passes(interval, phase, state.clock.step, self.dt)
+        now = recurs(interval, phase, state.clock.step, self.dt)
         shares = noise.uniform(clock.counter, noise.Stream.COMMAND, (len(ranges),), age.dtype)
         for i, name in enumerate(self.config.commands):
             low, high = ranges[name]
@@ -389,14 +388,14 @@ class Env:
         redraw = Redraw(jnp.where(now, 0.0, age) + self.dt, ranges)
         return state._replace(clock=clock, command=command, redraw=redraw)
 
-    def _moved(self, state: Any, command: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    def _next_command(self, state: Any, command: dict[str, jax.Array]) -> dict[str, jax.Array]:
         """The commands that the task moves on."""
         following = self.task.next_command(state, command)
         named = f"next_command of the task {type(self.task).__name__}"
         check_names(named, "command", following, command)
         return following
 
-    def _before_impact(self, state: EnvState, truth: Kinematics) -> EnvState:
+    def _with_impact(self, state: EnvState, truth: Kinematics) -> EnvState:
         """The state whose parameters have the damping of the next impact."""
         if state.impact is None:
             return state
@@ -407,7 +406,7 @@ class Env:
         parameters = parameters._replace(contact_damping=damping(impact))
         return state._replace(impact=impact, parameters=parameters)
 
-    def _of_sensors(self, state: EnvState) -> tuple:
+    def _sensor_inputs(self, state: EnvState) -> tuple:
         """What the sensors need beside the truth."""
         known = _entries(state.command) | {"action": state.last_action}
         return state.world, state.clock, known, state.actuation.setpoint
@@ -428,17 +427,17 @@ class Env:
         """True positions and velocities of one environment's state, read from its physics."""
         addresses, (qpos, qvel) = self.addresses, (state.physics.qpos, state.physics.qvel)
 
-        def of_balls(coordinates: jax.Array, entries: list[tuple[int, ...]]) -> jax.Array:
+        def ball_rows(coordinates: jax.Array, entries: list[tuple[int, ...]]) -> jax.Array:
             rows = [jnp.stack([coordinates[i] for i in row]) for row in entries]
             return rows[0] if len(rows) == 1 else jnp.stack(rows)
 
         return Kinematics(
             joint_angles=jnp.stack([qpos[i] for i in addresses.arm_qpos]),
-            ball_position=of_balls(qpos, [ball.qpos[:3] for ball in addresses.balls]),
-            ball_quaternion=of_balls(qpos, [ball.qpos[3:] for ball in addresses.balls]),
+            ball_position=ball_rows(qpos, [ball.qpos[:3] for ball in addresses.balls]),
+            ball_quaternion=ball_rows(qpos, [ball.qpos[3:] for ball in addresses.balls]),
             joint_velocities=jnp.stack([qvel[i] for i in addresses.arm_qvel]),
-            ball_velocity=of_balls(qvel, [ball.qvel[:3] for ball in addresses.balls]),
-            ball_angular_velocity=of_balls(qvel, [ball.qvel[3:] for ball in addresses.balls]),
+            ball_velocity=ball_rows(qvel, [ball.qvel[:3] for ball in addresses.balls]),
+            ball_angular_velocity=ball_rows(qvel, [ball.qvel[3:] for ball in addresses.balls]),
             paddle_position=self.engine.paddle_position(state.parameters, qpos),
         )
 
@@ -473,11 +472,11 @@ class Env:
         return state._replace(world=world, parameters=parameters, impact=impact)
 
     def _parameters(self, world: World, own: PhysicsParameters) -> PhysicsParameters:
-        """The physics of a drawn world, in which the parameters of `randomize` replace its own."""
+        """The physics of a world, in which the parameters of `randomize` replace its own."""
         pairs = zip(own, physics_parameters(world, self.mj_model), strict=True)
-        return PhysicsParameters(*(drawn if x is None else x for x, drawn in pairs))
+        return PhysicsParameters(*(sampled if x is None else x for x, sampled in pairs))
 
-    def _privileged(self, world: World, truth: Kinematics) -> dict[str, jax.Array]:
+    def _privileged_metrics(self, world: World, truth: Kinematics) -> dict[str, jax.Array]:
         """Quantities that only a critic may see: `world/<term>` and, where the sensors differ from
         the truth, `true/<quantity>`. Each entry of an array has its own name with an index."""
         named = {f"world/{name}": value for name, value in world.items()}
@@ -502,7 +501,7 @@ def world_model(config: WorldConfig, visual: bool = True) -> mujoco.MjModel:
     return edited_model(mj_model, PhysicsParameters(contact_friction=np.float64(config.friction)))
 
 
-def _finite(physics: PhysicsState, before: PhysicsState) -> tuple[PhysicsState, jax.Array]:
+def _keep_finite(physics: PhysicsState, before: PhysicsState) -> tuple[PhysicsState, jax.Array]:
     """The physics after a step, or before it if the step diverged; and whether it did not []."""
     finite = jnp.array(True)
     for coordinates in jax.tree.leaves(physics):
@@ -516,7 +515,7 @@ def _finite(physics: PhysicsState, before: PhysicsState) -> tuple[PhysicsState, 
     return jax.tree.map(kept, physics, before), finite
 
 
-def _acting(action: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _clip_action(action: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The action [n] that acts, and whether that is the clipped one []: a NaN acts as 0."""
     is_number = ~jnp.any(jnp.isnan(action))
     return jnp.where(is_number, jnp.clip(action, -1.0, 1.0), 0.0), is_number

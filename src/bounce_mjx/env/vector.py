@@ -93,7 +93,7 @@ def step(
     episode_steps: int,
     ranges: Any = None,
 ) -> tuple[VectorState, VectorStep]:
-    """Advances every environment, and resets every ended episode with a new draw.
+    """Advances every environment, and resets every ended episode with a new sample.
 
     Args:
       action: [B, A].
@@ -108,7 +108,7 @@ def step(
 def step_with(
     env: AnyEnv, state: VectorState, action: jax.Array, fresh: State, episode_steps: int
 ) -> tuple[VectorState, VectorStep]:
-    """`step` with initial states that were drawn in advance; one draw for many steps costs less.
+    """`step` with initial states from before; one sample for many steps costs less.
 
     Args:
       fresh: result of `first_states`, which replaces the states of ended episodes. An environment

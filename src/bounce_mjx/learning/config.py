@@ -25,7 +25,7 @@ class PPOConfig(StrictModel):
     """Control steps of each environment in one iteration."""
     training_episode_seconds: Duration | None = None
     """Time limit of training episodes, s; null for the environment's limit. With a shorter
-    limit the training sees more resets and more drawn worlds; a time-out is bootstrapped and does
+    limit the training sees more resets and more sampled worlds; a time-out is bootstrapped and does
     not count as a termination."""
     num_epochs: Count = 4
     """Passes over the data of one iteration."""

@@ -86,7 +86,7 @@ class Rollout(NamedTuple):
     inputs: jax.Array
     """Inputs of the networks before normalisation: observation and critic metrics [T, B, N + K]."""
     action: jax.Array
-    """Drawn action before clipping [T, B, A]."""
+    """Sampled action before clipping [T, B, A]."""
     log_prob: jax.Array
     """Logarithm of the action's probability density [T, B]."""
     reward: jax.Array
@@ -243,7 +243,7 @@ def collect(
     """
     config, env = ppo.config, ppo.env
     noise_key, reset_key = jax.random.split(key)
-    # All numbers are drawn at once, because on a GPU each draw costs a kernel or two.
+    # All numbers are sampled at once, because on a GPU each sample costs a kernel or two.
     shape = (config.rollout_length, config.num_envs, env.action_size)
     noise = jax.random.normal(noise_key, shape, jnp.float32)
     ranges = vector.ranges_after(env, state.iteration, config.batch_steps)

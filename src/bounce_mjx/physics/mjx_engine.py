@@ -13,7 +13,7 @@ from mujoco import mjx
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics.control import Control, drag, servo_target
 from bounce_mjx.physics.edited import MIN_FRICTION, edited, edited_model
-from bounce_mjx.physics.fused.turning import turning_of
+from bounce_mjx.physics.fused.turning import read_turning
 from bounce_mjx.physics.parameters import PhysicsParameters
 from bounce_mjx.physics.scalars import scalars_of
 from bounce_mjx.physics.state import PhysicsState
@@ -86,7 +86,7 @@ def _by_air(control: Control, ball: BallAddresses, data: mjx.Data) -> jax.Array:
     if control.air_drag is not None:
         acceleration += jnp.stack(drag(control.air_drag, velocity))
     if control.air_lift is not None:
-        spin = jnp.stack(turning_of(tuple(data.qpos[np.array(ball.qpos[3:])]), tuple(spin)).spin)
+        spin = jnp.stack(read_turning(tuple(data.qpos[np.array(ball.qpos[3:])]), tuple(spin)).spin)
         acceleration += control.air_lift * jnp.cross(spin, velocity)
     return acceleration
 

@@ -622,8 +622,8 @@ def _couplings(model: mujoco.MjModel) -> Iterator[tuple[str, Iterable[int], Iter
         if model.eq_type[i] == mujoco.mjtEq.mjEQ_JOINT:
             yield words, ends, []
         elif int(model.eq_type[i]) in (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD):
-            of_sites = model.eq_objtype[i] == mujoco.mjtObj.mjOBJ_SITE
-            yield words, [], model.site_bodyid[ends].tolist() if of_sites else ends
+            between_sites = model.eq_objtype[i] == mujoco.mjtObj.mjOBJ_SITE
+            yield words, [], model.site_bodyid[ends].tolist() if between_sites else ends
     for i in range(model.ntendon):
         path = slice(model.tendon_adr[i], model.tendon_adr[i] + model.tendon_num[i])
         kinds, ids = model.wrap_type[path], model.wrap_objid[path]

@@ -70,7 +70,7 @@ class Moment(NamedTuple):
     seconds: jax.Array
     """Time since the reset [], s."""
     command_seconds: jax.Array
-    """Time since the commands were drawn [], s; at most `seconds`."""
+    """Time since the commands were sampled [], s; at most `seconds`."""
 
 
 class Tally(NamedTuple):
@@ -98,7 +98,7 @@ class Task:
     num_balls: ClassVar[tuple[int, ...]] = (1,)
     """Numbers of balls (`WorldConfig.num_balls`) that it takes."""
     num_draws: ClassVar[int] = 0
-    """Random numbers that a reset draws for the task."""
+    """Random numbers that a reset samples for the task."""
     hits: ClassVar[str] = ""
     """The sum of `tally` that counts hits; `benchmarks/rank.py` then measures episodes without a
     time limit, up to a number of hits."""
@@ -125,7 +125,7 @@ class Task:
 
         Args:
           draws: uniform random numbers between 0 and 1 [num_draws].
-          command: value [] of each command, as it is drawn.
+          command: value [] of each command, as it is sampled.
         """
         return None
 

@@ -66,7 +66,7 @@ class Config(task.WorldConfig):
     randomization: task.RandomizationConfig = task.RandomizationConfig(
         push_speed=(0.1, 0.1), push_interval=(2.0, 2.0)
     )
-    """The world that each episode draws."""
+    """The world that each episode samples."""
     reward: Rewards = Rewards()
     """The reward terms."""
 
@@ -114,7 +114,7 @@ class Balance(task.Task):
         )
 
     def next_command(self, centre: jax.Array, command: task.Values) -> task.Values:
-        """The point turns about the drawn centre, from where it is or where a user has set it, and
+        """The point turns about its sampled centre, from where it is or a user has set it, and
         stays within reach."""
         arm = _point(command) - centre
         turn = command["point_speed"] * self.config.control_dt

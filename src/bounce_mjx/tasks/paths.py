@@ -52,7 +52,7 @@ def offset(command: Values, size: float, phase: Any, xp: Any = None) -> Any:
     wander_y = (wave(1, 7.0 * course) + wave(3, 11.0 * course) / 3.0) / 1.5
     xs = (wave(1, 0.25), wave(1), wave(1), side * wave(1, 0.25, corner), wander_x)
     ys = (wave(1), 0.0 * phase, wave(2) / 2.0, side * wave(1, 0.0, corner), wander_y)
-    x, y = (size * _of_path(values, command, xp) for values in (xs, ys))
+    x, y = (size * _choose(values, command, xp) for values in (xs, ys))
     cosine, sine = wave(1, 0.25, course), wave(1, 0.0, course)
     return xp.stack([cosine * x - sine * y, sine * x + cosine * y, SWAY * wave(1, course)])
 
@@ -63,7 +63,7 @@ def phase_in(seconds: Any, command: Values, size: float) -> jax.Array:
     speed = command["point_speed"]
     rates = [speed / (2.0 * math.pi * size * fastest) for fastest in FASTEST]
     rates[STEPS] = (speed > 0.0) / (CORNERS * STEP_SECONDS)
-    return command["phase"] + seconds * _of_path(rates, command, jnp)
+    return command["phase"] + seconds * _choose(rates, command, jnp)
 
 
 def seconds_at_corner(command: Values) -> jax.Array:
@@ -87,7 +87,7 @@ def name(command: dict[str, float]) -> str:
     return NAMES[min(int(command["path"]), len(NAMES) - 1)]
 
 
-def _of_path(values: Any, command: Values, xp: Any) -> Any:
+def _choose(values: Any, command: Values, xp: Any) -> Any:
     """The value that belongs to the command's path, of one for each path."""
     # Not jnp.select, which is made with argmax: XLA for CPUs aborts where it fuses two of them.
     value, *others = values

@@ -84,7 +84,7 @@ class Config(task.WorldConfig):
 
     @property
     def commands(self) -> dict[str, task.Command]:
-        """The point, drawn as the middle of its path, its speed, and its path."""
+        """The point, sampled as the middle of its path, its speed, and its path."""
         (x, y, z), (low, high) = self.home, self.height_range
         return {
             "target_x": task.Command(x - 0.02, x + 0.02, "m", span=(x - 0.15, x + 0.15), step=0.01),
@@ -104,7 +104,7 @@ class Track(task.Task):
     )
 
     def reset(self, start: task.Start) -> tuple[jax.Array, jax.Array]:
-        # Whether the ball rises, and the point's offset, 0 as it is drawn in the middle.
+        # Whether the ball rises, and the point's offset, 0 as it is sampled in the middle.
         return jnp.array(False), jnp.zeros_like(start.truth.ball_position)
 
     def next_command(self, state: Any, command: dict[str, jax.Array]) -> dict[str, jax.Array]:

@@ -168,7 +168,7 @@ class Actuators:
         steps. Several balls are pushed at one time, each in its direction [B, 3]."""
         config, phase = self._config, clock.phases[1]
         interval = world.get("push_interval", jnp.full_like(phase, DEFAULT_PUSH_INTERVAL))
-        now = passes(interval, phase, clock.step, config.control_dt)
+        now = recurs(interval, phase, clock.step, config.control_dt)
         each = () if config.num_balls == 1 else (config.num_balls,)
         counter = noise.next_counter(clock.counter)
         angle = 2.0 * math.pi * noise.uniform(counter, noise.Stream.PUSH, each, phase.dtype)
@@ -215,9 +215,9 @@ def add_delay(
         # and a switch at the end of the step.
         whole = jnp.floor(latency + 1e-4)
         if moving is None:
-            control = Control(taken(queue, whole), previous=taken(queue[1:], whole))
+            control = Control(entry_at(queue, whole), previous=entry_at(queue[1:], whole))
         else:
-            control = _late(queue, whole, moving, num_substeps)
+            control = _delay_moving(queue, whole, moving, num_substeps)
         control = control._replace(switch=jnp.round((latency - whole) * num_substeps))
     if filtered is not None:
         steps = world["servo_lag"] / (control_dt / num_substeps)
@@ -226,22 +226,22 @@ def add_delay(
     return control, memory._replace(queue=queue, filtered=filtered)
 
 
-def _late(queue: Setpoint, whole: jax.Array, moving: Moving, num_substeps: int) -> Control:
+def _delay_moving(queue: Setpoint, whole: jax.Array, moving: Moving, num_substeps: int) -> Control:
     """Control of moving targets that are late by a whole number of control steps []."""
     accelerations = queue.acceleration
     smoothed = moving.smoothing is not None
     late = Moving(
-        velocity=taken(queue.velocity, whole),
-        acceleration=taken(accelerations[:-1], whole),
-        before=taken(accelerations[1:], whole),
+        velocity=entry_at(queue.velocity, whole),
+        acceleration=entry_at(accelerations[:-1], whole),
+        before=entry_at(accelerations[1:], whole),
         smoothing=moving.smoothing,
-        earlier=taken(accelerations[2:], whole) if smoothed else None,
+        earlier=entry_at(accelerations[2:], whole) if smoothed else None,
         duration=jnp.asarray(num_substeps, accelerations.dtype) if smoothed else None,
     )
-    return Control(taken(queue.position, whole), late)
+    return Control(entry_at(queue.position, whole), late)
 
 
-def taken(queue: jax.Array, index: jax.Array) -> jax.Array:
+def entry_at(queue: jax.Array, index: jax.Array) -> jax.Array:
     """Entry of a queue [K, ...] at a whole-number index []; beyond the end, the last entry."""
     # XLA fuses a chain of selections with what follows; it does not fuse indexing.
     entry = queue[0]
@@ -250,7 +250,7 @@ def taken(queue: jax.Array, index: jax.Array) -> jax.Array:
     return entry
 
 
-def passes(interval: jax.Array, phase: jax.Array, step: jax.Array, control_dt: float) -> jax.Array:
+def recurs(interval: jax.Array, phase: jax.Array, step: jax.Array, control_dt: float) -> jax.Array:
     """Whether an event that recurs every interval (s) falls into the control step [], bool."""
     per_step = control_dt / interval
     time = phase + step.astype(phase.dtype) * per_step

@@ -33,11 +33,11 @@ NumBalls = Annotated[int, pydantic.BeforeValidator(whole_number), Field(ge=1, le
 
 
 class Command(NamedTuple):
-    """A number that the policy has to follow: drawn at a reset and after each interval
+    """A number that the policy has to follow: sampled at a reset and after each interval
     (`randomization.command_interval`), or set by a user."""
 
     low: float
-    """Lower end of the range from which it is drawn."""
+    """Lower end of the range from which it is sampled."""
     high: float
     """Upper end of that range."""
     unit: str = ""
@@ -47,7 +47,7 @@ class Command(NamedTuple):
     greatest: float = math.inf
     """Greatest value that a user may set."""
     span: tuple[float, float] | None = None
-    """Range that a viewer offers; by default, and at least, the range from which it is drawn."""
+    """Range that a viewer offers; by default, and at least, the range from which it is sampled."""
     step: float = 0.05
     """Change by a key of a viewer."""
 
@@ -145,7 +145,7 @@ class WorldConfig(StrictModel):
     observation: ObservationConfig = ObservationConfig()
     """The quantities that the policy sees."""
     randomization: RandomizationConfig = RandomizationConfig()
-    """The world that each episode draws."""
+    """The world that each episode samples."""
 
     @pydantic.model_validator(mode="before")
     @classmethod

@@ -33,7 +33,7 @@ class Impact(NamedTuple):
 
 
 def first_impact(world: World, mj_model: mujoco.MjModel) -> Impact | None:
-    """What the damping depends on after a reset; None if the drawn restitution is the same at all
+    """What the damping depends on after a reset; None if the sampled restitution is the same at all
     speeds."""
     if "restitution_slope" not in world:
         return None

@@ -102,14 +102,14 @@ class NamedWorld(StrictModel):
         kept = {key: value for key, value in before.items() if key in CURRICULUM}
         return merged(env | {"randomization": kept}, self.settings)
 
-    def doubled(self) -> dict[str, dict[str, Any]]:
+    def double_assumed(self) -> dict[str, dict[str, Any]]:
         """For each assumed key, the nested settings of `env` in which alone its number is doubled.
 
         A term of the randomisation goes twice as far from the model's value, within its limits; a
         rate, an interval, or a limit, of which less is harder, is halved.
         """
         given = dict(_leaves(self.settings))
-        return {key: _nested(key, _doubled(key, given[key])) for key in self.assumed}
+        return {key: _nest(key, _double(key, given[key])) for key in self.assumed}
 
 
 def read_world(path: Path) -> NamedWorld:
@@ -131,7 +131,7 @@ def _leaves(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any
             yield prefix + name, value
 
 
-def _nested(key: str, value: Any) -> dict[str, Any]:
+def _nest(key: str, value: Any) -> dict[str, Any]:
     """Nested settings with one value, by its dotted key."""
     for name in reversed(key.split(".")):
         value = {name: value}
@@ -144,7 +144,7 @@ def _is_numeric(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _doubled(key: str, value: Any) -> Any:
+def _double(key: str, value: Any) -> Any:
     group, _, name = key.rpartition(".")
     factor, centre, (least, most) = 2.0, 0.0, (-math.inf, math.inf)
     if group == "randomization":

@@ -58,7 +58,7 @@ def uniform(counter: jax.Array, stream: int, shape: tuple[int, ...], dtype: jnp.
     numbers."""
     size = math.prod(shape)
     index = jnp.arange(size, dtype=jnp.int32) + jnp.int32(stream * 1024)
-    bits = _mixed(counter + _mixed(index))
+    bits = _mix(counter + _mix(index))
     shares = jax.lax.shift_right_logical(bits, jnp.int32(9)).astype(dtype)
     return ((shares + 0.5) * 2.0**-23).reshape(shape)
 
@@ -80,7 +80,7 @@ def joints(counter: jax.Array, num_joints: int, dtype: jnp.dtype) -> tuple[jax.A
     return numbers[:num_joints], numbers[num_joints:]
 
 
-def _mixed(x: jax.Array) -> jax.Array:
+def _mix(x: jax.Array) -> jax.Array:
     """A bijection of int32 in which every output bit depends on every input bit (lowbias32 of
     Wellons, hash-prospector)."""
     shift = lambda x, n: jax.lax.shift_right_logical(x, jnp.int32(n))  # noqa: E731

@@ -1,7 +1,7 @@
-"""Domain randomisation: each episode draws its own world.
+"""Domain randomisation: each episode samples its own world.
 
-A term is a key of the config with a range (low, high), from which a reset draws every entry of the
-term uniformly. Each end of a term of several entries may be one number for all, or one for each
+A term is a key of the config with a range (low, high), from which a reset samples every entry of
+the term uniformly. Each end of a term of several entries may be one number for all, or one for each
 entry. A term that is null is inactive and costs nothing.
 """
 
@@ -38,7 +38,7 @@ Range = tuple[_End, _End]
 command line takes two numbers."""
 
 World = dict[str, "jax.Array"]
-"""Values drawn for one episode, by the names of the active terms."""
+"""Values sampled for one episode, by the names of the active terms."""
 
 Ranges = dict[str, tuple["jax.Array", "jax.Array"]]
 """Lower and upper ends of the active terms' ranges, each a number [] or an array of the term's
@@ -55,9 +55,9 @@ def shift(own: jax.Array, added: jax.Array) -> jax.Array:
     return own + added
 
 
-def replace(_: jax.Array | None, drawn: jax.Array) -> jax.Array:
+def replace(_: jax.Array | None, value: jax.Array) -> jax.Array:
     """The operation of a term that is the value itself."""
-    return drawn
+    return value
 
 
 def limit(own: jax.Array, most: jax.Array) -> jax.Array:
@@ -93,7 +93,7 @@ class Term(NamedTuple):
     """A quantity that may differ between episodes: the metadata of its range."""
 
     size: tuple[int, ...] | None
-    """Shape of one episode's draw; None for one entry for each acting joint."""
+    """Shape of one episode's sample; None for one entry for each acting joint."""
     nominal: float | None
     """Value without randomisation, from which the range grows during the warm-up; None for a range
     that does not grow."""
@@ -102,10 +102,10 @@ class Term(NamedTuple):
     parameter: str | None = None
     """The field of `PhysicsParameters` that it changes."""
     operation: Callable[[Any, Any], Any] | None = None
-    """(the model's own value, drawn value) -> value of the parameter; None for a restitution."""
+    """(the model's own value, sampled value) -> value of the parameter; None for a restitution."""
 
     def shape(self, num_joints: int) -> tuple[int, ...]:
-        """Shape of one episode's draw for an arm with this number of acting joints."""
+        """Shape of one episode's sample for an arm with this number of acting joints."""
         return (num_joints,) if self.size is None else self.size
 
 
@@ -119,8 +119,8 @@ range's lower end."""
 
 
 class RandomizationConfig(StrictModel):
-    """The world that each episode draws: a range for each term, null for off. In a file, a term of
-    several joints or axes may have a range for each: two lists, of the lower and the upper ends."""
+    """The world that each episode samples: a range for each term, null for off. In a file, a term
+    of several joints or axes may have a range for each: two lists, of lower and of upper ends."""
 
     restitution: Annotated[Range | None, Term((), 0.85, (0.6, 0.98), "contact_damping")] = None
     """Restitution of the ball on the paddle, 0.6 to 0.98; the model's is 0.85."""
@@ -207,13 +207,13 @@ class RandomizationConfig(StrictModel):
     push_interval: Annotated[Range | None, Term((), None, (0.01, 600.0))] = None
     """Time between two pushes, s; 2 s if only push_speed is given."""
     command_interval: Annotated[Range | None, Term((), None, (0.01, 600.0))] = None
-    """Time between two draws of the task's commands within an episode, s."""
+    """Time between two samples of the task's commands within an episode, s."""
     ball_start: Annotated[Range | None, Term((3,), 0.0, (-1.0, 1.0))] = None
     """Displacement of each coordinate of the ball at a reset, in addition to `env.reset`, m."""
     joint_start: Annotated[Range | None, Term(None, 0.0, (-3.0, 3.0))] = None
     """Displacement of each joint angle at a reset, in addition to `env.reset`, rad."""
     share: UnitInterval = 1.0
-    """Probability that a term with a nominal value is drawn in an episode; otherwise it has that
+    """Probability that a term with a nominal value is sampled in an episode; otherwise it has that
     value. A small share allows wide ranges of single terms, even if no policy can handle all their
     extremes together."""
     shares: dict[str, UnitInterval] | None = None
@@ -306,7 +306,7 @@ TERMS: dict[str, Term] = {
 """All terms of `RandomizationConfig`."""
 
 
-def draw_world(
+def sample_world(
     ranges: Ranges,
     key: jax.Array,
     dtype: jnp.dtype,
@@ -314,33 +314,33 @@ def draw_world(
     share: float | jax.Array = 1.0,
     shares: Mapping[str, float] = MappingProxyType({}),
 ) -> World:
-    """Draws the world of one episode; consumes the key.
+    """Samples the world of one episode; consumes the key.
 
     Args:
       num_joints: number of acting joints.
-      share: probability [] that each term with a nominal value is drawn.
+      share: probability [] that each term with a nominal value is sampled.
       shares: probabilities of single terms, in place of `share`.
     """
     # The order of TERMS, because JAX sorts the keys of a traced dictionary.
     shapes = {name: TERMS[name].shape(num_joints) for name in TERMS if name in ranges}
     sizes = {name: math.prod(shape) for name, shape in shapes.items()}
-    # One draw for all numbers, because splitting the key costs more than drawing.
+    # One sample for all numbers, because splitting the key costs more than sampling.
     uniform = jax.random.uniform(key, (sum(sizes.values()) + len(sizes),), dtype)
     world, start = {}, len(sizes)
     for i, (name, size) in enumerate(sizes.items()):
         term, (low, high) = TERMS[name], ranges[name]
         places = uniform[start : start + size].reshape(shapes[name])
-        drawn = jnp.asarray(low, dtype) + jnp.asarray(high - low, dtype) * places
+        value = jnp.asarray(low, dtype) + jnp.asarray(high - low, dtype) * places
         if term.nominal is not None:
-            is_drawn = uniform[i] < shares.get(name, share)
-            drawn = jnp.where(is_drawn, drawn, jnp.asarray(term.nominal, dtype))
-        world[name] = drawn
+            is_sampled = uniform[i] < shares.get(name, share)
+            value = jnp.where(is_sampled, value, jnp.asarray(term.nominal, dtype))
+        world[name] = value
         start += size
     return world
 
 
 def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParameters:
-    """Parameters of the physics for a drawn world."""
+    """Parameters of the physics for a sampled world."""
     # The engines are not needed to read a config.
     from bounce_mjx.physics.edited import direct_solref, own_parameters
     from bounce_mjx.physics.parameters import PhysicsParameters
@@ -350,12 +350,13 @@ def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParamet
         return PhysicsParameters()
     own, given = own_parameters(mj_model), {}
     for name, (*_, parameter, operation) in terms.items():
-        drawn, value = world[name], getattr(own, parameter)
+        value, own_value = world[name], getattr(own, parameter)
         if operation is None:
-            given[parameter] = contact_damping(drawn, direct_solref(mj_model)[0])
+            given[parameter] = contact_damping(value, direct_solref(mj_model)[0])
         else:
-            value = None if value is None else jnp.asarray(value, drawn.dtype)
-            given[parameter] = operation(value, drawn)
+            if own_value is not None:
+                own_value = jnp.asarray(own_value, value.dtype)
+            given[parameter] = operation(own_value, value)
     return PhysicsParameters(**given)
 
 

@@ -13,7 +13,7 @@ from bounce_mjx.physics.parameters import MODEL_PARAMETERS
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.robot.setpoints import Setpoint
 from bounce_mjx.world import noise
-from bounce_mjx.world.actuation import taken
+from bounce_mjx.world.actuation import entry_at
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.noise import Clock
 from bounce_mjx.world.observation import Kinematics, ObservationConfig
@@ -41,9 +41,9 @@ class Picture(NamedTuple):
     velocity: jax.Array
     """Measured velocity or difference quotient of the last two pictures [3], m/s."""
     age: jax.Array
-    """Time since the picture was taken [], s."""
+    """Time since the picture was entry_at [], s."""
     number: jax.Array
-    """Number of the last picture due since the reset []; negative for those taken before it."""
+    """Number of the last picture due since the reset []; negative for those entry_at before it."""
 
 
 class Sensing(NamedTuple):
@@ -201,11 +201,11 @@ def take_picture(
         number, age = steps, latency
     age = jnp.maximum(age, 0.0)
     whole = jnp.floor(age)
-    newer, older = taken(balls, whole), taken(balls, whole + 1.0)
+    newer, older = entry_at(balls, whole), entry_at(balls, whole + 1.0)
     position, velocity = _between(newer, older, age - whole, control_dt)
 
     noises = noise.normal(clock.counter, noise.Stream.BALL, balls.shape[1:], dtype)
-    position = _disturbed(world, "ball_position", position, noises[..., :3])
+    position = _add_errors(world, "ball_position", position, noises[..., :3])
     due = number > last.number
     arrived = due
     if "frame_drop" in world:
@@ -215,7 +215,7 @@ def take_picture(
     if config.observation.velocity == "differences":
         elapsed = jnp.maximum(held_age - age * control_dt, 1e-3)
         velocity = (position - last.position) / elapsed
-    velocity = _disturbed(world, "ball_velocity", velocity, noises[..., 3:])
+    velocity = _add_errors(world, "ball_velocity", velocity, noises[..., 3:])
     fresh = Picture(position, velocity, age * control_dt, number)
     # A lost picture stays lost.
     held = last._replace(age=held_age, number=jnp.where(due, number, last.number))
@@ -242,7 +242,7 @@ def _between(
     return position, velocity + share * (velocity_before - velocity)
 
 
-def _disturbed(world: World, name: str, value: jax.Array, noises: jax.Array) -> jax.Array:
+def _add_errors(world: World, name: str, value: jax.Array, noises: jax.Array) -> jax.Array:
     if f"{name}_bias" in world:
         value = value + world[f"{name}_bias"]
     if f"{name}_noise" in world:
@@ -255,12 +255,12 @@ def measured_joints(
 ) -> tuple[jax.Array, jax.Array]:
     """Measured joint angles [n] (rad) and joint velocities [n] (rad/s)."""
     angles = truth.joint_angles
-    of_angles, of_velocities = noise.joints(counter, len(angles), angles.dtype)
+    angle_noise, velocity_noise = noise.joints(counter, len(angles), angles.dtype)
     if "joint_angle_noise" in world:
-        angles = angles + world["joint_angle_noise"] * of_angles
+        angles = angles + world["joint_angle_noise"] * angle_noise
     if "encoder_bias" in world:
         angles = angles + world["encoder_bias"]
-    return angles, _disturbed(world, "joint_velocity", truth.joint_velocities, of_velocities)
+    return angles, _add_errors(world, "joint_velocity", truth.joint_velocities, velocity_noise)
 
 
 def remember(

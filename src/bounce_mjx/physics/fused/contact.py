@@ -72,7 +72,7 @@ def relative(model: ContactModel, vectors: Sequence[Vec3]) -> Vec3:
     return vsub(*last, first) if last else first
 
 
-def shared(a: ContactModel, b: ContactModel) -> list[tuple[int, float]]:
+def shared_balls(a: ContactModel, b: ContactModel) -> list[tuple[int, float]]:
     """The balls of both contacts, and the product of their signs (`side`)."""
     return [(i, side(a, i) * side(b, i)) for i in a.balls if i in b.balls]
 

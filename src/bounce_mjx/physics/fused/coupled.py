@@ -104,17 +104,17 @@ def _newton_step(
     # Columns of L with the first entry's row, and Q L.
     columns = [(3 * k, column) for k, factor in enumerate(factors) for column in factor]
     q_columns = [[dot(row[k : k + 3], column) for row in q] for k, column in columns]
-    system = [[dot(column, of_q[k : k + 3]) for of_q in q_columns] for k, column in columns]
+    system = [[dot(column, q_column[k : k + 3]) for q_column in q_columns] for k, column in columns]
     for i, row in enumerate(system):
         row[i] = add(row[i], 1.0)
     factor = not_inlined(chain.cholesky(system))
     pulls = [dot(column, q_lack[k : k + 3]) for k, column in columns]
     z = chain.solve_upper(factor, chain.solve_lower(factor, pulls))
     step, y_step = list(lack), list(q_lack)
-    for (k, column), of_q, size in zip(columns, q_columns, z, strict=True):
+    for (k, column), q_column, size in zip(columns, q_columns, z, strict=True):
         for i in range(3):
             step[k + i] = sub(step[k + i], mul(column[i], size))
-        y_step = [sub(a, mul(b, size)) for a, b in zip(y_step, of_q, strict=True)]
+        y_step = [sub(a, mul(b, size)) for a, b in zip(y_step, q_column, strict=True)]
     x, y, step, y_step = not_inlined((list(x), y, step, y_step))
     return tuple(_ahead(x, _line_search(cones, (x, y), (step, y_step)), step))
 

@@ -17,7 +17,7 @@ from bounce_mjx.physics.control import Control, drag, servo_target
 from bounce_mjx.physics.fused import chain, joint_friction
 from bounce_mjx.physics.fused.model import FusedModel, Servo, read_model
 from bounce_mjx.physics.fused.response import contact_response, paddle_origin
-from bounce_mjx.physics.fused.turning import Turning, spin_in_ball, turned, turning_of
+from bounce_mjx.physics.fused.turning import Turning, advance_turning, read_turning, spin_in_ball
 from bounce_mjx.physics.parameters import PhysicsParameters
 from bounce_mjx.physics.scalars import (
     ZERO3,
@@ -73,7 +73,7 @@ def step(
     world = _in_any_world(model, parameters)
     turns = world.contacts[0].friction is not None or control.air_lift is not None
     turnings = [
-        turning_of(_entries(qpos, x.qpos[3:]), _entries(qvel, x.qvel[3:])) for x in at.balls
+        read_turning(_entries(qpos, x.qpos[3:]), _entries(qvel, x.qvel[3:])) for x in at.balls
     ]
     velocities = [_entries(qvel, x.qvel[:3]) for x in at.balls]
     if control.ball_push is not None:
@@ -94,7 +94,7 @@ def step(
     _put(qpos, at.arm_qpos, motion.q)
     _put(qvel, at.arm_qvel, motion.v)
     for x, ball, before in zip(at.balls, motion.balls, turnings, strict=True):
-        after = ball.turning or turned(before, ZERO3, num_substeps * model.dt)
+        after = ball.turning or advance_turning(before, ZERO3, num_substeps * model.dt)
         _put(qpos, x.qpos, (*ball.position, *after.orientation))
         _put(qvel, x.qvel[:3], ball.velocity)
         if turns:
@@ -193,12 +193,12 @@ def _targets(control: Control, step: jax.Array) -> tuple[Scalar, ...]:
         return control.ctrl
     step = jax.lax.convert_element_type(step, control.ctrl[0].dtype)
 
-    def of_servo(i: int) -> Control:
+    def servo_control(i: int) -> Control:
         return jax.tree.map(
             lambda x: x[i] if type(x) is tuple else x, control, is_leaf=lambda x: type(x) is tuple
         )
 
-    return tuple(servo_target(of_servo(i), step) for i in range(len(control.ctrl)))
+    return tuple(servo_target(servo_control(i), step) for i in range(len(control.ctrl)))
 
 
 @functools.lru_cache(maxsize=16)
@@ -310,16 +310,16 @@ def integrate(
     v = tuple(a + dt * b for a, b in zip(motion.v, acceleration, strict=True))
     q = tuple(a + dt * b for a, b in zip(motion.q, v, strict=True))
     accelerations = zip(motion.balls, ball_accelerations, spin_accelerations, strict=True)
-    return Motion(q, v, tuple(_moved(*ball, dt) for ball in accelerations))
+    return Motion(q, v, tuple(_move_ball(*ball, dt) for ball in accelerations))
 
 
-def _moved(ball: Ball, acceleration: Vec3, spin_acceleration: Vec3, dt: float) -> Ball:
+def _move_ball(ball: Ball, acceleration: Vec3, spin_acceleration: Vec3, dt: float) -> Ball:
     """The ball one step later."""
     velocity = vadd(ball.velocity, scale(acceleration, dt))
     position = vadd(ball.position, scale(velocity, dt))
     turning = ball.turning
     if turning is not None:
-        turning = turned(turning, spin_acceleration, dt)
+        turning = advance_turning(turning, spin_acceleration, dt)
     return Ball(position, velocity, turning)
 
 

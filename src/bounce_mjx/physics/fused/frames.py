@@ -50,7 +50,7 @@ def cheapest(links: Sequence[Link], last_body: Frame) -> tuple[list[Link], Frame
     Args:
       last_body: a body in the frame of the last link.
     """
-    return min((list(links), last_body), _aligned(links, last_body), key=_cost)
+    return min((list(links), last_body), _align_with_axes(links, last_body), key=_cost)
 
 
 def _cost(chain: tuple[Sequence[Link], Frame]) -> int:
@@ -62,7 +62,7 @@ def _cost(chain: tuple[Sequence[Link], Frame]) -> int:
     return int(np.sum(~np.isin(directions, (-1.0, 0.0, 1.0)))) + offsets
 
 
-def _aligned(links: Sequence[Link], last_body: Frame) -> tuple[list[Link], Frame]:
+def _align_with_axes(links: Sequence[Link], last_body: Frame) -> tuple[list[Link], Frame]:
     """The chain in turned frames. In the frame of a hinge, z is its axis, and x is normal to its
     axis and the next one (Denavit and Hartenberg). The joint's angle contains the angle between its
     x axis and the last one. The frame of a slide is parallel to its parent's."""

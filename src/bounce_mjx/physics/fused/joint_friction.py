@@ -141,11 +141,11 @@ def _sweep(
     (projected Gauss-Seidel)."""
     new = list(friction)
     for j, (row, limit) in enumerate(zip(problem.matrix, limits, strict=True)):
-        pull = dot([of_contact[j] for of_contact in problem.coupling], contact)
+        pull = dot([row[j] for row in problem.coupling], contact)
         pull = add(
             add(problem.offset[j], pull), dot(row[:j] + row[j + 1 :], new[:j] + new[j + 1 :])
         )
-        new[j] = _limited(neg(mul(pull, problem.inverse_diagonal[j])), limit)
+        new[j] = _clip(neg(mul(pull, problem.inverse_diagonal[j])), limit)
     return tuple(new)
 
 
@@ -188,7 +188,7 @@ def _eliminate_sticking(
         half = [add(x, mul(entry, force)) for x, entry in zip(half, row, strict=True)]
     change = chain.solve_upper(factor, half)
     return contact, tuple(
-        _limited(sub(f, x), limit) for f, x, limit in zip(kept, change, limits, strict=True)
+        _clip(sub(f, x), limit) for f, x, limit in zip(kept, change, limits, strict=True)
     )
 
 
@@ -200,5 +200,5 @@ def _contact_offset(problem: DryFrictionProblem, friction: Scalars) -> tuple[Sca
     )
 
 
-def _limited(force: Scalar, limit: Scalar) -> Scalar:
+def _clip(force: Scalar, limit: Scalar) -> Scalar:
     return jnp.clip(force, neg(limit), limit)

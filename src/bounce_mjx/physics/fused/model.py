@@ -256,17 +256,17 @@ def _inertial_frame(mj_model: mujoco.MjModel, body: int) -> Frame:
     """Inertial frame of a body in the body's frame."""
     m = mj_model
     frame = Frame(floats(m.body_ipos[body]), _rotation(m.body_iquat[body]))
-    return _as_flagged(m.body_sameframe[body], frame, frame)
+    return _apply_flag(m.body_sameframe[body], frame, frame)
 
 
 def _geom_frame(m: EditedModel, geom: int) -> Frame:
     """Frame of a geom in its body's frame."""
     frame = Frame(m["geom_pos", geom], _rotation(m["geom_quat", geom]))
     inertial = _inertial_frame(m.model, int(m.model.geom_bodyid[geom]))
-    return _as_flagged(m["geom_sameframe", geom], frame, inertial)
+    return _apply_flag(m["geom_sameframe", geom], frame, inertial)
 
 
-def _as_flagged(same: int, frame: Frame, inertial: Frame) -> Frame:
+def _apply_flag(same: int, frame: Frame, inertial: Frame) -> Frame:
     """A frame in its body's frame. Where it is almost the same as that one, or as the body's
     inertial one, MuJoCo has a flag and computes as if they were the same."""
     flags = mujoco.mjtSameFrame

@@ -17,7 +17,7 @@ from bounce_mjx.physics.fused.contact import (
     ContactModel,
     impedance,
     relative,
-    shared,
+    shared_balls,
     side,
     softness,
     sphere_box,
@@ -207,7 +207,7 @@ def _by_balls(model: FusedModel, one: tuple[Touch, int], other: tuple[Touch, int
     component of another."""
     (first, a), (second, b) = one, other
     share: Scalar = 0.0
-    for i, sign in shared(first.model, second.model):
+    for i, sign in shared_balls(first.model, second.model):
         ball = model.balls[i]
         if first is not second:
             share = add(share, mul(dot(first.axes[a], second.axes[b]), sign / ball.mass))

@@ -29,9 +29,9 @@ class Turning(NamedTuple):
     """Unit quaternion w, x, y, z."""
 
 
-def turning_of(quaternion: Quaternion, spin: Vec3) -> Turning:
+def read_turning(quaternion: Quaternion, spin: Vec3) -> Turning:
     """Spin in the world and normalised orientation from MuJoCo's coordinates."""
-    orientation = _normalised(quaternion)
+    orientation = _normalise(quaternion)
     return Turning(matvec(quaternion_matrix(orientation), spin), orientation)
 
 
@@ -41,7 +41,7 @@ def spin_in_ball(turning: Turning) -> Vec3:
     return matvec(transpose(matrix), turning.spin)
 
 
-def turned(turning: Turning, acceleration: Vec3, dt: float) -> Turning:
+def advance_turning(turning: Turning, acceleration: Vec3, dt: float) -> Turning:
     """Spin and orientation after a time dt, in which the new spin turns the orientation."""
     spin = vadd(turning.spin, scale(acceleration, dt))
     squared = dot(spin, spin)
@@ -52,7 +52,7 @@ def turned(turning: Turning, acceleration: Vec3, dt: float) -> Turning:
     return Turning(spin, quaternion_product(rotation, turning.orientation))
 
 
-def _normalised(quaternion: Quaternion) -> Quaternion:
+def _normalise(quaternion: Quaternion) -> Quaternion:
     w, x, y, z = quaternion
     inverse_norm = lax.rsqrt(w * w + x * x + y * y + z * z)
     return w * inverse_norm, x * inverse_norm, y * inverse_norm, z * inverse_norm
