@@ -1,9 +1,11 @@
 """Draws the pictures of the documentation: `python docs/pictures.py [NAME ...]`, all by default.
 
-The diagrams need matplotlib only; the others run the policies that come with the package.
+The diagrams need matplotlib only; the others run the policies that come with the package, and the
+animations need OpenGL. `bounce-mjx plot` draws curves.svg, rewards.svg and evaluation.svg.
 """
 
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -424,7 +426,6 @@ def arms():
 def page():
     """A screenshot of the page of `bounce-mjx play`; needs Chromium and playwright."""
     import shutil
-    import subprocess
 
     from playwright.sync_api import sync_playwright
 
@@ -462,6 +463,25 @@ PICTURES = (
 )  # fmt: skip
 """`parity` is the last one, as it switches JAX to float64."""
 
+_LATE = "--randomization.action-latency 0.06 0.06 --randomization.ball-latency 0.03 0.03"
+FILMS = {
+    "bounce": "pretrained --size 832 468 --zoom 1.4 --randomization.command-interval 2 2",
+    "track": "track --zoom 1.4",
+    "balance": "balance --zoom 3",
+    "catch": "catch --zoom 2 --seconds 4",
+    "juggle": "juggle --zoom 1.7",
+    "latency_pretrained": f"pretrained {_LATE} --zoom 1.2",
+    "latency_robust": f"robust {_LATE} --zoom 1.2",
+}
+"""Arguments of `bounce-mjx play` by the name of its WebP."""
+
+
+def film(name: str) -> None:
+    """Records an animation; the later of two equal flags counts."""
+    flags = f"--seconds 6 --size 400 300 {FILMS[name].partition(' ')[2]}".split()
+    command = [sys.executable, "-m", "bounce_mjx", "play", FILMS[name].split()[0], *flags]
+    subprocess.run([*command, "--fps", "20", "--video", IMAGES / f"{name}.webp"], check=True)
+
 
 def save(draw) -> None:
     """Writes one picture: a diagram or a plot as SVG, a rendering as PNG with 200 colours."""
@@ -477,6 +497,10 @@ def save(draw) -> None:
 
 
 if __name__ == "__main__":
+    wanted = sys.argv[1:] or [*FILMS, *(draw.__name__ for draw in PICTURES)]
+    for name in FILMS:
+        if name in wanted:
+            film(name)
     for draw in PICTURES:
-        if len(sys.argv) == 1 or draw.__name__ in sys.argv:
+        if draw.__name__ in wanted:
             save(draw)

@@ -17,10 +17,16 @@ from bounce_mjx.task import term_names
 from bounce_mjx.tasks.bounce_rewards import BounceReward
 from bounce_mjx.viewers.browser import reward_bars
 from bounce_mjx.viewers.controls import direction
-from bounce_mjx.viewers.display import Display, _primitive, body_scenes, marker_body
+from bounce_mjx.viewers.display import (
+    Display,
+    _primitive,
+    body_scenes,
+    camera_pose,
+    marker_body,
+)
 from bounce_mjx.viewers.guard import open_server
 from bounce_mjx.viewers.page import write_page
-from bounce_mjx.viewers.scene import Scene, camera_pose
+from bounce_mjx.viewers.scene import Scene
 from bounce_mjx.viewers.scene import _grid as scene_grid
 from bounce_mjx.viewers.simulation import (
     Simulation,
@@ -93,9 +99,9 @@ def test_a_model_without_markers_gets_them(tmp_path: Path) -> None:
     assert marker_position(display, "paddle_home")[2] == pytest.approx(home_height)
 
 
-def projected(points: np.ndarray, focus, aspect: float, offsets) -> np.ndarray:
+def projected(points: np.ndarray, focus, aspect: float, offsets, zoom=1.0) -> np.ndarray:
     """Points [N, 3] in the picture [N, 2]: -1 to 1 from left to right and from below."""
-    position, gaze = camera_pose(offsets, focus, aspect)
+    position, gaze = camera_pose(offsets, focus, aspect, zoom)
     forward = (gaze - position) / np.linalg.norm(gaze - position)
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
@@ -108,6 +114,16 @@ ASPECTS = (0.46, 0.85, 2.0)
 
 
 HOMES = ((0.58856, 0.0, 0.05), (0.67, 0.0, 0.4), (0.0, 0.55, 0.25), (-0.6, 0.0, 0.3))
+
+
+def test_a_zoom_enlarges_the_paddle_and_brings_it_to_the_middle() -> None:
+    home, one = np.array(HOMES[0]), np.zeros((1, 3))
+    edges = home + [(0.0, 0.0, 0.0), (0.0, 0.0, 0.01)]
+    middle, above = projected(edges, home, 4 / 3, one)
+    near_middle, near_above = projected(edges, home, 4 / 3, one, zoom=3.0)
+    size = np.linalg.norm(near_above - near_middle) / np.linalg.norm(above - middle)
+    assert size == pytest.approx(3.0, rel=0.2)
+    assert abs(near_middle[0]) < abs(middle[0])
 
 
 @pytest.mark.parametrize("home", HOMES, ids=["default", "raised", "turned", "behind"])

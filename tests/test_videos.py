@@ -22,7 +22,7 @@ from bounce_mjx.viewers.offscreen import choose_backend
 from bounce_mjx.viewers.simulation import (
     Simulation,
 )
-from bounce_mjx.viewers.video import VideoWriter, find_ffmpeg
+from bounce_mjx.viewers.video import VideoWriter, caption, find_ffmpeg
 
 
 @pytest.fixture(autouse=True)
@@ -41,6 +41,19 @@ def test_a_video_needs_ffmpeg_of_the_extra_or_of_the_system(monkeypatch, tmp_pat
         VideoWriter(tmp_path / "a.mp4", (64, 64), None)
     (tmp_path / "ffmpeg").touch(mode=0o755)
     assert Path(find_ffmpeg()) == tmp_path / "ffmpeg"
+
+
+@pytest.mark.parametrize("value", ["2", "figure of eight, 0.25 m/s"])
+def test_a_caption_stays_in_its_box(value: str) -> None:
+    """Nothing white outside the dark box on a white picture; the box ends after the text."""
+    paper = np.full((300, 400, 3), 255, np.uint8)
+    drawn = caption(paper, {"path": value, "second": "0.50 m"}, 0.5)
+    rows, columns = np.nonzero(np.any(drawn != 255, axis=2))
+    box = drawn[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
+    text = box.min(axis=2) > 200
+    assert text[10:-10, 10:-10].any()
+    # Its corners are round.
+    assert not text[:, -6:][8:-8].any() and not text[-6:, 8:-8].any()
 
 
 def run(command: list[str], cwd: Path, **variables: str) -> subprocess.CompletedProcess:
@@ -144,7 +157,7 @@ def test_native_viewer_shows_the_arm(tmp_path: Path) -> None:
 
 
 MISTAKES = {
-    "suffix of a video": ("play --video a.avi", "--video a.avi", ".mp4 or .gif", "rename"),
+    "suffix of a video": ("play --video a.avi", "--video a.avi", ".mp4 or .webp or .gif", "rename"),
     "suffix of a page": ("view --html a.txt", "--html a.txt", ".html", "rename"),
     "no folder": ("play --video no/a.mp4", "no/a.mp4", "does not exist", "make it"),
     "a folder": ("view --html folder.html", "folder.html is a folder", "give a file"),

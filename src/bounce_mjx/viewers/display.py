@@ -22,6 +22,17 @@ _SEGMENTS = 40
 _EDGE = 0.004
 _CREASE_ANGLE = np.radians(30.0)
 
+# With the task's focus at _USUAL_FOCUS, the camera looks at this point, from a place that far from
+# it, and sees one arm and its ball up to the highest target.
+_USUAL_FOCUS = np.array([0.58856, 0.0, 0.05])
+_LOOK_AT = np.array([0.34, 0.0, 0.44])
+_VIEW = np.array([1.06, -1.17, 0.42])
+_HIGHEST = 0.85
+FIELD_OF_VIEW = 40.0
+"""Vertical angle of the camera's view, degrees."""
+# A canvas that is narrower than this, such as a phone's, needs a more distant camera.
+_FULL_ASPECT = 0.9
+
 TRAIL_SECONDS = 0.6
 """Age of the end of the line, s."""
 TRAIL_RGB = np.array([235.0, 85.0, 0.0])
@@ -186,3 +197,25 @@ class Trail:
         restarted = frame.time < self._time
         self.points[:, restarted] = frame.balls[restarted]
         self._time = frame.time
+
+
+def camera_pose(
+    offsets: np.ndarray, focus: np.ndarray, aspect: float = 1.0, zoom: float = 1.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Position of a camera that sees all environments, and the point that it looks at, each [3], m.
+
+    Args:
+      offsets: positions of the environments [N, 3], m.
+      focus: the task's point [3] in the middle of the picture (`Task.focus`), m.
+      aspect: width / height of the picture.
+      zoom: how much larger the focus is shown; the camera then turns towards it.
+    """
+    *aside, rise = focus - _USUAL_FOCUS
+    rise = max(0.0, rise)
+    size = 1.0 + max(rise / _HIGHEST, np.linalg.norm(aside))
+    look_at = _LOOK_AT + 0.5 * np.array([*aside, rise])
+    extent = size + 1.05 * np.linalg.norm(np.ptp(offsets, axis=0))
+    view = extent * max(1.0, _FULL_ASPECT / aspect) * _VIEW
+    # What is above the focus stays above it; what is beside it leaves the picture.
+    look_at = focus + (look_at - focus) / (zoom**2, zoom**2, zoom)
+    return look_at + view / zoom, look_at

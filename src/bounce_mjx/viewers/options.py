@@ -21,7 +21,7 @@ class ViewerOptions(StrictModel):
     """browser serves a page, native opens MuJoCo's own window, auto is native on a machine with a
     display and browser elsewhere."""
     video: Path | None = None
-    """File for a video, .mp4 or .gif, instead of a viewer."""
+    """File for a video, .mp4, .webp or .gif, instead of a viewer."""
     html: Path | None = None
     """File for a page that replays the episode offline, instead of a viewer."""
     seconds: Positive | None = None
@@ -31,13 +31,15 @@ class ViewerOptions(StrictModel):
     speed: Annotated[float, Field(ge=SPEED_RANGE[0], le=SPEED_RANGE[1])] = 1.0
     """Speed of a viewer, as a factor of real time."""
     fps: Annotated[int, Field(ge=1, le=240)] | None = None
-    """Frames per second of a recording. The default is 60 for an MP4, 25 for a GIF and 30 for a
-    page."""
+    """Frames per second of a recording. The default is 60 for an MP4, 25 for a WebP or a GIF,
+    and 30 for a page."""
     size: tuple[Annotated[int, Field(ge=64, le=4096)], Annotated[int, Field(ge=64, le=4096)]] = (
         640,
         480,
     )
     """Width and height of a video in pixels."""
+    zoom: Annotated[float, Field(ge=1.0, le=10.0)] = 1.0
+    """How much larger a video shows the paddle and its ball; 1 shows the whole arm."""
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
     """Seed of the resets."""
     host: str = "127.0.0.1"

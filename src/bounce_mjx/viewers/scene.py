@@ -9,7 +9,14 @@ import numpy as np
 import viser
 
 from bounce_mjx.env.env import Env
-from bounce_mjx.viewers.display import TRAIL_RGB, Display, Trail, body_scenes
+from bounce_mjx.viewers.display import (
+    FIELD_OF_VIEW,
+    TRAIL_RGB,
+    Display,
+    Trail,
+    body_scenes,
+    camera_pose,
+)
 from bounce_mjx.viewers.simulation import EnvFrame, environment_pose, frame_readings
 
 _SPACING = np.array([1.3, 0.9, 0.0])
@@ -18,15 +25,6 @@ _LABEL_HEIGHT = 0.74
 _LABEL_DISTANCE = 0.14
 _ANNOUNCED_SECONDS = 1.5
 _BACKGROUND = np.array([222.0, 228.0, 235.0])
-# With the task's focus at _USUAL_FOCUS, the camera looks at this point, from a place that far from
-# it, and sees one arm and its ball up to the highest target.
-_USUAL_FOCUS = np.array([0.58856, 0.0, 0.05])
-_LOOK_AT = np.array([0.34, 0.0, 0.44])
-_VIEW = np.array([1.06, -1.17, 0.42])
-_HIGHEST = 0.85
-_FIELD_OF_VIEW = math.radians(40.0)
-# A canvas that is narrower than this, such as a phone's, needs a more distant camera.
-_FULL_ASPECT = 0.9
 # Where there are more robots than this, their labels are short.
 _MAX_LONG_LABELS = 4
 _FOLLOWING = 0.1
@@ -112,7 +110,7 @@ class Scene:
             self._frame(client)
         initial = self._server.initial_camera
         initial.position, initial.look_at = tuple(position), tuple(self._gaze)
-        initial.up, initial.fov = (0.0, 0.0, 1.0), _FIELD_OF_VIEW
+        initial.up, initial.fov = (0.0, 0.0, 1.0), math.radians(FIELD_OF_VIEW)
 
     def update(self, frames: Sequence[EnvFrame]) -> None:
         """Shows the last of the frames since the last update; the trail uses all of them."""
@@ -186,25 +184,6 @@ class Scene:
             position, gaze = camera_pose(self._offsets, self._focus, client.camera.aspect)
             if np.all(np.isfinite(position)):
                 client.camera.position, client.camera.look_at = position, gaze
-
-
-def camera_pose(
-    offsets: np.ndarray, focus: np.ndarray, aspect: float = 1.0
-) -> tuple[np.ndarray, np.ndarray]:
-    """Position of a camera that sees all environments, and the point that it looks at, each [3], m.
-
-    Args:
-      offsets: positions of the environments [N, 3], m.
-      focus: the task's point [3] in the middle of the picture (`Task.focus`), m.
-      aspect: width / height of the picture.
-    """
-    *aside, rise = focus - _USUAL_FOCUS
-    rise = max(0.0, rise)
-    size = 1.0 + max(rise / _HIGHEST, np.linalg.norm(aside))
-    look_at = _LOOK_AT + 0.5 * np.array([*aside, rise])
-    extent = size + 1.05 * np.linalg.norm(np.ptp(offsets, axis=0))
-    view = extent * max(1.0, _FULL_ASPECT / aspect) * _VIEW
-    return look_at + view, look_at
 
 
 def _grid(number: int) -> np.ndarray:

@@ -88,7 +88,7 @@ def _recording(options: ViewerOptions, console: Console) -> Present:
         from bounce_mjx.viewers.video import SUFFIXES, VideoWriter
 
         check_output(options.video, "--video", SUFFIXES)
-        film = VideoWriter(options.video, options.size, options.fps)
+        film = VideoWriter(options.video, options.size, options.fps, options.zoom)
     if options.html is not None:
         from bounce_mjx.viewers.page import SUFFIXES, write_page
 

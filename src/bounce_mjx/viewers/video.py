@@ -1,4 +1,4 @@
-"""Videos of an episode: MP4, or an animated GIF for a web page."""
+"""Videos of an episode: MP4, or an animated WebP or GIF for a web page."""
 
 import contextlib
 import shutil
@@ -25,12 +25,13 @@ from bounce_mjx.viewers.simulation import (
     resample,
 )
 
-SUFFIXES = (".mp4", ".gif")
+SUFFIXES = (".mp4", ".webp", ".gif")
 # A GIF counts time in 1/100 s, and browsers show at most 50 frames per second.
-_DEFAULT_FPS = {".mp4": 60, ".gif": 25}
+_DEFAULT_FPS = {".mp4": 60, ".webp": 25, ".gif": 25}
 _MAX_GIF_FPS = 50
 _ENCODINGS = {
     ".mp4": "-c:v libx264 -pix_fmt yuv420p -crf 20 -movflags +faststart".split(),
+    ".webp": "-c:v libwebp_anim -q:v 60 -loop 0".split(),
     # One palette, for the moving parts; each picture stores only its changed pixels.
     ".gif": (
         "-filter_complex",
@@ -66,18 +67,19 @@ class VideoWriter:
     """Writes recordings as a video; the constructor checks everything that can be checked in
     advance."""
 
-    def __init__(self, path: Path, size: tuple[int, int], fps: int | None):
+    def __init__(self, path: Path, size: tuple[int, int], fps: int | None, zoom: float = 1.0):
         """Chooses the OpenGL library.
 
         Args:
           size: width and height in pixels.
-          fps: frames per second; None for 60, or 25 for a GIF.
+          fps: frames per second; None for 60, or 25 for a WebP or a GIF.
+          zoom: see `camera_pose`.
 
         Raises:
           UserError: the size or the rate does not fit the format, there is no ffmpeg, or no
             OpenGL library works.
         """
-        self._path, self._size = path, size
+        self._path, self._size, self._zoom = path, size, zoom
         self.fps = fps or _DEFAULT_FPS[path.suffix.lower()]
         if any(pixels % 2 for pixels in size):
             raise UserError(f"--size {size[0]} {size[1]} is odd; give even numbers of pixels")
@@ -133,7 +135,7 @@ class VideoWriter:
     def _pictures(self, env: Env, frames: EnvFrame) -> Iterator[np.ndarray]:
         """One picture [height, width, 3] for each frame."""
         trail = Trail(1.0 / self.fps)
-        with Renderer(env, *self._size) as renderer:
+        with Renderer(env, *self._size, zoom=self._zoom) as renderer:
             for i in range(len(frames.time)):
                 frame = frame_at(frames, i)
                 trail.add(frame)
@@ -146,19 +148,16 @@ def caption(picture: np.ndarray, readings: dict[str, str], height: float) -> np.
     the ball's height, m."""
     image = Image.fromarray(picture)
     draw = ImageDraw.Draw(image, "RGBA")
-    unit = max(10, image.height // 24)
-    large, small = ImageFont.load_default(2 * unit), ImageFont.load_default(unit)
-    (name, value), *others = [*readings.items(), ("ball", f"{height:.2f} m")]
-    bottom = (3.9 + 1.15 * len(others)) * unit
-    left = 2.1 * unit + draw.textlength(value, font=large)
-    right = max(10.4 * unit, left + draw.textlength(name, font=small))
-    box = (unit, unit, right + 0.6 * unit, bottom)
+    unit = max(16, image.height // 26)
+    large, small = (ImageFont.load_default(size) for size in (round(1.5 * unit), unit))
+    lines = [f"{name}: {value}" for name, value in (*readings.items(), ("ball", f"{height:.2f} m"))]
+    fonts = [large] + [small] * (len(lines) - 1)
+    longest = max(draw.textlength(line, font) for line, font in zip(lines, fonts, strict=True))
+    # In steps, so that the box seldom changes its width.
+    right = 2.0 * unit * (1 + longest // (2.0 * unit))
+    tops = unit * (1.2 + np.array([0.0, *(1.9 + 1.3 * np.arange(len(lines) - 1))]))
+    box = (0.6 * unit, 0.6 * unit, 1.6 * unit + right, tops[-1] + 1.8 * unit)
     draw.rounded_rectangle(box, unit // 2, fill=(15, 20, 28, 170))
-    draw.text((1.6 * unit, 1.2 * unit), value, font=large, fill="white")
-    draw.text((left, 2.1 * unit), name, font=small, fill=(255, 255, 255, 220))
-    for row, (name, value) in enumerate(others):
-        color = (255, 190, 120, 255) if name == "ball" else (120, 235, 140, 255)
-        top = 3.7 * unit + 1.15 * row * unit
-        draw.text((1.6 * unit, top), name, font=small, fill=color)
-        draw.text((right, top), value, font=small, fill=color, anchor="ra")
+    for line, font, top in zip(lines, fonts, tops, strict=True):
+        draw.text((1.2 * unit, top), line, font=font, fill="white")
     return np.asarray(image)
