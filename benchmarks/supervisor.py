@@ -23,8 +23,7 @@ from bounce_mjx import load_policy
 from bounce_mjx.deploy.chain import Chain
 from bounce_mjx.deploy.faults import EARLIER, FLYING, allowed, faults, picture_age
 from bounce_mjx.deploy.metadata import Metadata
-from bounce_mjx.env.env import Env
-from bounce_mjx.env.state import State
+from bounce_mjx.env.env import Env, State
 from bounce_mjx.evaluation.episodes import reset_episodes
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.resources import POLICIES, resource_path

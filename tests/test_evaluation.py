@@ -17,8 +17,7 @@ from rich.console import Console
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.commands import eval as eval_command
 from bounce_mjx.config import command_line
-from bounce_mjx.env.env import Env, Redraw
-from bounce_mjx.env.state import State
+from bounce_mjx.env.env import Env, Redraw, State
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import policy_evaluation
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator

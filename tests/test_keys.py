@@ -17,8 +17,7 @@ from rich.console import Console
 from arms import ARM
 from bounce_mjx.config.settings import StrictModel, merged
 from bounce_mjx.config.validation import validate
-from bounce_mjx.env.env import Env
-from bounce_mjx.env.state import State
+from bounce_mjx.env.env import Env, State
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.ppo import make_trainer
 from bounce_mjx.physics import Control

@@ -7,7 +7,7 @@ import pytest
 
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.env import vector
-from bounce_mjx.env.state import State
+from bounce_mjx.env.env import State
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import judge

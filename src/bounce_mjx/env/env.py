@@ -1,5 +1,6 @@
-"""`Env`: one environment, which is a world and a task."""
+"""`Env`: one environment, which is a world and a task. It and `State` match brax's by structure."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -8,7 +9,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from bounce_mjx.env.state import State
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics import (
     Control,
@@ -80,6 +80,29 @@ class EnvState(NamedTuple):
     actuation: Actuation = Actuation()
     sensing: Sensing | None = None
     """For an observation that differs from the true state of one instant."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class State:
+    """A pytree with the fields of brax's `State`, so that brax's wrappers work on it."""
+
+    pipeline_state: Any
+    """Everything that the next step depends on."""
+    obs: jax.Array
+    """Observation [observation_size]."""
+    reward: jax.Array
+    """Reward of the last step []."""
+    done: jax.Array
+    """1 where the last step ended the episode, else 0 []."""
+    metrics: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
+    """Named numbers of the last step, each []."""
+    info: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Data of wrappers, which the environment passes on unchanged."""
+
+    def replace(self, **changes: Any) -> "State":
+        """A copy with other values of the named fields."""
+        return dataclasses.replace(self, **changes)
 
 
 class Env:

@@ -4,12 +4,35 @@ Internally the batch is the last axis of every array, so that the physics works 
 coordinates. Observations [B, N] and actions [B, A] have the batch first.
 """
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 
-from bounce_mjx.env.state import AnyEnv, State
+from bounce_mjx.env.env import State
+from bounce_mjx.task import Task
+
+
+class AnyEnv(Protocol):
+    """One environment, unbatched and pure: the part of brax's `Env` that training needs, and the
+    task, which names what to log."""
+
+    task: Task | type[Task]
+    """The task, of which a training run reads `curves` and `critic_metrics`."""
+
+    @property
+    def observation_size(self) -> int:
+        """Length of the observation vector."""
+
+    @property
+    def action_size(self) -> int:
+        """Length of the action vector."""
+
+    def reset(self, rng: jax.Array) -> State:
+        """Starts an episode; consumes the key `rng`."""
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Advances one control step under the action [action_size]."""
 
 
 class VectorState(NamedTuple):

@@ -10,8 +10,7 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from bounce_mjx.env.env import Env, EnvState, world_model
-from bounce_mjx.env.state import State
+from bounce_mjx.env.env import Env, EnvState, State, world_model
 from bounce_mjx.evaluation.episodes import Batch, add_step, begin, reset_episodes
 from bounce_mjx.evaluation.statistics import Statistics
 from bounce_mjx.learning.policy import Actor, Policy

@@ -7,8 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bounce_mjx.env.env import Env
-from bounce_mjx.env.state import State
+from bounce_mjx.env.env import Env, State
 from bounce_mjx.evaluation.recording import empty_recording, record
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
 from bounce_mjx.learning.policy import Actor, Policy

@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from bounce_mjx.env.env import Env
-from bounce_mjx.env.state import State
+from bounce_mjx.env.env import Env, State
 from bounce_mjx.evaluation.statistics import moment
 from bounce_mjx.task.shown import Recording
 

@@ -5,8 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from bounce_mjx.env.env import Env
-from bounce_mjx.env.state import State
+from bounce_mjx.env.env import Env, State
 from bounce_mjx.task.task import Moment, Tally
 
 

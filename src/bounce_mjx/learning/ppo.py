@@ -18,7 +18,7 @@ import optax
 from jax.flatten_util import ravel_pytree
 
 from bounce_mjx.env import vector
-from bounce_mjx.env.state import AnyEnv
+from bounce_mjx.env.vector import AnyEnv
 from bounce_mjx.errors import UserError
 from bounce_mjx.gpu.rows import pack, unpack
 from bounce_mjx.learning import statistics

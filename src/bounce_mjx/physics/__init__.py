@@ -3,8 +3,7 @@
 from bounce_mjx.physics.control import Control, servo_targets
 from bounce_mjx.physics.edited import edited_model
 from bounce_mjx.physics.engine import Engine, make_engine
-from bounce_mjx.physics.parameters import PhysicsParameters
-from bounce_mjx.physics.state import PhysicsState
+from bounce_mjx.physics.parameters import PhysicsParameters, PhysicsState
 
 __all__ = [
     "Control",

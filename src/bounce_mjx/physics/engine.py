@@ -10,8 +10,7 @@ import mujoco
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics import fused
 from bounce_mjx.physics.control import Control
-from bounce_mjx.physics.parameters import PhysicsParameters, check_shapes
-from bounce_mjx.physics.state import PhysicsState
+from bounce_mjx.physics.parameters import PhysicsParameters, PhysicsState, check_shapes
 from bounce_mjx.physics.support import unsupported_feature, unsupported_parameter
 from bounce_mjx.robot.model import find_addresses
 

@@ -14,9 +14,8 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.physics.control import Control, drag, servo_target
 from bounce_mjx.physics.edited import MIN_FRICTION, edited, edited_model
 from bounce_mjx.physics.fused.turning import read_turning
-from bounce_mjx.physics.parameters import PhysicsParameters
+from bounce_mjx.physics.parameters import PhysicsParameters, PhysicsState
 from bounce_mjx.physics.scalars import scalars_of
-from bounce_mjx.physics.state import PhysicsState
 from bounce_mjx.robot.model import Addresses, BallAddresses, find_addresses
 
 

@@ -1,4 +1,5 @@
-"""Physics parameters: the numbers of a model that may differ between environments."""
+"""The state of the physics, and its parameters: the numbers of a model that may differ between
+environments."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -10,6 +11,17 @@ import numpy as np
 from bounce_mjx.errors import UserError
 
 Array = np.ndarray | jax.Array
+
+
+class PhysicsState(NamedTuple):
+    """Generalised coordinates in MuJoCo's order, the same for every engine."""
+
+    qpos: jax.Array
+    """Positions [nq]: joint angles in rad; each ball's position in m, quaternion [w, x, y, z]."""
+    qvel: jax.Array
+    """Velocities [nv]: joints in rad/s; each ball in m/s (world) and rad/s (its frame)."""
+    act: jax.Array | None = None
+    """Activations [na] of the actuators; None if the model has none."""
 
 
 class PhysicsParameters(NamedTuple):

@@ -9,8 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bounce_mjx.env.env import Env, EnvState
-from bounce_mjx.env.state import State
+from bounce_mjx.env.env import Env, EnvState, State
 from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.world.randomization import TERMS, Ranges, World
 

@@ -16,8 +16,7 @@ from flax import struct
 
 from bounce_mjx.adapters.randomization import randomized_task
 from bounce_mjx.config.validation import validate
-from bounce_mjx.env.env import Env, EnvState
-from bounce_mjx.env.state import State
+from bounce_mjx.env.env import Env, EnvState, State
 from bounce_mjx.errors import UserError
 from bounce_mjx.task.task import Task
 from bounce_mjx.tasks.registry import DEFAULT, task_config

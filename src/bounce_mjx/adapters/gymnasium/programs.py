@@ -10,8 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from bounce_mjx.env.env import Env
-from bounce_mjx.env.state import State
+from bounce_mjx.env.env import Env, State
 from bounce_mjx.training.setup import cache_compilations
 from bounce_mjx.world.config import WorldConfig
 

@@ -12,7 +12,7 @@ from flax import struct
 
 from bounce_mjx.adapters.randomization import randomized_task
 from bounce_mjx.config.validation import validate
-from bounce_mjx.env import state as core
+from bounce_mjx.env import env as core
 from bounce_mjx.env.env import Env, EnvState
 from bounce_mjx.errors import needed
 from bounce_mjx.lazy import silence_mjx

@@ -18,7 +18,7 @@ from bounce_mjx.physics.fused import chain, joint_friction
 from bounce_mjx.physics.fused.model import FusedModel, Servo, read_model
 from bounce_mjx.physics.fused.response import contact_response, paddle_origin
 from bounce_mjx.physics.fused.turning import Turning, advance_turning, read_turning, spin_in_ball
-from bounce_mjx.physics.parameters import PhysicsParameters
+from bounce_mjx.physics.parameters import PhysicsParameters, PhysicsState
 from bounce_mjx.physics.scalars import (
     ZERO3,
     Scalar,
@@ -34,7 +34,6 @@ from bounce_mjx.physics.scalars import (
     sub,
     vadd,
 )
-from bounce_mjx.physics.state import PhysicsState
 
 
 class Ball(NamedTuple):
