@@ -13,8 +13,8 @@ from bounce_mjx.world.randomization import Term
 
 _HEAD = """# Config reference
 
-Look up any setting of a training: its key, default, meaning and range. In a YAML file (`--config
-FILE`, see [training](training.md#a-file-of-your-own)) the keys are nested groups, one per section
+Look up any setting of a training: its key, default, meaning and range. In a YAML file
+([training](training.md#a-file-of-your-own)) the keys are nested groups, one per section
 here. A flag is the full name without `env.` or `ppo.`, with hyphens: `--num-envs` for
 `ppo.num_envs`, `--reward.height.weight` for `env.reward.height.weight`. [Other
 tasks](tasks.md#write-a-task) have other keys in `env`.

@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.plugins import event_priority
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
@@ -11,10 +12,15 @@ CHECKOUT = Path(__file__).resolve().parent.parent
 _OUTSIDE = re.compile(r"\]\(\.\./([^)#]+)")
 
 
+@event_priority(100)  # before the redirects, whose targets must exist
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Adds the files at the paths that they have in the checkout."""
+    """Adds the README, which is the home page, and the files that the pages link to, at the paths
+    that they have in the checkout."""
     pages = files.documentation_pages()
-    for path in sorted({path for page in pages for path in _OUTSIDE.findall(page.content_string)}):
+    outside = {path for page in pages for path in _OUTSIDE.findall(page.content_string)}
+    home = (CHECKOUT / "README.md").read_text(encoding="utf-8")
+    outside |= {"README.md", *re.findall(r"\]\((?!docs/|http)([^)#]+)", home)}
+    for path in sorted(outside):
         files.append(File.generated(config, path, abs_src_path=str(CHECKOUT / path)))
     return files
 
