@@ -1,4 +1,4 @@
-"""The fused engine on arms of 3, 5 and 7 joints with every feature that it computes, against C."""
+"""The fused engine moves arms of 3, 5 and 7 joints with every feature that it has as C does."""
 
 from typing import NamedTuple
 
@@ -7,14 +7,23 @@ import mujoco
 import numpy as np
 import pytest
 
+import random_arms
+from against_c import (
+    CEngine,
+    States,
+    assert_same_step,
+    c_models,
+    c_steps,
+    difference,
+    fused_steps,
+    num_contacts,
+)
 from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, make_engine
 from bounce_mjx.robot.model import Addresses, find_addresses
-from random_arms import HALF_SIZE, RADIUS, random_arm
+from random_arms import random_arm
 from random_worlds import random_parameters
-from test_parameters import assert_same_step, c_steps, uncompiled_steps
-from test_physics import CEngine, States, difference
 
-BATCH = 8
+COUNT = 8
 CONTROL_STEPS, STEPS_OF_A_BALL, NUM_SUBSTEPS = 200, 20, 10
 # Number of joints and seed.
 ARMS = ((3, 0), (5, 1), (7, 2))
@@ -51,7 +60,7 @@ def place_ball(arm: Arm, qpos: np.ndarray, local: np.ndarray) -> None:
     qpos[arm.at.ball_qpos[:3],] = paddle.xpos + paddle.xmat.reshape(3, 3) @ local
 
 
-def drop_ball(arm: Arm, qpos: np.ndarray, qvel: np.ndarray, rng: np.random.Generator) -> None:
+def drop_on_paddle(arm: Arm, qpos: np.ndarray, qvel: np.ndarray, rng: np.random.Generator) -> None:
     """Puts the ball of one state above the paddle, in place."""
     place_ball(arm, qpos, np.array([*rng.uniform(-0.02, 0.02, 2), rng.uniform(0.03, 0.06)]))
     qvel[arm.at.ball_qvel,] = [0.0, 0.0, rng.uniform(-1.0, 0.0), *rng.uniform(-30.0, 30.0, 3)]
@@ -64,8 +73,8 @@ def test_2000_steps_of_any_arm_are_mujocos(arm, record_property):
     at their limits, and some are not."""
     model, at = arm
     rng = np.random.default_rng(0)
-    qpos = np.tile(model.qpos0, (BATCH, 1))
-    qvel = rng.uniform(-0.5, 0.5, (BATCH, model.nv))
+    qpos = np.tile(model.qpos0, (COUNT, 1))
+    qvel = rng.uniform(-0.5, 0.5, (COUNT, model.nv))
     state = PhysicsState(qpos, qvel)
     reference = CEngine(model, state)
     engine = make_engine(model, "fused")
@@ -79,10 +88,10 @@ def test_2000_steps_of_any_arm_are_mujocos(arm, record_property):
         if i % STEPS_OF_A_BALL == 0:
             state = PhysicsState(*(np.array(x) for x in state[:2]))
             for data, qpos, qvel in zip(reference.data, *state[:2], strict=True):
-                drop_ball(arm, data.qpos, data.qvel, rng)
+                drop_on_paddle(arm, data.qpos, data.qvel, rng)
                 qpos[at.ball_qpos,] = data.qpos[at.ball_qpos,]
                 qvel[at.ball_qvel,] = data.qvel[at.ball_qvel,]
-        ctrl = targets(arm, rng, BATCH)
+        ctrl = targets(arm, rng, COUNT)
         state = step(state, ctrl)
         contacts += reference.step(ctrl, NUM_SUBSTEPS)
         error = max(error, *difference(state, reference.state))
@@ -94,7 +103,6 @@ def test_2000_steps_of_any_arm_are_mujocos(arm, record_property):
             at_limit[name].append((force[..., None] == ranges).any(-1))
     limited = {name: np.mean(limits) for name, limits in at_limit.items()}
     record_property("largest_difference", error)
-    print(f"2,000 steps x {BATCH}: {contacts} contacts, {limited} at a limit, {error:.1e}")
     assert contacts >= 200
     assert all(0.02 < share < 0.8 for share in limited.values())
     assert error < 1e-9
@@ -102,17 +110,22 @@ def test_2000_steps_of_any_arm_are_mujocos(arm, record_property):
 
 @pytest.mark.usefixtures("float64")
 def test_one_step_of_any_arm_in_random_worlds_is_mujocos(arm):
-    """All parameters are given; the links have welded bodies, and so has the paddle."""
+    """As the model is and with all parameters given; links and paddle have welded bodies."""
     model, at = arm
     count, rng = 32, np.random.default_rng(1)
     qpos = np.tile(model.qpos0, (count, 1))
     qpos[:, at.arm_qpos] += rng.uniform(-2.0, 2.0, (count, len(at.arm_qpos)))
     qvel = rng.uniform(-5.0, 5.0, (count, model.nv))
     for row in qpos:
-        place_ball(arm, row, rng.uniform(-1.0, 1.0, 3) * (np.array(HALF_SIZE) + 0.7 * RADIUS))
+        place_ball(
+            arm,
+            row,
+            rng.uniform(-1.0, 1.0, 3)
+            * (np.array(random_arms.HALF_SIZE) + 0.7 * random_arms.RADIUS),
+        )
     ctrl = qpos[:, at.arm_qpos] * model.actuator_gear[:, 0] + rng.uniform(-0.1, 0.1, (count, 1))
     states = States(qpos, qvel, ctrl)
-    parameters = random_parameters(model, count, seed=2)
-    expected, contacts = c_steps(model, parameters, states)
-    assert contacts >= count // 2
-    assert_same_step(uncompiled_steps(model, parameters, states), expected)
+    for parameters in (PhysicsParameters(), random_parameters(model, count, seed=2)):
+        expected, forces = c_steps(c_models(model, parameters, count), states)
+        assert num_contacts(forces) >= count // 2
+        assert_same_step(fused_steps(model, parameters, states), expected)

@@ -1,4 +1,4 @@
-"""The GPU kernel of the fused physics, in Pallas' interpreter, against XLA's own program; rows."""
+"""The GPU kernel of the physics computes what XLA's own program computes; rows keep every bit."""
 
 import subprocess
 import sys
@@ -104,22 +104,6 @@ def test_a_batch_equals_the_xla_program(env, by_xla, in_kernel):
 
 
 @pytest.mark.slow
-def test_physics_is_traced_once_for_all_programs(env, monkeypatch):
-    """Tracing the physics takes some tenths of a second, and a training has several programs."""
-    traced = []
-    substep = dynamics.substep
-    monkeypatch.setattr(dynamics, "substep", lambda *args: traced.append(1) or substep(*args))
-    dynamics._substeps.cache_clear()
-    jax.make_jaxpr(batched(env))(*moving(env, 3))
-    assert traced
-    traced.clear()
-    jax.make_jaxpr(batched(env))(*moving(env, 4))
-    assert not traced
-    # The cached trace calls the list above.
-    dynamics._substeps.cache_clear()
-
-
-@pytest.mark.slow
 def test_parameters_enter_the_kernel(env, by_xla, in_kernel, monkeypatch):
     """The kernel takes more inputs than coordinates and targets: all physics parameters of each
     environment."""
@@ -192,8 +176,7 @@ def test_devices_keep_their_shard(monkeypatch):
     assert done.stdout.split() == ["0", "0"]
 
 
-@pytest.mark.parametrize("order", ["of the batch", "in the batch"])
-def test_the_kernel_has_the_derivative_of_the_function(order):
+def test_the_kernel_has_the_derivative_of_the_function():
     """A kernel itself has no derivative, so the derivative is the plain function's."""
 
     def function(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -201,12 +184,13 @@ def test_the_kernel_has_the_derivative_of_the_function(order):
 
     in_kernel = kernel.elementwise(function, 2, interpret=True)
     x, y = jnp.linspace(0.5, 2.0, BATCH), jnp.linspace(-1.0, 1.0, BATCH)
-    if order == "of the batch":
-        given = jax.grad(lambda x, y: sum(jax.vmap(in_kernel)(x, y)).sum(), argnums=(0, 1))(x, y)
-    else:
-        given = jax.vmap(jax.grad(lambda x, y: sum(in_kernel(x, y)), argnums=(0, 1)))(x, y)
-    np.testing.assert_allclose(given[0], y**3 + np.cos(x), rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(given[1], 3.0 * x * y**2, rtol=1e-5, atol=1e-6)
+    for gradient in (
+        jax.grad(lambda x, y: sum(jax.vmap(in_kernel)(x, y)).sum(), argnums=(0, 1)),
+        jax.vmap(jax.grad(lambda x, y: sum(in_kernel(x, y)), argnums=(0, 1))),
+    ):
+        given = gradient(x, y)
+        np.testing.assert_allclose(given[0], y**3 + np.cos(x), rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(given[1], 3.0 * x * y**2, rtol=1e-5, atol=1e-6)
 
 
 def test_a_step_in_the_kernel_has_a_gradient(env, in_kernel):
@@ -239,28 +223,20 @@ def test_the_kernel_is_lowered_for_a_gpu(env, monkeypatch):
     on_gpu = traced.lower(lowering_platforms=("cuda",)).as_text()
     assert on_gpu.count("custom_call @mosaic_gpu") == 1
     assert "mosaic" not in traced.lower(lowering_platforms=("cpu",)).as_text()
-
-
-def test_the_kernel_with_parameters_is_lowered_for_a_gpu(env, monkeypatch):
-    monkeypatch.setattr(kernel, "has_kernels", lambda: True)
     traced = jax.jit(in_worlds(env)).trace(*moving(env, BATCH), random_worlds(env, BATCH))
     on_gpu = traced.lower(lowering_platforms=("cuda",)).as_text()
     assert on_gpu.count("custom_call @mosaic_gpu") == 1
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("num_seeds", [1, 2])
-def test_a_training_is_lowered_for_a_gpu(monkeypatch, num_seeds: int):
-    """With kernels of the physics in it, and with rows, here of one iteration."""
+def test_a_training_is_lowered_for_a_gpu(monkeypatch):
+    """Of two seeds, with kernels of the physics in it, and with rows, here of one iteration."""
     for module in (kernel, rows):
         monkeypatch.setattr(module, "has_kernels", lambda: True)
     config = PPOConfig(num_envs=64, num_minibatches=2, hidden_layers=(8,))
     env = BounceBall()
-    trainer = ppo.make_trainer(config, env, env.config.episode_steps)
-    key = jax.random.PRNGKey(0)
-    if num_seeds > 1:
-        trainer, key = ppo.population(trainer), jax.random.split(key, num_seeds)
-    state = jax.eval_shape(trainer.init, key)
+    trainer = ppo.population(ppo.make_trainer(config, env, env.config.episode_steps))
+    state = jax.eval_shape(trainer.init, jax.random.split(jax.random.PRNGKey(0), 2))
     traced = jax.jit(lambda state: trainer.run(state, 1)).trace(state)
     assert "custom_call @mosaic_gpu" in traced.lower(lowering_platforms=("cuda",)).as_text()
     assert jax.tree.structure(traced.out_info[0]) == jax.tree.structure(state)
@@ -287,11 +263,11 @@ def test_rows_hold_every_type(monkeypatch):
         np.testing.assert_array_equal(twice[name][1], expected)
 
 
-@pytest.mark.parametrize("other", [jax.random.key(0), jnp.zeros(1, jnp.bfloat16)])
-def test_rows_leave_other_types_alone(monkeypatch, other):
+def test_rows_leave_other_types_alone(monkeypatch):
     monkeypatch.setattr(rows, "has_kernels", lambda: True)
-    tree = {"float": jnp.zeros(1), "other": other}
-    assert rows.pack(tree) is tree
+    for other in (jax.random.key(0), jnp.zeros(1, jnp.bfloat16)):
+        tree = {"float": jnp.zeros(1), "other": other}
+        assert rows.pack(tree) is tree
 
 
 def test_there_is_no_kernel_on_a_cpu(monkeypatch):
@@ -301,11 +277,9 @@ def test_there_is_no_kernel_on_a_cpu(monkeypatch):
     assert not availability.has_kernels()
 
 
-@pytest.mark.parametrize(
-    ("capability", "expected"), [("9.0", True), ("10.0", True), ("8.6", False), ("gfx90a", False)]
-)
-def test_only_supported_gpus_use_kernels(monkeypatch, capability, expected):
-    device = type("Device", (), {"compute_capability": capability})
+def test_only_supported_gpus_use_kernels(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    monkeypatch.setattr(jax, "local_devices", lambda backend=None: [device])
-    assert availability.has_kernels() is expected
+    for capability, expected in (("9.0", True), ("10.0", True), ("8.6", False), ("gfx90a", False)):
+        device = type("Device", (), {"compute_capability": capability})
+        monkeypatch.setattr(jax, "local_devices", lambda backend=None, device=device: [device])
+        assert availability.has_kernels() is expected

@@ -8,11 +8,11 @@ import mujoco
 import numpy as np
 import pytest
 
+from against_c import XML
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics import PhysicsState
 from bounce_mjx.robot.model import find_addresses, load_model
-from test_physics import XML
 
 SERVO_2 = '<position name="act2" joint="Joint2"/>'
 REFUSED = {
@@ -70,14 +70,6 @@ def test_a_step_that_is_long_for_the_contact_is_refused(solref, longest, tmp_pat
     assert load_model(path, longest).opt.timestep == longest
     with pytest.raises(UserError, match=rf"physics_dt {1.1 * longest:g} s .* to {longest:.3g}"):
         load_model(path, 1.1 * longest)
-
-
-def test_inertia_from_geoms_that_only_pictures_need(tmp_path):
-    """MuJoCo refuses to drop such geoms."""
-    text = XML.replace('autolimits="true"', 'inertiafromgeom="true"').replace(' mass="0" ', " ")
-    (tmp_path / "robot.xml").write_text(text)
-    pictured, plain = (load_model(tmp_path / "robot.xml", 0.001, visual=v) for v in (True, False))
-    np.testing.assert_array_equal(plain.body_mass, pictured.body_mass)
 
 
 def test_an_edited_model_is_an_error():
@@ -158,8 +150,7 @@ def dropped(mj_model: mujoco.MjModel, *positions: tuple[float, float, float]):
     return np.array(heights), touched
 
 
-@pytest.mark.parametrize("num_balls", [2, 3])
-def test_further_balls_bounce_and_touch_each_other(num_balls):
+def test_further_balls_bounce_and_touch_each_other(num_balls=3):
     model = load_model(None, 0.001, num_balls=num_balls)
     at = find_addresses(model)
     x, y, z = EnvConfig().ball_init_pos

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
+from against_c import assert_same_step, c_steps, converged, fused_steps, touching_states
 from bounce_mjx.adapters.randomization import domain_randomize, parameters_of
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics import Control, PhysicsState, make_engine
 from bounce_mjx.physics.edited import edited_model
 from bounce_mjx.physics.parameters import PhysicsParameters
 from random_worlds import random_parameters
-from test_friction import assert_same_step, c_steps, converged, fused_steps, touching_states
 
 BATCH = 3
 
@@ -126,15 +126,6 @@ def test_entries_act_as_in_mujoco(mj_model):
             assert field_of(models[i], field)[place] == values[i]
     expected, _ = c_steps(models, states)
     assert_same_step(fused_steps(mj_model, parameters, states), expected)
-
-
-def test_equal_values_change_nothing(mj_model, base):
-    """A function that only gives every field a batch axis is not a randomisation."""
-    fields = {
-        name: np.stack([getattr(base, name)] * 2)
-        for name in ("qpos0", "body_mass", "dof_frictionloss")
-    }
-    assert read(mj_model, base, **fields) == PhysicsParameters()
 
 
 def test_dry_friction_acts_where_it_differs(mj_model, base):

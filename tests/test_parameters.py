@@ -1,4 +1,4 @@
-"""Physics parameters: each engine against MuJoCo's C step with an edited model."""
+"""A given physics parameter acts in each engine as in C with an edited model."""
 
 from functools import partial
 
@@ -9,6 +9,21 @@ import numpy as np
 import pytest
 from mujoco import rollout
 
+from against_c import (
+    MODEL,
+    States,
+    assert_same_step,
+    bouncing_states,
+    c_models,
+    c_steps,
+    edited,
+    fused_steps,
+    num_contacts,
+    paddle_frame,
+    push_by_air,
+    random_states,
+    world,
+)
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.c_episodes import (
@@ -32,99 +47,54 @@ from bounce_mjx.physics import (
 from bounce_mjx.physics.parameters import shapes
 from bounce_mjx.robot.model import load_model, resting_activations
 from random_worlds import own_parameters, random_parameters
-from test_impact import push_by_air
-from test_physics import (
-    DT,
-    ONE_STEP,
-    XML,
-    CEngine,
-    States,
-    bouncing_states,
-    c_step,
-    difference,
-    edited,
-    paddle_frame,
-    random_states,
-)
 
-MODEL = PhysicsParameters()
 # Parameters of the shipped model; test_friction.py and test_joint_friction.py cover friction.
 _NOT_IN_THE_MODEL = ("contact_friction", "force_limit", "frictionloss", "entries")
 FIELDS = [f for f in PhysicsParameters._fields if f not in _NOT_IN_THE_MODEL]
-NUM_WORLDS = 16
-
-
-def world(parameters: PhysicsParameters, i: int) -> PhysicsParameters:
-    """Parameters of world i from a batch [N, ...]."""
-    return jax.tree.map(lambda array: array[i], parameters)
-
-
-def uncompiled_steps(mj_model, parameters: PhysicsParameters, states: States) -> PhysicsState:
-    """One fused step from each state in its own world, operation by operation."""
-    step = partial(fused.step, fused.read_model(mj_model), num_substeps=1)
-    with jax.disable_jit():
-        return jax.vmap(step)(
-            jax.tree.map(jnp.asarray, parameters),
-            PhysicsState(jnp.asarray(states.qpos), jnp.asarray(states.qvel)),
-            Control(jnp.asarray(states.ctrl)),
-        )
-
-
-def c_steps(mj_model, parameters: PhysicsParameters, states: States) -> tuple[PhysicsState, int]:
-    """One mj_step from each state in its own world, and the number of contacts."""
-    after, contacts = [], 0
-    for i in range(len(states.qpos)):
-        one = States(*(x[i : i + 1] for x in states))
-        state, touching = c_step(edited_model(mj_model, world(parameters, i)), one)
-        after.append(state)
-        contacts += int(touching[0])
-    return joined(after), contacts
-
-
-def joined(states: list[PhysicsState]) -> PhysicsState:
-    """Joins batches of states."""
-    return PhysicsState(*(np.concatenate(x) for x in zip(*(s[:2] for s in states), strict=True)))
-
-
-def assert_same_step(actual: PhysicsState, expected: PhysicsState) -> None:
-    fastest = np.max(np.abs(expected.qvel))
-    qpos, qvel = difference(actual, expected)
-    assert qvel < ONE_STEP * fastest
-    assert qpos < ONE_STEP * fastest * DT
 
 
 @pytest.mark.usefixtures("float64")
 def test_one_step_in_random_worlds_is_mujocos(mj_model):
-    """All parameters are given, with contacts of every kind."""
-    states, _ = random_states(mj_model, 128, seed=5)
-    parameters = random_parameters(mj_model, 128, seed=6)
-    expected, contacts = c_steps(mj_model, parameters, states)
-    assert contacts >= 80
-    assert_same_step(uncompiled_steps(mj_model, parameters, states), expected)
+    """All parameters are given, with contacts of every kind; with force limits, at which servos
+    have no implicit damping, some servos are at their limits and some are not."""
+    count = 128
+    states, _ = random_states(mj_model, count, seed=5)
+    parameters = random_parameters(mj_model, count, seed=6)
+    limits = 10.0 ** np.random.default_rng(0).uniform(1.0, 3.5, (count, 6))
+    for given in (parameters, parameters._replace(force_limit=limits)):
+        models = c_models(mj_model, given, count)
+        expected, forces = c_steps(models, states)
+        assert num_contacts(forces) >= 80
+        assert_same_step(fused_steps(mj_model, given, states), expected)
+    at_limit = []
+    for i, (model, *start) in enumerate(zip(models, *states, strict=True)):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = start
+        mujoco.mj_forward(model, data)
+        at_limit.append(np.abs(data.actuator_force) == limits[i])
+    assert 0.2 < np.mean(at_limit) < 0.8
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("float64")
 def test_each_number_alone_acts_as_in_mujoco(mj_model):
     """In one batch with shared states and parameters, except for one random field."""
-    fields = FIELDS
-    count = 8
+    count, size = 8, 8 * len(FIELDS)
     states, _ = random_states(mj_model, count, seed=1)
-    states = States(*(np.tile(x, (len(fields), 1)) for x in states))
+    states = States(*(np.tile(x, (len(FIELDS), 1)) for x in states))
     own = jax.tree.map(
-        lambda array: np.broadcast_to(array, (len(fields) * count, *np.shape(array))).copy(),
+        lambda array: np.broadcast_to(array, (size, *np.shape(array))).copy(),
         own_parameters(mj_model),
     )
-    drawn = random_parameters(mj_model, len(fields) * count, seed=2)
-    for i, field in enumerate(fields):
+    drawn = random_parameters(mj_model, size, seed=2)
+    for i, field in enumerate(FIELDS):
         rows = slice(i * count, (i + 1) * count)
         getattr(own, field)[rows] = getattr(drawn, field)[rows]
-    expected, _ = c_steps(mj_model, own, states)
-    assert_same_step(uncompiled_steps(mj_model, own, states), expected)
-
-    shipped, _ = c_step(mj_model, states)
-    change = np.abs(expected.qvel - shipped.qvel).max(axis=1).reshape(len(fields), count)
-    assert np.all(change.max(axis=1) > 1e-4), dict(zip(fields, change.max(axis=1), strict=True))
+    expected, _ = c_steps(c_models(mj_model, own, size), states)
+    assert_same_step(fused_steps(mj_model, own, states), expected)
+    shipped, _ = c_steps(mj_model, states)
+    change = np.abs(expected.qvel - shipped.qvel).max(axis=1).reshape(len(FIELDS), count)
+    assert np.all(change.max(axis=1) > 1e-4), dict(zip(FIELDS, change.max(axis=1), strict=True))
 
 
 @pytest.mark.parametrize("field", FIELDS)
@@ -135,59 +105,8 @@ def test_one_given_number_leaves_the_others_to_the_model(mj_model, field):
     states, _ = random_states(model, 4, seed=3)
     drawn = getattr(random_parameters(model, 4, seed=4), field)
     parameters = PhysicsParameters(**{field: drawn})
-    expected, _ = c_steps(model, parameters, states)
-    assert_same_step(uncompiled_steps(model, parameters, states), expected)
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("float64")
-def test_random_worlds_stay_with_mujoco_for_500_steps(mj_model, record_property):
-    """Both engines run freely; neither sees the other's state."""
-    rng = np.random.default_rng(0)
-    start = bouncing_states(mj_model, rng)
-    state = PhysicsState(*(x[:NUM_WORLDS] for x in start[:2]))
-    parameters = random_parameters(mj_model, NUM_WORLDS, seed=7)
-    parameters = parameters._replace(gravity=parameters.gravity * [0.1, 0.1, 1.0])
-    models = [edited_model(mj_model, world(parameters, i)) for i in range(NUM_WORLDS)]
-    reference = [
-        CEngine(model, PhysicsState(*(x[i : i + 1] for x in state[:2])))
-        for i, model in enumerate(models)
-    ]
-    step = jax.jit(
-        jax.vmap(lambda p, s, u: make_engine(mj_model, "fused").step(p, s, Control(u), 1))
-    )
-    contacts, error = 0, 0.0
-    for i in range(500):
-        if i % 10 == 0:
-            action = rng.uniform(-0.03, 0.03, (NUM_WORLDS, 6))
-            ctrl = np.asarray(state.qpos[:, :6]) + action
-            c_ctrl = np.concatenate([c.state.qpos[:, :6] for c in reference]) + action
-        state = step(parameters, state, ctrl)
-        for j, c in enumerate(reference):
-            contacts += c.step(c_ctrl[j : j + 1], 1)
-        error = max(error, *difference(state, joined([c.state for c in reference])))
-    record_property("largest_difference", error)
-    print(f"500 steps x {NUM_WORLDS} worlds: {contacts} contact steps, difference {error:.1e}")
-    assert contacts >= 200
-    assert error < 1e-9
-
-
-@pytest.mark.usefixtures("float64")
-def test_given_force_limits_are_mujocos(mj_model):
-    """Some servos are at their limits, where they have no implicit damping, and some are not."""
-    states, _ = random_states(mj_model, 128, seed=11)
-    limits = 10.0 ** np.random.default_rng(0).uniform(1.0, 3.5, (128, 6))
-    alone = PhysicsParameters(force_limit=limits)
-    for parameters in (alone, random_parameters(mj_model, 128, 12)._replace(force_limit=limits)):
-        expected, _ = c_steps(mj_model, parameters, states)
-        assert_same_step(uncompiled_steps(mj_model, parameters, states), expected)
-    data = mujoco.MjData(edited_model(mj_model, world(alone, 0)))
-    at_limit = []
-    for i, start in enumerate(zip(*states, strict=True)):
-        data.qpos[:], data.qvel[:], data.ctrl[:] = start
-        mujoco.mj_forward(edited_model(mj_model, world(alone, i)), data)
-        at_limit.append(np.abs(data.actuator_force) == limits[i])
-    assert 0.2 < np.mean(at_limit) < 0.8
+    expected, _ = c_steps(c_models(model, parameters, 4), states)
+    assert_same_step(fused_steps(model, parameters, states), expected)
 
 
 def test_nothing_given_leaves_the_program_alone(mj_model):
@@ -202,21 +121,6 @@ def test_nothing_given_leaves_the_program_alone(mj_model):
     assert not default.consts
     given = jax.make_jaxpr(step)(PhysicsParameters(ball_mass=jnp.ones(())), state, Control(ctrl))
     assert len(given.in_avals) == 4
-    # One given field adds only the operations that use it.
-    assert 0 < num_operations(given) - num_operations(default) < 20
-
-
-def num_operations(jaxpr) -> int:
-    """Number of equations in a program, including its calls and loops."""
-    inner = [
-        value
-        for equation in jaxpr.eqns
-        for value in jax.tree.leaves(
-            equation.params, is_leaf=lambda x: hasattr(x, "eqns") or hasattr(x, "jaxpr")
-        )
-        if hasattr(value, "eqns") or hasattr(value, "jaxpr")
-    ]
-    return len(jaxpr.eqns) + sum(num_operations(getattr(x, "jaxpr", x)) for x in inner)
 
 
 @pytest.mark.slow
@@ -296,40 +200,6 @@ def test_a_parameter_of_another_shape_is_refused(mj_model):
 def heavy_and_light(key: jax.Array) -> PhysicsParameters:
     """Environment with balls of 1 to 100 times the mass."""
     return PhysicsParameters(ball_mass=0.0027 * 100.0 ** jax.random.uniform(key))
-
-
-@pytest.mark.slow
-def test_each_environment_of_a_batch_has_its_own_ball():
-    """A drawn mass acts like in C with the edited model, and is in the state."""
-    with jax.enable_x64(True):
-        config = EnvConfig(ball_init_pos=(0.58856, 0.0, 0.08))
-        env = BounceBall(config, randomize=heavy_and_light)
-        keys = jax.random.split(jax.random.PRNGKey(3), 2)
-        state = jax.vmap(env.reset)(keys)
-        parameters = state.pipeline_state.parameters
-        assert abs(np.log(parameters.ball_mass[0] / parameters.ball_mass[1])) > 0.5
-        at = env.addresses
-        action = jnp.zeros((2, 6))
-        start = state.pipeline_state.physics
-        reference = [
-            CEngine(edited_model(env.mj_model, world(parameters, i)), world(start, slice(i, i + 1)))
-            for i in range(2)
-        ]
-        step = jax.jit(jax.vmap(env.step))
-        contacts = np.zeros(2, int)
-        for _ in range(15):
-            ctrl = jax.vmap(env.servo_targets)(state.pipeline_state.physics, action)
-            state = step(state, action)
-            contacts += [c.step(ctrl[i : i + 1], 10) for i, c in enumerate(reference)]
-        assert np.all(contacts > 0)
-        assert not np.any(state.done)
-        expected = joined([c.state for c in reference])
-        assert max(difference(state.pipeline_state.physics, expected)) < 1e-9
-        np.testing.assert_array_equal(
-            state.pipeline_state.parameters.ball_mass, parameters.ball_mass
-        )
-        height = state.pipeline_state.physics.qpos[:, at.ball_qpos[2]]
-        assert abs(height[0] - height[1]) > 1e-5
 
 
 @pytest.fixture(scope="module")
@@ -413,15 +283,6 @@ def test_c_evaluation_carries_the_whole_state(name):
         np.testing.assert_allclose(after.act.T, [d.act for d in data], rtol=1e-6)
     else:
         assert after.act is None
-
-
-def test_c_evaluation_takes_a_delayed_sensor(networks, untrained, tmp_path):
-    """A short evaluation runs without an error."""
-    mjcf = tmp_path / "delayed.xml"
-    mjcf.write_text(XML.replace(*STATEFUL["delayed sensor"], 1))
-    env = BounceBall(EnvConfig(mjcf=mjcf, episode_seconds=0.1))
-    statistics = make_mujoco_evaluator(env, networks, 2)(untrained, jax.random.PRNGKey(0))
-    np.testing.assert_array_equal(statistics.steps, 10)
 
 
 def test_filtered_servos_start_at_rest():

@@ -70,7 +70,7 @@ def random_rollout(seed=0, steps=30, envs=40):
     }
 
 
-@pytest.mark.parametrize(("discount", "lam"), [(0.99, 0.95), (0.9, 0.0), (0.9, 1.0), (1.0, 1.0)])
+@pytest.mark.parametrize(("discount", "lam"), [(0.99, 0.95), (0.9, 0.0), (1.0, 1.0)])
 def test_advantages_equal_their_definition(discount, lam):
     rollout = random_rollout()
     actual = generalized_advantages(**rollout, discount=discount, gae_lambda=lam)
@@ -78,59 +78,28 @@ def test_advantages_equal_their_definition(discount, lam):
     np.testing.assert_allclose(actual, expected, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("terminated_at", "truncated_at", "expected"),
-    [
-        # Errors: 1 + 1/2 - 1 = 0.5, 2 + 10/2 - 1 = 6, 3 + 1/2 - 1 = 2.5, 4 + 2/2 - 1 = 4; each
-        # advantage is its error plus a quarter of the next advantage.
-        pytest.param([], [], [2.21875, 6.875, 3.5, 4.0], id="no end"),
+def test_advantages_by_hand():
+    """Errors: 1 + 1/2 - 1 = 0.5, 2 + 10/2 - 1 = 6, 3 + 1/2 - 1 = 2.5, 4 + 2/2 - 1 = 4; each
+    advantage is its error plus a quarter of the next advantage."""
+    for terminated_at, truncated_at, expected in (
+        ([], [], [2.21875, 6.875, 3.5, 4.0]),
         # The second step keeps its error of 6 and gets nothing from the third.
-        pytest.param([], [1], [2.0, 6.0, 3.5, 4.0], id="time-out"),
+        ([], [1], [2.0, 6.0, 3.5, 4.0]),
         # Without a value to follow, the second error is 2 - 1 = 1.
-        pytest.param([1], [], [0.75, 1.0, 3.5, 4.0], id="termination"),
+        ([1], [], [0.75, 1.0, 3.5, 4.0]),
         # The last error is 4 - 1 = 3.
-        pytest.param([3], [], [2.203125, 6.8125, 3.25, 3.0], id="termination at the last step"),
-    ],
-)
-def test_advantages_by_hand(terminated_at, truncated_at, expected):
-    steps = np.arange(4)
-    actual = generalized_advantages(
-        reward=jnp.array([[1.0], [2.0], [3.0], [4.0]]),
-        value=jnp.ones((4, 1)),
-        next_value=jnp.array([[1.0], [10.0], [1.0], [2.0]]),
-        terminated=jnp.array(np.isin(steps, terminated_at)[:, None]),
-        truncated=jnp.array(np.isin(steps, truncated_at)[:, None]),
-        discount=0.5,
-        gae_lambda=0.5,
-    )
-    np.testing.assert_allclose(actual[:, 0], expected, rtol=1e-6)
-
-
-@pytest.mark.parametrize("end", ["terminated", "truncated"])
-def test_no_advantage_flows_back_over_an_end(end):
-    rollout = random_rollout(seed=1)
-    rollout["terminated"][:], rollout["truncated"][:] = False, False
-    rollout[end][10] = True
-    later = {name: array.copy() for name, array in rollout.items()}
-    for name in ("reward", "value", "next_value"):
-        later[name][11:] += 5.0
-    first, second = (
-        np.asarray(generalized_advantages(**r, discount=0.99, gae_lambda=0.95))
-        for r in (rollout, later)
-    )
-    np.testing.assert_array_equal(first[:11], second[:11])
-    assert np.all(first[11:] != second[11:])
-
-
-def test_only_a_time_out_uses_the_following_value():
-    rollout = random_rollout(seed=2)
-    changed = rollout | {"next_value": rollout["next_value"] + 1.0}
-    first, second = (
-        np.asarray(generalized_advantages(**r, discount=0.5, gae_lambda=0.0))
-        for r in (rollout, changed)
-    )
-    expected = np.where(rollout["terminated"], 0.0, 0.5)
-    np.testing.assert_allclose(second - first, expected, atol=1e-5)
+        ([3], [], [2.203125, 6.8125, 3.25, 3.0]),
+    ):
+        actual = generalized_advantages(
+            reward=jnp.array([[1.0], [2.0], [3.0], [4.0]]),
+            value=jnp.ones((4, 1)),
+            next_value=jnp.array([[1.0], [10.0], [1.0], [2.0]]),
+            terminated=jnp.array(np.isin(np.arange(4), terminated_at)[:, None]),
+            truncated=jnp.array(np.isin(np.arange(4), truncated_at)[:, None]),
+            discount=0.5,
+            gae_lambda=0.5,
+        )
+        np.testing.assert_allclose(actual[:, 0], expected, rtol=1e-6)
 
 
 # Learning rate
@@ -146,18 +115,10 @@ def rate_config():
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("iteration", "expected"), [(0, 1e-2), (5, 1e-3), (10, 1e-4), (11, 1e-4), (10**6, 1e-4)]
-)
-def test_max_learning_rate_decays_exponentially(iteration, expected, rate_config):
-    actual = ppo.max_learning_rate(rate_config, jnp.int32(iteration))
-    np.testing.assert_allclose(actual, expected, rtol=1e-5)
-
-
-def test_max_learning_rate_never_rises(rate_config):
-    rates = np.array([ppo.max_learning_rate(rate_config, jnp.int32(i)) for i in range(15)])
-    assert np.all(np.diff(rates[:11]) < 0)
-    np.testing.assert_array_equal(rates[10:], rates[10])
+def test_max_learning_rate_decays_exponentially(rate_config):
+    for iteration, expected in ((0, 1e-2), (5, 1e-3), (10, 1e-4), (11, 1e-4), (10**6, 1e-4)):
+        actual = ppo.max_learning_rate(rate_config, jnp.int32(iteration))
+        np.testing.assert_allclose(actual, expected, rtol=1e-5)
 
 
 def adapted(config, kl, learning_rate=1e-3, limit=1e-2):
@@ -176,12 +137,9 @@ def test_learning_rate_stays_in_its_limits(rate_config):
     np.testing.assert_allclose(adapted(rate_config, 0.0, 9.9e-3), 1e-2, rtol=1e-6)
     np.testing.assert_allclose(adapted(rate_config, 0.01, 5e-3, limit=2e-3), 2e-3, rtol=1e-6)
     np.testing.assert_allclose(adapted(rate_config, 1.0, 1.01e-5), 1e-5, rtol=1e-6)
-
-
-def test_learning_rate_is_fixed_without_a_target(rate_config):
+    # Without a target it is fixed.
     fixed = rate_config.model_copy(update={"target_kl": 0.0})
-    for kl in (0.0, 1.0):
-        np.testing.assert_allclose(adapted(fixed, kl), 1e-3, rtol=1e-6)
+    np.testing.assert_allclose([adapted(fixed, kl) for kl in (0.0, 1.0)], 1e-3, rtol=1e-6)
 
 
 # Bootstrapping, end to end
@@ -229,30 +187,30 @@ def two_state_config(**changes) -> PPOConfig:
 
 
 @pytest.mark.parametrize(
-    ("env", "critic_metrics", "expected"),
+    ("terminates", "expected"),
     [
-        # 0.1 / (1 - 0.9) in both states; 0.1 and 0.19 if the time-out counted as a termination.
-        pytest.param(TwoStates(1.0), (), [1.0, 1.0], id="constant reward", marks=pytest.mark.slow),
-        # The second state is worth 0.1 / (1 - 0.9), the first one 0.9 of that. If a time-out led
-        # on to the first state of the next episode, they would be worth 0.526 and 0.474.
-        pytest.param(TwoStates(0.0), (), [0.9, 1.0], id="second state pays"),
-        pytest.param(TwoStates(0.0, hidden=True), ("n_bounces",), [0.9, 1.0], id="by metric"),
-        pytest.param(TwoStates(1.0, terminates=True), (), [0.19, 0.1], id="terminates"),
+        # The second state is worth 0.1 / (1 - 0.9), the first one 0.9 of that. If a time-out led on
+        # to the first state of the next episode, they would be worth 0.526 and 0.474, and if it
+        # counted as a termination, 0.09 and 0.1.
+        (False, [0.9, 1.0]),
+        (True, [0.09, 0.1]),
     ],
 )
-def test_time_out_bootstraps_the_old_episodes_last_state(env, critic_metrics, expected):
-    config = two_state_config(critic_metrics=critic_metrics)
+def test_time_out_bootstraps_the_old_episodes_last_state(terminates, expected):
+    """The observation does not tell the two states apart, but a metric of the critic does."""
+    config = two_state_config(critic_metrics=("n_bounces",))
+    env = TwoStates(0.0, terminates=terminates, hidden=True)
     trainer = ppo.make_trainer(config, env, episode_steps=2)
     state, metrics = jax.jit(lambda key: trainer.run(trainer.init(key), 500))(jax.random.key(0))
     networks = policy.make_networks(config, env.observation_size, env.action_size)
-    seen = jnp.array([[1.0, 1.0, 0.0], [1.0, 1.0, 1.0]]) if env.hidden else jnp.eye(2)
+    seen = jnp.array([[1.0, 1.0, 0.0], [1.0, 1.0, 1.0]])
     values = networks.value_network.apply(
         state.params.value, normalize(seen, state.statistics.normalizer)
     )
     np.testing.assert_allclose(values, expected, atol=0.03)
-    np.testing.assert_allclose(metrics["episode/return"][-1], 1.0 + env.first_reward, rtol=1e-6)
+    np.testing.assert_allclose(metrics["episode/return"][-1], 1.0, rtol=1e-6)
     np.testing.assert_allclose(metrics["episode/length"][-1], 2.0, rtol=1e-6)
-    assert metrics["reward"][-1] == (1.0 + env.first_reward) / 2
+    assert metrics["reward"][-1] == 0.5
 
 
 class Precise(TwoStates):
@@ -263,23 +221,22 @@ class Precise(TwoStates):
         return state.replace(reward=-jnp.square(action[0] - 0.3))
 
 
-@pytest.mark.parametrize(("bound", "least", "greatest"), [(0.0, 0.0, 0.05), (0.2, 0.2, 0.3)])
-def test_the_noise_shrinks_to_its_bound(bound, least, greatest):
+def test_the_noise_shrinks_to_its_bound():
     """The bounds of the environments have the mean `min_noise_std`; the policy is as precise."""
     config = two_state_config(
-        num_envs=64, min_noise_std=bound, reward_scale=10.0, learning_rate=1e-2, discount=0.0,
+        num_envs=64, min_noise_std=0.2, reward_scale=10.0, learning_rate=1e-2, discount=0.0,
         max_learning_rate=1e-2,
     )  # fmt: skip
     trainer = ppo.make_trainer(config, Precise(1.0), episode_steps=2)
     state, metrics = jax.jit(lambda key: trainer.run(trainer.init(key), 300))(jax.random.key(0))
-    assert least <= metrics["policy/action_std"][-1] < greatest
+    assert 0.2 <= metrics["policy/action_std"][-1] < 0.3
     networks = policy.make_networks(config, 2, 1)
     action = networks.act(ppo.policy_of(state, 2), jnp.eye(2))
     np.testing.assert_allclose(action, 0.3, atol=0.03)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("bound", [0.0, 0.3])
+@pytest.mark.parametrize("bound", [0.3])
 def test_update_uses_the_normalisation_of_the_next_rollout(bound):
     """If the policy does not change, the KL divergence of an update is the divergence between the
     policy on the rollout's own normalised observations and on the same observations normalised with
@@ -308,21 +265,12 @@ def test_update_uses_the_normalisation_of_the_next_rollout(bound):
     np.testing.assert_allclose(metrics["policy/kl"][0], divergence, rtol=0.1)
 
 
-def test_the_loss_is_the_only_one(monkeypatch):
-    """A user edits `loss`; nothing else computes it."""
-    plain = ppo.loss
-
-    def of_the_values(ppo, params, samples):
-        total, metrics = plain(ppo, params, samples)
-        return ppo.config.value_cost * metrics["loss/value"], metrics
-
-    monkeypatch.setattr(ppo, "loss", of_the_values)
-    trainer = ppo.make_trainer(two_state_config(), TwoStates(1.0), episode_steps=2)
-    before = trainer.init(jax.random.key(0))
-    after, _ = jax.jit(lambda state: trainer.run(state, 2))(before)
-    assert_identical(after.params.policy, before.params.policy)
-    changed = jax.tree.map(lambda x, y: np.any(x != y), after.params.value, before.params.value)
-    assert all(jax.tree.leaves(changed))
+def test_settings_that_no_training_can_have_are_refused():
+    with pytest.raises(UserError, match="rollout_length 2 .* episode of 1 "):
+        ppo.make_trainer(two_state_config(), TwoStates(1.0), episode_steps=1)
+    config = two_state_config(critic_metrics=("n_bounces", "n_bounce"))
+    with pytest.raises(UserError, match="names n_bounce, .* choose from .*n_bounces"):
+        ppo.make_trainer(config, TwoStates(1.0), episode_steps=2)
 
 
 def test_episodes_do_not_all_time_out_together():
@@ -330,17 +278,6 @@ def test_episodes_do_not_all_time_out_together():
     steps = np.asarray(trainer.init(jax.random.key(0)).env.clock)
     assert steps.min() >= 0 and steps.max() < 1000
     assert len(np.unique(steps)) > 8
-
-
-def test_rollout_longer_than_an_episode_is_refused():
-    with pytest.raises(UserError, match="rollout_length 2 .* episode of 1 "):
-        ppo.make_trainer(two_state_config(), TwoStates(1.0), episode_steps=1)
-
-
-def test_unknown_critic_metric_is_refused():
-    config = two_state_config(critic_metrics=("n_bounces", "n_bounce"))
-    with pytest.raises(UserError, match="names n_bounce, .* choose from .*n_bounces"):
-        ppo.make_trainer(config, TwoStates(1.0), episode_steps=2)
 
 
 # The trainer as a pure function
@@ -381,21 +318,14 @@ def after_two(init, run):
 
 
 def test_training_is_a_function_of_its_key(init, run, after_two):
-    assert_identical(run(init(jax.random.key(0)), 2), after_two)
+    """And changes every parameter."""
+    first = init(jax.random.key(0))
+    assert_identical(run(first, 2), after_two)
     other, _ = run(init(jax.random.key(1)), 2)
-    for a, b in zip(
-        jax.tree.leaves(other.params), jax.tree.leaves(after_two[0].params), strict=True
+    for before, a, b in zip(
+        *(jax.tree.leaves(x.params) for x in (first, after_two[0], other)), strict=True
     ):
-        assert np.any(np.asarray(a) != np.asarray(b))
-
-
-def test_training_changes_every_parameter(init, after_two):
-    before = init(jax.random.key(0))
-    after, _ = after_two
-    for a, b in zip(jax.tree.leaves(before.params), jax.tree.leaves(after.params), strict=True):
-        assert np.any(np.asarray(a) != np.asarray(b))
-    assert np.any(jax.random.key_data(before.key) != jax.random.key_data(after.key))
-    assert all_finite((after.params, after.optimizer, after.statistics))
+        assert np.any(np.asarray(a) != np.asarray(b)) and np.any(np.asarray(a) != before)
 
 
 def test_counters(tiny, init, after_two):
@@ -453,28 +383,6 @@ def test_learning_is_in_float32_with_physics_in_float64(tiny):
     assert {x.dtype for x in jax.tree.leaves(learned)} == {jnp.dtype(jnp.float32)}
 
 
-@pytest.mark.slow
-def test_bfloat16_is_used_only_for_the_hidden_layers(tiny, env, init, run):
-    """The state stays in float32, and the update has the same direction as in float32."""
-    config = tiny.model_copy(update={"compute_dtype": "bfloat16"})
-    trainer = ppo.make_trainer(config, env, env.config.episode_steps)
-    before = init(jax.random.key(0))
-    traced = jax.jit(trainer.run, static_argnums=1).trace(before, 1)
-    assert "bf16" in str(traced.jaxpr)
-    after, metrics = traced.lower().compile()(before)
-    assert jax.tree.map(lambda x: x.dtype, after) == jax.tree.map(lambda x: x.dtype, before)
-
-    reference, reference_metrics = run(before, 1)
-    step, reference_step = (
-        np.concatenate([(x - y).ravel() for x, y in zip(*map(jax.tree.leaves, pair), strict=True)])
-        for pair in ((after.params, before.params), (reference.params, before.params))
-    )
-    cosine = step @ reference_step / np.linalg.norm(step) / np.linalg.norm(reference_step)
-    assert 0.9 < cosine < 1.0 - 1e-6
-    # Adam's first steps have the size of the learning rate, whatever the type.
-    np.testing.assert_allclose(metrics["loss/value"], reference_metrics["loss/value"], rtol=0.05)
-
-
 def test_hidden_layers_are_computed_in_bfloat16_and_outputs_not(tiny, env):
     sizes = env.observation_size, env.action_size
     for network in policy.make_networks(tiny, *sizes, dtype="bfloat16"):
@@ -508,7 +416,7 @@ def test_the_first_state_needs_no_lapack(trainer):
     assert "lapack" not in program
 
 
-@pytest.mark.parametrize("size", [1, 2, 6, 64])
+@pytest.mark.parametrize("size", [2, 64])
 def test_random_orders_are_uniform(size):
     keys = jax.random.split(jax.random.PRNGKey(size), 2000)
     orders = np.asarray(jax.vmap(lambda key: ppo.random_order(key, size))(keys))
@@ -517,22 +425,9 @@ def test_random_orders_are_uniform(size):
     counts = np.stack([np.bincount(column, minlength=size) for column in orders.T])
     expected = 2000 / size
     assert np.abs(counts - expected).max() <= 5 * np.sqrt(expected * (1 - 1 / size))
-    if size > 1:
-        # Neighbours are independent: the second is larger than the first in half of the orders.
-        rises = np.mean(orders[:, 1:] > orders[:, :-1], axis=0)
-        assert np.abs(rises - 0.5).max() <= 5 * 0.5 / np.sqrt(2000)
-
-
-def test_equal_random_numbers_leave_a_long_order_random():
-    """With 18 random bits, 512 pairs of neighbours would have equal numbers, and the smaller index
-    first."""
-    size, count = 2**14, 20
-    keys = jax.random.split(jax.random.PRNGKey(0), count)
-    orders = np.asarray(jax.vmap(lambda key: ppo.random_order(key, size))(keys))
-    np.testing.assert_array_equal(np.sort(orders), np.tile(np.arange(size), (count, 1)))
-    # The variance of the number of rises in a permutation is (size + 1) / 12.
-    rises = np.mean(orders[:, 1:] > orders[:, :-1])
-    assert np.abs(rises - 0.5) <= 5 / np.sqrt(12 * count * size)
+    # Neighbours are independent: the second is larger than the first in half of the orders.
+    rises = np.mean(orders[:, 1:] > orders[:, :-1], axis=0)
+    assert np.abs(rises - 0.5).max() <= 5 * 0.5 / np.sqrt(2000)
 
 
 class FaultyBall(BounceBall):

@@ -1,0 +1,242 @@
+"""The physics against MuJoCo's C engine: random states, steps of both, and their differences."""
+
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, edited_model, fused
+from bounce_mjx.resources import resource_path
+from bounce_mjx.robot.model import find_addresses
+
+HOME = np.deg2rad([0.0, 40.0, 110.0, 0.0, -60.0, 0.0])
+HALF_SIZE = np.array([0.05, 0.065, 0.0035])
+RADIUS = 0.019
+DT = 1e-3
+BATCH = 32
+MODEL = PhysicsParameters()
+XML = Path(resource_path("mjcf/bounce_ball.xml")).read_text()
+PICOMETRE = 1e-12
+# Largest difference of one step relative to the largest speed: room for the rounding errors of some
+# thousand operations. (The ball's spin has the largest error: in MuJoCo, rounding of the contact's
+# lever turns the ball; in the fused engine, nothing turns it.)
+ONE_STEP = 1e-11
+
+
+class States(NamedTuple):
+    """Batch of states and servo targets, in the order of the unedited MJCF."""
+
+    qpos: np.ndarray
+    """Generalised positions [N, nq]."""
+    qvel: np.ndarray
+    """Generalised velocities [N, nv]."""
+    ctrl: np.ndarray
+    """Servo targets [N, nu], rad."""
+
+
+def edited(old: str, new: str) -> mujoco.MjModel:
+    """Shipped model with one piece of its MJCF replaced."""
+    assert old in XML
+    return mujoco.MjModel.from_xml_string(XML.replace(old, new, 1))
+
+
+def converged(model: mujoco.MjModel, iterations: int = 100) -> mujoco.MjModel:
+    """The model, edited so that C's solver converges to rounding error.
+
+    In a trajectory the solver starts from the forces of the last step, and 20 iterations suffice.
+    """
+    model.opt.tolerance, model.opt.iterations, model.opt.ls_iterations = 0.0, iterations, 50
+    return model
+
+
+def paddle_frame(mj_model: mujoco.MjModel, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """World position [3] of the paddle's centre and axes [3, 3] by MuJoCo's kinematics."""
+    data = mujoco.MjData(mj_model)
+    data.qpos[find_addresses(mj_model).arm_qpos,] = angles
+    mujoco.mj_kinematics(mj_model, data)
+    return data.geom("blocker").xpos, data.geom("blocker").xmat.reshape(3, 3)
+
+
+def random_states(mj_model: mujoco.MjModel, count: int, seed: int) -> tuple[States, np.ndarray]:
+    """Arm states in a wide range with the ball at the paddle, and the ball's centre [N, 3] in the
+    paddle's frame: in turn around the paddle, inside it, near an edge or a corner, over a face."""
+    rng = np.random.default_rng(seed)
+    qpos, qvel = np.zeros((count, mj_model.nq)), np.zeros((count, mj_model.nv))
+    qpos[:, :6] = rng.uniform(-np.pi, np.pi, (count, 6))
+    qvel[:, :6] = rng.uniform(-6.0, 6.0, (count, 6))
+    qvel[:, 6:9] = rng.uniform(-3.0, 3.0, (count, 3))
+    qvel[:, 9:] = rng.uniform(-30.0, 30.0, (count, 3))
+    quaternion = rng.normal(size=(count, 4))
+    qpos[:, 9:] = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
+
+    local = rng.uniform(-1.0, 1.0, (count, 3)) * (HALF_SIZE + 1.2 * RADIUS)
+    local[1::4] = rng.uniform(-1.0, 1.0, local[1::4].shape) * HALF_SIZE
+    beyond = HALF_SIZE + rng.uniform(0.0, 0.6 * RADIUS, local[2::4].shape)
+    along = np.arange(len(beyond)) % 4  # 3: a corner
+    edge = along < 3
+    beyond[edge, along[edge]] *= rng.uniform(0.0, 0.9, edge.sum())
+    local[2::4] = beyond * rng.choice([-1.0, 1.0], beyond.shape)
+    local[3::4, :2] *= 0.6
+    local[3::4, 2] = rng.choice([-1.0, 1.0], len(local[3::4])) * (
+        HALF_SIZE[2] + RADIUS * rng.uniform(-0.5, 1.1, len(local[3::4]))
+    )
+    for i in range(count):
+        centre, axes = paddle_frame(mj_model, qpos[i, :6])
+        qpos[i, 6:9] = centre + axes @ local[i]
+    ctrl = qpos[:, :6] + rng.uniform(-0.03, 0.03, (count, 6))
+    return States(qpos, qvel, ctrl), local
+
+
+def touching_states(model: mujoco.MjModel, count: int, seed: int) -> States:
+    """`random_states`, but every third ball rolls on the paddle; some of these slip or leave."""
+    states, _ = random_states(model, count, seed)
+    rng = np.random.default_rng(seed)
+    at = find_addresses(model)
+    for i in range(0, count, 3):
+        data = mujoco.MjData(model)
+        states.qvel[i, :6] *= 0.1
+        data.qpos[:], data.qvel[:] = states.qpos[i], states.qvel[i]
+        mujoco.mj_fwdPosition(model, data)
+        centre, axes = paddle_frame(model, states.qpos[i, :6])
+        gap = -rng.uniform(0.0, 0.002)
+        local = np.array([0.8, 0.8, 0.0]) * rng.uniform(-1.0, 1.0, 3) * HALF_SIZE
+        local[2] = HALF_SIZE[2] + RADIUS + gap
+        states.qpos[i, 6:9] = centre + axes @ local
+        contact = states.qpos[i, 6:9] - axes[:, 2] * (RADIUS + 0.5 * gap)
+        jacobian = np.zeros((3, model.nv))
+        mujoco.mj_jac(model, data, jacobian, None, contact, model.geom_bodyid[at.paddle_geom])
+        rotation = np.zeros(9)
+        mujoco.mju_quat2Mat(rotation, states.qpos[i, 9:])
+        turning = np.cross(
+            rotation.reshape(3, 3) @ states.qvel[i, 9:], contact - states.qpos[i, 6:9]
+        )
+        slip = rng.uniform(-1.0, 1.0, 3) * [0.3, 0.3, 0.1] * (i % 2)
+        states.qvel[i, 6:9] = jacobian @ states.qvel[i] - turning + axes @ slip
+    return states
+
+
+def bouncing_states(mj_model: mujoco.MjModel, rng: np.random.Generator) -> PhysicsState:
+    """BATCH states with the arm near home and a spinning ball just above the paddle."""
+    qpos, qvel = np.zeros((BATCH, mj_model.nq)), np.zeros((BATCH, mj_model.nv))
+    qpos[:, :6] = HOME + rng.uniform(-0.2, 0.2, (BATCH, 6))
+    qvel[:, :6] = rng.uniform(-1.0, 1.0, (BATCH, 6))
+    qpos[:, 9] = 1.0
+    for i in range(BATCH):
+        drop_ball(mj_model, qpos[i], qvel[i], rng)
+    return PhysicsState(qpos, qvel)
+
+
+def drop_ball(
+    mj_model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, rng: np.random.Generator
+) -> None:
+    """Puts the ball of one state above the paddle, in place."""
+    qpos[6:9] = paddle_frame(mj_model, qpos[:6])[0]
+    qpos[6:9] += [*rng.uniform(-0.02, 0.02, 2), rng.uniform(0.04, 0.1)]
+    qvel[6:9] = [*rng.uniform(-0.2, 0.2, 2), rng.uniform(-2.0, 0.0)]
+    qvel[9:] = rng.uniform(-30.0, 30.0, 3)
+
+
+def c_steps(
+    models: mujoco.MjModel | list[mujoco.MjModel], states: States
+) -> tuple[PhysicsState, np.ndarray]:
+    """One mj_step from each state in its own model or in the same, and the force of the first
+    contact [N, 3] in its own frame; NaN without a contact."""
+    models = models if isinstance(models, list) else [models] * len(states.qpos)
+    after, forces = [], []
+    for model, *start in zip(models, *states, strict=True):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = start
+        mujoco.mj_step(model, data)
+        wrench = np.full(6, np.nan)
+        if data.ncon:
+            mujoco.mj_contactForce(model, data, 0, wrench)
+        after.append((data.qpos.copy(), data.qvel.copy()))
+        forces.append(wrench[:3])
+    return PhysicsState(*map(np.array, zip(*after, strict=True))), np.array(forces)
+
+
+def num_contacts(forces: np.ndarray) -> int:
+    """Number of states with a contact, from the forces of `c_steps`."""
+    return int(np.sum(~np.isnan(forces[:, 0])))
+
+
+def world(parameters: PhysicsParameters, i: int | slice) -> PhysicsParameters:
+    """Parameters of world i from a batch [N, ...]."""
+    return jax.tree.map(lambda array: np.asarray(array)[i], parameters)
+
+
+def c_models(
+    model: mujoco.MjModel, parameters: PhysicsParameters, count: int
+) -> list[mujoco.MjModel]:
+    """The edited model of each world, with a solver that converges to rounding error."""
+    return [converged(edited_model(model, world(parameters, i))) for i in range(count)]
+
+
+def fused_steps(model: mujoco.MjModel, parameters: PhysicsParameters, states: States):
+    """One fused step from each state, operation by operation."""
+    step = partial(fused.step, fused.read_model(model), num_substeps=1)
+    axes = jax.tree.map(lambda x: 0 if np.ndim(x) else None, parameters)
+    with jax.disable_jit():
+        return jax.vmap(step, in_axes=(axes, 0, 0))(
+            jax.tree.map(jnp.asarray, parameters),
+            PhysicsState(jnp.asarray(states.qpos), jnp.asarray(states.qvel)),
+            Control(jnp.asarray(states.ctrl)),
+        )
+
+
+class CEngine:
+    """Batch of MuJoCo simulations with their own states."""
+
+    def __init__(self, mj_model: mujoco.MjModel, start: PhysicsState):
+        self.model = mj_model
+        self.data = [mujoco.MjData(mj_model) for _ in start.qpos]
+        for data, qpos, qvel in zip(self.data, *start[:2], strict=True):
+            data.qpos[:], data.qvel[:] = qpos, qvel
+
+    def step(self, ctrl: np.ndarray, num_substeps: int) -> int:
+        """Advances all simulations; returns the number of steps with a contact."""
+        contacts = 0
+        for data, targets in zip(self.data, ctrl, strict=True):
+            data.ctrl[:] = targets
+            for _ in range(num_substeps):
+                mujoco.mj_step(self.model, data)
+                contacts += data.ncon
+        return contacts
+
+    @property
+    def state(self) -> PhysicsState:
+        """Copy of all states."""
+        return PhysicsState(
+            np.array([data.qpos for data in self.data]), np.array([data.qvel for data in self.data])
+        )
+
+
+def difference(a: PhysicsState, b: PhysicsState) -> tuple[float, float]:
+    """Largest differences of qpos and of qvel."""
+    return tuple(
+        float(np.max(np.abs(np.asarray(x) - y))) for x, y in zip(a[:2], b[:2], strict=True)
+    )
+
+
+def assert_same_step(actual: PhysicsState, expected: PhysicsState) -> float:
+    """Checks each state to ONE_STEP times its largest speed; returns the largest ratio."""
+    fastest = np.max(np.abs(expected.qvel), axis=1, keepdims=True)
+    error = np.max(np.abs(np.asarray(actual.qvel) - expected.qvel) / fastest)
+    assert error < ONE_STEP
+    # The comparison includes the orientation, which has no unit of length.
+    assert np.max(np.abs(np.asarray(actual.qpos) - expected.qpos) / fastest) < ONE_STEP * DT + 1e-15
+    return float(error)
+
+
+def push_by_air(model: mujoco.MjModel, data: mujoco.MjData, drag: float, lift: float) -> None:
+    """Applies the force of the air on the ball by hand."""
+    ball = model.body("ball_link")
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, data.qpos[9:13] / np.linalg.norm(data.qpos[9:13]))
+    velocity, spin = data.qvel[6:9], rotation.reshape(3, 3) @ data.qvel[9:12]
+    force = lift * np.cross(spin, velocity) - drag * np.linalg.norm(velocity) * velocity
+    data.xfrc_applied[ball.id, :3] = ball.mass[0] * force
