@@ -1,4 +1,4 @@
-"""brax: its registry, wrappers, trainers, checkpoints and pictures on the environment."""
+"""brax's registry, wrappers, trainers, checkpoints and pictures work on the environment."""
 
 import functools
 import json
@@ -113,16 +113,6 @@ def test_brax_draws_the_links_where_mujoco_has_them():
         jax.tree.map(lambda x: jnp.stack([x, x]), state).pipeline_state.x  # noqa: B018
 
 
-def test_brax_renders_states(opengl):
-    env = brax.envs.get_environment("bounce_ball")
-    state = jax.jit(env.reset)(jax.random.PRNGKey(0)).pipeline_state
-    moved = state.replace(
-        task=state.task._replace(physics=state.task.physics._replace(qpos=state.q.at[8].add(0.2)))
-    )
-    first, second = env.render([state, moved], 60, 80, camera="overview")
-    assert first.shape == (60, 80, 3) and not np.array_equal(first, second)
-
-
 # Wrappers
 
 
@@ -167,24 +157,6 @@ def test_step_keeps_what_wrappers_added(env):
     assert after.metrics["mine"] == 1.0
     np.testing.assert_array_equal(after.info["lap"], 1.0)
     assert after.metrics["reward/height"] > 0.0
-
-
-@pytest.mark.slow
-def test_torchrl_steps_the_environment(need):
-    """Its wrapper turns the state into tensors and back."""
-    torchrl, torch = need("torchrl.envs"), need("torch")
-    bounce_ball = BraxBounceBall()
-    envs = torchrl.BraxWrapper(bounce_ball, batch_size=(2,), device="cpu")
-    envs.set_seed(3)
-    data = envs.reset()
-    # TorchRL's keys.
-    _, *keys = jax.random.split(jax.random.PRNGKey(3), 3)
-    state = jax.vmap(bounce_ball.reset)(jnp.stack(keys))
-    step = jax.jit(jax.vmap(bounce_ball.step))
-    for _ in range(2):
-        data = torchrl.utils.step_mdp(envs.step(data.set("action", torch.full((2, 6), 0.5))))
-        state = step(state, jnp.full((2, 6), 0.5))
-        np.testing.assert_allclose(data["observation"], state.obs, rtol=1e-5, atol=1e-6)
 
 
 # Trainers
@@ -267,11 +239,6 @@ def test_brax_checkpoint_has_the_trained_policy(ppo_example):
         np.testing.assert_allclose(action, expected, rtol=1e-3, atol=1e-3)
 
 
-def test_folder_without_a_checkpoint_gives_one_sentence(tmp_path):
-    with pytest.raises(UserError, match="no checkpoint of brax's PPO; give"):
-        load_brax_policy(tmp_path)
-
-
 @pytest.mark.slow
 def test_brax_sac_trains_and_evaluates(env):
     (make_policy, trained, _), history = train(
@@ -308,33 +275,11 @@ def test_brax_apg_learns():
 
 
 def test_device_put_replicated_exists_only_in_the_context(monkeypatch):
-    # If jax still has the function, it is left alone: see the next test.
     monkeypatch.delattr(jax, "device_put_replicated", raising=False)
     with pytest.raises(KeyError), pmap_support.device_put_replicated():
         assert jax.device_put_replicated is pmap_support.replicate
         raise KeyError
     assert not hasattr(jax, "device_put_replicated")
-
-
-def test_device_put_replicated_of_jax_is_left_alone(monkeypatch):
-    own = object()
-    monkeypatch.setattr(jax, "device_put_replicated", own, raising=False)
-    with pmap_support.device_put_replicated():
-        assert jax.device_put_replicated is own
-    assert jax.device_put_replicated is own
-
-
-def test_replicate_copies_arrays_numbers_and_keys():
-    tree = {"a": np.arange(3, dtype=np.int8), "b": 2.5, "key": jax.random.key(3)}
-    copies = pmap_support.replicate(tree, jax.local_devices()[:1])
-    assert copies["a"].dtype == jnp.int8
-    np.testing.assert_array_equal(copies["a"], [[0, 1, 2]])
-    np.testing.assert_array_equal(copies["b"], [2.5])
-    assert jnp.issubdtype(copies["key"].dtype, jax.dtypes.prng_key)
-    assert copies["key"].shape == (1,)
-    np.testing.assert_array_equal(
-        jax.random.key_data(copies["key"])[0], jax.random.key_data(tree["key"])
-    )
 
 
 @pytest.mark.slow

@@ -340,110 +340,26 @@ def test_onnx_equals_jax(name: str, runs: dict[str, Path]) -> None:
     assert 0.0 < np.mean(np.abs(expected) == 1.0) < 0.9
 
 
-@pytest.mark.parametrize("name", ["sensors", "another task"])
-def test_onnx_remembers_as_the_task_does(name: str, runs: dict[str, Path]) -> None:
-    """1,000 steps at once, some of them the first one."""
-    checkpoint, session = find_checkpoint(runs[name]), session_of(runs[name])
-    config = load_run_config(checkpoint.run)
-    inputs, _ = draw_inputs(name, runs)
-    own, rng = config.env.observation.lengths("task"), np.random.default_rng(0)
-    given = {input_name(quantity): values for quantity, values in inputs.items()}
-    measured, remembered = {}, {}
-    for tensor in session.get_inputs():
-        shape = 1000, *tensor.shape[1:]
-        kind, _, quantity = tensor.name.partition("/")
-        if kind == "measured":
-            measured[quantity] = rng.normal(scale=0.3, size=shape).astype(np.float32)
-            given[tensor.name] = measured[quantity]
-        elif kind in ("memory", "step"):
-            draw = {
-                "tensor(float)": rng.normal(scale=0.3, size=shape).astype(np.float32),
-                "tensor(int32)": rng.integers(0, 9, shape).astype(np.int32),
-                "tensor(bool)": rng.random(shape) < 0.5,
-            }
-            given[tensor.name] = draw[tensor.type]
-            remembered[tensor.name] = given[tensor.name]
-    is_first = remembered.pop("step/is_first")
-    results = session.run(None, given)
-    results = dict(zip((output.name for output in session.get_outputs()), results, strict=True))
-
-    task = config.env.task(config.env)
-    newest = dict.fromkeys(QUANTITIES, np.zeros((1000, 6), np.float32)) | measured
-    start, first = jax.vmap(task.first_quantities)(newest)
-    # The inputs of a memory are in the order of its leaves.
-    memory = jax.tree.structure(start).unflatten(remembered.values())
-    past = {quantity: inputs[quantity] for quantity in own}
-    after, later = jax.vmap(task.next_quantities)(memory, past, newest)
-    seen = {
-        name: np.where(
-            is_first[:, None, None], np.asarray(first[name])[:, None], np.asarray(later[name])
-        )
-        for name in own
-    }
-    for quantity, values in seen.items():
-        np.testing.assert_allclose(results[f"next/{quantity}"], values, rtol=1e-6, atol=1e-5)
-        assert np.mean(values != inputs[quantity]) > 0.05
-    leaves = zip(jax.tree.leaves(start), jax.tree.leaves(after), strict=True)
-    for name, (new, old) in zip(remembered, leaves, strict=True):
-        shape = -1, *[1] * (np.ndim(new) - 1)
-        values = np.where(is_first.reshape(shape), new, old)
-        np.testing.assert_allclose(results[f"next/{name}"], values, rtol=1e-6, atol=1e-6)
-    network = network_of(config, reading.read_policy(checkpoint, config))
-    np.testing.assert_allclose(results["action"], network(inputs | seen), rtol=0.0, atol=2e-5)
-
-
 OWN_LIMITS = {"velocity": (2.0,) * 6, "acceleration": (15.0,) * 6, "jerk": (7500.0,) * 6}
 
 
-def test_metadata_describes_inputs_servos_and_training(runs: dict[str, Path]) -> None:
-    model = onnx.load_from_string(export_onnx(find_checkpoint(runs["sensors"])))
-    metadata = from_entries({prop.key: prop.value for prop in model.metadata_props})
-    config = load_run_config(runs["sensors"])
-    assert {p.name: p.history for p in metadata.observation} == {
-        input_name(name): count for name, count in config.env.observation.lengths().items()
-    }
-    assert [p.unit for p in metadata.observation if p.name == "ball_position"] == ["m"]
-    assert metadata.joint_names == tuple(f"Joint{i}" for i in range(1, 7)) and metadata.steps == 64
-    assert metadata.control_dt == config.env.control_dt
-    assert metadata.randomization["camera_rate"] == (80.0, 130.0)
-    assert metadata.commands == {"target_height": CommandRange((0.4, 0.6), "m")}
-    assert metadata.servo_stiffness == (20000.0,) * 6 and metadata.servo_damping == (200.0,) * 6
-    assert metadata.torque_limits == (None,) * 6
+def test_metadata_describes_the_training_and_survives_the_file() -> None:
     ranges = {"air_drag": (0.0, 0.2), "paddle_tilt": ((-0.08, 0.01), (-0.07, 0.03))}
     limits = {"robot": {"limits": OWN_LIMITS}, "action": {"base": "target"}}
-    other = policy_metadata(TrainConfig(env={"randomization": ranges} | limits), 0)
-    assert other.limits == CommandLimits(**OWN_LIMITS) and from_entries(to_entries(other)) == other
-    assert other.randomization == {
+    metadata = policy_metadata(TrainConfig(env={"randomization": ranges} | limits), 64)
+    assert from_entries(to_entries(metadata)) == metadata
+    assert metadata.limits == CommandLimits(**OWN_LIMITS) and metadata.steps == 64
+    assert metadata.randomization == {
         "air_drag": (0.0, 0.2), "paddle_tilt[0]": (-0.08, -0.07), "paddle_tilt[1]": (0.01, 0.03)
     }  # fmt: skip
-    shapes = {
-        tensor.name: [d.dim_value or d.dim_param for d in tensor.type.tensor_type.shape.dim]
-        for tensor in model.graph.input
+    config = EnvConfig()
+    assert {p.name: p.history for p in metadata.observation} == {
+        input_name(name): count for name, count in config.observation.lengths().items()
     }
-    for part in metadata.observation:
-        assert shapes[part.name] == ["N", part.history, part.size]
-    # The bounces depend on these measurements and on no other ones.
-    assert {name for name in shapes if name.startswith("measured/")} == {
-        f"measured/{name}"
-        for name in "ball_picture ball_position joint_angles joint_velocities paddle_position "
-        "target_height".split()
-    }
-
-
-def test_servo_targets_are_those_of_the_environment() -> None:
-    env, policy = BounceBall(EnvConfig()), load_policy("pretrained")
-    rng = np.random.default_rng(0)
-    limits = np.array(policy.metadata.joint_ranges)
-    for _ in range(20):
-        # Some angles are at the limits of their ranges.
-        angles = np.clip(rng.uniform(1.2 * limits[:, 0], 1.2 * limits[:, 1]), *limits.T)
-        state = env.reset(jax.random.PRNGKey(0)).pipeline_state
-        physics = state.physics._replace(qpos=state.physics.qpos.at[:6].set(angles))
-        action = rng.uniform(-1.0, 1.0, 6)
-        policy.reset()
-        policy.step(measured_once() | {"joint_angles": angles})
-        expected = env.servo_targets(physics, jnp.asarray(action, jnp.float32))
-        np.testing.assert_allclose(policy.servo_targets(action), expected, atol=1e-6)
+    assert metadata.joint_names == tuple(f"Joint{i}" for i in range(1, 7))
+    assert metadata.control_dt == config.control_dt and metadata.torque_limits == (None,) * 6
+    assert metadata.commands == {"target_height": CommandRange((0.4, 0.6), "m")}
+    assert metadata.servo_stiffness == (20000.0,) * 6 and metadata.servo_damping == (200.0,) * 6
 
 
 def test_servo_targets_lead_the_measured_angles_as_in_the_environment() -> None:
@@ -578,19 +494,6 @@ def test_a_policy_of_two_balls_sees_what_the_environment_sees(tmp_path: Path) ->
             policy.step(measured | now.command | {"ball_position": wrong})
 
 
-def test_velocity_is_the_difference_of_the_last_two_pictures(tmp_path: Path) -> None:
-    """Without a measured age, a picture is new if the ball has moved."""
-    observation = dict.fromkeys(QUANTITIES, 0)
-    observation |= {"ball_velocity": 1, "velocity": "differences"}
-    policy = load_policy(make_run(tmp_path / "run", {"observation": observation}))
-    assert policy.needs == ("ball_position",)
-    speeds = []
-    for x in (0.0, 0.001, 0.001, 0.005, 0.005, 0.005, 0.002):
-        policy.step({"ball_position": [x, 0.0, 0.3]})
-        speeds.append(policy.observation[0])
-    np.testing.assert_allclose(speeds, [0.0, 0.1, 0.1, 0.2, 0.2, 0.2, -0.1], atol=1e-12)
-
-
 def measured_once() -> dict:
     """Valid measurements for every policy of these tests."""
     return {
@@ -705,70 +608,33 @@ def test_the_shipped_file_is_a_fresh_export(name: str, runs: dict[str, Path]) ->
 
 
 def test_load_policy_refuses_other_files(tmp_path: Path) -> None:
-    with pytest.raises(
-        UserError, match="nowhere.onnx cannot be read .*give pretrained, robust, .*iiwa"
-    ):
+    with pytest.raises(UserError, match="nowhere.onnx cannot be read .*give pretrained, robust, "):
         load_policy("nowhere.onnx")
     with pytest.raises(UserError, match="not in a run's folder"):
         load_policy(tmp_path)
     shipped = resource_path("pretrained/pretrained.onnx").read_bytes()
-    foreign = onnx.load_from_string(shipped)
-    del foreign.metadata_props[:]
-    older = onnx.load_from_string(shipped)
-    entries = {prop.key: prop for prop in older.metadata_props}
-    entries["format"].value = "1"
-    older.metadata_props.remove(entries["chain"])
-    unknown = onnx.load_from_string(shipped)
-    for prop in unknown.metadata_props:
-        prop.value = prop.value.replace("ball_velocity", "ball_colour")
-    broken = {
-        "ball_colour": unknown.SerializeToString(),
-        "text": b"hello",
-        "half": shipped[: len(shipped) // 2],
-        "lacks format": foreign.SerializeToString(),
-        "format is 1, not 3": older.SerializeToString(),
+    broken = {"": b"hello", " ": shipped[: len(shipped) // 2]}
+    model = onnx.load_from_string(shipped)
+    broken |= {
+        "ball_colour": edited(model, "observation", "ball_velocity", "ball_colour"),
+        "format is 1, not 3": edited(model, "format", "3", "1"),
+        "Kalman filter, .* 0.1.0": edited(model, "velocity", "measured", "filter"),
     }
+    del model.metadata_props[:]
+    broken["lacks format"] = model.SerializeToString()
     for reason, content in broken.items():
         (tmp_path / "a.onnx").write_bytes(content)
-        with pytest.raises(
-            UserError, match="a.onnx is not a policy .*bounce-mjx export"
-        ) as refusal:
+        with pytest.raises(UserError, match=f"a.onnx is not a policy .*{reason}"):
             load_policy(tmp_path / "a.onnx")
-        assert reason in ("text", "half") or reason in str(refusal.value)
 
 
-@pytest.fixture(scope="module")
-def curious(tmp_path_factory: pytest.TempPathFactory) -> onnx.ModelProto:
-    """A policy that sees every kind of quantity."""
-    observation = ALL | {"velocity": "differences", "ball_velocity": 2}
-    run = make_run(tmp_path_factory.mktemp("curious") / "run", {"observation": observation})
-    model = export_onnx(find_checkpoint(run))
-    DeployedPolicy(model, "the file before the edits")
-    return onnx.load_from_string(model)
-
-
-def edited(model: onnx.ModelProto, name: str, text: str) -> bytes:
-    """An ONNX file with another text of an entry."""
+def edited(model: onnx.ModelProto, name: str, old: str, new: str) -> bytes:
+    """An ONNX file with another text in an entry."""
     copy = onnx.ModelProto.FromString(model.SerializeToString())
     (prop,) = (prop for prop in copy.metadata_props if prop.key == name)
-    prop.value = text
+    assert old in prop.value
+    prop.value = prop.value.replace(old, new)
     return copy.SerializeToString()
-
-
-def test_a_policy_with_a_filter_is_refused(curious: onnx.ModelProto) -> None:
-    with pytest.raises(UserError, match="a.onnx is not a policy .*Kalman filter, .* 0.1.0"):
-        DeployedPolicy(edited(curious, "velocity", '"filter"'), "a.onnx")
-
-
-def test_a_network_that_gives_no_number_is_refused(curious: onnx.ModelProto) -> None:
-    copy = onnx.ModelProto.FromString(curious.SerializeToString())
-    for tensor in copy.graph.initializer:
-        array = onnx.numpy_helper.to_array(tensor).copy()
-        # The biases of the last layer are among them.
-        if array.shape == (6,) and array.dtype == np.float32:
-            tensor.CopyFrom(onnx.numpy_helper.from_array(array * np.nan, tensor.name))
-    with pytest.raises(UserError, match="a.onnx is not a policy .*not finite"):
-        DeployedPolicy(copy.SerializeToString(), "a.onnx")
 
 
 def test_no_servo_targets_for_a_wrong_action(policies) -> None:
@@ -848,34 +714,9 @@ def test_only_the_robust_policy_bounces_with_a_late_camera() -> None:
     assert lost_bounces < 5 and lost_at < 4.0
 
 
-def test_the_example_prints_bounces_and_time(monkeypatch, capsys) -> None:
-    source = CHECKOUT / "examples" / "deploy.py"
-    assert len(source.read_text(encoding="utf-8").splitlines()) <= 100
-    monkeypatch.setattr(sys, "argv", ["deploy.py", "pretrained", "--seconds", "0.6"])
-    runpy.run_path(str(source), run_name="__main__")
-    # The ball falls 0.36 m in 0.27 s and returns 0.5 s later.
-    assert capsys.readouterr().out == "1 bounces in 0.6 s of 0.6 s\n"
-
-
 def test_command_writes_the_file(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     export_command.main("pretrained --onnx policy.onnx".split())
     fresh = export_onnx(pretrained_checkpoint())
     assert (tmp_path / "policy.onnx").read_bytes() == fresh
     assert "written: policy.onnx" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("args", "words"),
-    [
-        ("pretrained", "give --onnx FILE"),
-        ("pretrained --onnx nowhere/a.onnx", "folder of --onnx nowhere/a.onnx does not exist"),
-    ],
-)
-def test_command_refuses(args: str, words: str, tmp_path: Path, monkeypatch, capsys) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as exit_info:
-        export_command.main(args.split())
-    error = capsys.readouterr().err
-    assert exit_info.value.code == 2 and words in error and error.count("\n") == 1
-    assert not list(tmp_path.iterdir())

@@ -2,7 +2,6 @@
 
 import functools
 import itertools
-import pickle
 import re
 from pathlib import Path
 
@@ -176,14 +175,6 @@ def test_task_page_has_the_layout():
 # Reset
 
 
-def test_a_pickled_environment_is_the_same_environment() -> None:
-    env = BounceBall(EnvConfig(target_height_range=(0.7, 0.7)))
-    copy = pickle.loads(pickle.dumps(env))
-    assert type(copy) is BounceBall and copy.config == env.config
-    key = jax.random.PRNGKey(0)
-    np.testing.assert_array_equal(copy.reset(key).obs, env.reset(key).obs)
-
-
 N_RESETS = 2000
 
 
@@ -236,16 +227,6 @@ def test_reset_is_a_function_of_its_key(reset):
 
 
 NO_NOISE = {"joint_angles": 0, "joint_velocities": 0, "ball_position": 0}
-# Of the configs of 0.1.0.
-FORMER_NO_NOISE = dict.fromkeys(
-    ("joint_angle_noise", "joint_velocity_noise", "ball_position_noise"), 0
-)
-
-
-def test_a_reset_has_its_noise_in_one_place() -> None:
-    assert EnvConfig(**FORMER_NO_NOISE) == EnvConfig(reset=NO_NOISE)
-    both = EnvConfig(joint_angle_noise=0.5, reset={"ball_position": 0.3}).reset
-    assert (both.joint_angles, both.ball_position) == (0.5, 0.3)
 
 
 def test_a_config_of_an_earlier_version_has_no_filter() -> None:
@@ -264,12 +245,6 @@ def test_noise_free_reset_has_the_paddle_at_home():
     np.testing.assert_allclose(obs[25:28], [0.59356, 0, 0.04980], atol=1e-5)
     np.testing.assert_allclose(obs[25:28], PADDLE_HOME, atol=1e-5)
     assert obs[28] == np.float32(0.8)
-
-
-def test_another_arm_starts_with_the_ball_over_its_paddle():
-    settings = EnvConfig.settings_at((0.4, -0.2, 0.3))
-    assert settings["ball_init_pos"] == [0.4, -0.2, 0.7]
-    assert (settings["reward"]["target_x"], settings["reward"]["target_y"]) == (0.4, -0.2)
 
 
 # Actions

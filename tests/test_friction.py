@@ -32,7 +32,6 @@ from bounce_mjx.physics import (
     Control,
     PhysicsParameters,
     PhysicsState,
-    fused,
     make_engine,
 )
 from bounce_mjx.physics.support import unsupported_feature
@@ -263,36 +262,6 @@ def test_one_step_with_dry_friction_is_mujocos(name, record_property, tmp_path, 
 
 
 @pytest.mark.usefixtures("float64")
-@pytest.mark.slow
-def test_a_joint_holds_below_its_dry_friction(mj_model):
-    """A weak servo pushes one joint with 5 N m. Below its dry friction, the joint creeps at the
-    speed of MuJoCo's soft constraint; beyond it, the friction subtracts from the torque."""
-    loss = np.zeros((3, 6))
-    loss[:, 0] = [0.0, 2.0, 10.0]
-    parameters = PhysicsParameters(
-        frictionloss=jnp.asarray(loss),
-        servo_gain=jnp.full((3, 6), 1e-3),
-        servo_damping=jnp.zeros((3, 6)),
-        damping=jnp.zeros((3, 6)),
-        gravity=jnp.zeros((3, 3)),
-    )
-    qpos = np.tile(mj_model.qpos0, (3, 1))
-    qpos[:, 8] = 2.0  # the ball is away
-    ctrl = qpos[:, :6].copy()
-    ctrl[:, 0] += 5.0 / 1e-3
-    state = PhysicsState(jnp.asarray(qpos), jnp.zeros((3, mj_model.nv)))
-    step = make_engine(mj_model, "fused").step
-    state = jax.jit(jax.vmap(lambda p, s, u: step(p, s, Control(u), 8)))(parameters, state, ctrl)
-    free, slid, held = np.asarray(state.qvel)[:, 0]
-    assert free > 0.02
-    assert slid == pytest.approx((5.0 - 2.0) / 5.0 * free, rel=0.01)
-    # MuJoCo's defaults: impedance 0.9 at no violation, at most 0.95, time constant 0.02 s.
-    softness = (1.0 - 0.9) / 0.9 * mj_model.dof_invweight0[0]
-    assert 0.0 < held <= 1.01 * softness * 5.0 * (0.95 * 0.02 / 2.0)
-    assert held < 0.1 * free
-
-
-@pytest.mark.usefixtures("float64")
 def test_dry_friction_follows_its_flag():
     """With the flag off, C ignores the model's dry friction and a given one."""
     model = edited("<flag ", '<flag frictionloss="disable" ')
@@ -329,21 +298,3 @@ def test_mjx_refuses_given_dry_friction(mj_model):
     given = PhysicsParameters(frictionloss=jnp.full(6, 10.0))
     with pytest.raises(UserError, match="dry friction .*--physics fused"):
         engine.step(given, state, Control(jnp.zeros(mj_model.nu)), 1)
-
-
-def test_no_dry_friction_leaves_the_program_alone(mj_model):
-    """A model without dry friction has the program of a model in which the flag is off."""
-    off = edited("<flag ", '<flag frictionloss="disable" ')
-    state = PhysicsState(jnp.zeros(mj_model.nq), jnp.zeros(mj_model.nv))
-    programs = [
-        str(
-            jax.make_jaxpr(
-                lambda s, u, m=m: fused.step(
-                    fused.read_model(m), PhysicsParameters(), s, Control(u)
-                )
-            )(state, jnp.zeros(mj_model.nu))
-        )
-        for m in (mj_model, off)
-    ]
-    assert programs[0] == programs[1]
-    assert "while" not in programs[0]

@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 
 from bounce_mjx import task
-from bounce_mjx.env.env import Env
 from bounce_mjx.robot.model import find_addresses, load_model
-from bounce_mjx.tasks.juggle import REST, Config, Juggle, Rewards
-from bounce_mjx.viewers.display import Display
+from bounce_mjx.tasks.juggle import REST, Config, Juggle
 
 JUGGLE = Juggle(Config())
 HOME = np.array(JUGGLE.config.home)
@@ -138,19 +136,6 @@ def test_the_reward_of_turns_is_greatest_half_a_period_apart() -> None:
         assert rewards[2] == pytest.approx(JUGGLE.config.reward.turn.weight, rel=1e-3)
 
 
-class WithConstant(Rewards):
-    decay: float = 0.5
-    """A setting that is no term."""
-
-
-def test_a_setting_of_the_reward_may_be_no_term() -> None:
-    balls, velocities = (np.asarray(x) for x in JUGGLE.throw(jnp.zeros(0), {"target_height": 0.5}))
-    action, state = jnp.zeros(6), (jnp.array([False, True]), 1.0)
-    now = task.Step(truth(balls, velocities), {"target_height": jnp.float32(0.5)}, action, action)
-    reward = Juggle(Config(reward=WithConstant())).step(state, now).reward
-    assert reward.keys() == Rewards.model_fields.keys()
-
-
 def test_the_policy_sees_the_ball_that_lands_next() -> None:
     rng = np.random.default_rng(1)
     observe = jax.jit(lambda measured: JUGGLE.first_quantities(measured)[1]["next_ball"])
@@ -173,19 +158,6 @@ def test_the_policy_sees_the_ball_that_lands_next() -> None:
         expected = [there - paddle[:2], there - columns[ball, :2], velocities[ball, :2]]
         expected += [[top, times[ball], times.mean() - times[ball]]]
         np.testing.assert_allclose(seen, np.concatenate(expected), atol=2e-6)
-
-
-def test_the_picture_shows_all_balls_and_the_next_landing() -> None:
-    env = Env(JUGGLE.config)
-    state = env.reset(jax.random.PRNGKey(0)).pipeline_state
-    display, qpos = Display(env), np.asarray(state.physics.qpos)
-    display.pose(qpos, {"target_height": 0.5}, {"landing_x": 0.6, "landing_y": 0.02})
-    data = display.data
-    for ball, name in zip(env.addresses.balls, ("ball", "ball2"), strict=True):
-        np.testing.assert_allclose(data.geom(name).xpos, qpos[list(ball.qpos[:3])], atol=1e-9)
-    np.testing.assert_allclose(data.body("marker next ball").xpos[:2], (0.6, 0.02))
-    tops = [data.body(f"marker target height {i}").xpos for i in (1, 2)]
-    np.testing.assert_allclose(tops, JUGGLE.config.columns(0.5))
 
 
 def test_results_judge_what_the_issue_asks_for() -> None:

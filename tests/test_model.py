@@ -169,35 +169,3 @@ def test_further_balls_bounce_and_touch_each_other(num_balls=3):
         expected, _ = dropped(alone, position)
         assert np.ptp(expected[200:]) > 0.2
         np.testing.assert_allclose(heights[:400, i], expected[:400, 0], atol=1e-3)
-
-
-OWN_BALL = (
-    "</worldbody>",
-    '<body name="ball_link2"><freejoint/><geom name="mine" size="0.03" mass="0.01"/></body>'
-    "</worldbody>",
-)
-OWN_PAIRS = ("</contact>", '<pair geom1="mine" geom2="ball" solref="-500 -5"/></contact>')
-
-
-def test_a_ball_of_the_mjcf_stays_as_it_is(tmp_path):
-    text = XML
-    for old, new in (OWN_BALL, OWN_PAIRS):
-        text = text.replace(old, new, 1)
-    mjcf = tmp_path / "robot.xml"
-    mjcf.write_text(text)
-    model = load_model(mjcf, 0.001, num_balls=3)
-    first, own, third = find_addresses(model).balls
-    assert [model.geom_size[ball.geom, 0] for ball in (first, own, third)] == [0.019, 0.03, 0.019]
-    names = [
-        {model.geom(int(geom)).name for geom in geoms}
-        for geoms in zip(model.pair_geom1, model.pair_geom2, strict=True)
-    ]
-    assert sorted(map(sorted, names)) == [
-        ["ball", "ball3"], ["ball", "blocker"], ["ball", "mine"], ["ball3", "blocker"],
-        ["ball3", "mine"],
-    ]  # fmt: skip
-    assert model.pair_solref[names.index({"ball", "mine"})].tolist() == [-500.0, -5.0]
-    assert model.pair_solref[names.index({"ball", "ball3"})].tolist() == [-98696.0, -31.4]
-    with pytest.raises(UserError, match="2 balls .*but num_balls is 1; set it to 2") as error:
-        load_model(mjcf, 0.001)
-    assert str(mjcf) in str(error.value)

@@ -1,8 +1,6 @@
 """A deployed policy's commands stay within the limits; its supervisor brakes at every fault."""
 
-import copy
 import math
-import pickle
 from typing import Any
 
 import jax
@@ -12,7 +10,7 @@ import pytest
 
 from bounce_mjx import BounceBall, EnvConfig, load_policy
 from bounce_mjx.deploy.chain import Chain
-from bounce_mjx.deploy.faults import allowed, faults, first_fault, picture_age
+from bounce_mjx.deploy.faults import picture_age
 from bounce_mjx.deploy.metadata import CommandLimits
 from bounce_mjx.deploy.policy import DeployedPolicy
 from bounce_mjx.errors import UserError
@@ -333,48 +331,6 @@ def test_an_arm_is_home_when_its_angles_are() -> None:
     for _ in range(60):
         arm.commands({"joint_angles": HOME + 0.008})
     assert arm.state == "ready"
-
-
-def test_the_table_judges_recorded_steps_as_single_ones() -> None:
-    metadata, rng = load_policy("ur5e").metadata, np.random.default_rng(0)
-    bounds = allowed(metadata, 0.1, 2.0, np.array([[-1.0] * 3, [1.0] * 3]))
-    size, steps = (2, 40), bounds["angles"].window + 1
-    # Some joints rest, though they are asked to move.
-    moves = np.cumsum(rng.normal(0.0, 0.03, (*size, steps, 6)), axis=-2)
-    angles = HOME + moves * rng.choice([0.0, 1.0], (*size, 1, 6), p=[0.1, 0.9])
-    recorded = {
-        "elapsed": rng.uniform(0.0, 0.021, size),
-        "idle": rng.integers(0, 4, size),
-        "age": rng.uniform(-0.002, 0.11, size),
-        "ball": rng.normal(0.0, 1.0, (*size, 1, 3)),
-        "ball_velocity": rng.normal(0.0, 5.0, (*size, 1, 3)),
-        "ball_motion": rng.normal(0.0, 10.0, (*size, 1, 3)),
-        "earlier_ball": rng.normal(0.0, 1.0, (*size, 1, 3)),
-        "paddle": rng.normal(0.0, 0.1, (*size, 3)),
-        "velocities": rng.normal(0.0, 1.5, (*size, 6)),
-        "angles": angles,
-        "commands": HOME + rng.uniform(-0.1, 0.1, (*size, steps, 6)),
-        "target": rng.normal(0.0, 0.5, (*size, 3)),
-    }
-    found = faults(bounds, recorded)
-    for rule, broken, number in found:
-        assert broken.shape == number.shape == size and 0 < np.sum(broken) < 80, rule.fault
-    for at in np.ndindex(size):
-        codes = [rule.fault for rule, broken, _ in found if broken[at]]
-        single = first_fault(bounds, {name: value[at] for name, value in recorded.items()})
-        assert (single and single[0]) == (codes[0] if codes else None)
-
-
-def test_a_policy_can_be_copied_in_the_middle_of_an_episode() -> None:
-    arm = running()
-    others = copy.deepcopy(arm), pickle.loads(pickle.dumps(arm))
-    for i in range(25, 30):
-        arm.step(**flying(i))
-    for other in others:
-        assert len(other.rows) < len(arm.rows)
-        for i in range(25, 30):
-            other.step(**flying(i))
-        np.testing.assert_array_equal(other.rows, arm.rows)
 
 
 def test_joints_may_have_the_names_of_the_driver() -> None:

@@ -19,7 +19,6 @@ from against_c import (
     edited,
     fused_steps,
     num_contacts,
-    paddle_frame,
     push_by_air,
     random_states,
     world,
@@ -121,18 +120,6 @@ def test_nothing_given_leaves_the_program_alone(mj_model):
     assert not default.consts
     given = jax.make_jaxpr(step)(PhysicsParameters(ball_mass=jnp.ones(())), state, Control(ctrl))
     assert len(given.in_avals) == 4
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("choice", ("fused", pytest.param("mjx", marks=pytest.mark.separate_loops)))
-@pytest.mark.usefixtures("float64")
-def test_paddle_position_follows_its_parameter(mj_model, choice):
-    parameters = random_parameters(mj_model, 1, seed=8)
-    qpos = np.random.default_rng(0).uniform(-1.0, 1.0, mj_model.nq)
-    expected, _ = paddle_frame(edited_model(mj_model, world(parameters, 0)), qpos[:6])
-    engine = make_engine(mj_model, choice)
-    position = jax.jit(engine.paddle_position)(world(parameters, 0), qpos)
-    np.testing.assert_allclose(position, expected, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -245,29 +232,17 @@ def test_c_evaluates_each_episode_in_its_own_world(networks, untrained):
     assert len(episode_models(BounceBall(config), MODEL)) == 1
 
 
-STATEFUL = {
-    "activations": ('<position kp="20000"', '<position timeconst="0.02" kp="20000"'),
-    "delayed sensor": (
-        "<actuator>",
-        '<sensor><jointpos joint="Joint1" delay="0.005" nsample="9"/></sensor><actuator>',
-    ),
-}
-
-
-@pytest.mark.parametrize("name", STATEFUL)
-def test_c_evaluation_carries_the_whole_state(name):
+def test_c_evaluation_carries_the_whole_state():
     """Control steps of the evaluation equal an uninterrupted run of mj_step."""
-    model = edited(*STATEFUL[name])
+    model = edited('<position kp="20000"', '<position timeconst="0.02" kp="20000"')
     rng = np.random.default_rng(0)
     qpos = np.tile(model.qpos0, (2, 1)) + 0.1
-    act = np.array(qpos[:, :6]) if model.na else None
-    start = PhysicsState(qpos.T, 0.1 * np.ones((model.nv, 2)), None if act is None else act.T)
+    act = np.array(qpos[:, :6])
+    start = PhysicsState(qpos.T, 0.1 * np.ones((model.nv, 2)), act.T)
     states = full_states(model, start)
     data = [mujoco.MjData(model) for _ in range(2)]
     for i, d in enumerate(data):
-        d.qpos[:], d.qvel[:] = qpos[i], 0.1
-        if act is not None:
-            d.act[:] = act[i]
+        d.qpos[:], d.qvel[:], d.act[:] = qpos[i], 0.1, act[i]
     with rollout.Rollout(nthread=1) as pool:
         for _ in range(3):
             ctrl = qpos[:, :6] + rng.uniform(-0.05, 0.05, (2, 6))
@@ -279,10 +254,7 @@ def test_c_evaluation_carries_the_whole_state(name):
     after = physics_states(model, states)
     np.testing.assert_allclose(after.qpos.T, [d.qpos for d in data], rtol=1e-6)
     np.testing.assert_allclose(after.qvel.T, [d.qvel for d in data], rtol=1e-6, atol=1e-9)
-    if model.na:
-        np.testing.assert_allclose(after.act.T, [d.act for d in data], rtol=1e-6)
-    else:
-        assert after.act is None
+    np.testing.assert_allclose(after.act.T, [d.act for d in data], rtol=1e-6)
 
 
 def test_filtered_servos_start_at_rest():

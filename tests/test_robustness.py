@@ -2,7 +2,6 @@
 
 import io
 import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -24,10 +23,9 @@ from bounce_mjx.evaluation.robustness import (
     measure_conditions,
 )
 from bounce_mjx.evaluation.statistics import Statistics
-from bounce_mjx.evaluation.suite import Condition, load_suite, neutral_range, read_suite
+from bounce_mjx.evaluation.suite import Condition, load_suite, read_suite
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Networks, Policy, networks_of
-from bounce_mjx.reports.page import write_report
 from bounce_mjx.reports.robustness import (
     load_robustness,
     misses,
@@ -348,21 +346,6 @@ def test_every_condition_gets_its_own_ranges_and_outcome(tmp_path: Path, monkeyp
     ]
 
 
-def test_neutral_ranges_are_of_the_world_as_it_is() -> None:
-    env = EnvConfig(target_height_range=(0.3, 0.5))
-    for name, term in TERMS.items():
-        bounds = neutral_range(name, env)
-        if term.nominal is not None:
-            np.testing.assert_array_equal(
-                bounds, np.full((2, *term.shape(env.num_joints)), term.nominal)
-            )
-    np.testing.assert_array_equal(neutral_range("target_height", env), [0.3, 0.5])
-    # Wider ranges of a training are perturbations: the suite is the same for all such policies.
-    wide = EnvConfig(target_height_range=(0.3, 0.8))
-    np.testing.assert_array_equal(neutral_range("target_height", wide), [0.4, 0.6])
-    assert neutral_range("camera_rate", env) is None
-
-
 # Table and figure
 
 
@@ -484,31 +467,6 @@ def test_a_damaged_report_is_refused(report: RobustnessReport, tmp_path: Path) -
             load_robustness(tmp_path)
 
 
-def test_report_page_shows_the_picture(
-    report: RobustnessReport, tmp_path: Path, monkeypatch
-) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(pretrained_checkpoint().run, run)
-    monkeypatch.setattr("bounce_mjx.reports.page.group_runs", lambda runs: [])
-    monkeypatch.setattr(
-        "bounce_mjx.reports.page.evaluation_figure", lambda *_: robustness_figure(report)
-    )
-    monkeypatch.setattr(
-        "bounce_mjx.reports.page.curves_figure", lambda *_: robustness_figure(report)
-    )
-    monkeypatch.setattr(
-        "bounce_mjx.reports.page.rewards_figure", lambda _: robustness_figure(report)
-    )
-    page, _ = write_report(run, None)
-    assert "Perturbed worlds" not in page.read_text(encoding="utf-8")
-    (run / "robustness.json").write_text(report.model_dump_json(), encoding="utf-8")
-    page, _ = write_report(run, None)
-    assert "Perturbed worlds" in page.read_text(encoding="utf-8")
-    (run / "robustness.json").write_text("{}", encoding="utf-8")
-    with pytest.raises(UserError, match="robustness.json is damaged .*delete it"):
-        write_report(run, None)
-
-
 # Another task
 
 
@@ -535,47 +493,3 @@ def test_a_perturbation_of_one_task_is_skipped_for_others(tmp_path: Path) -> Non
         suite(tmp_path, dict(name="target", terms={"target_height": 0.5}), trained=dribble)
     with pytest.raises(UserError, match="apex .0.001, 0.001. leaves 0.01 to inf"):
         suite(tmp_path, dict(name="apex", terms={"apex": 0.001}), trained=dribble)
-
-
-def test_another_task_is_measured_in_perturbed_worlds(tmp_path: Path, monkeypatch) -> None:
-    """The table and the figure name its results; the figures of this fake evaluator are of its
-    commands."""
-    conditions = suite(
-        tmp_path,
-        dict(name="apex", unit="cm", strengths=[7, 9], terms={"apex": "strength"}),
-        trained=find_task(DRIBBLE).Config(),
-    )
-
-    def make_evaluator(env, networks, count):
-        def evaluate(policy, key, ranges):
-            wished = np.repeat(ranges["apex"][0], 2)
-            sums = {"apexes": 400.0 * wished, "low_apexes": np.full(count, 28.0)}
-            return Statistics(
-                running=np.array([True, True, True, False]),
-                steps=np.full(count, 100.0),
-                episode_return=np.zeros(count),
-                tally=Tally(sums | {"seconds": np.full(count, 10.0)}),
-            )
-
-        return evaluate
-
-    monkeypatch.setattr(robustness, "make_evaluator", make_evaluator)
-    outcomes = measure_conditions(None, networks_of(PPOConfig()), conditions, EvaluationOptions(2))
-    # 28 apexes in 10 s, all of them low, and 36 of which 28 are low.
-    values = [[*outcome.values.values()] for outcome in outcomes]
-    np.testing.assert_allclose(values, [[100.0, 2.8, 100.0], [2800 / 36, 3.6, 50.0]], rtol=1e-5)
-    assert [outcome.failed for outcome in outcomes] == [["rate"], ["height", "stable"]]
-    assert [outcome.lasted for outcome in outcomes] == [1.0, 0.5]
-    report = RobustnessReport(
-        checkpoint="", steps=0, suite="", episodes=2, seed=0,
-        measured=outcomes[0].measured, outcomes=outcomes,
-    )  # fmt: skip
-    stream = io.StringIO()
-    Console(file=stream, width=80).print(robustness_table(report))
-    lines = [line.strip() for line in stream.getvalue().splitlines()]
-    assert {"R  rate: apexes a second", "H  height: apexes 5 to 10 cm high, %"} <= {*lines}
-    (row,) = [line.split() for line in lines if "9 cm" in line]
-    assert row == ["9", "cm", "77.8*", "3.60", "50.0*", "FAIL"]
-    axes = robustness_figure(report).axes
-    words = [text.get_text() for ax in axes for text in (*ax.texts, *ax.get_yticklabels())]
-    assert {"R", "HS", "7", "9", "apex, cm"} <= {*words}

@@ -13,11 +13,7 @@ from scipy import stats
 from scipy.interpolate import CubicHermiteSpline
 
 from bounce_mjx import BounceBall, EnvConfig
-from bounce_mjx.evaluation.episodes import make_evaluator
-from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.metrics import PRIVILEGED
-from bounce_mjx.learning.policy import Policy, make_networks
-from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.physics import PhysicsState
 from bounce_mjx.world import noise
 
@@ -247,22 +243,6 @@ def test_servo_targets_start_from_the_measured_angles(watch) -> None:
     assert np.abs(measured - trajectory()[0][:-1, :6]).max() > 0.03
 
 
-def test_the_first_observation_is_measured_like_the_others(watch) -> None:
-    """Its errors have the sizes of all others, and histories repeat it."""
-    sizes = {"ball_position": 0.02, "joint_angle": 0.01, "joint_velocity": 0.2}
-    noisy = {f"{name}_noise": (size, size) for name, size in sizes.items()}
-    seen, clean = watch(**noisy), watch()
-    names = ("ball_position", "joint_angles", "joint_velocities")
-    for name, size in zip(names, sizes.values(), strict=True):
-        first = seen.first[name]
-        error = (first - clean.first[name])[:, 0].ravel()
-        assert stats.kstest(error / size, "norm").pvalue > 1e-3
-        np.testing.assert_array_equal(first, first[:, :1].repeat(PARTS[name], axis=1))
-    bias = watch(encoder_bias=(-0.05, 0.05))
-    error = bias.first["joint_angles"][:, 0] - trajectory()[0][0, :6]
-    np.testing.assert_allclose(error, bias.world["encoder_bias"], atol=1e-9)
-
-
 def test_the_critic_may_see_the_world_and_the_truth(watch, mj_model) -> None:
     seen = watch(**{name: (0.5, 1.0) for name in SENSORS if name.endswith(("noise", "bias"))})
     qpos, qvel = (x[1:] for x in trajectory())
@@ -289,17 +269,6 @@ def test_the_critic_may_see_the_world_and_the_truth(watch, mj_model) -> None:
             err_msg=name,
         )
     assert np.abs(seen.parts["ball_position"][:, :, 0] - hidden["ball_position"]).max() > 1.0
-
-
-def test_histories_have_the_newest_first(watch) -> None:
-    seen = watch(ball_position_noise=(0.01, 0.01), joint_angle_noise=(0.01, 0.01))
-    for name in ("joint_angles", "ball_position", "joint_velocities", "ball_velocity", "action"):
-        values = seen.parts[name]
-        for i in range(1, PARTS[name]):
-            np.testing.assert_array_equal(values[:, i:, i], values[:, :-i, 0])
-    np.testing.assert_allclose(seen.parts["action"][0, :, 0], seen.actions, atol=1e-7)
-    qpos, qvel = trajectory()
-    np.testing.assert_allclose(seen.parts["joint_velocities"][0, :, 0], qvel[1:, :6], atol=1e-9)
 
 
 def test_bounces_are_those_of_the_measurements(watch) -> None:
@@ -350,30 +319,6 @@ def test_latency_without_a_camera_and_velocity_by_differences() -> None:
         np.testing.assert_allclose(seen.parts["ball_age"][w, :, 0, 0], latency, atol=1e-9)
         velocity = seen.parts["ball_velocity"][w, :, 0]
         np.testing.assert_allclose(velocity[5:], np.diff(expected, axis=0)[4:] / DT, atol=1e-6)
-
-
-@pytest.mark.slow
-def test_results_are_of_the_truth() -> None:
-    """A policy that ignores its observation has the same results even with absurd sensor errors."""
-    sensors = {
-        "ball_position_noise": (0.0, 0.5), "ball_velocity_noise": (0.0, 10.0),
-        "ball_position_bias": (0.0, 0.5), "ball_latency": (0.0, 0.05),
-    }  # fmt: skip
-    env = BounceBall(
-        EnvConfig(randomization=sensors, episode_seconds=2.5, ball_init_pos=(0.59, 0, 0.3))
-    )
-    networks = make_networks(PPOConfig(hidden_layers=(4,)), env.observation_size, 6)
-    params = networks.policy_network.init(jax.random.PRNGKey(0))
-    deaf = Policy(init_normalizer(env.observation_size), jax.tree.map(jnp.zeros_like, params))
-    ranges = {
-        name: (jnp.array([0.0, high]), jnp.array([0.0, high]))
-        for name, (_, high) in sensors.items()
-    }
-    ranges["ball_position_bias"] = tuple(jnp.array([[0.0] * 3, [0.5] * 3]) for _ in range(2))
-    statistics = make_evaluator(env, networks, 16)(deaf, jax.random.PRNGKey(2), ranges)
-    assert np.any(statistics.tally.maxima["n_bounces"] > 0)
-    for values in jax.tree.leaves(statistics):
-        np.testing.assert_array_equal(*np.asarray(values).reshape(2, 8))
 
 
 # Random numbers

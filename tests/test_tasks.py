@@ -1,13 +1,12 @@
-"""The seam between the world and the task: bouncing is one file among others."""
+"""A task is a file among others: of the package, of a user, of another package."""
 
-import ast
-import os
 import re
 import shlex
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -27,105 +26,28 @@ from bounce_mjx.tasks.registry import find_task, task_name
 from tiny_runs import TINY
 
 CHECKOUT = Path(__file__).parent.parent
-PACKAGE = CHECKOUT / "src" / "bounce_mjx"
+
 REST = f"{CHECKOUT / 'tests' / 'rest_task.py'}:Rest"
 DRIBBLE = f"{CHECKOUT / 'examples' / 'dribble_task.py'}:Dribble"
 
-# Words that stay outside of tasks/: public names, ids of other libraries, files of the package.
-PUBLIC = re.compile(
-    r"bounce_mjx|BOUNCE_MJX|BounceMjx|bounce-mjx|BounceBall|bounce_ball|BounceConfig|tasks\.bounce\b|tasks/bounce\b"
-)
+
 # A row of the results of `REST`.
 RESULT = r"rests +episodes"
 
-# A baseline for bouncing; a ball that hits something in the physics of the world; a default or an
-# example in a sentence for users.
-ALLOWED = {
-    "__init__.py", "baselines/mirror.py",
-    "commands/main.py", "commands/play.py", "commands/train.py", "training/command.py",
-    "commands/run_options.py", "physics/convergence.py",
-    "physics/mjx_engine.py", "robot/pose.py", "task/results.py", "task/shown.py",
-    "world/observation.py", "world/randomization.py",
-    "identify/fit.py", "identify/stages.py",
-    "identify/unknowns.py", "identify/windows.py", "identify/words.py", "identify/world.py",
-    "reports/identification.py",
-}  # fmt: skip
 
-
-def test_only_the_tasks_folder_speaks_of_bouncing() -> None:
-    found = {}
-    for path in PACKAGE.rglob("*.py"):
-        name = path.relative_to(PACKAGE).as_posix()
-        text = PUBLIC.sub("", path.read_text(encoding="utf-8"))
-        words = re.findall(r"(?i)\w*(?:bounc|apex|target_?.?height)\w*", text)
-        if words and not name.startswith("tasks/") and name not in ALLOWED:
-            found[name] = sorted(set(words))
-    assert not found
-
-
-def test_nothing_imports_a_task() -> None:
-    """Modules find a task by its name, except for the public names of the package."""
-    found = set()
-    for path in PACKAGE.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            module = node.module if isinstance(node, ast.ImportFrom) else None
-            if re.search(r"tasks\.(?!registry)", str(module)):
-                found.add(path.relative_to(PACKAGE).as_posix())
-    assert found == {"__init__.py", "tasks/bounce.py", "tasks/bounce_ball.py"}
-
-
-@pytest.fixture(scope="module")
-def without_bouncing(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the package without its tasks."""
-    root = tmp_path_factory.mktemp("package")
-    shutil.copytree(PACKAGE, root / "src" / "bounce_mjx")
-    for folder in ("mjcf", "configs"):
-        shutil.copytree(CHECKOUT / folder, root / folder)
-    for path in (root / "src/bounce_mjx/tasks").glob("bounce*.py"):
-        path.unlink()
-    return root / "src"
-
-
-def run(source: Path, folder: Path, *args: str, code: int = 0) -> str:
-    """The output of a command of the package in `source`, which must exit with `code`."""
+def run(folder: Path, *args: str, code: int = 0) -> str:
+    """The output of a command, which must exit with `code`."""
     done = subprocess.run(
-        [sys.executable, "-m", "bounce_mjx", *args],
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(source)},
-        capture_output=True,
-        text=True,
+        [sys.executable, "-m", "bounce_mjx", *args], cwd=folder, capture_output=True, text=True
     )
     assert done.returncode == code, done.stdout + done.stderr
     return done.stdout + done.stderr
 
 
 @pytest.mark.slow
-def test_all_modules_import_without_bouncing(without_bouncing: Path, tmp_path: Path) -> None:
-    script = """
-import importlib, pkgutil, bounce_mjx
-for module in pkgutil.walk_packages(bounce_mjx.__path__, "bounce_mjx."):
-    if not module.name.endswith("__main__"):
-        importlib.import_module(module.name)
-print(bounce_mjx.__file__)
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", script],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(without_bouncing)},
-        capture_output=True,
-        text=True,
-    )
-    assert done.stdout.strip() == str(without_bouncing / "bounce_mjx/__init__.py"), done.stderr
-
-
-@pytest.mark.slow
-def test_a_task_without_events_goes_through_every_command(
-    without_bouncing: Path, tmp_path: Path
-) -> None:
-    """In the package without bouncing. The task has no command, event, curve, marker or plot."""
-
-    def command(*args: str, code: int = 0) -> str:
-        return run(without_bouncing, tmp_path, *args, code=code)
+def test_a_task_without_events_goes_through_every_command(tmp_path: Path) -> None:
+    """It has no command, event, curve, marker or plot."""
+    command = partial(run, tmp_path)
 
     task = ("--task", REST)
     said = command("train", *task, *TINY, "--total-steps", "128")
@@ -165,12 +87,10 @@ print(policy.step({name: np.zeros(sizes[name]) for name in policy.needs}).shape)
     done = subprocess.run(
         [sys.executable, "-c", script.replace("TASK", repr(REST))],
         cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(without_bouncing)},
         capture_output=True,
         text=True,
     )
     assert done.stdout == "(6,)\n", done.stderr
-    assert "error: the task bounce cannot be imported" in command("train", code=2)
 
 
 def adapters() -> dict[str, Callable[[], tuple[int, ...]]]:
@@ -292,28 +212,6 @@ def test_another_file_than_the_runs_is_told(
     assert "changed.py:Dribble differs from the task that" in capsys.readouterr().err
     flags[-1] = f"{mine}:Dribble"
     assert read_command(flags).env == config.env
-
-
-def test_another_class_of_the_same_file_is_another_task(
-    mine: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with mine.open("a") as file:
-        file.write("\n\nclass Other(Dribble):\n    class Config(Config):\n        pass\n")
-    config = read_preset(None, task=f"{mine}:Dribble").model_copy(update={"log_dir": tmp_path})
-    load_run_config(create_run(config), f"{mine}:Other")
-    assert "Other differs from the task that" in capsys.readouterr().err
-
-
-def test_an_edited_copy_of_a_task_is_told(
-    mine: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    name = f"{mine}:Dribble"
-    config = read_preset(None, task=name).model_copy(update={"log_dir": tmp_path})
-    run_folder = create_run(config)
-    with (run_folder / "task" / "mine.py").open("a") as file:
-        file.write("# edited\n")
-    load_run_config(run_folder, name)
-    assert "Dribble differs from the task that" in capsys.readouterr().err
 
 
 def test_a_config_file_cannot_name_code(mine: Path, tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import onnxruntime
 import pytest
 import torch
 from tensordict import TensorDict
@@ -63,19 +62,23 @@ def random_actions(steps: int) -> torch.Tensor:
 # Memory
 
 
-def test_results_share_the_memory_of_jax(env, monkeypatch):
-    arrays = []
+def test_actions_and_results_share_the_memory_of_jax(env, monkeypatch):
+    seen, arrays = [], []
     env.reset()
     step = env._jit_step
 
     def spy(carried, action):
+        seen.append(action.unsafe_buffer_pointer())
         carried, result = step(carried, action)
         arrays.extend(result)
         return carried, result
 
     monkeypatch.setattr(env, "_jit_step", spy)
-    for tensor, array in zip(env.step(torch.zeros(NUM_ENVS, 6)), arrays, strict=True):
+    # PyTorch aligns a tensor as JAX needs it unless it is a part of another tensor.
+    action = torch.zeros(NUM_ENVS, 6)
+    for tensor, array in zip(env.step(action), arrays, strict=True):
         assert tensor.data_ptr() == array.unsafe_buffer_pointer()
+    assert seen == [action.data_ptr()]
 
 
 def test_only_the_first_step_compiles(task):
@@ -87,22 +90,6 @@ def test_only_the_first_step_compiles(task):
     assert env._jit_step._cache_size() == 1
 
 
-def test_action_reaches_jax_without_a_copy(env, monkeypatch):
-    seen = []
-    env.reset()
-    step = env._jit_step
-
-    def spy(carried, action):
-        seen.append(action.unsafe_buffer_pointer())
-        return step(carried, action)
-
-    monkeypatch.setattr(env, "_jit_step", spy)
-    # PyTorch aligns a tensor as JAX needs it unless it is a part of another tensor.
-    action = torch.zeros(NUM_ENVS, 6)
-    env.step(action)
-    assert seen == [action.data_ptr()]
-
-
 def test_tensors_of_a_step_outlive_the_following_steps(env):
     """They stay valid although the state is donated from step to step."""
     first, _ = env.reset()
@@ -112,33 +99,6 @@ def test_tensors_of_a_step_outlive_the_following_steps(env):
         kept += [result.observation, result.final_observation, result.reward, result.metrics]
         copies += [tensor.clone() for tensor in kept[-4:]]
     assert all(torch.equal(*pair) for pair in zip(kept, copies, strict=True))
-
-
-def test_clock_is_a_copy(env):
-    env.reset()
-    clock = env.clock
-    clock += 5
-    assert torch.equal(env.clock, torch.zeros(NUM_ENVS, dtype=torch.int32))
-    given = torch.arange(NUM_ENVS)
-    env.clock = given
-    given += 7
-    env.step(torch.zeros(NUM_ENVS, 6))
-    assert env.clock.tolist() == [1, 2, 3, 4]
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
-def test_step_waits_for_nothing_on_cuda(task):
-    env = RslRlVecEnv(TorchVectorEnv(task, NUM_ENVS))
-    action = torch.zeros(NUM_ENVS, 6, device="cuda")
-    env.step(action)
-    torch.cuda.set_sync_debug_mode("error")
-    try:
-        with jax.transfer_guard("disallow"):
-            observations, rewards, dones, extras = env.step(action)
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
-    assert {t.device.type for t in (rewards, dones, extras["time_outs"])} == {"cuda"}
-    assert observations["policy"].device == action.device
 
 
 # The same steps
@@ -252,15 +212,6 @@ def test_rsl_rl_log_has_the_mean_reward_terms(env):
     torch.testing.assert_close(sum(terms), rewards.mean())
 
 
-def test_rsl_rl_env_restarts(env):
-    vec_env = RslRlVecEnv(env)
-    # rsl_rl's curiosity asks for this one.
-    assert vec_env.unwrapped.step_dt == 0.01
-    first, extras = vec_env.reset()
-    assert extras == {} and vec_env.get_observations() is first
-    assert not torch.equal(vec_env.reset()[0]["policy"], first["policy"])
-
-
 # skrl
 
 
@@ -278,23 +229,6 @@ def test_skrl_gets_terminal_observations(env):
 
 
 # The randomisation
-
-
-@pytest.mark.slow
-def test_the_ranges_of_the_randomisation_grow_over_the_warm_up():
-    """Episodes of five steps, a warm-up of ten: the drag of the third episodes is drawn from the
-    whole range."""
-    ranges = {"air_drag": (0.1, 0.2), "warmup_steps": 10 * NUM_ENVS}
-    task = BounceBall(EnvConfig(episode_seconds=0.05, randomization=ranges))
-    env = TorchVectorEnv(task, NUM_ENVS, critic_metrics=("world/air_drag",))
-    drag = [env.reset()[1]]
-    for _ in range(2):
-        for _ in range(5):
-            result = env.step(torch.zeros(NUM_ENVS, 6))
-        drag.append(result.critic_metrics)
-    for share, drawn in zip((0.0, 0.5, 1.0), drag, strict=True):
-        assert drawn.min() >= 0.1 * share - 1e-6 and drawn.max() <= 0.2 * share + 1e-6
-    assert len(drag[2].unique()) == NUM_ENVS
 
 
 # Policies
@@ -348,21 +282,6 @@ def test_the_run_of_a_library_acts_like_its_network(trained):
     assert np.abs(expected).max() > 0.01
     np.testing.assert_allclose(actions, expected, atol=1e-5)
     assert find_checkpoint(run).steps == 512
-
-
-@pytest.mark.slow
-def test_rsl_rl_exports_the_policy(trained):
-    """TorchScript and ONNX give the actions of the trained network."""
-    if not (folder := trained.out / "rsl_rl").exists():
-        pytest.skip("skrl exports nothing")
-    observation = torch.randn(8, 29)
-    with torch.no_grad():
-        expected = trained.act(observation)
-        torch.testing.assert_close(torch.jit.load(folder / "policy.pt")(observation), expected)
-    session = onnxruntime.InferenceSession(folder / "policy.onnx")
-    for row, action in zip(observation, expected, strict=True):
-        (given,) = session.run(None, {"obs": row[None].numpy()})
-        np.testing.assert_allclose(given[0], action, rtol=1e-4, atol=1e-5)
 
 
 def linear_policy(sizes: list[int], activation: type[nn.Module] = nn.SiLU) -> Policy:

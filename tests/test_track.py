@@ -74,32 +74,6 @@ def test_the_point_is_at_most_as_fast_as_commanded(path: int, speed: float) -> N
     assert np.abs(points[..., :2] - [0.6, 0.1]).max() < 0.2
 
 
-@pytest.mark.parametrize("path", range(len(paths.NAMES)))
-def test_a_path_is_closed_and_its_markers_lie_on_it(path: int) -> None:
-    start = command(path)
-    ends = [np.asarray(paths.offset(start, SIZE, phase)) for phase in (0.0, 1.0)]
-    np.testing.assert_allclose(*ends, atol=1e-6)
-    now = {name: float(value) for name, value in start.items()}
-    disc, *dots = TRACK.markers(now, {})
-    np.testing.assert_allclose(disc.position, (0.6, 0.1, 0.5))
-    later = start | {"target_x": 0.7, "phase": jnp.float32(0.7)}
-    assert [m.name for m in TRACK.markers(later, {})] == [disc.name, *(dot.name for dot in dots)]
-    middle = np.array([0.6, 0.1, 0.5]) - np.asarray(paths.offset(start, SIZE, start["phase"]))
-    walked = [middle + np.asarray(paths.offset(start, SIZE, i / 24)) for i in range(24)]
-    np.testing.assert_allclose([dot.position for dot in dots], walked, atol=1e-6)
-
-
-def test_a_point_stays_where_a_user_sets_it() -> None:
-    for path in range(len(paths.NAMES)):
-        still = followed(command(path, speed=0.0), 50)
-        np.testing.assert_allclose(still, still[:1].repeat(50, 0), atol=1e-6)
-    # A path continues from the place that a user sets.
-    now = command(0)
-    offset = paths.offset(now, SIZE, now["phase"])
-    moved = TRACK.next_command((jnp.array(True), offset), now | {"target_x": jnp.float32(0.7)})
-    assert 0.0 < np.hypot(moved["target_x"] - 0.7, moved["target_y"] - 0.1) < 0.3 * DT + 1e-6
-
-
 def test_flight_is_that_of_a_falling_ball() -> None:
     """Against small steps of Newton's law."""
     ball, velocity = np.array([0.5, 0.1, 0.3]), np.array([0.2, -0.1, 1.5])
@@ -242,9 +216,3 @@ def test_the_margin_of_a_root_mean_square_is_that_of_the_mean_square() -> None:
     assert root.value == pytest.approx(np.sqrt(12 / 5)) and root.margin == mean.margin
     assert 0.0 < root.margin < 1.0 and root.passed
     assert not task.root_mean_square("", "", squares, events, 1.5).passed
-
-
-def test_another_arm_tracks_at_its_own_home() -> None:
-    settings = Config.settings_at((0.4, 0.2, 0.3))
-    x, y, z = (Config(**settings).commands[f"target_{axis}"] for axis in ("x", "y", "height"))
-    np.testing.assert_allclose([c.low + c.high for c in (x, y, z)], (0.8, 0.4, 1.5))

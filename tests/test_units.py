@@ -1,6 +1,5 @@
-"""Settings in a wrong unit, without an effect, or that no episode survives: one sentence each."""
+"""A setting in a wrong unit, without an effect, or that no episode survives is refused by name."""
 
-import math
 import re
 from typing import ClassVar
 
@@ -23,18 +22,14 @@ from tiny_runs import TINY
 WRONG = """
 default_joint_angles: [0, 40, 110, 0, -60, 0]            # degrees
 ball_init_pos: [588.56, 0, 450]                          # mm
-ball_init_pos: [58.856, 0, 45]                           # cm
 target_height_range: [400, 600]                          # mm
-target_height_range: [40, 60]                            # cm
 target_height_range: [0.02, 0.04]                        # over the floor, not over the paddle
 action_scale: 1.15                                       # degrees
 action: {base: target, max_lead: 8.6}                    # degrees
 control_dt: 10                                           # ms
-control_dt: 100                                          # Hz
 episode_seconds: 20000                                   # ms
 max_joint_velocity: 360                                  # degrees a second
 min_ball_height: 50                                      # mm
-min_ball_height: 5                                       # cm
 max_horizontal_distance: 0.15                            # less than the paddle's own distance
 max_horizontal_distance: 1500                            # mm
 max_height_above_target: 1000                            # mm
@@ -46,21 +41,16 @@ reward: {target_x: 588.56}                               # mm
 reward: {velocity_matching: {desired_velocity: 500}}     # mm/s
 randomization: {action_latency: [20, 40]}                # ms
 randomization: {ball_latency: [8, 30]}                   # ms
-randomization: {servo_lag: [5, 10]}                      # ms
 randomization: {paddle_tilt: [-3, 3]}                    # degrees
-randomization: {gravity_tilt: [-2, 2]}                   # degrees
 randomization: {paddle_offset: [-5, 5]}                  # mm
-randomization: {encoder_bias: [-1, 1]}                   # degrees
 randomization: {joint_start: [-5, 5]}                    # degrees
 randomization: {ball_start: [-30, 30]}                   # mm
 randomization: {ball_radius: [19, 20]}                   # mm, where a factor is due
 randomization: {ball_position_noise: [1, 2]}             # mm
-randomization: {ball_position_bias: [-5, 5]}             # mm
 randomization: {push_speed: [100, 200]}                  # mm/s
 randomization: {push_speed: [0.1, 0.2], push_interval: [2000, 3000]}  # ms
 randomization: {command_interval: [2000, 3000]}          # ms
 robot: {paddle: {half_size: [0.2, 0.2, 0.01], mass: 5}}  # does nothing without robot.site
-robot: {joints: [nope]}                                  # the same
 robot: {site: s, paddle: {half_size: [50, 65, 3.5]}}     # mm
 robot: {site: s, paddle: {position: [0, 0, 190]}}        # mm
 robot: {site: s, paddle: {mass: 100}}                    # g
@@ -70,8 +60,6 @@ robot: {limits: {velocity: [180], acceleration: [9]}}    # degrees a second
 action: {max_lead: 0.3}                                  # does nothing with the base measured
 randomization: {push_interval: [1, 2]}                   # does nothing without push_speed
 max_joint_velocity: true                                 # a switch is no number
-ball_init_pos: [true, 0, 0.45]                           # the same
-num_balls: true                                          # the same
 randomization: {restitution: [0.8, true]}                # the same
 """
 
@@ -101,25 +89,12 @@ def test_a_wrong_unit_is_refused_by_name(line: str) -> None:
 @pytest.mark.parametrize(
     "name, env, reason",
     [
-        (
-            "juggle",
-            {"height_range": (0, 0)},
-            "height_range is 0, but must be greater than or equal to 0.1 m",
-        ),
         ("juggle", {"height_range": (0.5, 0.4)}, "height_range: (0.5, 0.4) is not a range"),
         ("juggle", {"height_range": (350, 550)}, "height_range is 350"),
-        (
-            "juggle",
-            {"home": (0.6, 0.0, -0.5)},
-            "height_range has the height -0.15 m, which is not over",
-        ),
+        ("juggle", {"home": (0.6, 0.0, -0.5)}, "height_range has the height -0.15 m, which is not"),
         ("track", {"height_range": (0.0, 0.4)}, "height_range is 0.0"),
-        ("track", {"height_range": (0.5, 0.4)}, "height_range: (0.5, 0.4) is not a range"),
-        ("track", {"height_range": (400, 500)}, "height_range is 400"),
-        ("track", {"speed_range": (-0.1, 0.3)}, "speed_range is -0.1"),
         ("track", {"speed_range": (50, 300)}, "speed_range is 50"),
         ("track", {"path_size": 120}, "path_size is 120"),
-        ("catch", {"ball_init_pos": (2.1, 0.0, 0.0723)}, "ball_init_pos is 2.1 m from the base"),
         ("catch", {"ball_init_pos": (-1.5, 1.5, 0.0723)}, "ball_init_pos is 2.12 m from the base"),
         ("balance", {"ball_init_pos": (0.59, 0.0, 0.02)}, "ball_init_pos has the height 0.02 m"),
     ],
@@ -157,12 +132,6 @@ track: {home: [1.5, 0.5, 1], path_size: 0.5}
 def test_other_arms_and_balls_are_accepted(case: str) -> None:
     ((name, env),) = yaml.safe_load(case).items()
     config(name, **env)
-
-
-def test_a_command_is_no_switch() -> None:
-    with pytest.raises(UserError, match="target_height is True, but must be a finite number"):
-        Command(0.4, 0.6, "m").checked(True, "target_height")
-    assert math.isclose(Command(0.4, 0.6, "m").checked("0.5", "target_height"), 0.5)
 
 
 # A user's own task
