@@ -1,9 +1,11 @@
 """Tests of an optional package are skipped if the package is missing; CI must have all packages.
 
-All tests and their processes share one cache of compiled programs, which is deleted at the end. XLA
-joins the loops of the programs, as in the commands, which halves the compilation.
+All tests and their processes share one cache of compiled programs and one folder of trained runs
+(`tiny_runs.shared_run`), which are deleted at the end. XLA joins the loops of the programs, as in
+the commands, which halves the compilation.
 """
 
+import collections
 import importlib
 import importlib.util
 import os
@@ -26,6 +28,7 @@ from bounce_mjx.training.setup import JOINED_LOOPS
 from bounce_mjx.viewers.offscreen import choose_opengl
 
 CACHE = "JAX_COMPILATION_CACHE_DIR"
+RUNS = "BOUNCE_MJX_TESTS_RUNS"
 # A folder that keeps the compiled programs from one run to the next.
 KEPT_CACHE = os.environ.get("BOUNCE_MJX_TESTS_CACHE")
 
@@ -47,15 +50,26 @@ def pytest_configure(config: pytest.Config) -> None:
     # A shell script starts a process in the background with SIGINT ignored, and the processes of
     # the tests about Ctrl-C would inherit that. A command leaves a program's own handler alone.
     signal.signal(signal.SIGINT, lambda *args: signal.default_int_handler(*args))
-    # The workers of pytest-xdist inherit the folder.
+    # The workers of pytest-xdist inherit the folders.
     if not hasattr(config, "workerinput"):
+        os.environ[RUNS] = tempfile.mkdtemp(prefix="bounce_mjx_runs_")
         os.environ[CACHE] = KEPT_CACHE or tempfile.mkdtemp(prefix="bounce_mjx_tests_")
     jax.config.update("jax_compilation_cache_dir", os.environ[CACHE])
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
-    if not hasattr(config, "workerinput") and not KEPT_CACHE:
-        shutil.rmtree(os.environ[CACHE], ignore_errors=True)
+    if not hasattr(config, "workerinput"):
+        for folder in {os.environ[RUNS], os.environ[CACHE]} - {KEPT_CACHE}:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Long files come first, so that the processes end at about the same time; a slow test counts
+    as ten."""
+    weights = collections.Counter()
+    for item in items:
+        weights[item.path] += 10 if item.get_closest_marker("slow") else 1
+    items.sort(key=lambda item: -weights[item.path])
 
 
 @pytest.hookimpl(tryfirst=True)

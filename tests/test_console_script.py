@@ -8,7 +8,6 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -56,14 +55,16 @@ LOST = {
 }
 
 
-@pytest.mark.parametrize("lost", LOST.values(), ids=LOST)
-@pytest.mark.parametrize(("args", "status"), [(["doctor"], 0), (["evl"], 2)])
+@pytest.mark.parametrize(
+    ("lost", "args", "status"),
+    [("pipe", ["doctor"], 0), ("terminal", ["evl"], 2), ("full disk", ["doctor"], 0)],
+)
 def test_an_output_that_cannot_be_written_is_dropped(
-    lost: Callable[[], int], args: list[str], status: int
+    lost: str, args: list[str], status: int
 ) -> None:
     """A mistake is said on stderr."""
     command = [sys.executable, "-m", "bounce_mjx", *args]
-    output = lost()
+    output = LOST[lost]()
     streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     streams["stderr" if status else "stdout"] = output
     done = subprocess.run(command, **streams, text=True)
@@ -72,17 +73,15 @@ def test_an_output_that_cannot_be_written_is_dropped(
     assert not done.stderr and not done.stdout
 
 
-@pytest.mark.parametrize("closed", [">&-", ">&- 2>&-"])
-def test_a_command_may_start_without_its_output(closed: str, tmp_path: Path) -> None:
+def test_a_command_may_start_without_its_output(tmp_path: Path) -> None:
     """No file gets the number of the output that is closed."""
     code = (
         "from bounce_mjx.commands.main import main; main(['--version'])\n"
         f"file = open({str(tmp_path / 'file')!r}, 'w')\n"
         "import os; os.write(1, b'to stdout'); assert file.fileno() > 2"
     )
-    command = ["sh", "-c", f'exec "$@" {closed}', "sh", sys.executable, "-c", code]
-    done = subprocess.run(command, stderr=subprocess.PIPE, text=True)
-    assert (done.returncode, done.stderr) == (0, "")
+    command = ["sh", "-c", 'exec "$@" >&- 2>&-', "sh", sys.executable, "-c", code]
+    assert subprocess.run(command).returncode == 0
     assert (tmp_path / "file").read_text() == ""
 
 
@@ -185,28 +184,15 @@ def test_script_without_the_package(before: str, sentence: str) -> None:
     assert re.fullmatch(sentence + "train_jax.py\n", done.stderr), done.stderr
 
 
-@pytest.mark.parametrize("name", ["eval", "play", "view", "plot", "report", "export"])
-def test_help_of_a_command_names_it(name: str, capsys) -> None:
-    with pytest.raises(SystemExit) as exit_info:
-        console_script.main([name, "--help"])
-    assert exit_info.value.code == 0
-    assert f"usage: bounce-mjx {name} " in capsys.readouterr().out
-
-
 def test_a_start_without_compilation_is_said(capsys) -> None:
     with jax.disable_jit():
         set_up_jax()
     assert re.fullmatch(r"warning: JAX_DISABLE_JIT .+\n", capsys.readouterr().err)
 
 
-def test_every_command_is_a_module() -> None:
-    for name in console_script.COMMANDS:
-        assert callable(importlib.import_module(f"bounce_mjx.commands.{name}").main)
-
-
-@pytest.mark.parametrize("options", [[], ["-OO"]], ids=["", "without docstrings"])
-@pytest.mark.parametrize("module", ["bounce_mjx", "bounce_mjx.eval"])
+@pytest.mark.parametrize(("module", "options"), [("bounce_mjx", ["-OO"]), ("bounce_mjx.eval", [])])
 def test_the_console_script_is_also_a_module(module: str, options: list[str]) -> None:
+    """It also runs without docstrings (`-OO`)."""
     done = subprocess.run(
         [
             sys.executable,
@@ -291,10 +277,9 @@ STARTS = {
 }
 
 
-@pytest.mark.parametrize("start", STARTS.values(), ids=STARTS)
-@pytest.mark.parametrize("moment", ["numpy", "jax", "tyro"])
+@pytest.mark.parametrize(("start", "moment"), [*zip(STARTS, ("numpy", "jax", "tyro"), strict=True)])
 def test_ctrl_c_while_a_command_is_imported(tmp_path: Path, start: str, moment: str) -> None:
-    code = PRESS.format(moment=moment, start=start)
+    code = PRESS.format(moment=moment, start=STARTS[start])
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True
     )
@@ -306,15 +291,9 @@ def test_ctrl_c_while_a_command_is_imported(tmp_path: Path, start: str, moment: 
 
 USUAL_SPELLINGS = {
     "--stop-when-solved=false": (False, "stop_when_solved"),
-    "--stop_when_solved=True": (True, "stop_when_solved"),
-    "--no-stop-when-solved": (False, "stop_when_solved"),
     "--total-steps 1e6": (10**6, "total_steps"),
-    "--total-steps=1.5e6": (1_500_000, "total_steps"),
-    "--num-devices 1e0": (1, "num_devices"),
-    "--hidden-layers 256,64": ((256, 64), "ppo", "hidden_layers"),
     "--hidden-layers=256,64 --seed 3": ((256, 64), "ppo", "hidden_layers"),
     "--hidden-layers 1e2,64 16": ((100, 64, 16), "ppo", "hidden_layers"),
-    "--target-height-range 0.3,0.8": ((0.3, 0.8), "env", "target_height_range"),
     "--ball-init-pos=0.5,-0.1,0.4": ((0.5, -0.1, 0.4), "env", "ball_init_pos"),
     "--critic-metrics bounced,apex_error": (("bounced", "apex_error"), "ppo", "critic_metrics"),
     "--log-dir a,b": (Path("a,b"), "log_dir"),

@@ -44,7 +44,7 @@ from bounce_mjx.runs.progress import load_results
 from bounce_mjx.task import Curve, Histogram, Hits, Recording, term_names
 from bounce_mjx.tasks.bounce import Bounce, BounceReward
 from bounce_mjx.training.log import WandbLog, open_log
-from tiny_runs import TINY
+from tiny_runs import TINY, shared_run
 
 TERMS = term_names(BounceReward)
 CURVES = (
@@ -54,12 +54,9 @@ CURVES = (
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trained() -> Path:
     """The folder of a run of 256 steps."""
-    log_dir = tmp_path_factory.mktemp("trained") / "runs"
-    train_command.main([*TINY, "--total-steps", "256", "--log-dir", str(log_dir)])
-    (run,) = log_dir.iterdir()
-    return run
+    return shared_run()
 
 
 def write_run(folder: Path, config: TrainConfig, scalars: dict[str, dict[int, float]]) -> Path:

@@ -1,6 +1,8 @@
-"""A run that is small enough for a test, and a process that trains one."""
+"""A run that is small enough for a test, the trained runs that all tests share, and a process that
+trains one."""
 
 import contextlib
+import fcntl
 import os
 import subprocess
 import sys
@@ -12,6 +14,7 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
+from bounce_mjx.commands import train as train_command
 from bounce_mjx.runs.files import MANIFEST_FILE, check_integrity
 from bounce_mjx.runs.folders import Checkpoint
 
@@ -24,6 +27,23 @@ TINY = (
 ).split()
 # Generous, because a busy machine compiles slowly.
 TIMEOUT = 300.0
+
+
+def shared_run(name: str = "straight", *flags: str) -> Path:
+    """The folder of a run of 256 steps, in `NAME/runs/bounce_ball`, for reading alone.
+
+    The first test that asks for a name trains the run, and another process waits for it.
+    """
+    folder = Path(os.environ["BOUNCE_MJX_TESTS_RUNS"]) / name
+    folder.mkdir(exist_ok=True)
+    with (folder / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (folder / "trained").exists():
+            log_dir = ["--log-dir", str(folder / "runs/bounce_ball")]
+            train_command.main([*TINY, "--total-steps", str(STEPS), *log_dir, *flags])
+            (folder / "trained").touch()
+    (run,) = (folder / "runs/bounce_ball").iterdir()
+    return run
 
 
 def arrays(checkpoint: Checkpoint) -> dict[str, np.ndarray]:
