@@ -50,9 +50,9 @@ from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import create_run, pretrained_checkpoint
 from bounce_mjx.runs.reading import read_policy
 from bounce_mjx.runs.writing import save_checkpoint
-from bounce_mjx.training.command import config_of, read_command
+from bounce_mjx.training.command import read_command
 
-config = config_of(read_command(sys.argv[1:]))
+config = read_command(sys.argv[1:]).training
 layers = {"hidden_layers": load_run_config(pretrained_checkpoint().run).ppo.hidden_layers}
 config = config.model_copy(update={"ppo": config.ppo.model_copy(update=layers)})
 run, results = create_run(config), json.loads(resource_path("pretrained/results.json").read_text())

@@ -21,7 +21,7 @@ from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.runs.config import train_config
 from bounce_mjx.tasks.bounce import Bounce
-from bounce_mjx.training.command import TrainCommand, config_of
+from bounce_mjx.training.command import TrainCommand
 from tiny_runs import contents
 
 CONFIG = train_config(Bounce)
@@ -79,7 +79,7 @@ def read(folder: Path, reader: Callable[[], StrictModel]) -> StrictModel | None:
 def assert_valid_run(command: TrainCommand) -> None:
     """Checks that the command's config passes the validation again and survives a round trip
     through a file."""
-    config = config_of(command)
+    config = command.training
     again = CONFIG.model_validate(yaml.safe_load(dump_config(config)))
     assert again == config
 

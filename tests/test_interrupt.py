@@ -28,7 +28,7 @@ def test_the_innermost_request_receives_the_signal() -> None:
         assert stop.requested and not outer.requested
 
 
-@pytest.mark.parametrize("moment", ["bounce_mjx.training.hosts", "bounce_mjx.training.run_command"])
+@pytest.mark.parametrize("moment", ["bounce_mjx.training.hosts", "bounce_mjx.training.run"])
 def test_ctrl_c_counts_while_a_training_starts(moment: str, tmp_path: Path) -> None:
     """It comes right after an import, of which the second is the last one."""
     process = subprocess.Popen(

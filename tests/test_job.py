@@ -22,7 +22,7 @@ from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import Checkpoint, best_checkpoint, latest_checkpoint
 from bounce_mjx.runs.reading import policy_shapes, read_policy, read_record
 from bounce_mjx.training import job
-from bounce_mjx.training.command import Options
+from bounce_mjx.training.callbacks import Event
 from bounce_mjx.training.trainer import Snapshot
 
 BLOCK = 64
@@ -53,7 +53,7 @@ class CountingTrainer:
 
     def snapshot(self):
         policy = jax.tree.map(lambda x: np.full(x.shape, self.state, x.dtype), self.shapes)
-        return Snapshot(policy, self.state)
+        return Snapshot([policy], self.state)
 
 
 class Scores:
@@ -65,8 +65,8 @@ class Scores:
     def __call__(self, config, env, mesh, pool) -> "Scores":
         return self
 
-    def select(self, policy) -> list[Report]:
-        iterations = int(np.ravel(jax.tree.leaves(policy)[0])[0])
+    def select(self, policies) -> list[Report]:
+        iterations = int(np.ravel(jax.tree.leaves(policies)[0])[0])
         result = Result("stable", "episodes, %", 0.0, ">= 99", False)
         return [
             Report(
@@ -79,15 +79,25 @@ class Scores:
 
 
 def train(
-    log_dir: Path, returns: dict[int, float], resume: Path | None = None, scores=Scores
+    log_dir: Path,
+    returns: dict[int, float],
+    resume: Path | None = None,
+    scores=Scores,
+    callbacks=(),
 ) -> Path:
     """The folder of a run that evaluates after each block of one iteration."""
     ppo = PPOConfig(num_envs=8, rollout_length=8, num_minibatches=2, hidden_layers=(4,))
     config = TrainConfig(
         ppo=ppo, block_steps=BLOCK, eval_every=BLOCK, total_steps=BLOCK * max(returns)
     ).model_copy(update={"log_dir": log_dir})
-    options, console = Options(resume=resume, report=False), Console(file=io.StringIO())
-    (seed,) = job.train(config, console, CountingTrainer, options, make_evaluators=scores(returns))
+    (seed,) = job.train(
+        config,
+        Console(file=io.StringIO()),
+        resume=resume,
+        callbacks=callbacks,
+        make_trainer=CountingTrainer,
+        make_evaluators=scores(returns),
+    )
     return seed.run
 
 
@@ -154,10 +164,10 @@ def test_an_evaluation_that_was_stopped_is_repeated(tmp_path: Path) -> None:
     """Its checkpoint has the next number, as the one without it had the steps."""
 
     class Stopped(Scores):
-        def select(self, policy):
+        def select(self, policies):
             os.kill(os.getpid(), signal.SIGTERM)
             time.sleep(0.5)
-            return super().select(policy)
+            return super().select(policies)
 
     with pytest.raises(job.TrainingStopped, match="stopped after 64 steps"):
         train(tmp_path, {1: 5.0}, scores=Stopped)
@@ -166,3 +176,42 @@ def test_an_evaluation_that_was_stopped_is_repeated(tmp_path: Path) -> None:
     train(tmp_path, {1: 5.0}, run)
     best = best_checkpoint(run)
     assert (best.steps, read_record(best).steps, best_steps(run)) == (BLOCK + 1, BLOCK, BLOCK)
+
+
+def test_a_callback_sees_blocks_and_evaluations_and_ends_the_training(tmp_path: Path) -> None:
+    """The training ends as after its last step: with an evaluation, and results."""
+    seen = []
+
+    class Tracker:
+        def start(self, run: Path, config: TrainConfig) -> None:
+            seen.append(config.total_steps)
+
+        def __call__(self, event: Event) -> bool | None:
+            figure = event.metrics.get("results/mean_return", event.metrics.get("episode/return"))
+            seen.append((event.steps, figure, event.report is not None))
+            return event.steps < 2 * BLOCK
+
+        def close(self) -> None:
+            seen.append("closed")
+
+    run = train(tmp_path, {1: 5.0, 2: 9.0, 3: 7.0}, callbacks=[Tracker()])
+    blocks = [(64, 0.0, False), (64, 5.0, True), (128, 0.0, False), (128, 9.0, True)]
+    assert seen == [3 * BLOCK, *blocks, "closed"]
+    results = json.loads((run / "results.json").read_text())
+    assert (results["trained_steps"], results["best_steps"]) == (2 * BLOCK, 2 * BLOCK)
+    assert results["fresh_resets"]
+
+
+def test_an_error_in_a_callback_ends_the_training(tmp_path: Path) -> None:
+    """What was saved stays, and the training resumes from it."""
+
+    def fail(event: Event) -> None:
+        if event.steps == 2 * BLOCK:
+            raise RuntimeError("pruned")
+
+    with pytest.raises(RuntimeError, match="pruned"):
+        train(tmp_path, {1: 5.0, 2: 9.0}, callbacks=[fail])
+    (run,) = tmp_path.iterdir()
+    assert iterations_of(latest_checkpoint(run)) == 1
+    train(tmp_path, {1: 5.0, 2: 9.0}, run)
+    assert best_steps(run) == 2 * BLOCK

@@ -24,9 +24,8 @@ from bounce_mjx.physics import Control
 from bounce_mjx.robot.model import fingerprint
 from bounce_mjx.runs.config import TrainConfig, train_config
 from bounce_mjx.tasks.registry import find_task
-from bounce_mjx.training.command import Options
 from bounce_mjx.training.evaluators import Evaluators
-from bounce_mjx.training.job import _Job
+from bounce_mjx.training.job import Job
 from bounce_mjx.training.ppo_trainer import PPOTrainer, episode_steps
 from bounce_mjx.training.trainer import in_whole_blocks
 from bounce_mjx.world.randomization import Term
@@ -185,7 +184,8 @@ def of_run(config: TrainConfig) -> tuple:
     blocks, measured = [], []
     with contextlib.ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
         config = in_whole_blocks(config)
-        job = _Job(config, Console(quiet=True), PPOTrainer, Evaluators, Options(), stack)
+        job = Job(config, Console(quiet=True), None, (), stack)
+        job.prepare(PPOTrainer)
         job.open()
 
         def run_block() -> None:

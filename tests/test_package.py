@@ -72,7 +72,7 @@ print(*sorted(set(bounce_mjx.__all__) & set(dir(bounce_mjx))))
     done = subprocess.run(
         [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True
     )
-    names = "BounceBall EnvConfig __version__ load_policy"
+    names = "BounceBall EnvConfig Run __version__ load_policy train"
     assert done.stdout.splitlines() == ["False", "fused", names], done.stderr
 
 

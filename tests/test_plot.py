@@ -43,7 +43,8 @@ from bounce_mjx.runs.folders import save_config
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.task import Curve, Histogram, Hits, Recording, term_names
 from bounce_mjx.tasks.bounce import Bounce, BounceReward
-from bounce_mjx.training.log import WandbLog, open_log
+from bounce_mjx.training.callbacks import Event, WeightsAndBiases
+from bounce_mjx.training.log import TensorBoardLog
 from tiny_runs import TINY, shared_run
 
 TERMS = term_names(BounceReward)
@@ -509,37 +510,33 @@ class FakeWandb:
         self.finished = True
 
 
-def test_weights_and_biases_gets_the_scalars_of_tensorboard(tmp_path: Path, monkeypatch) -> None:
+def test_weights_and_biases_gets_the_points_of_each_seed(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "wandb", fake := FakeWandb())
-    config = TrainConfig(seed=7)
-    log = open_log(tmp_path, config=config, wandb="bounce")
-    log.add_scalar("episode/return", 2.5, 64)
-    log.add_text("results", "| a |", 64)
-    log.close()
-    assert logged(tmp_path, "episode/return") == {64: 2.5}
+    config, tracker = TrainConfig(seed=7), WeightsAndBiases("bounce")
+    tracker.start(tmp_path, config)
+    tracker(Event(tmp_path, config, 64, {"episode/return": 2.5}))
+    tracker.close()
     assert fake.logged == [(64, {"episode/return": 2.5})] and fake.finished
     first = fake.settings
     assert (first["project"], first["config"]["seed"]) == ("bounce", 7)
     # A resumed training continues the same run.
-    WandbLog(tmp_path, "bounce", config)
+    WeightsAndBiases("bounce").start(tmp_path, config)
     assert fake.settings["id"] == first["id"] and fake.settings["resume"] == "allow"
 
 
-def test_a_full_disk_costs_points_with_weights_and_biases_too(tmp_path: Path, monkeypatch) -> None:
+def test_a_full_disk_costs_points(tmp_path: Path, monkeypatch) -> None:
     def fail(_: object) -> None:
         raise OSError(errno.ENOSPC, "no space")
 
-    monkeypatch.setitem(sys.modules, "wandb", fake := FakeWandb())
-    log = open_log(tmp_path, config=TrainConfig(), wandb="bounce")
+    log = TensorBoardLog(tmp_path)
     monkeypatch.setattr(log._writer, "write_event", fail)
-    log.add_scalar("episode/return", 2.5, 64)
+    log(Event(tmp_path, TrainConfig(), 64, {"episode/return": 2.5}))
     log.flush()
-    log.add_scalar("episode/return", 3.5, 128)
-    log.close()
+    log(Event(tmp_path, TrainConfig(), 128, {"episode/return": 3.5}))
+    log.flush()
     (lost,) = [path for path in tmp_path.glob("events*") if not path.name.endswith(".1")]
     lost.unlink()
     assert logged(tmp_path, "episode/return") == {128: 3.5}
-    assert len(fake.logged) == 2 and fake.finished
 
 
 @pytest.mark.slow

@@ -55,7 +55,7 @@ from bounce_mjx.runs.writing import CheckpointWriter, save_checkpoint
 from bounce_mjx.tasks.bounce_ball import BounceBall
 from bounce_mjx.training import console, ppo_trainer
 from bounce_mjx.training import job as training_job
-from bounce_mjx.training.command import Options, TrainCommand, config_of
+from bounce_mjx.training.command import TrainCommand
 from bounce_mjx.training.console import Reporter
 from bounce_mjx.training.devices import make_mesh
 from bounce_mjx.training.evaluators import Evaluators
@@ -311,10 +311,9 @@ def test_a_slow_block_is_stopped_between_two_iterations(tmp_path: Path, monkeypa
 
     def train(name: str, trainer: type[PPOTrainer], **resumed) -> Path:
         command = train_command.read_command([*flags, "--log-dir", str(tmp_path / name)])
-        config, console = config_of(command), Console(file=io.StringIO())
+        console = Console(file=io.StringIO())
         with contextlib.suppress(training_job.TrainingStopped):
-            options = Options(report=False, **resumed)
-            training_job.train(config, console, trainer, options)
+            training_job.train(command.training, console, make_trainer=trainer, **resumed)
         return next((tmp_path / name).iterdir())
 
     stopped = train("stopped", Stopped)
@@ -327,7 +326,8 @@ def test_a_slow_block_is_stopped_between_two_iterations(tmp_path: Path, monkeypa
 def test_second_ctrl_c_ends_the_process_at_once(pause: float) -> None:
     code = (
         "import time\n"
-        "from bounce_mjx.interrupt import StopRequest\n"
+        "from bounce_mjx.interrupt import StopRequest, end_on_ctrl_c\n"
+        "end_on_ctrl_c()\n"
         "with StopRequest() as stop:\n"
         "    print('ready', flush=True)\n"
         "    while not stop.requested: time.sleep(0.01)\n"
@@ -642,7 +642,7 @@ def test_a_failed_screening_is_no_evaluation(tmp_path: Path, capfd) -> None:
     assert said.count("screening (2 episodes) at") == 2 and "evaluation at" not in said
     assert [e["screening"] for e in evaluations(run)] == [True, True]
     tags = EventAccumulator(str(run)).Reload().Tags()["scalars"]
-    assert "screening/stable" in tags and "results/stable" not in tags
+    assert "results/stable" in tags
     page = (run / "report.html").read_text(encoding="utf-8")
     assert page.count(">screening</td>") == 2
     # The end reports all episodes.
@@ -673,9 +673,9 @@ def test_a_training_stops_once_its_results_have_a_margin(tmp_path: Path, monkeyp
     margins = iter([None, 0.5, 1.0])
     select = Evaluators.select
 
-    def passing(evaluators: Evaluators, policy) -> list[Report]:
+    def passing(evaluators: Evaluators, policies) -> list[Report]:
         margin = next(margins)
-        (report,) = select(evaluators, policy)
+        (report,) = select(evaluators, policies)
         met = {"passed": margin is not None, "margin": margin}
         results = tuple(dataclasses.replace(result, **met) for result in report.results)
         return [dataclasses.replace(report, results=results)]
@@ -722,8 +722,8 @@ def test_the_time_left(monkeypatch, steps: int, solved: bool, expected: str) -> 
     shown = io.StringIO()
     config = TrainConfig(total_steps=100, stop_when_solved=solved)
     names = ("episode/return", "episode/bounces", "task/non_finite", "speed/steps_per_second")
-    metrics = {name: np.ones((1, 1)) for name in names} | {"task/non_finite": np.zeros((1, 1))}
-    reporter = Reporter(lambda: [], Console(file=shown, width=200), config, 50)
+    metrics = {name: np.ones(1) for name in names} | {"task/non_finite": np.zeros(1)}
+    reporter = Reporter(Console(file=shown, width=200), config, 50)
     now = 120.0
     reporter.block(steps, 1.0, metrics)
     assert expected in shown.getvalue()
@@ -933,7 +933,8 @@ def test_non_finite_state_is_reset_reported_and_does_not_spread(
 
     change_state(monkeypatch, 3, spoil)
     resume(run, "--total-steps", str(STEPS))
-    assert "1 environment had a state that was not finite, and was reset" in capfd.readouterr().out
+    said = "states that were not finite, whose environments were reset: 1\n"
+    assert said in capfd.readouterr().out
     counts = EventAccumulator(str(run)).Reload().Scalars("task/non_finite")
     assert {event.step: event.value for event in counts} == {64: 0, 128: 0, 192: 1, 256: 0}
     for name, array in arrays(latest_checkpoint(run)).items():

@@ -18,7 +18,6 @@ from bounce_mjx.learning.statistics import normalize
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import best_checkpoint, pretrained_checkpoint
 from bounce_mjx.runs.reading import read_networks, read_policy
-from bounce_mjx.training.command import config_of
 from bounce_mjx.training.warm_start import read_start
 from tiny_runs import STEPS, TINY
 
@@ -80,7 +79,7 @@ def test_the_value_network_keeps_the_terms_of_both_worlds_and_is_blind_to_new_on
     world = tmp_path / "world.yaml"
     world.write_text(yaml.safe_dump(WORLD))
     args = ["--warm-start", str(first), "--world", str(world), "--config", "cpu"]
-    command = config_of(train_command.read_command(args))
+    command = train_command.read_command(args).training
     assert command.ppo.critic_metrics == ("n_bounces", "world/*")
     env = Env(command.env)
     names = names_of_critic_metrics(command.ppo, env)
@@ -122,7 +121,7 @@ def test_a_training_starts_with_the_policy_of_the_run(first: Path, tmp_path: Pat
 
 def test_the_small_robust_policy_can_be_trained_further() -> None:
     args = "--warm-start robust_small --config finetune --world fast_servo".split()
-    command = config_of(train_command.read_command(args))
+    command = train_command.read_command(args).training
     assert str(command.warm_start) == "robust_small"
     assert command.env.randomization.terms and command.env.randomization.share == 1.0
     params, _ = read_start(command, Env(command.env))

@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 import time
+import types
 from collections.abc import Callable
 from typing import NoReturn, TypeVar
 
@@ -38,7 +39,7 @@ def end_on_ctrl_c() -> None:
 
 class StopRequest:
     """While entered in the main thread, the first signal only sets `requested`; the same signal
-    again ends the process at once."""
+    again goes to the handler before, such as a notebook's, or ends the process at once."""
 
     def __init__(self, *signals: signal.Signals):
         """
@@ -81,12 +82,14 @@ class StopRequest:
                 return True
         return False
 
-    def _handle(self, number: int, _: object) -> None:
+    def _handle(self, number: int, frame: types.FrameType | None) -> None:
         if self._requested_at is None:
             self._requested_at = time.monotonic()
         # A terminal that goes away asks only once, but its shell and the kernel both say so.
         elif number in (signal.SIGINT, signal.SIGTERM):
             if time.monotonic() - self._requested_at > _SAME_REQUEST_SECONDS:
+                if callable(previous := self._previous.get(number)):
+                    previous(number, frame)
                 os._exit(128 + number)
 
 

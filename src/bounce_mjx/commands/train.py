@@ -1,19 +1,32 @@
 """Trains a policy in JAX and writes a run's folder (`bounce-mjx train`)."""
 
+import importlib.util
+import shlex
 from collections.abc import Sequence
 
-from rich.console import Console
-
-from bounce_mjx.errors import exit_on_user_error
+from bounce_mjx.config.command_line import stdout
+from bounce_mjx.errors import UserError, exit_on_user_error, install_command
 from bounce_mjx.interrupt import leave
-from bounce_mjx.runs.config import default_preset, has_accelerator, has_plugin
-from bounce_mjx.training.command import config_of, read_command
+from bounce_mjx.runs.config import (
+    default_preset,
+    has_accelerator,
+    has_plugin,
+    preset_files,
+    shown_file,
+)
+from bounce_mjx.training.command import read_command
 
 
 def main(args: Sequence[str]) -> None:
     """Runs the command line."""
     with exit_on_user_error():
-        command = read_command(args, default_preset(has_plugin()))
+        machine = default_preset(has_plugin())
+        command = read_command(args, machine)
+        if command.wandb is not None and importlib.util.find_spec("wandb") is None:
+            raise UserError(
+                "--wandb needs the package wandb; install it with: "
+                f"{install_command('bounce_mjx[wandb]')}"
+            )
         from bounce_mjx.training.setup import find_devices, set_up_jax
 
         set_up_jax(command.env)
@@ -21,8 +34,10 @@ def main(args: Sequence[str]) -> None:
             # CUDA starts during the imports.
             find_devices()
         from bounce_mjx.training import hosts
-        from bounce_mjx.training.ppo_trainer import PPOTrainer
-        from bounce_mjx.training.run_command import run_command
+        from bounce_mjx.training.callbacks import WeightsAndBiases
+        from bounce_mjx.training.console import say
+        from bounce_mjx.training.job import TrainingStopped, named_task
+        from bounce_mjx.training.run import train
 
     with hosts.leave_at_once(), exit_on_user_error():
         if command.on_several_hosts:
@@ -30,15 +45,37 @@ def main(args: Sequence[str]) -> None:
             numbers = command.num_processes, command.process_id, command.host_timeout
             hosts.join(command.coordinator_address, *numbers)
         if command.on_several_hosts or has_plugin() != has_accelerator():
+            machine = None
             command = read_command(args)
-        page = None
+        console, page = stdout(quiet=not hosts.is_leader()), None
         if command.watch and hosts.is_leader():
             # Only a training run that is watched pays for this import.
             from bounce_mjx.viewers.watch import TrainingPage
 
             address = command.watch_host, command.watch_port
-            page = TrainingPage(config_of(command), *address, Console(), command.watch_allow_host)
-        run_command(command, PPOTrainer, page)
+            page = TrainingPage(command.training, *address, console, command.watch_allow_host)
+        if command.resume is None:
+            files = preset_files(command.config, command.task, machine)
+            say(console, f"config: {' on '.join(map(shown_file, reversed(files)))}")
+            if command.warm_start is not None:
+                say(console, f"warm start: {command.warm_start}")
+        callbacks = [] if page is None else [page]
+        if command.wandb is not None:
+            callbacks.append(WeightsAndBiases(command.wandb))
+        try:
+            run = train(
+                config=command.training,
+                resume=command.resume,
+                callbacks=callbacks,
+                report=command.report,
+            )
+        except TrainingStopped as stop:
+            say(console, str(stop))
+            # Does not wait for a compilation or an evaluation in another thread.
+            leave(0)
+        words = shlex.join([str(run.checkpoint.run), *named_task(command.training)])
+        say(console, f"measure it: bounce-mjx eval {words}")
+        say(console, f"watch it: bounce-mjx play {words}")
         if page is not None:
             page.wait()
             # A thread that simulates cannot be stopped.

@@ -59,18 +59,18 @@ class Evaluators:
         """Waits until the program is compiled."""
         self._program.result()
 
-    def select(self, policy: Policy) -> list[Report]:
+    def select(self, policies: Sequence[Policy]) -> list[Report]:
         """A report of each policy; if no policy passes the screening, the reports of the
         screening."""
         if self._config.screening_episodes:
-            screened = self._measure(policy, self._config.eval_seed, screening=True)
+            screened = self._measure(policies, self._config.eval_seed, screening=True)
             if not any(report.passed for report in screened):
                 return [dataclasses.replace(report, screening=True) for report in screened]
-        return self._measure(policy, self._config.eval_seed)
+        return self._measure(policies, self._config.eval_seed)
 
-    def final(self, policy: Policy) -> list[Report]:
+    def final(self, policies: Sequence[Policy]) -> list[Report]:
         """A full report of each policy, on resets that no selection has seen."""
-        return self._measure(policy, self._config.eval_seed + _FINAL)
+        return self._measure(policies, self._config.eval_seed + _FINAL)
 
     def _lower(self) -> jax.stages.Lowered:
         """The program (policy, seed, index of the first episode) -> statistics and recording of a
@@ -121,10 +121,15 @@ class Evaluators:
         # In jaxlib, two batched calls of LAPACK may wait for each other for ever.
         return 1 if "lapack" in self._program.result().as_text() else os.cpu_count() or 1
 
-    def _measure(self, policy: Policy, seed: int, screening: bool = False) -> list[Report]:
+    def _measure(
+        self, policies: Sequence[Policy], seed: int, screening: bool = False
+    ) -> list[Report]:
         config, program = self._config, self._program.result()
         first = config.eval_episodes if screening else 0
         episodes = config.screening_episodes if screening else config.eval_episodes
+        policy = policies[0]
+        if config.num_seeds > 1:
+            policy = jax.tree.map(lambda *leaves: np.stack(leaves), *policies)
         on_devices = hosts.distribute(policy, jax.tree.map(lambda _: self._sharding, policy))
 
         def evaluate(start: int):

@@ -10,9 +10,9 @@ import importlib
 import shlex
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Any
 
 import jax
 import numpy as np
@@ -23,7 +23,7 @@ from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.files import UNFINISHED
-from bounce_mjx.interrupt import StopRequest, leave
+from bounce_mjx.interrupt import Interrupted, StopRequest
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.runs import folders
 from bounce_mjx.runs.config import TrainConfig
@@ -39,22 +39,21 @@ from bounce_mjx.runs.reading import (
     read_training,
 )
 from bounce_mjx.runs.writing import CheckpointWriter
+from bounce_mjx.tasks.registry import is_file
 from bounce_mjx.training import hosts
-from bounce_mjx.training.command import PROG, Options, named_task
+from bounce_mjx.training.callbacks import Callback, Event, block_means, call_all, points_of
 from bounce_mjx.training.console import Reporter, say
 from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.first_block import fault_of
-from bounce_mjx.training.log import TensorBoardLog, open_log
+from bounce_mjx.training.log import TensorBoardLog
+from bounce_mjx.training.ppo_trainer import PPOTrainer
 from bounce_mjx.training.trainer import (
     Snapshot,
     Trainer,
-    Watcher,
     in_whole_blocks,
     iterations_per_block,
 )
 from bounce_mjx.training.warm_start import present_start, read_start
-
-Tree = TypeVar("Tree")
 
 # Imported by name during the compilation, because these imports take half a second each.
 CHECKPOINT_MODULE, REPORT_MODULE = "orbax.checkpoint", "bounce_mjx.reports.page"
@@ -85,23 +84,25 @@ class SeedRun:
         return self.final or self.progress.best
 
 
-class TrainingStopped(Exception):
+class TrainingStopped(Interrupted):
     """The user stopped the training; the text says how to continue."""
 
 
 def train(
     config: TrainConfig,
     console: Console,
-    make_trainer: Callable[[TrainConfig, Env], Trainer],
-    options: Options,
-    watcher: Watcher | None = None,
+    *,
+    resume: Path | None = None,
+    callbacks: Sequence[Callback] = (),
+    make_trainer: Callable[[TrainConfig, Env], Trainer] = PPOTrainer,
     make_evaluators: Callable[..., Evaluators] = Evaluators,
 ) -> list[SeedRun]:
     """Trains with a config, and returns its seeds.
 
     Args:
+      resume: folder of the run to continue, whose config is `config`.
+      callbacks: see `Callback`.
       make_trainer: builds the trainer; raises UserError where the config does not fit it.
-      watcher: receives the progress of the first seed.
       make_evaluators: builds what evaluates the policies, with the arguments of `Evaluators`.
 
     Raises:
@@ -109,18 +110,19 @@ def train(
         another process trains in the run's folder, the hosts have different configs, a device
         failed, the training diverged, or its final state could not be saved.
       TrainingStopped: SIGINT, SIGTERM or SIGHUP came; the state is saved.
+      Interrupted: the signal came before the first block, and there is no run.
     """
-    if options.resume is None and (present := present_start(config)) != config:
+    if resume is None and (present := present_start(config)) != config:
         was, config = config.warm_start, present
         say(console, f"{was} was replaced meanwhile: starting from {config.warm_start}")
-    hosts.agree(config, options.resume)
-    config = in_whole_blocks(config)
+    hosts.agree(config, resume)
     with contextlib.ExitStack() as stack:
-        job = _Job(config, console, make_trainer, make_evaluators, options, stack, watcher)
+        job = Job(in_whole_blocks(config), console, resume, callbacks, stack)
+        job.prepare(make_trainer)
         job.open()
         job.announce()
         try:
-            job.compile()
+            job.compile(make_evaluators)
             job.train()
             job.finish()
         except jax.errors.JaxRuntimeError as error:
@@ -128,7 +130,12 @@ def train(
         return job.members
 
 
-class _Job:
+def named_task(config: TrainConfig) -> list[str]:
+    """The flag with which a later command has to name a task's file again."""
+    return ["--task", config.task] if is_file(config.task) else []
+
+
+class Job:
     """A training run in progress.
 
     With several seeds the run's folder has the latest state of all seeds. Each seed has its own
@@ -140,42 +147,42 @@ class _Job:
         self,
         config: TrainConfig,
         console: Console,
-        make_trainer: Callable[[TrainConfig, Env], Trainer],
-        make_evaluators: Callable[..., Evaluators],
-        options: Options,
+        resume: Path | None,
+        callbacks: Sequence[Callback],
         stack: contextlib.ExitStack,
-        watcher: Watcher | None = None,
     ):
-        """Builds what may refuse the config, before a folder is made."""
-        self.config, self.console, self.options, self.stack = config, console, options, stack
-        self.make_evaluators, self.watcher = make_evaluators, watcher
+        self.config, self.console, self.resume, self.stack = config, console, resume, stack
+        self.callbacks = callbacks if hosts.is_leader() else ()
         self.pool = concurrent.futures.ThreadPoolExecutor()
         stack.callback(self.pool.shutdown, wait=False, cancel_futures=True)
-        self.resumed = options.resume is not None
         self.clock = Clock()
-        self.env = Env(config.env)
-        self.trainer = make_trainer(config, self.env)
-        warm = config.warm_start is not None and not self.resumed
-        self.first = read_start(config, self.env) if warm else None
         self.block_steps = iterations_per_block(config) * config.ppo.batch_steps
         self.eval_steps = self.block_steps * max(1, round(config.eval_every / self.block_steps))
         self.state: Any = None
         self.steps = 0
+        self.ended = False
         self.writers: list[CheckpointWriter] = []
         self.seed_writers: list[CheckpointWriter] = []
+
+    def prepare(self, make_trainer: Callable[[TrainConfig, Env], Trainer]) -> None:
+        """Builds what may refuse the config, before a folder is made."""
+        self.env = Env(self.config.env)
+        self.trainer = make_trainer(self.config, self.env)
+        warm = self.config.warm_start is not None and self.resume is None
+        self.first = read_start(self.config, self.env) if warm else None
 
     def open(self) -> None:
         """Makes the folder of a new run, or reads the resumed one."""
         # Before, a signal ends the process by its default action.
         self.stop = self.stack.enter_context(StopRequest())
-        self.run = folders.find_run(self.options.resume) if self.resumed else self._create()
-        self.keeps_folder = self.resumed
+        self.keeps_folder = self.resume is not None
+        self.run = self.resume or self._create()
         self.stack.push(self._remove_unstarted)
         if hosts.is_leader():
             self.stack.enter_context(lock_run(self.run))
         self.members = self._seed_runs()
-        if self.resumed:
-            self._resume()
+        if self.resume is not None:
+            self._read_resumed()
         if hosts.is_leader():
             self._write_configs()
 
@@ -197,7 +204,7 @@ class _Job:
     @property
     def _go_on(self) -> str:
         flags = [*named_task(self.config), "--resume", str(self.run)]
-        return f"continue with: {PROG} {shlex.join(flags)}"
+        return f"continue with: bounce-mjx train {shlex.join(flags)}"
 
     def failure(self, error: jax.errors.JaxRuntimeError) -> str:
         """What a device's failure means to the user, once the last state is saved."""
@@ -248,12 +255,12 @@ class _Job:
     def _write_configs(self) -> None:
         for folder, config in self._configs().items():
             # A new run has its own config.
-            if self.resumed or folder != self.run:
+            if self.resume is not None or folder != self.run:
                 with writable(folder, "make room there or make it writable"):
                     folder.mkdir(exist_ok=True)
                     folders.save_config(folder, config)
 
-    def _resume(self) -> None:
+    def _read_resumed(self) -> None:
         folders.check_links(self.run)
         folders.refuse_brackets(self.run)
         if hosts.is_leader():
@@ -281,19 +288,32 @@ class _Job:
             continues = f"it continues to {total}"
             say(self.console, f"{met}; {how if self.config.stop_when_solved else continues}")
 
-    def compile(self) -> None:
+    def compile(self, make_evaluators: Callable[..., Evaluators]) -> None:
         """Compiles the programs that training needs to start. Evaluations are compiled, logs are
         opened, and the libraries that save and draw are imported in the background, also while the
         training already runs."""
+
+        def compile() -> None:
+            # The longest program is traced first: Python traces one program at a time while XLA
+            # compiles others.
+            compiling = self.trainer.compile(self.pool)
+            mesh = self.trainer.mesh
+            self.evaluators = make_evaluators(self.config, self.env, mesh, self.pool)
+            first_step = None if self.resume is None else self.steps
+            self.logs = self.pool.submit(self._open_logs, first_step)
+            for module in (CHECKPOINT_MODULE, REPORT_MODULE):
+                self.logs.add_done_callback(lambda _, m=module: importlib.import_module(m))
+            compiling.result()
+
         with self.console.status("compiling"):
-            compiling = self.pool.submit(self._compile)
-            stopped = not self.stop.wait_for(compiling)
-        if stopped:
-            self._leave_untrained()
-        opening = compiling.result()
-        if self.options.wandb is not None:
-            # It may refuse the run.
-            opening.result()
+            starting = self.pool.submit(self._start_callbacks)
+            compiling = self.pool.submit(compile)
+            if not self.stop.wait_for(compiling):
+                raise Interrupted
+        compiling.result()
+        # One of them may refuse the run.
+        starting.result()
+        self.stack.callback(call_all, self.callbacks, "close")
         # A process that finds its programs in the cache waits here for a process that compiles
         # them; otherwise the exchange between devices would time out after 30 s.
         hosts.any_of(False)
@@ -307,31 +327,35 @@ class _Job:
             configs = self._configs().items()
             self.writers = [CheckpointWriter(run, config, saving) for run, config in configs]
             self.seed_writers = self.writers[-len(self.members) :]
-        self.reporter = self.stack.enter_context(
-            Reporter(opening.result, self.console, self.config, self.steps, self.watcher)
-        )
+        reporter = Reporter(self.console, self.config, self.steps)
+        self.reporter = self.stack.enter_context(reporter)
+        self.stack.callback(self._flush)
         self.clock.lap("compile")
 
-    def _leave_untrained(self) -> NoReturn:
-        """Ends the process as Ctrl-C would, without the folder of a new run."""
-        self._remove_unstarted(KeyboardInterrupt)
-        leave()
-
-    def _compile(self) -> concurrent.futures.Future:
-        """Returns once the training can start, with the future of its logs. The longest program is
-        traced first: Python traces one program at a time while XLA compiles others."""
-        compiling = self.trainer.compile(self.pool)
-        self.evaluators = self.make_evaluators(self.config, self.env, self.trainer.mesh, self.pool)
-        opening = self.pool.submit(self._open_logs, self.steps if self.resumed else None)
-        for module in [CHECKPOINT_MODULE, *([REPORT_MODULE] if self.options.report else [])]:
-            opening.add_done_callback(lambda _, module=module: importlib.import_module(module))
-        compiling.result()
-        return opening
+    def _start_callbacks(self) -> None:
+        for member in self.members:
+            call_all(self.callbacks, "start", member.run, member.config)
 
     def _open_logs(self, first_step: int | None) -> list[TensorBoardLog]:
+        """A log for each seed, none in a process that writes nothing."""
         members = self.members if hosts.is_leader() else []
-        wandb = self.options.wandb
-        return [open_log(m.run, first_step, config=m.config, wandb=wandb) for m in members]
+        logs = [TensorBoardLog(member.run) for member in members]
+        for log, member in zip(logs, members, strict=True):
+            log.start(member.config, first_step)
+        return logs
+
+    def _flush(self) -> None:
+        """Writes everything logged so far to the logs' files."""
+        for log in self.logs.result():
+            log.flush()
+
+    def _tell(self, events: Sequence[Event]) -> None:
+        """Logs an event of each seed, and tells the callbacks."""
+        logs = {log.run: log for log in self.logs.result()}
+        for event in events if hosts.is_leader() else ():
+            logs[event.run](event)
+            answers = [callback(event) for callback in self.callbacks]
+            self.ended |= any(answer is False for answer in answers)
 
     def train(self) -> None:
         """Trains until the last step, or until a stop is requested."""
@@ -339,9 +363,10 @@ class _Job:
             if self._is_due() and not self._evaluate():
                 break
             solved = self.config.stop_when_solved and self._is_solved()
-            if solved or self.steps >= self.config.total_steps:
+            if solved or self._is_done():
                 break
             self._run_block()
+            self.ended = hosts.any_of(self.ended)
 
     def finish(self) -> None:
         """Waits until everything is saved, and evaluates the best policy on fresh resets.
@@ -350,9 +375,9 @@ class _Job:
           TrainingStopped: a stop was requested.
         """
         stopping = self._stopping()
-        if stopping and not (self.resumed or self.steps or self._evaluated()):
+        if stopping and not (self.resume or self.steps or self._evaluated()):
             jax.distributed.shutdown()
-            self._leave_untrained()
+            raise Interrupted
         if stopping and not self._evaluated():
             self._save(self.trainer.snapshot())
         self._wait_until_saved()
@@ -374,8 +399,11 @@ class _Job:
     def _evaluated(self) -> bool:
         return all(member.progress.has(self.steps) for member in self._healthy())
 
+    def _is_done(self) -> bool:
+        return self.ended or self.steps >= self.config.total_steps
+
     def _is_due(self) -> bool:
-        done = self.steps >= self.config.total_steps
+        done = self._is_done()
         # A policy that is good already is the first that counts as best.
         trained = self.steps > 0 or self.first is not None
         at_evaluation = trained and (done or self.steps % self.eval_steps == 0)
@@ -385,21 +413,26 @@ class _Job:
     def _evaluate(self) -> bool:
         """Evaluates and saves; returns False if a stop was requested meanwhile."""
         snapshot = self.trainer.snapshot()
-        reports = self._wait_for_reports(self.evaluators.select, snapshot.policy)
+        reports = self._wait_for_reports(self.evaluators.select, snapshot.policies)
         if reports is None:
             return False
         healthy = [member.progress.fault is None for member in self.members]
-        self.reporter.evaluation(self.steps, reports, healthy)
-        if self.watcher is not None:
-            policy = self._of_seed(snapshot.policy, 0)
-            self.watcher.evaluation(self.steps, reports[0], policy)
+        sound = [report for report, is_sound in zip(reports, healthy, strict=True) if is_sound]
+        self.reporter.evaluation(self.steps, sound)
+        self._tell(
+            [
+                Event(m.run, m.config, self.steps, points_of(report), report, policy)
+                for m, report, policy in zip(self.members, reports, snapshot.policies, strict=True)
+                if m.progress.fault is None
+            ]
+        )
         self._settle()
         seconds, scores = sum(self.clock.seconds.values()), {}
         for i, member in enumerate(self.members):
             if healthy[i] and member.progress.improves(reports[i], self.steps, seconds):
-                member.best_policy = self._of_seed(snapshot.policy, i)
+                member.best_policy = snapshot.policies[i]
                 scores[i] = reports[i].score
-            elif self.config.num_seeds == 1:
+            elif len(self.members) == 1:
                 scores[i] = reports[i].score
         self._save(snapshot, scores)
         return True
@@ -424,10 +457,7 @@ class _Job:
         # A seed that diverged before its first evaluation has no best policy; another seed's policy
         # takes its place in the batch.
         policies = [member.best_policy or evaluated[0].best_policy for member in self.members]
-        policy = policies[0]
-        if self.config.num_seeds > 1:
-            policy = jax.tree.map(lambda *leaves: np.stack(leaves), *policies)
-        reports = self._wait_for_reports(self.evaluators.final, policy)
+        reports = self._wait_for_reports(self.evaluators.final, policies)
         if reports is None:
             return False
         for member, report in zip(self.members, reports, strict=True):
@@ -449,14 +479,14 @@ class _Job:
         self.clock.lap("save")
 
     def _wait_for_reports(
-        self, evaluate: Callable[[Policy], list[Report]], policy: Policy
+        self, evaluate: Callable[[list[Policy]], list[Report]], policies: list[Policy]
     ) -> list[Report] | None:
         """Returns a report of each seed, or None if a stop was requested meanwhile."""
         if jax.process_count() > 1:
             # See `compile`.
             self.evaluators.wait()
             hosts.any_of(False)
-        evaluating = self.pool.submit(evaluate, policy)
+        evaluating = self.pool.submit(evaluate, policies)
         # On several hosts, a process that stopped on its own would keep the others waiting.
         if not self.stop.wait_for(evaluating) and jax.process_count() == 1:
             return None
@@ -485,7 +515,12 @@ class _Job:
         self.steps += done
         rate = done * self.config.num_seeds / seconds
         metrics["speed/steps_per_second"] = np.full((self.config.num_seeds, 1), rate)
-        self.reporter.block(self.steps, seconds, metrics)
+        means = block_means(metrics)
+        self.reporter.block(self.steps, seconds, means)
+        points = [{name: float(x[i]) for name, x in means.items()} for i in range(len(faults))]
+        points = [{name: x for name, x in seed.items() if np.isfinite(x)} for seed in points]
+        members = zip(self.members, points, strict=True)
+        self._tell([Event(member.run, member.config, self.steps, x) for member, x in members])
         self.reporter.saving_problem(self._problem(wait=False))
         self._check_faults(faults)
         self.clock.lap("train")
@@ -533,7 +568,7 @@ class _Job:
         """
         # A second signal may end the process at any time, so the log must already hold every step
         # of the checkpoint.
-        self.reporter.flush()
+        self._flush()
         # Each save waits for the one before.
         self.reporter.saving_problem(self._problem())
         self.keeps_folder = True
@@ -545,20 +580,18 @@ class _Job:
             if several and i not in scores:
                 writer.save_results(results)
                 continue
-            items = {POLICY: self._of_seed(snapshot.policy, i)}
-            items[NETWORKS] = self._of_seed(snapshot.networks, i)
+            items = {POLICY: snapshot.policies[i]}
+            if snapshot.networks is not None:
+                items[NETWORKS] = snapshot.networks[i]
             if not several:
                 items[TRAINING] = snapshot.state
             writer.save(self.steps, items, plain[i], scores.get(i, ()), results)
         if several and self.writers:
             # Last, as it refers to the best policies of the seeds.
-            items = {POLICY: snapshot.policy, TRAINING: snapshot.state}
+            policies = jax.tree.map(lambda *leaves: np.stack(leaves), *snapshot.policies)
+            items = {POLICY: policies, TRAINING: snapshot.state}
             self.writers[0].save(self.steps, items, {"seeds": plain})
         self.clock.lap("save")
-
-    def _of_seed(self, tree: Tree, index: int) -> Tree:
-        """One seed's part of a policy or a state."""
-        return tree if self.config.num_seeds == 1 else jax.tree.map(lambda x: x[index], tree)
 
     def _results(self, member: SeedRun) -> dict[str, Any] | None:
         """The content of the seed's results.json; None before its first evaluation."""

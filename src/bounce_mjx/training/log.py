@@ -1,7 +1,7 @@
-"""The logs of a training run: TensorBoard, and Weights & Biases if it is asked for."""
+"""The TensorBoard log of a run."""
 
 import contextlib
-import hashlib
+import math
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,35 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from bounce_mjx.config.files import dump_config
-from bounce_mjx.errors import UserError, reason_of
+from bounce_mjx.config.files import dump_config, flat
+from bounce_mjx.reports.tables import results_markdown
 from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.training.callbacks import Event
 
 # Time after which points appear in TensorBoard, s.
 _FLUSH_SECONDS = 10.0
-
-
-def open_log(
-    run: Path,
-    first_step: int | None = None,
-    suffix: str = "",
-    config: TrainConfig | None = None,
-    wandb: str | None = None,
-) -> "TensorBoardLog":
-    """Opens a TensorBoard log in a run's folder.
-
-    Args:
-      first_step: the step from which a resumed run continues; TensorBoard drops all later points.
-      suffix: suffix of the file's name; two logs opened in the same second need different suffixes.
-      config: the run's config, to be logged as text.
-      wandb: project of Weights & Biases that receives the scalars too; needs the config.
-    """
-    log = TensorBoardLog(run, suffix) if wandb is None else WandbLog(run, wandb, config)
-    if first_step is not None:
-        log.purge(first_step + 1)
-    if config is not None:
-        log.add_text("config", f"```yaml\n{dump_config(config)}```", first_step or 0)
-    return log
 
 
 class TensorBoardLog:
@@ -49,30 +27,52 @@ class TensorBoardLog:
     """
 
     def __init__(self, run: Path, suffix: str = ""):
+        """
+        Args:
+          suffix: suffix of the file's name; two logs opened in the same second need different ones.
+        """
         from tensorboardX import event_file_writer, summary
         from tensorboardX.proto import event_pb2
 
-        self._summary, self._events = summary, event_pb2
+        self.summary, self._events = summary, event_pb2
         self._new_writer = event_file_writer.EventsWriter
-        self._run, self._suffix, self._files = run, suffix, 0
+        self.run, self._suffix, self._files = run, suffix, 0
         self._writer, self._flushed = None, time.monotonic()
         run.mkdir(parents=True, exist_ok=True)
         self.flush()
 
-    def add_scalar(self, name: str, value: float, steps: int) -> None:
-        self._add(step=steps, summary=self._summary.scalar(name, value))
+    def start(self, config: TrainConfig, steps: int | None) -> None:
+        """Logs the config, as text and as hyperparameters.
 
-    def add_text(self, name: str, text: str, steps: int) -> None:
-        self._add(step=steps, summary=self._summary.text(name, text))
+        Args:
+          steps: the step from which a resumed run continues; TensorBoard drops all later points.
+        """
+        if steps is not None:
+            start = self._events.SessionLog(status=self._events.SessionLog.START)
+            self._add(step=steps + 1, session_log=start)
+        text = f"```yaml\n{dump_config(config)}```"
+        self.add(self.summary.text("config", text), steps or 0)
+        plain = flat(config.model_dump(mode="json")).items()
+        plain = {name: x if isinstance(x, int | float) else str(x) for name, x in plain}
+        shown = dict.fromkeys(("results/mean_return", "episode/return"), 0.0)
+        for part in self.summary.hparams(plain, shown):
+            self.add(part, 0)
+
+    def __call__(self, event: Event) -> None:
+        """Logs the points of an event, and the table of an evaluation."""
+        for name, value in event.metrics.items():
+            if math.isfinite(value):
+                self.add(self.summary.scalar(name, value), event.steps)
+        if event.report is not None:
+            self.add(self.summary.text("results", results_markdown(event.report)), event.steps)
 
     def add_image(self, name: str, pixels: np.ndarray, steps: int) -> None:
         """Adds a picture [height, width, 3]."""
-        self._add(step=steps, summary=self._summary.image(name, pixels, dataformats="HWC"))
+        self.add(self.summary.image(name, pixels, dataformats="HWC"), steps)
 
-    def purge(self, steps: int) -> None:
-        """Makes TensorBoard drop the points of earlier files at these steps and later."""
-        start = self._events.SessionLog(status=self._events.SessionLog.START)
-        self._add(step=steps, session_log=start)
+    def add(self, summary: Any, steps: int) -> None:
+        """Adds a summary as tensorboardX makes it."""
+        self._add(step=steps, summary=summary)
 
     def flush(self) -> None:
         """Writes everything to the file. A file with a point that is only half written ends there
@@ -82,11 +82,8 @@ class TensorBoardLog:
             if self._writer is None:
                 number = f".{self._files}" if self._files else ""
                 self._files += 1
-                self._writer = self._new_writer(f"{self._run / 'events'}", self._suffix + number)
+                self._writer = self._new_writer(f"{self.run / 'events'}", self._suffix + number)
             self._writer.flush()
-
-    def close(self) -> None:
-        self.flush()
 
     def _add(self, **content: Any) -> None:
         event = self._events.Event(wall_time=time.time(), **content)
@@ -103,42 +100,3 @@ class TensorBoardLog:
             yield
         except OSError:
             self._writer = None
-
-
-class WandbLog(TensorBoardLog):
-    """A TensorBoard log whose scalars go to a run of Weights & Biases too; the run has the config
-    and the results by itself. A resumed training continues its run."""
-
-    def __init__(self, run: Path, project: str, config: TrainConfig):
-        """
-        Raises:
-          UserError: Weights & Biases refuses the run, for example without an account.
-        """
-        super().__init__(run)
-        # Imported only when it is asked for; it is optional and takes seconds.
-        import wandb
-
-        try:
-            self._tracker = wandb.init(
-                project=project,
-                name=run.name,
-                id=hashlib.sha256(str(run.absolute()).encode()).hexdigest()[:16],
-                resume="allow",
-                reinit="create_new",
-                dir=run,
-                config=config.model_dump(mode="json"),
-            )
-        except Exception as error:
-            reason = reason_of(error)
-            raise UserError(
-                f"--wandb {project} is refused ({reason}); run wandb login, or set WANDB_MODE to "
-                "offline"
-            ) from error
-
-    def add_scalar(self, name: str, value: float, steps: int) -> None:
-        super().add_scalar(name, value, steps)
-        self._tracker.log({name: value}, step=steps)
-
-    def close(self) -> None:
-        super().close()
-        self._tracker.finish()

@@ -112,8 +112,15 @@ class PPOTrainer:
 
     def snapshot(self) -> Snapshot:
         state = hosts.gather(self.state)
-        networks = {"params": state.params, "statistics": state.statistics}
-        return Snapshot(policy_of(state, self._observation_size), state, networks)
+        seeds = [state]
+        if self._config.num_seeds > 1:
+            count = range(self._config.num_seeds)
+            seeds = [jax.tree.map(lambda x, i=i: x[i], state) for i in count]
+        return Snapshot(
+            [policy_of(seed, self._observation_size) for seed in seeds],
+            state,
+            [{"params": seed.params, "statistics": seed.statistics} for seed in seeds],
+        )
 
 
 def _iterations_at_once(config: TrainConfig, env: Env) -> int:

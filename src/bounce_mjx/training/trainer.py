@@ -1,4 +1,4 @@
-"""The interfaces between the job, an algorithm that trains policies, and an onlooker."""
+"""The interface between the job and an algorithm that trains policies."""
 
 import concurrent.futures
 from collections.abc import Callable
@@ -7,7 +7,6 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from jax.sharding import Mesh
 
-from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.learning.ppo import Params
 from bounce_mjx.learning.statistics import RunningStatistics
@@ -17,13 +16,15 @@ Metrics = dict[str, np.ndarray]
 
 
 class Snapshot(NamedTuple):
-    """The policy and the state of a training run at one moment, as pytrees of NumPy arrays."""
+    """The policies and the state of a training run at one moment, as pytrees of NumPy arrays."""
 
-    policy: Policy
+    policies: list[Policy]
+    """The policy of each seed."""
     state: Any
     """Everything that is needed to continue the training; numbers of at most 32 bits."""
-    networks: dict[str, Any] | None = None
-    """What another training can start with: "params" and "statistics" of both networks."""
+    networks: list[dict[str, Any]] | None = None
+    """What another training can start with, for each seed: "params" and "statistics" of both
+    networks."""
 
 
 def iterations_per_block(config: TrainConfig) -> int:
@@ -40,10 +41,7 @@ def in_whole_blocks(config: TrainConfig) -> TrainConfig:
 
 
 class Trainer(Protocol):
-    """S independent runs of one algorithm, one for each seed.
-
-    With several seeds, the first axis of every array in a state or a policy is the seed.
-    """
+    """S independent runs of one algorithm, one for each seed."""
 
     mesh: Mesh
     """The devices on which it trains."""
@@ -76,19 +74,4 @@ class Trainer(Protocol):
         """
 
     def snapshot(self) -> Snapshot:
-        """The policy and the whole state."""
-
-
-class Watcher(Protocol):
-    """An onlooker of training. Its methods are called between blocks and must return at once."""
-
-    def block(self, steps: int, means: dict[str, float]) -> None:
-        """A block has ended.
-
-        Args:
-          steps: environment steps so far.
-          means: the metrics of the block's iterations; NaN where there was nothing to measure.
-        """
-
-    def evaluation(self, steps: int, report: Report, policy: Policy) -> None:
-        """A policy was evaluated; its arrays are NumPy arrays."""
+        """The policies and the whole state."""

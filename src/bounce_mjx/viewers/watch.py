@@ -2,6 +2,7 @@
 
 import collections
 import contextlib
+import functools
 import html
 import queue
 import signal
@@ -17,10 +18,11 @@ from bounce_mjx.env.env import Env
 from bounce_mjx.errors import reason_of
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.interrupt import StopRequest
-from bounce_mjx.learning.policy import Policy, make_networks, untrained_policy
+from bounce_mjx.learning.policy import make_networks, untrained_policy
 from bounce_mjx.reports.tables import figure_text
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.task.shown import Curve
+from bounce_mjx.training.callbacks import Event
 from bounce_mjx.viewers.browser import AXIS, LivePage, free_port
 from bounce_mjx.viewers.guard import open_server
 from bounce_mjx.viewers.options import Address, PageStart
@@ -32,7 +34,7 @@ _MAX_POINTS = 2000
 
 
 class TrainingPage:
-    """A `training.trainer.Watcher` that serves a page from its own thread. The simulation runs
+    """A callback of a training that serves a page from its own thread. The simulation runs
     on the CPU, so that training on a GPU keeps its speed."""
 
     def __init__(
@@ -57,18 +59,10 @@ class TrainingPage:
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
 
-    def block(self, steps: int, means: dict[str, float]) -> None:
-        """See `Watcher`."""
-        self._news.put(lambda _, panel: panel.add_block(steps, means))
-
-    def evaluation(self, steps: int, report: Report, policy: Policy) -> None:
-        """See `Watcher`."""
-
-        def show(simulation: Simulation, panel: _Panel) -> None:
-            simulation.policy = policy
-            panel.add_evaluation(steps, report)
-
-        self._news.put(show)
+    def __call__(self, event: Event) -> None:
+        """Shows a block or an evaluation of the first seed."""
+        if event.config.seed == self._config.seed:
+            self._news.put(functools.partial(_show, event))
 
     def wait(self) -> None:
         """Waits until Ctrl-C ends the page."""
@@ -116,6 +110,14 @@ class TrainingPage:
 
     def _say(self, line: str) -> None:
         self._console.out(line, highlight=False)
+
+
+def _show(event: Event, simulation: Simulation, panel: "_Panel") -> None:
+    if event.report is None:
+        panel.add_block(event.steps, event.metrics)
+    else:
+        simulation.policy = event.policy
+        panel.add_evaluation(event.steps, event.report)
 
 
 class _Panel:

@@ -1,0 +1,203 @@
+"""`train`, and the run that it leaves."""
+
+import dataclasses
+import functools
+import os
+import shlex
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+from rich.console import Console
+
+from bounce_mjx.config.command_line import stdout
+from bounce_mjx.config.validation import validate
+from bounce_mjx.env.env import Env
+from bounce_mjx.errors import reason_of
+from bounce_mjx.evaluation.config import EvaluationOptions
+from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
+from bounce_mjx.evaluation.results import Report
+from bounce_mjx.reports.tables import details_line, results_table, seeds_table, unsolved_line
+from bounce_mjx.runs import folders
+from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.progress import load_results
+from bounce_mjx.runs.reading import read_actor
+from bounce_mjx.training import hosts, job
+from bounce_mjx.training.callbacks import Callback
+from bounce_mjx.training.console import say
+from bounce_mjx.training.log import TensorBoardLog
+from bounce_mjx.training.setup import set_up_jax
+from bounce_mjx.training.start import Start, changed
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """A run's folder, read when it is asked for. With several seeds, its policy and results are
+    those of the best one."""
+
+    folder: Path
+    task: str | None = None
+    """The task as the user names it: a run of a task in a file, FILE.py:CLASS, needs it once."""
+
+    @property
+    def config(self) -> TrainConfig:
+        """The run's config."""
+        return load_run_config(self.folder, self.task)
+
+    @property
+    def seeds(self) -> tuple["Run", ...]:
+        """The run of each seed; with one seed, this run."""
+        return tuple(Run(seed, self.task) for seed in folders.runs_of_seeds(self.folder))
+
+    @property
+    def checkpoint(self) -> folders.Checkpoint:
+        """The best checkpoint."""
+        return folders.find_checkpoint(self.folder)
+
+    @property
+    def results(self) -> Report | None:
+        """The results of the best checkpoint; None before the first evaluation."""
+        found = load_results(self.checkpoint.run)
+        return None if found is None else found.best
+
+    @property
+    def curves(self) -> dict[str, Any]:
+        """The learning curves by name, such as "episode/return": each has `steps` and `values`."""
+        from bounce_mjx.reports.curves import read_curves
+
+        return read_curves(self.checkpoint.run).curves
+
+    @property
+    def policy(self) -> Callable[[jax.Array], jax.Array]:
+        """The best checkpoint's policy: the most likely actions [..., A] of observations [..., N].
+        It can be compiled and differentiated."""
+        _, arrays, actor = read_actor(self.checkpoint, self.config)
+        return functools.partial(actor(Env(self.config.env)).act, arrays)
+
+    def evaluate(self, **options: Any) -> Report:
+        """Measures the results of the best checkpoint, as `bounce-mjx eval` does.
+
+        Args:
+          options: fields of `EvaluationOptions`, such as episodes=64, or commands={"target_height":
+            0.5}.
+
+        Raises:
+          UserError: the engine does not support the model.
+        """
+        _, arrays, actor = read_actor(self.checkpoint, self.config)
+        options = EvaluationOptions(**options)
+        return evaluate_policy(arrays, self.config.env, actor, options).report
+
+
+def train(
+    task: str | None = None,
+    config: str | Path | Sequence[str | Path] | TrainConfig = (),
+    *,
+    robot: str | Path | None = None,
+    world: str | Path | None = None,
+    warm_start: str | Path | None = None,
+    resume: str | Path | None = None,
+    callbacks: Sequence[Callback] = (),
+    report: bool = False,
+    quiet: bool = False,
+    **settings: Any,
+) -> Run:
+    """Trains a policy, and returns its run; `bounce-mjx train` from Python.
+
+        run = train("bounce", "cpu", num_envs=512, seed=1, reward={"height": {"weight": 2.0}})
+        print(run.results.summary)
+
+    In the main thread, a first Ctrl-C saves the state and raises `TrainingStopped`, a
+    KeyboardInterrupt. Compiled programs are kept in the user's cache folder. On a CPU, JAX starts
+    with an option that halves compilation; MJX needs a process of its own then.
+
+    Args:
+      task: name of a task, or FILE.py:CLASS.
+      config: name of a preset or a YAML file, or several, each of which lies on those before it; by
+        default, the preset for this machine. Or a whole config, on which nothing else lies.
+      robot: name or file of a robot's config.
+      world: name or file of a world.
+      warm_start: run with whose networks the training starts.
+      resume: run to continue in place; only its length and evaluations may change.
+      callbacks: functions that are called with an `Event` for each block and each evaluation; the
+        training ends once one returns False.
+      report: whether to write report.html into the run's folder.
+      quiet: whether to print nothing.
+      settings: keys of the config, such as seed=1. Those of `env` and `ppo` need no prefix, and
+        nested ones are mappings.
+
+    Raises:
+      UserError: a setting is wrong; or as `job.train`.
+      TrainingStopped: the user stopped the training.
+    """
+    if not isinstance(config, TrainConfig):
+        files = [config] if isinstance(config, str | Path) else config
+        given = {"task": task, "config": tuple(files), "robot": robot, "world": world}
+        given |= {"warm_start": warm_start, "resume": resume}
+        given |= {name: settings.get(name) for name in ("log_dir", "total_steps")}
+        start = validate(Start, given, "train")
+        base = start.base()
+        config, resume = start.settle(changed(base, settings), base), start.run
+    _start_jax(config)
+    console = stdout(quiet=quiet or not hosts.is_leader())
+    seeds = job.train(config, console, resume=resume, callbacks=callbacks)
+    best = print_results(seeds, console)
+    if report and hosts.is_leader():
+        leave_report(best, console)
+    run = best.run if len(seeds) == 1 else best.run.parent
+    return Run(run, config.task)
+
+
+def _start_jax(config: TrainConfig) -> None:
+    """Starts JAX for this environment, and leaves the process's environment as it was."""
+    flags = os.environ.get("XLA_FLAGS")
+    set_up_jax(config.env)
+    jax.devices()
+    if flags is None:
+        os.environ.pop("XLA_FLAGS", None)
+    else:
+        os.environ["XLA_FLAGS"] = flags
+
+
+def print_results(seeds: Sequence[job.SeedRun], console: Console) -> job.SeedRun:
+    """Prints the results of a training run; returns the best seed."""
+    best = max((s for s in seeds if s.report is not None), key=lambda s: s.report.score)
+    if len(seeds) > 1:
+        console.print(seeds_table({s.config.seed: s.report for s in seeds}))
+    else:
+        steps = best.progress.best_steps
+        console.print(results_table(best.report, f"best checkpoint, {steps:,} steps"))
+        say(console, details_line(best.report))
+    if unsolved := unsolved_line(best.report):
+        say(console, unsolved)
+    spent = ", ".join(f"{name} {value:.1f} s" for name, value in best.seconds.items())
+    say(console, f"time: {spent}")
+    label = "run" if len(seeds) == 1 else f"best seed: {best.config.seed}  run"
+    say(console, f"{label}: {best.run}")
+    return best
+
+
+def leave_report(seed: job.SeedRun, console: Console) -> None:
+    """Draws the report, and the figure of the final evaluation in the TensorBoard log. The training
+    is already saved, so a failure only prints one line."""
+    started = time.perf_counter()
+    try:
+        # Imported during the compilation (`job.REPORT_MODULE`).
+        from bounce_mjx.reports import figures, page
+
+        recording = seed.report.recording
+        if recording is None:
+            recording = page.record_checkpoint(folders.find_checkpoint(seed.run))
+        path, evaluation = page.write_report(seed.run, recording)
+        # A new file, because the log of the training is already closed.
+        log = TensorBoardLog(seed.run, suffix=".report")
+        log.add_image("evaluation", figures.pixels(evaluation), seed.progress.best_steps)
+        log.flush()
+    except Exception as error:
+        again = shlex.join([str(seed.run), *job.named_task(seed.config)])
+        reason = reason_of(error)
+        say(console, f"report: not drawn ({reason}); draw it with: bounce-mjx report {again}")
+    else:
+        say(console, f"report: {path}  ({time.perf_counter() - started:.1f} s)")
