@@ -12,13 +12,7 @@ from bounce_mjx.identify.fit import Fit, Noise, Problem, _eliminate
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.reading import read_csv
 from bounce_mjx.identify.simulation import make_targets
-from bounce_mjx.identify.stages import (
-    Identified,
-    _align_frame,
-    _Search,
-    identify,
-    sensor_noise,
-)
+from bounce_mjx.identify.stages import Identified, _align_frame, identify, sensor_noise
 from bounce_mjx.identify.unknowns import Layout, make_layout
 from bounce_mjx.identify.windows import Windows, cut
 from bounce_mjx.identify.world import compare, estimates, sentences, to_yaml
@@ -145,7 +139,8 @@ def test_whitening_leaves_independent_errors_after_a_bounce() -> None:
     s = int(np.flatnonzero(w.has_ball)[0])
     eye = np.zeros((3 * count, *weights.shape))
     eye[np.arange(3 * count), s, -3 * count + np.arange(3 * count)] = 1.0
-    whitening = problem.whiten(eye, weights)[:, s, -3 * count :].T
+    predicted = w.measured + eye * problem.deviations
+    whitening = problem.whiten(predicted, weights)[:, s, -3 * count :].T
     after = np.maximum(w.picture_times[s] - w.bounces[s], 0.0) * w.picture_weights[s]
     covariance = np.diag(np.repeat(w.picture_weights[s], 3))
     for axis, deviation in enumerate((0.02, 0.02, 0.1)):
@@ -173,12 +168,12 @@ def test_a_world_has_the_range_of_each_joint_and_axis(tmp_path: Path) -> None:
     vector, places = layout.mean.copy(), layout.slices()
     vector[places["servo_gain"]] = 0.8 + 0.07 * np.arange(6)
     vector[places["paddle_tilt"]] = -0.08, 0.04
-    fit = Fit(vector, *4 * (np.zeros(0),), 0.0)
+    fit = Fit(vector, np.zeros(0))
     spread, noise = (
         np.diag((0.1 * layout.deviation) ** 2),
         Noise(np.full(6, 1e-3), np.full(3, 2e-3)),
     )
-    found = Identified(layout, windows_of(log), noise, fit, spread, {}, {"ball": 1.0}, {}, 0)
+    found = Identified(layout, windows_of(log), noise, fit, None, spread, {}, {"ball": 1.0}, {}, 0)
     path.write_text(to_yaml(found, log, NAMES, None), encoding="utf-8")
     config = read_preset(Path("default"), world=path).env
     assert np.shape(config.randomization.restitution) == (2,)
@@ -219,12 +214,11 @@ def test_a_frame_beside_the_paddle_is_found(shift) -> None:
     log, model = at_home(shift), load_model(None, 0.001)
     w, layout = windows_of(log), make_layout(6, True, 0.001)
     problem = Problem(None, w, layout, Noise(np.full(6, 1e-3), np.full(3, 2e-3)))
-    first = Fit(layout.mean, w.starts, *3 * (np.zeros(0),), 0.0)
-    search, fit = _align_frame(_Search(problem, lambda line: None), first, model)
+    problem, fit = _align_frame(problem, Fit(layout.mean, w.starts), model)
     place = layout.slices()["ball_position_bias"]
     off = np.abs(shift) > 0.03
     np.testing.assert_allclose(fit.vector[place], np.where(off, shift, 0.0), atol=0.015)
-    deviation = search.problem.layout.deviation[place]
+    deviation = problem.layout.deviation[place]
     np.testing.assert_array_equal(deviation, np.where(off, 0.1, 0.012))
     moved = (w.starts - fit.starts)[w.has_ball, 12:15]
     np.testing.assert_allclose(moved, np.tile(fit.vector[place], (len(moved), 1)), atol=1e-12)
@@ -237,8 +231,8 @@ def test_estimates_far_from_the_prior_are_warnings() -> None:
     spread = np.diag((0.1 * layout.deviation) ** 2)
 
     def said(vector: np.ndarray, layout: Layout = layout) -> list[str]:
-        fit = Fit(vector, np.zeros(0), np.linalg.inv(spread), *2 * (np.zeros(0),), 0.0)
-        found = Identified(layout, windows_of(log), None, fit, spread, {}, {"b": 1.0}, {}, 0)
+        known = Fit(vector, np.zeros(0)), np.linalg.inv(spread), spread
+        found = Identified(layout, windows_of(log), None, *known, {}, {"b": 1.0}, {}, 0)
         return [text for text in sentences(found, NAMES) if text.startswith("warning: ")]
 
     assert not said(vector)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bounce_mjx.identify.simulation import Predicted, Simulate
+from bounce_mjx.identify.simulation import Simulate
 from bounce_mjx.identify.unknowns import ARM, Layout
 from bounce_mjx.identify.windows import Windows
 
@@ -53,20 +53,17 @@ class Noise(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """A minimum of the residuals."""
+    """A minimum of the residuals, or where a search for it begins."""
 
     vector: np.ndarray
     """The unknowns [P]."""
     starts: np.ndarray
     """States at the windows' starts [S, D]."""
-    information: np.ndarray
-    """Information [P, P] of the log about the unknowns, without the prior: the inverse of their
-    covariance, after the starts are eliminated."""
-    predicted: Predicted
-    """What the sensors would have measured: [S, A, n] and [S, B, 3]."""
-    weights: np.ndarray
-    """Weight of each residual [S, A n + 3 B]; 0 for padding and for pictures of no flight."""
-    cost: float
+    predicted: np.ndarray = np.zeros(0)
+    """What the sensors would have measured [S, A n + 3 B]."""
+    weights: np.ndarray = np.zeros(0)
+    """Weight of each measurement [S, A n + 3 B]; 0 for padding and for pictures of no flight."""
+    cost: float = np.inf
     """Half the sum of squared weighted residuals and the prior's."""
 
 
@@ -77,69 +74,60 @@ class Problem(NamedTuple):
     windows: Windows
     layout: Layout
     noise: Noise
+    progress: Callable[[str], None] = lambda line: None
+    """Called with a line about each step of a search."""
 
-    def predict(self, vector: np.ndarray, starts: np.ndarray) -> Predicted:
-        """What the sensors would have measured, in one world."""
-        every = self.simulate(vector[None], starts[None], np.ones((1, len(starts)), bool))
-        return Predicted(every.angles[0], every.balls[0])
+    @property
+    def deviations(self) -> np.ndarray:
+        """The noise of each entry of a window's measurements [A n + 3 B]."""
+        shape = self.windows.angles.shape[1], self.windows.balls.shape[1]
+        return np.concatenate([np.tile(*x) for x in zip(self.noise, shape, strict=True)])
 
-    def residuals(self, predicted: Predicted) -> np.ndarray:
-        """Residuals [C, S, A n + 3 B] in units of the noise."""
-        w, count = self.windows, len(predicted.angles)
-        angles = (predicted.angles - w.angles) / self.noise.angles
-        balls = (predicted.balls - w.balls) / self.noise.balls
-        shape = count, len(w.first), -1
-        return np.concatenate([angles.reshape(shape), balls.reshape(shape)], axis=2)
+    def predict(self, vector: np.ndarray, starts: np.ndarray) -> np.ndarray:
+        """What the sensors would have measured [S, A n + 3 B], in one world."""
+        return self.simulate(vector[None], starts[None], np.ones((1, len(starts)), bool))[0]
 
-    def whiten(self, residuals: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Residuals [..., S, M] times the roots of their weights, and without the common error of
-        the pictures after a bounce.
+    def whiten(self, predicted: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Residuals [..., S, A n + 3 B] in units of the noise, times the roots of their weights,
+        and without the common error of the pictures after a bounce.
 
         A bounce that deviates from the model moves each picture after it, along each axis, by c =
         time since the bounce * deviation / noise. The residuals' covariance is then I + c c', and
         its inverse root is I - c c' (1 - 1 / sqrt(1 + |c|^2)) / |c|^2.
         """
-        root, count = np.sqrt(weights), self.windows.balls.shape[1]
-        scaled = residuals * root
-        balls = scaled[..., -3 * count :].reshape(*scaled.shape[:-1], count, 3)
-        since = np.nan_to_num(self.windows.picture_times - self.windows.bounces[:, None])
+        w, root = self.windows, np.sqrt(weights)
+        scaled = (predicted - w.measured) / self.deviations * root
+        angles, balls = w.split(scaled)
+        since = np.nan_to_num(w.picture_times - w.bounces[:, None])
         common = np.maximum(since, 0.0)[:, :, None] * _BOUNCE_DEVIATION / self.noise.balls
-        common = common * root[:, -3 * count :].reshape(-1, count, 3)
+        common = common * w.split(root)[1]
         squared = np.maximum(np.sum(common**2, axis=1), 1e-12)
         share = (1.0 - 1.0 / np.sqrt(1.0 + squared)) / squared
         along = np.sum(common * balls, axis=-2)
         white = balls - common * (share * along)[..., None, :]
-        scaled[..., -3 * count :] = white.reshape(*scaled.shape[:-1], -1)
-        return scaled
+        return np.concatenate([x.reshape(*scaled.shape[:-1], -1) for x in (angles, white)], axis=-1)
 
-    def whiten_fit(self, predicted: Predicted, weights: np.ndarray) -> np.ndarray:
-        """White residuals [S, M] of what one world predicts."""
-        one = Predicted(predicted.angles[None], predicted.balls[None])
-        return self.whiten(self.residuals(one), weights)[0]
-
-    def weights(self, with_angles: bool = True, pictures: np.ndarray | float = 1.0) -> np.ndarray:
+    def weights(self, pictures: np.ndarray | float = 1.0) -> np.ndarray:
         """Weights [S, A n + 3 B]; those of the pictures [S, B] are multiplied by `pictures`."""
         w = self.windows
-        angles = np.repeat(w.angle_weights * with_angles, w.angles.shape[2], axis=1)
+        angles = np.repeat(w.angle_weights, w.angles.shape[2], axis=1)
         return np.concatenate([angles, np.repeat(w.picture_weights * pictures, 3, axis=1)], axis=1)
 
 
 def minimise(
     problem: Problem,
-    vector: np.ndarray,
-    starts: np.ndarray,
+    fit: Fit,
     free: np.ndarray,
     weights: np.ndarray,
     iterations: int,
     free_states: np.ndarray | None = None,
-    log: Callable[[str], None] = lambda line: None,
 ) -> Fit:
-    """Steps of Levenberg and Marquardt until one lowers the cost by less than 0.3, a fraction of
-    what a change of the unknowns by their deviation does.
+    """Steps of Levenberg and Marquardt from a fit, until one lowers the cost by less than 0.3, a
+    fraction of what a change of the unknowns by their deviation does.
 
     Args:
       free: which unknowns [P] may change.
-      weights: of the residuals [S, M].
+      weights: of the measurements [S, M].
       free_states: which entries [D] of the starts may change; all by default.
     """
     layout, guess = problem.layout, problem.windows.starts
@@ -149,24 +137,23 @@ def minimise(
     scale, reach = layout.deviation[unknowns], deviations[entries]
     # The start of a window that does not count stays as it is.
     used = np.any(weights > 0.0, axis=1)
-    num_tried, each = len(_DAMPINGS) * len(_SHARES), np.arange(len(starts))
+    num_tried, each = len(_DAMPINGS) * len(_SHARES), np.arange(len(guess))
 
-    def data_costs(predicted: Predicted, states: np.ndarray) -> np.ndarray:
+    def data_costs(white: np.ndarray, states: np.ndarray) -> np.ndarray:
         """Half the sum of squares of each candidate and window [C, S]."""
-        r = problem.whiten(problem.residuals(predicted), weights)
         squares = np.sum(((states - guess) / deviations) ** 2, axis=2)
-        return 0.5 * (np.sum(r**2, axis=2) + squares)
+        return 0.5 * (np.sum(white**2, axis=2) + squares)
 
     def prior_costs(vectors: np.ndarray) -> np.ndarray:
         return 0.5 * np.sum(((vectors - layout.mean) / layout.deviation) ** 2, axis=-1)
 
     for iteration in range(iterations):
+        vector, starts = fit[:2]
         line = _linearise(problem, vector, starts, unknowns, entries, weights)
-        now = float(np.sum(data_costs(line.predicted, starts[None])) + prior_costs(vector))
+        now = float(np.sum(data_costs(line.white[None], starts[None])) + prior_costs(vector))
+        fit = Fit(vector, starts, line.predicted, weights, now)
         at_guess = (starts - guess)[:, entries] / reach
-        reduced = _eliminate(
-            line.residuals, line.by_unknown * scale, line.by_state * reach, at_guess
-        )
+        reduced = _eliminate(line.white, line.by_unknown * scale, line.by_state * reach, at_guess)
         hessian = reduced.information + np.eye(len(unknowns))
         slope = reduced.gradient + (vector[unknowns] - layout.mean[unknowns]) / scale
         vectors = np.repeat(vector[None], num_tried, axis=0)
@@ -178,35 +165,23 @@ def minimise(
             change = (vectors[i, unknowns] - vector[unknowns]) / scale
             states[i][:, entries] += share * reduced.states(change) * reach * used[:, None]
         outcome = problem.simulate(vectors, states, np.tile(used, (num_tried, 1)))
-        costs = data_costs(outcome, states)
+        costs = data_costs(problem.whiten(outcome, weights), states)
         costs = np.where(np.isfinite(costs), costs, np.inf).reshape(len(_DAMPINGS), -1, len(starts))
         totals = np.sum(np.min(costs, axis=1), axis=1) + prior_costs(vectors[:: len(_SHARES)])
         damping = int(np.argmin(totals))
         best = damping * len(_SHARES) + np.argmin(costs[damping], axis=0)
-        log(f"step {iteration + 1}: {now:.1f} -> {totals[damping]:.1f}")
-        if not (gain := now - totals[damping]) > 0.0:
-            predicted = Predicted(*(part[0] for part in line.predicted))
+        problem.progress(f"step {iteration + 1}: {now:.1f} -> {totals[damping]:.1f}")
+        if now > totals[damping]:
+            total = float(totals[damping])
+            fit = Fit(vectors[best[0]], states[best, each], outcome[best, each], weights, total)
+        if not now - totals[damping] >= _CONVERGED:
             break
-        vector, starts, now = vectors[best[0]], states[best, each], float(totals[damping])
-        predicted = Predicted(*(part[best, each] for part in outcome))
-        if gain < _CONVERGED:
-            break
-    information = np.zeros((len(vector), len(vector)))
-    information[np.ix_(unknowns, unknowns)] = reduced.information / np.outer(scale, scale)
-    return Fit(vector, starts, information, predicted, weights, now)
+    return fit
 
 
-class Certainty(NamedTuple):
-    """What a log says about the unknowns at a minimum."""
-
-    covariance: np.ndarray
-    """[P, P], with the prior."""
-    information: np.ndarray
-    """[P, P], without the prior, after the starts are eliminated."""
-
-
-def certainty(problem: Problem, fit: Fit) -> Certainty:
-    """Information about the unknowns at a minimum, and their covariance.
+def certainty(problem: Problem, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+    """Information [P, P] of a log about the unknowns at a minimum, without the prior, and their
+    covariance [P, P], with it.
 
     In units of the prior's deviations, window s has the derivatives J_s [M, P] and the gradient
     g_s = J_s' r_s, after its start is eliminated (`_eliminate`).
@@ -237,7 +212,7 @@ def certainty(problem: Problem, fit: Fit) -> Certainty:
     ]
     central = [0.5 * (a.by_unknown + b.by_unknown) * scale for a, b in (lines[:2], lines[2:])]
     reduced = _eliminate(
-        problem.whiten_fit(fit.predicted, fit.weights),
+        problem.whiten(fit.predicted, fit.weights),
         np.concatenate(central, axis=2),
         np.mean([line.by_state for line in lines], axis=0) * reach,
         (fit.starts - problem.windows.starts)[:, entries] / reach,
@@ -256,7 +231,7 @@ def certainty(problem: Problem, fit: Fit) -> Certainty:
     sandwich = root @ scatter @ root.T
     wider = np.sqrt(np.maximum(np.diag(sandwich) / np.diag(independent), 1.0)) * scale
     information = (vectors * values) @ vectors.T
-    return Certainty(independent * np.outer(wider, wider), information / np.outer(scale, scale))
+    return information / np.outer(scale, scale), independent * np.outer(wider, wider)
 
 
 def _has_no_derivative(informations: np.ndarray, layout: Layout) -> np.ndarray:
@@ -282,10 +257,10 @@ def _symmetrise(matrices: np.ndarray) -> np.ndarray:
 class _Linearisation(NamedTuple):
     """The residuals at a point, and their derivatives by differences."""
 
-    predicted: Predicted
-    """At the point [1, S, ...]."""
-    residuals: np.ndarray
-    """[S, M]."""
+    predicted: np.ndarray
+    """What the sensors would measure at the point [S, M]."""
+    white: np.ndarray
+    """White residuals [S, M]."""
     by_unknown: np.ndarray
     """[S, M, F]."""
     by_state: np.ndarray
@@ -293,24 +268,23 @@ class _Linearisation(NamedTuple):
 
 
 class _Difference(NamedTuple):
-    """One simulation for derivatives."""
+    """One simulation for derivatives: some columns of the Jacobian, in some rows each."""
 
     columns: np.ndarray
-    """Derivatives that it gives: F unknowns, then D entries of the starts. Of several, each is that
-    of one joint's angles."""
+    """F unknowns, then D entries of the starts."""
     steps: np.ndarray
     """Change of each."""
-    angles: bool
-    """Whether it gives the derivatives of the angles."""
-    pictures: bool
-    """Whether it gives those of the pictures."""
+    rows: list[slice]
+    """Where each column is read."""
 
 
 def _list_differences(
     problem: Problem, vector: np.ndarray, unknowns: np.ndarray, entries: np.ndarray, size: float
 ) -> list[_Difference]:
     """The simulations for the F `unknowns` and the D `entries` of the starts."""
-    layout, n = problem.layout, problem.layout.num_joints
+    layout, n, split = problem.layout, problem.layout.num_joints, problem.windows.angles[0].size
+    angles, pictures, both = slice(0, split), slice(split, None), slice(0, None)
+    joints = [slice(j, split, n) for j in range(n)]
 
     def turn_inside(step: np.ndarray) -> np.ndarray:
         """Differences, with the other sign where they would leave the limits."""
@@ -325,21 +299,21 @@ def _list_differences(
             continue
         unknown, places = layout.unknowns[name], range(place.start, place.stop)
         if unknown.own:
-            together = np.array([column[p] for p in places])
-            found.append(_Difference(together, steps[place], True, False))
+            found.append(_Difference(np.array([column[p] for p in places]), steps[place], joints))
+        rows = pictures if name not in ARM else both if unknown.ball_step is None else angles
         for p in places:
-            one, apart = np.array([column[p]]), unknown.ball_step is not None
             if not unknown.own:
-                found.append(_Difference(one, steps[[p]], name in ARM, not apart))
+                found.append(_Difference(np.array([column[p]]), steps[[p]], [rows]))
             if unknown.ball_step:
-                found.append(_Difference(one, ball_steps[[p]], False, True))
-    start_steps, first = size * _scale_starts(problem.windows)[1], len(unknowns)
+                found.append(_Difference(np.array([column[p]]), ball_steps[[p]], [pictures]))
+    start_steps = size * _scale_starts(problem.windows)[1]
+    columns = len(unknowns) + np.arange(len(entries))
     arm = np.flatnonzero(entries < n)
     if len(arm):
         # A servo has forgotten its start before the first picture.
-        found.append(_Difference(first + arm, start_steps[entries[arm]], True, False))
+        found.append(_Difference(columns[arm], start_steps[entries[arm]], joints))
     for d in np.flatnonzero(entries >= 2 * n):
-        found.append(_Difference(first + np.array([d]), start_steps[entries[[d]]], False, True))
+        found.append(_Difference(columns[[d]], start_steps[entries[[d]]], [pictures]))
     return found
 
 
@@ -352,8 +326,8 @@ def _linearise(
     weights: np.ndarray,
     size: float = 1.0,
 ) -> _Linearisation:
-    """Residuals r, and derivatives (r(x + h e) - r(x)) / h by the F `unknowns` and the D `entries`
-    of the starts, where h is `size` times the step of each.
+    """White residuals r, and derivatives (r(x + h e) - r(x)) / h by the F `unknowns` and the D
+    `entries` of the starts, where h is `size` times the step of each.
 
     The Jacobian is sparse: a joint's start and its servo's gains move, nearly, that joint's angles
     alone, and a start matters in its own window. Columns that share no row share a simulation
@@ -362,43 +336,27 @@ def _linearise(
     all starts gives the column of each window. Where the rows of the angles and of the pictures
     need different steps (`Unknown.ball_step`), each have their own simulation.
     """
-    n, num_free = problem.layout.num_joints, len(unknowns)
-    num_angles = weights.shape[1] - 3 * problem.windows.balls.shape[1]
-    angles, pictures = (
-        np.any(part > 0.0, axis=1) for part in np.split(weights, [num_angles], axis=1)
-    )
-    differences = [
-        d
-        for d in _list_differences(problem, vector, unknowns, entries, size)
-        if (d.angles and np.any(angles)) or (d.pictures and np.any(pictures))
-    ]
+    num_free, differences, used = len(unknowns), [], [np.any(weights > 0.0, axis=1)]
+    for difference in _list_differences(problem, vector, unknowns, entries, size):
+        counts = [np.any(weights[:, rows] > 0.0, axis=1) for rows in difference.rows]
+        if np.any(counts):
+            differences.append(difference)
+            used.append(np.any(counts, axis=0))
     vectors = np.repeat(vector[None], 1 + len(differences), axis=0)
     states = np.repeat(starts[None], len(vectors), axis=0)
-    used = np.tile(angles | pictures, (len(vectors), 1))
     for i, difference in enumerate(differences, 1):
-        for column, step in zip(difference.columns, difference.steps, strict=True):
-            if column < num_free:
-                vectors[i, unknowns[column]] += step
-            else:
-                states[i, :, entries[column - num_free]] += step
-        used[i] = (difference.angles & angles) | (difference.pictures & pictures)
-    predicted = problem.simulate(vectors, states, used)
-    r = problem.whiten(problem.residuals(predicted), weights)
-    jacobian = np.zeros((*r.shape[1:], num_free + len(entries)))
+        is_unknown = difference.columns < num_free
+        vectors[i, unknowns[difference.columns[is_unknown]]] += difference.steps[is_unknown]
+        at = entries[difference.columns[~is_unknown] - num_free]
+        states[i][:, at] += difference.steps[~is_unknown]
+    predicted = problem.simulate(vectors, states, np.array(used))
+    white = problem.whiten(predicted, weights)
+    jacobian = np.zeros((*white.shape[1:], num_free + len(entries)))
     for i, difference in enumerate(differences, 1):
-        change, alone = r[i] - r[0], len(difference.columns) == 1
-        for j, (column, step) in enumerate(zip(difference.columns, difference.steps, strict=True)):
-            if difference.angles:
-                rows = slice(num_angles) if alone else slice(j, num_angles, n)
-                jacobian[:, rows, column] = change[:, rows] / step
-            if difference.pictures:
-                jacobian[:, num_angles:, column] = change[:, num_angles:] / step
-    return _Linearisation(
-        Predicted(*(part[:1] for part in predicted)),
-        r[0],
-        jacobian[..., :num_free],
-        jacobian[..., num_free:],
-    )
+        for column, step, rows in zip(*difference, strict=True):
+            jacobian[:, rows, column] = (white[i] - white[0])[:, rows] / step
+    by_unknown, by_state = np.split(jacobian, [num_free], axis=2)
+    return _Linearisation(predicted[0], white[0], by_unknown, by_state)
 
 
 class _Reduced(NamedTuple):
@@ -471,13 +429,11 @@ def _scale_starts(windows: Windows) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     return tuple(np.repeat(values, sizes) for values in groups)
 
 
-def picture_weights(problem: Problem, predicted: Predicted) -> np.ndarray:
+def picture_weights(problem: Problem, predicted: np.ndarray) -> np.ndarray:
     """Weights [S, B] of the pictures: less for outliers, and 0 for all of a window whose ball was
     not in free flight, such as one in a hand."""
     w = problem.windows
-    white = problem.whiten_fit(predicted, problem.weights())
-    r = white[:, -3 * w.balls.shape[1] :].reshape(w.balls.shape)
-    size = np.max(np.abs(r), axis=2)
+    size = np.max(np.abs(w.split(problem.whiten(predicted, problem.weights()))[1]), axis=2)
     count = np.maximum(np.sum(w.picture_weights, axis=1), 1.0)
     mean = np.sum(np.minimum(size, _WORST) ** 2 * w.picture_weights, axis=1) / count
     return np.minimum(1.0, _HUBER / np.maximum(size, 1e-9)) * (mean < _NO_FLIGHT)[:, None]

@@ -4,7 +4,6 @@ training."""
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,35 +23,73 @@ _LANES = 512
 """Windows that are simulated at a time; more would not fit the processor's cache."""
 
 
-class Predicted(NamedTuple):
-    """What the sensors of C candidates would have measured in S windows."""
-
-    angles: np.ndarray
-    """Joint angles [C, S, A, n], rad."""
-    balls: np.ndarray
-    """The ball in each picture [C, S, B, 3], m."""
-
-
-Simulate = Callable[[np.ndarray, np.ndarray, np.ndarray], Predicted]
+Simulate = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 """(vectors of unknowns [C, P], states at the starts [C, S, 2 n + 9], which windows count [C, S]) ->
-what they would measure; a window that does not count has the numbers of the first candidate, or 0
-if that has none."""
+what the sensors would have measured [C, S, A n + 3 B], as `Windows.measured`; a window that does
+not count has the numbers of the first candidate, or 0 if that has none."""
 
 
-Run = Callable[..., tuple[jax.Array, jax.Array]]
-"""The compiled part of a `Simulate`, which is the same for all logs."""
-
-
-def make_run(config: WorldConfig, num_joints: int) -> Run:
-    """Builds the simulation of windows in candidate worlds.
+def make_simulator(config: WorldConfig, layout: Layout, log: Log, windows: Windows) -> Simulate:
+    """Builds the simulation of a log's windows in candidate worlds.
 
     Measured angles are the true ones plus `encoder_bias`, which the servos share. A measured ball
     is the true one, `ball_latency` before its time stamp, turned by the camera's rotation about
     the middle of all measured ones, plus `ball_position_bias`.
     """
+    run, n = _compile(config, layout.num_joints), layout.num_joints
+    send = make_targets(log, windows, layout.physics_dt)
+    shown = windows.balls[windows.picture_weights > 0.0]
+    middle = np.mean(shown, axis=0) if len(shown) else np.zeros(3)
+    steps = windows.first + np.arange(windows.steps)[:, None]
+    angle_times, picture_times = (
+        times.T.astype(np.float32) for times in (windows.angle_times, windows.picture_times)
+    )
+    # A log without a ball lacks these terms; the compiled simulation has them.
+    absent = {name: np.zeros(_LANES) for name in ("air_drag", "ball_latency")}
+    absent |= {name: np.zeros((_LANES, 3)) for name in ("ball_position_bias", CAMERA_ROTATION)}
+    absent["encoder_bias"] = np.zeros((_LANES, n))
+
+    def simulate_block(
+        vectors: np.ndarray, starts: np.ndarray, c: np.ndarray, s: np.ndarray
+    ) -> np.ndarray:
+        """What is measured [L, A n + 3 B] in the windows s [L] of the candidates c [L]."""
+        count, fill = len(c), np.minimum(np.arange(_LANES), len(c) - 1)
+        # Another size would be compiled again.
+        c, s = c[fill], s[fill]
+        world = absent | layout.world(vectors[c])
+        targets = np.empty((windows.steps, n, _LANES), np.float32)
+        for i in np.unique(c):
+            lanes = c == i
+            late = send(*(float(world[x][lanes][0]) for x in ("action_latency", "servo_lag")))
+            targets[:, :, lanes] = np.moveaxis(late[steps[:, s[lanes]]], 2, 1)
+        given = {k: np.moveaxis(v, 0, -1).astype(np.float32) for k, v in world.items()}
+        first = starts[c, s].T.astype(np.float32)
+        out = run(
+            given, first, targets, angle_times[:, s], picture_times[:, s], middle.astype(np.float32)
+        )
+        rows = [np.moveaxis(np.asarray(x), 2, 0).reshape(_LANES, -1) for x in out]
+        return np.concatenate(rows, axis=1)[:count].astype(float)
+
+    def simulate(vectors: np.ndarray, starts: np.ndarray, used: np.ndarray) -> np.ndarray:
+        c, s = np.nonzero(used)
+        blocks = [slice(i, i + _LANES) for i in range(0, len(c), _LANES)]
+        with ThreadPoolExecutor() as pool:
+            rows = pool.map(lambda b: simulate_block(vectors, starts, c[b], s[b]), blocks)
+            measured = np.concatenate(list(rows))
+        result = np.zeros((*used.shape, measured.shape[1]))
+        result[:, s[c == 0]] = measured[c == 0]
+        result[c, s] = measured
+        return result
+
+    return simulate
+
+
+def _compile(config: WorldConfig, n: int) -> Callable[..., tuple[jax.Array, jax.Array]]:
+    """The part of a simulation that is compiled, which is the same for all logs: angles
+    [A, n, L], rad, and balls [B, 3, L], m."""
     model = world_model(config, visual=False)
     engine, addresses = make_engine(model, config.physics), find_addresses(model)
-    n, ball, dt = num_joints, addresses.balls[0], config.physics_dt
+    ball, dt = addresses.balls[0], config.physics_dt
     gear = model.actuator_gear[:, 0]
     shown_q = (*addresses.arm_qpos, *ball.qpos[:3])
     shown_v = (*addresses.arm_qvel, *ball.qvel[:3])
@@ -100,63 +137,6 @@ def make_run(config: WorldConfig, num_joints: int) -> Run:
         return angles, balls + turned + world["ball_position_bias"]
 
     return run
-
-
-def make_simulator(run: Run, layout: Layout, log: Log, windows: Windows) -> Simulate:
-    """Binds a log and its windows to a simulation."""
-    send, n = make_targets(log, windows, layout.physics_dt), layout.num_joints
-    shown = windows.balls[windows.picture_weights > 0.0]
-    middle = np.mean(shown, axis=0) if len(shown) else np.zeros(3)
-    steps = windows.first + np.arange(windows.steps)[:, None]
-    angle_times, picture_times = (
-        times.T.astype(np.float32) for times in (windows.angle_times, windows.picture_times)
-    )
-
-    # A log without a ball lacks these terms; the compiled simulation has them.
-    absent = {name: np.zeros(_LANES) for name in ("air_drag", "ball_latency")}
-    absent |= {name: np.zeros((_LANES, 3)) for name in ("ball_position_bias", CAMERA_ROTATION)}
-    absent["encoder_bias"] = np.zeros((_LANES, n))
-
-    def simulate_block(
-        vectors: np.ndarray, starts: np.ndarray, c: np.ndarray, s: np.ndarray
-    ) -> list[np.ndarray]:
-        """Angles and pictures [L, ...] of the windows s [L] in the candidates c [L]."""
-        count, fill = len(c), np.minimum(np.arange(_LANES), len(c) - 1)
-        # Another size would be compiled again.
-        c, s = c[fill], s[fill]
-        world = absent | layout.world(vectors[c])
-        targets = np.empty((windows.steps, n, _LANES), np.float32)
-        for i in np.unique(c):
-            pair = layout.world(vectors[i])
-            late = send(float(pair["action_latency"]), float(pair["servo_lag"]))
-            targets[:, :, c == i] = np.moveaxis(late[steps[:, s[c == i]]], 2, 1)
-        given = {k: np.moveaxis(v, 0, -1).astype(np.float32) for k, v in world.items()}
-        first = starts[c, s].T.astype(np.float32)
-        out = run(
-            given, first, targets, angle_times[:, s], picture_times[:, s], middle.astype(np.float32)
-        )
-        return [np.moveaxis(np.asarray(x), 2, 0)[:count].astype(float) for x in out]
-
-    def simulate(vectors: np.ndarray, starts: np.ndarray, used: np.ndarray) -> Predicted:
-        pairs = np.nonzero(used)
-        blocks = [slice(i, i + _LANES) for i in range(0, len(pairs[0]), _LANES)]
-        with ThreadPoolExecutor() as pool:
-            parts = list(
-                pool.map(
-                    lambda b: simulate_block(vectors, starts, pairs[0][b], pairs[1][b]), blocks
-                )
-            )
-        results = []
-        for k, measured in enumerate((windows.angles, windows.balls)):
-            result = np.zeros((len(vectors), *measured.shape))
-            values = np.concatenate([part[k] for part in parts])
-            first = pairs[0] == 0
-            result[:, pairs[1][first]] = values[first]
-            result[pairs] = values
-            results.append(result)
-        return Predicted(*results)
-
-    return simulate
 
 
 def make_targets(log: Log, windows: Windows, dt: float) -> Callable[[float, float], np.ndarray]:

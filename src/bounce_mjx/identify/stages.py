@@ -10,7 +10,7 @@ import numpy as np
 from bounce_mjx.env.env import world_model
 from bounce_mjx.identify.fit import Fit, Noise, Problem, certainty, minimise, picture_weights
 from bounce_mjx.identify.log import Log, least_age
-from bounce_mjx.identify.simulation import Predicted, make_run, make_simulator
+from bounce_mjx.identify.simulation import make_simulator
 from bounce_mjx.identify.unknowns import FRAME_DEVIATION, Layout, make_layout
 from bounce_mjx.identify.windows import GRAVITY, Windows, cut
 from bounce_mjx.robot.model import find_addresses
@@ -40,6 +40,9 @@ class Identified(NamedTuple):
     windows: Windows
     noise: Noise
     fit: Fit
+    information: np.ndarray
+    """Of the log about the unknowns [P, P], without the prior: the inverse of their covariance,
+    after the starts are eliminated."""
     covariance: np.ndarray
     """Of the unknowns [P, P], with the prior."""
     before: dict[str, float]
@@ -98,21 +101,6 @@ def sensor_noise(log: Log) -> Noise:
     return Noise(np.maximum(angles, 1e-5), np.maximum(balls, 1e-4))
 
 
-def _straighten_times(log: Log) -> Log:
-    """The log with each stretch of control steps at regular times: a line through its stamps."""
-    return log._replace(times=_fit_line(log.times), target_times=_fit_line(log.target_times))
-
-
-def _fit_line(times: np.ndarray) -> np.ndarray:
-    steps = np.diff(times)
-    typical, lines = float(np.median(steps)), []
-    for part in np.split(times, np.flatnonzero(steps > 1.5 * typical) + 1):
-        index = np.arange(len(part)) - 0.5 * (len(part) - 1)
-        slope = typical if len(part) < 50 else float(index @ part / (index @ index))
-        lines.append(np.mean(part) + slope * index)
-    return np.concatenate(lines)
-
-
 def _rms_at_rest(values: np.ndarray) -> np.ndarray:
     """Root mean square [k] in the quietest quarter of stretches of 200 rows."""
     count = max(len(values) // 200, 1)
@@ -143,112 +131,73 @@ def identify(
     with_ball = bounces >= _FEWEST_BOUNCES
     progress(f"{len(windows.first)} windows, {bounces} with a bounce")
     layout = make_layout(config.num_joints, with_ball, config.physics_dt, camera_rotation)
-    run, noise = make_run(config, config.num_joints), sensor_noise(log)
-
-    def search_in(log: Log) -> _Search:
-        windows = cut(log, config.physics_dt)
-        simulate = make_simulator(run, layout, log, windows)
-        return _Search(Problem(simulate, windows, layout, noise), progress)
-
-    search, fit = _fit_arm(search_in(log), search_in(_straighten_times(log)))
-    stages, states, pictures = ["arm"], search.arm_state, 1.0
+    simulate = make_simulator(config, layout, log, windows)
+    problem = Problem(simulate, windows, layout, sensor_noise(log), progress)
+    progress("arm")
+    fit = _search(problem, _guess_arm(problem), ["arm"], 10, 0.0, windows.arm_state)
+    stages, states, pictures = ["arm"], windows.arm_state, 1.0
     if with_ball:
-        search, fit = _align_frame(search, fit, world_model(config, visual=False))
-        fit, pictures = _fit_ball(search, fit)
+        problem, fit = _align_frame(problem, fit, world_model(config, visual=False))
+        fit, pictures = _fit_ball(problem, fit)
         stages, states = ["arm", "flight", "bounce"], None
     progress("all")
-    fit = search.run(stages, fit, pictures, 3, states)
-    unseen = search.fit_held_out(fit, pictures, states)
-    fit = search.run(stages, unseen, pictures, 3, states, np.ones_like(search.training))
-    problem, windows = search.problem, search.problem.windows
+    fit = _search(problem, fit, stages, 3, pictures, states)
+    unseen = _fit_held_out(problem, fit, pictures, states)
+    fit = _search(problem, unseen, stages, 3, pictures, states, np.ones(1))
     layout = problem.layout
     nominal = {name: TERMS[name].nominal for name in layout.terms() if name in TERMS}
     own = layout.vector({name: value for name, value in nominal.items() if value is not None})
     before = fit._replace(predicted=problem.predict(own, fit.starts))
-    counts = np.any(fit.weights[:, -3 * windows.balls.shape[1] :] > 0.0, axis=1)
-    known = certainty(problem, fit)
+    counts = np.any(windows.split(fit.weights)[1] > 0.0, axis=(1, 2))
     return Identified(
         layout,
         windows,
-        noise,
-        fit._replace(information=known.information),
-        known.covariance,
-        _measure_errors(problem, before),
-        _measure_errors(problem, fit),
-        _measure_errors(problem, unseen),
+        problem.noise,
+        fit,
+        *certainty(problem, fit),
+        *(_measure_errors(problem, x) for x in (before, fit, unseen)),
         int(np.sum(windows.has_ball & ~counts)),
         least_age(log),
     )
 
 
-class _Search(NamedTuple):
-    """Searches with one problem, on the windows that are not held out."""
-
-    problem: Problem
-    progress: Callable[[str], None]
-
-    @property
-    def training(self) -> np.ndarray:
-        """1 for each window of the search [S, 1], 0 for those held out."""
-        index = np.arange(len(self.problem.windows.first))
-        return np.where(index % _HELD_OUT == _HELD_OUT - 1, 0.0, 1.0)[:, None]
-
-    @property
-    def arm_state(self) -> np.ndarray:
-        """Which entries [D] of a window's start are the arm's."""
-        return np.arange(self.problem.windows.starts.shape[1]) < 2 * self.problem.layout.num_joints
-
-    def run(
-        self,
-        stages: Sequence[str],
-        fit: Fit,
-        pictures: np.ndarray | float,
-        iterations: int,
-        states: np.ndarray | None = None,
-        mask: np.ndarray | None = None,
-    ) -> Fit:
-        """The fit after a search over the unknowns of some stages.
-
-        Args:
-          pictures: weights of the pictures [S, B].
-          states: which entries [D] of the starts may change; all by default.
-          mask: weights of the windows [S, 1]; `training` by default.
-        """
-        weights = self.problem.weights(pictures=pictures)
-        weights = weights * (self.training if mask is None else mask)
-        free = self.problem.layout.free(stages) if stages else np.zeros(len(fit.vector), bool)
-        return minimise(
-            self.problem, fit.vector, fit.starts, free, weights, iterations, states, self.progress
-        )
-
-    def fit_held_out(
-        self, fit: Fit, pictures: np.ndarray | float, states: np.ndarray | None
-    ) -> Fit:
-        """The fit after a search over nothing but the starts of the windows held out."""
-        return self.run([], fit, pictures, 3, states, 1.0 - self.training)
+def _training(problem: Problem) -> np.ndarray:
+    """1 for each window of the search [S, 1], 0 for those held out."""
+    index = np.arange(len(problem.windows.first))
+    return np.where(index % _HELD_OUT == _HELD_OUT - 1, 0.0, 1.0)[:, None]
 
 
-def _fit_arm(search: _Search, regular: _Search) -> tuple[_Search, Fit]:
-    """The arm alone, with the log's time stamps or with regular ones, if they explain it better."""
-    search.progress("arm")
-    first = _pick_first(search.problem, search.training)
-    fit = search.run(["arm"], first, 0.0, 2, search.arm_state)
-    windows = regular.problem.windows
-    if len(windows.first) == len(search.problem.windows.first):
-        other = first._replace(starts=windows.starts)
-        other = regular.run(["arm"], other, 0.0, 2, regular.arm_state)
-        if other.cost < fit.cost:
-            message = "the time stamps jitter about regular steps, which explain the log better"
-            search.progress(message)
-            search, fit = regular, other
-    return search, search.run(["arm"], fit, 0.0, 8, search.arm_state)
+def _search(
+    problem: Problem,
+    fit: Fit,
+    stages: Sequence[str],
+    iterations: int,
+    pictures: np.ndarray | float = 1.0,
+    states: np.ndarray | None = None,
+    mask: np.ndarray | None = None,
+) -> Fit:
+    """The fit after a search over the unknowns of some stages.
+
+    Args:
+      pictures: weights of the pictures [S, B].
+      states: which entries [D] of the starts may change; all by default.
+      mask: weights of the windows [S, 1]; by default, those held out have none.
+    """
+    weights = problem.weights(pictures) * (_training(problem) if mask is None else mask)
+    return minimise(problem, fit, problem.layout.free(stages), weights, iterations, states)
 
 
-def _align_frame(search: _Search, fit: Fit, model: mujoco.MjModel) -> tuple[_Search, Fit]:
-    """The search and the fit with the ball's frame moved to where the bounces are on the paddle, if
+def _fit_held_out(
+    problem: Problem, fit: Fit, pictures: np.ndarray | float, states: np.ndarray | None
+) -> Fit:
+    """The fit after a search over nothing but the starts of the windows held out."""
+    return _search(problem, fit, [], 3, pictures, states, 1.0 - _training(problem))
+
+
+def _align_frame(problem: Problem, fit: Fit, model: mujoco.MjModel) -> tuple[Problem, Fit]:
+    """The problem and the fit with the ball's frame moved so that the bounces are on the paddle, if
     they are beside it: no search would find it, as a ball beside the paddle does not bounce."""
-    problem, layout = search.problem, search.problem.layout
-    windows, offsets = problem.windows, []
+    layout, windows, offsets = problem.layout, problem.windows, []
     addresses, data = find_addresses(model), mujoco.MjData(model)
     paddle, radius = addresses.paddle_geom, model.geom_size[addresses.ball_geom, 0]
     for s in np.flatnonzero(windows.has_ball):
@@ -265,8 +214,8 @@ def _align_frame(search: _Search, fit: Fit, model: mujoco.MjModel) -> tuple[_Sea
     sideways = np.hypot(*offset[:2]) > np.max(model.geom_size[paddle, :2])
     offset *= [sideways, sideways, abs(offset[2]) > _BESIDE]
     if not np.any(offset):
-        return search, fit
-    search.progress(f"the bounces are beside the paddle by {offset} m")
+        return problem, fit
+    problem.progress(f"the bounces are beside the paddle by {offset} m")
     name, n = "ball_position_bias", layout.num_joints
     unknown = layout.unknowns[name]
     deviation = np.where(offset != 0.0, FRAME_DEVIATION, unknown.deviation)
@@ -275,38 +224,32 @@ def _align_frame(search: _Search, fit: Fit, model: mujoco.MjModel) -> tuple[_Sea
     vector, starts = fit.vector.copy(), fit.starts.copy()
     vector[layout.slices()[name]] = offset
     starts[windows.has_ball, 2 * n : 2 * n + 3] -= offset
-    search = search._replace(problem=problem._replace(layout=layout))
-    return search, fit._replace(vector=vector, starts=starts)
+    return problem._replace(layout=layout), fit._replace(vector=vector, starts=starts)
 
 
-def _fit_ball(search: _Search, fit: Fit) -> tuple[Fit, np.ndarray]:
+def _fit_ball(problem: Problem, fit: Fit) -> tuple[Fit, np.ndarray]:
     """The ball's flights, then its bounces; and the weights of the pictures [S, B]."""
-    windows, ball_state = search.problem.windows, ~search.arm_state
-    search.progress("flight")
+    windows, states = problem.windows, ~problem.windows.arm_state
+    problem.progress("flight")
     flying = windows.picture_times < windows.bounces[:, None] - BEFORE_BOUNCE
-    fit = search.run(["flight"], fit, flying * 1.0, 4, ball_state)
-    search.progress("bounce")
+    fit = _search(problem, fit, ["flight"], 4, flying * 1.0, states)
+    problem.progress("bounce")
+    stages, few = ["flight", "bounce"], _sample(problem, windows.has_ball)
     # A ball that slips and one that sticks are two valleys, and each latency may be one.
     tried = [
-        _shift_flights(search.problem, fit, latency, friction)
+        _shift_flights(problem, fit, latency, friction)
         for latency, friction in itertools.product(_BALL_LATENCIES, _FRICTIONS)
     ]
-    used = np.flatnonzero(windows.has_ball & (search.training[:, 0] > 0.0))
-    few = np.zeros_like(search.training)
-    few[_sample(used)] = 1.0
     for kept, iterations in ((4, 1), (1, 2)):
-        found = [
-            search.run(["flight", "bounce"], t, 1.0, iterations, ball_state, few) for t in tried
-        ]
+        found = [_search(problem, x, stages, iterations, 1.0, states, few) for x in tried]
         tried = sorted(found, key=lambda fit: fit.cost)[:kept]
-    (fit,) = tried
-    fit = search.run(["flight", "bounce"], fit, 1.0, 5, ball_state)
-    fit = search.fit_held_out(fit, 1.0, ball_state)
-    pictures = picture_weights(search.problem, search.problem.predict(fit.vector, fit.starts))
-    return search.run(["flight", "bounce"], fit, pictures, 6, ball_state), pictures
+    fit = _search(problem, tried[0], stages, 5, 1.0, states)
+    fit = _fit_held_out(problem, fit, 1.0, states)
+    pictures = picture_weights(problem, problem.predict(fit.vector, fit.starts))
+    return _search(problem, fit, stages, 6, pictures, states), pictures
 
 
-def _pick_first(problem: Problem, mask: np.ndarray) -> Fit:
+def _guess_arm(problem: Problem) -> Fit:
     """The best of candidates that differ in latency and lag, which the search could confuse."""
     layout, own = problem.layout, problem.layout.world(problem.layout.mean)
     vectors = np.stack(
@@ -315,17 +258,13 @@ def _pick_first(problem: Problem, mask: np.ndarray) -> Fit:
             for latency, lag in itertools.product(_LATENCIES, _LAGS)
         ]
     )
-    weights = problem.weights(pictures=0.0) * mask
     starts = np.repeat(problem.windows.starts[None], len(vectors), axis=0)
-    counts = _sample(np.flatnonzero(np.any(weights > 0.0, axis=1)))
-    used = np.zeros((len(vectors), len(weights)), bool)
-    used[:, counts] = True
-    white = problem.whiten(problem.residuals(problem.simulate(vectors, starts, used)), weights)
-    costs = np.sum(0.5 * np.sum(white**2, axis=2)[:, counts], axis=1)
-    best = int(np.nanargmin(costs))
-    none = np.zeros((len(layout.mean), len(layout.mean)))
-    nothing = Predicted(np.zeros(0), np.zeros(0))
-    return Fit(vectors[best], starts[best], none, nothing, weights, float(costs[best]))
+    counts = np.any(problem.windows.angle_weights > 0.0, axis=1)
+    weights = problem.weights(pictures=0.0) * _sample(problem, counts)
+    used = np.tile(np.any(weights > 0.0, axis=1), (len(vectors), 1))
+    white = problem.whiten(problem.simulate(vectors, starts, used), weights)
+    best = int(np.nanargmin(np.sum(white**2, axis=(1, 2))))
+    return Fit(vectors[best], starts[best])
 
 
 def _shift_flights(problem: Problem, fit: Fit, latency: float, friction: float) -> Fit:
@@ -341,23 +280,26 @@ def _shift_flights(problem: Problem, fit: Fit, latency: float, friction: float) 
     return fit._replace(vector=vector, starts=starts)
 
 
-def _sample(windows: np.ndarray) -> np.ndarray:
-    """About `_FEW` of the windows, evenly over the log."""
-    return windows[:: max(len(windows) // _FEW, 1)]
+def _sample(problem: Problem, counts: np.ndarray) -> np.ndarray:
+    """1 for about `_FEW` of the windows of the search that count [S], evenly over the log
+    [S, 1]."""
+    used = np.flatnonzero(counts & (_training(problem)[:, 0] > 0.0))
+    few = np.zeros((len(counts), 1))
+    few[used[:: max(len(used) // _FEW, 1)]] = 1.0
+    return few
 
 
 def _measure_errors(problem: Problem, fit: Fit) -> dict[str, float]:
     """Root mean square of each sensor's residuals in units of its noise; the estimated starts count
     as degrees of freedom."""
-    white = problem.whiten_fit(fit.predicted, fit.weights)
-    split = fit.weights.shape[1] - 3 * problem.windows.balls.shape[1]
-    n, errors = problem.layout.num_joints, {}
-    for name, part, states in (
-        ("joint_angles", slice(0, split), 2 * n),
-        ("ball_position", slice(split, None), 6),
+    white = problem.whiten(fit.predicted, fit.weights)
+    parts = zip(problem.windows.split(white), problem.windows.split(fit.weights), strict=True)
+    states, errors = (2 * problem.layout.num_joints, 6), {}
+    for name, (residuals, weights), known in zip(
+        ("joint_angles", "ball_position"), parts, states, strict=True
     ):
-        used = np.sum(fit.weights[:, part] > 0.0, axis=1)
-        free = float(np.sum(np.maximum(used - states, 0)))
+        used = np.sum(weights > 0.0, axis=(1, 2))
+        free = float(np.sum(np.maximum(used - known, 0)))
         if free > 0.0:
-            errors[name] = float(np.sqrt(np.sum(white[:, part] ** 2) / free))
+            errors[name] = float(np.sqrt(np.sum(residuals**2) / free))
     return errors

@@ -69,6 +69,24 @@ class Windows(NamedTuple):
         """Which windows [S] show the ball."""
         return np.isfinite(self.bounces)
 
+    @property
+    def measured(self) -> np.ndarray:
+        """All measurements of each window in a row [S, A n + 3 B]: angles, then balls."""
+        return np.concatenate([x.reshape(len(x), -1) for x in (self.angles, self.balls)], axis=1)
+
+    def split(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The angles [..., A, n] and the balls [..., B, 3] of rows [..., A n + 3 B]."""
+        angles, balls = np.split(rows, [self.angles[0].size], axis=-1)
+        return tuple(
+            x.reshape(*rows.shape[:-1], *like.shape[1:])
+            for x, like in ((angles, self.angles), (balls, self.balls))
+        )
+
+    @property
+    def arm_state(self) -> np.ndarray:
+        """Which entries [2 n + 9] of a start are the arm's."""
+        return np.arange(self.starts.shape[1]) < 2 * self.angles.shape[2]
+
 
 def cut(log: Log, physics_dt: float, min_windows: int = 1) -> Windows:
     """Cuts a log into windows, `_MOST` at most: of more, every k-th is used.

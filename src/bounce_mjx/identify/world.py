@@ -172,7 +172,7 @@ def _describe_unseen(found: Identified, joint_names: Sequence[str]) -> list[str]
     units of the prior, with small eigenvalues."""
     layout, labels = found.layout, found.layout.labels(joint_names)
     owners = [n for n, place in layout.terms().items() for _ in range(place.start, place.stop)]
-    scaled = found.fit.information * np.outer(layout.deviation, layout.deviation)
+    scaled = found.information * np.outer(layout.deviation, layout.deviation)
     values, vectors = np.linalg.eigh(scaled)
     said: dict[frozenset[str], str] = {}
     for value, vector in zip(values, vectors.T, strict=True):

@@ -48,7 +48,8 @@ def identification_page(found: Identified, source: str, joint_names: Sequence[st
 def traces_figure(found: Identified, joint_names: Sequence[str]) -> Figure:
     """Measured (dots) and simulated (lines) joint angles and heights of the ball in some windows:
     those of the arm alone, then those of a bounce."""
-    windows, predicted = found.windows, found.fit.predicted
+    windows = found.windows
+    angles, balls = windows.split(found.fit.predicted)
     chosen = [
         group[i]
         for group in (np.flatnonzero(~windows.has_ball), np.flatnonzero(windows.has_ball))
@@ -63,13 +64,13 @@ def traces_figure(found: Identified, joint_names: Sequence[str]) -> Figure:
         means = np.mean(measured, axis=0)
         for j, name in enumerate(joint_names):
             above.plot(times, measured[:, j] - means[j], ".", ms=3, color=f"C{j}")
-            simulated = predicted.angles[s, used, j] - means[j]
+            simulated = angles[s, used, j] - means[j]
             above.plot(times, simulated, lw=1, color=f"C{j}", label=name)
         above.set_xlabel("time in the window, s")
         used = windows.picture_weights[s] > 0.0
         times = windows.picture_times[s, used]
         below.plot(times, windows.balls[s, used, 2], ".", ms=3, color="k")
-        below.plot(times, predicted.balls[s, used, 2], lw=1, color="C1")
+        below.plot(times, balls[s, used, 2], lw=1, color="C1")
         below.set_xlabel("time in the window, s")
         below.set_visible(bool(windows.has_ball[s]))
     axes[0, 0].set_ylabel("joint angles minus their means, rad")
