@@ -179,20 +179,20 @@ LATE = dict(name="late", strengths=[0.01], terms={"action_latency": "strength"})
 MISTAKES = {
     "unknown term": (
         [LATE | {"terms": {"action_latencies": "strength"}}],
-        "unknown term action_latencies; did you mean action_latency?",
+        "unknown key randomization.action_latencies; did you mean randomization.action_latency?",
     ),
     "limit of a command": (
         [LATE | {"terms": {"target_height": {"from": 0, "to": "strength"}}}],
-        "'late' at 0.01: target_height (0.0, 0.01) leaves 0.001 to inf; narrow the range",
+        "'late' at 0.01: target_height is 0, but must be a finite number >= 0.001",
     ),
     "unknown task": ([LATE | {"task": "bunce"}], "there is no task 'bunce'"),
     "unused strengths": ([LATE | {"terms": {"action_latency": 0.01}}], "strengths are alike"),
     "nothing": ([dict(name="late")], "it changes nothing"),
-    "unknown unit": ([LATE | {"unit": "furlongs"}], "the unit 'furlongs' is unknown"),
+    "unknown unit": ([LATE | {"unit": "furlongs"}], "unit is 'furlongs', but must be"),
     "same name": ([LATE, LATE], "'late': the name is taken"),
     "length": (
         [LATE | {"terms": {"paddle_tilt": ["strength", 0, 0]}}],
-        "paddle_tilt has 3 values, but must have 2",
+        "is not a range; give two numbers, or two lists with one for each of 2 axes",
     ),
     "limit": (
         [LATE | {"terms": {"restitution": "strength"}}],

@@ -26,6 +26,8 @@ _FRICTIONS = (0.01, 0.2)
 # Windows in which the first candidates are compared.
 _FEW = 13
 _LAGS = (0.001, 0.008, 0.016, 0.026, 0.038)
+# Standard deviation of stamps about regular steps below which the steps count as regular, s.
+_JITTER = 5e-4
 BEFORE_BOUNCE = 0.012
 """Time before a bounce at which a flight counts as over, s: the camera's jitter, half a contact."""
 _FEWEST_BOUNCES = 3
@@ -101,6 +103,19 @@ def sensor_noise(log: Log) -> Noise:
     return Noise(np.maximum(angles, 1e-5), np.maximum(balls, 1e-4))
 
 
+def _straighten(times: np.ndarray) -> np.ndarray:
+    """Stamps [T] of control steps at regular times, in each stretch in which they only jitter about
+    a line: what a stamp is off by is an error of the stamp, not of the step."""
+    steps = np.diff(times)
+    typical, stretches = float(np.median(steps)), []
+    for part in np.split(times, np.flatnonzero(steps > 1.5 * typical) + 1):
+        index = np.arange(len(part)) - 0.5 * (len(part) - 1)
+        slope = typical if len(part) < 50 else float(index @ part / (index @ index))
+        line = np.mean(part) + slope * index
+        stretches.append(line if np.std(part - line) < _JITTER else part)
+    return np.concatenate(stretches)
+
+
 def _rms_at_rest(values: np.ndarray) -> np.ndarray:
     """Root mean square [k] in the quietest quarter of stretches of 200 rows."""
     count = max(len(values) // 200, 1)
@@ -126,6 +141,8 @@ def identify(
     Raises:
       UserError: the log has fewer than five windows.
     """
+    times = {name: _straighten(getattr(log, name)) for name in ("times", "target_times")}
+    log = log._replace(**times)
     windows = cut(log, config.physics_dt, min_windows=5)
     bounces = int(np.sum(windows.has_ball))
     with_ball = bounces >= _FEWEST_BOUNCES

@@ -25,23 +25,17 @@ _WEAK = 1.5
 _SHARE = 0.35
 _GOOD_FIT = 1.2
 
+# What shows unknowns that a log does not show or separate.
 _MOTIONS = {
-    "encoder_bias": "bounces in other postures of the arm separate them",
-    "paddle_tilt": "bounces in other postures of the arm separate them",
-    "paddle_offset": "bounces in other postures of the arm, and near the paddle's edges, show it",
-    "ball_position_bias": "bounces at places far apart show it",
-    CAMERA_ROTATION: "bounces at places far apart, and a level under the base, show it",
-    "gravity_tilt": "long flights, and a level under the base, show it",
-    "link_mass": "a known weight on the paddle, or slow motions in other postures, show it",
-    "servo_gain": "a known weight on the paddle, or slow motions in other postures, show it",
-    "servo_damping": "faster motions show it (bounce-mjx excite --max-velocity)",
-    "servo_lag": "faster motions show it (bounce-mjx excite --max-velocity)",
-    "action_latency": "faster motions show it (bounce-mjx excite --max-velocity)",
-    "joint_frictionloss": "slow motions there and back show it (bounce-mjx excite)",
-    "contact_friction": "a ball that slips shows it: one with spin, or thrown from the side",
-    "air_drag": "higher flights show it",
-    "ball_latency": "bounces at several target heights show it",
-    "restitution": "more bounces show it",
+    "bounces in other postures of the arm": "encoder_bias paddle_tilt paddle_offset",
+    "bounces at places far apart": f"ball_position_bias {CAMERA_ROTATION}",
+    "long flights, and a level under the base,": "gravity_tilt",
+    "a known weight on the paddle, or slow motions in other postures,": "link_mass servo_gain",
+    "faster motions (bounce-mjx excite --max-velocity)": "servo_damping servo_lag action_latency",
+    "slow motions there and back (bounce-mjx excite)": "joint_frictionloss",
+    "balls with spin, or thrown from the side,": "contact_friction",
+    "higher flights": "air_drag",
+    "more bounces, at several target heights,": "ball_latency restitution",
 }
 # Deviations of the prior beyond which an estimate is a mistake, and what is likely to be wrong.
 _SURPRISING = 3.0
@@ -55,8 +49,7 @@ _ARM = (
     "another arm than --robot's, swapped columns of joints, a joint's zero, the unit of the "
     "angles, the clock of the servo targets, or the frame of the ball"
 )
-_MISTAKES = dict.fromkeys(BALL, _FRAME) | {CAMERA_ROTATION: _FRAME, "gravity_tilt": _FRAME}
-_MISTAKES |= dict.fromkeys(
+_MISTAKES = dict.fromkeys([*BALL, CAMERA_ROTATION, "gravity_tilt"], _FRAME) | dict.fromkeys(
     ("air_drag", "ball_latency", "restitution", "contact_friction"), _PICTURES
 )
 
@@ -176,19 +169,16 @@ def _describe_unseen(found: Identified, joint_names: Sequence[str]) -> list[str]
     values, vectors = np.linalg.eigh(scaled)
     said: dict[frozenset[str], str] = {}
     for value, vector in zip(values, vectors.T, strict=True):
-        if value > _WEAK:
-            break
         main = np.flatnonzero(np.abs(vector) > _SHARE)
         names = frozenset(owners[i] for i in main)
-        if not names or names in said:
+        if value > _WEAK or not names or names in said:
             continue
-        motion = next(_MOTIONS[name] for name in _MOTIONS if name in names)
-        if len(main) == 1:
-            text = f"The log does not show {labels[main[0]]}: its interval is the prior's"
-        else:
+        motion = next(x for x, shown in _MOTIONS.items() if names & set(shown.split()))
+        text = f"The log does not show {labels[main[0]]}: its interval is the prior's"
+        if len(main) > 1:
             listed = ", ".join(labels[i] for i in main)
             text = f"The log does not separate {listed}: their intervals are mostly the prior's"
-        said[names] = f"{text}; {motion}."
+        said[names] = f"{text}; {motion} would."
     return list(said.values())
 
 
@@ -217,26 +207,26 @@ def to_yaml(found: Identified, log: Log, joint_names: Sequence[str], robot: str 
         how = "Identified" if shown else "Not shown, so the prior stands,"
         values = ", ".join(map(_format, entries))
         sources[name] = f"{how} from {log.source}: {values} (95%)."
-    for name, unknown in {} if "ball_latency" in ranges else BALL.items():
+    for name in [name for name in BALL if name not in ranges]:
+        unknown = BALL[name]
         ends = unknown.mean - unknown.deviation, unknown.mean + unknown.deviation
         ranges[name] = _clip(name, ends)
         sources[name] = f"{log.source} shows no bounce; these are typical values."
         assumed.append(name)
-    for name, (ends, words) in _measure_sensors(found, log).items():
-        ranges[name] = _clip(name, ends)
+    for name, (low, high, words) in _measure_sensors(found, log).items():
+        ranges[name] = _clip(name, (low, high))
         sources[name] = f"{words} in {log.source}."
     content: dict[str, Any] = {} if robot is None else {"robot": robot}
     content["env"] = {"randomization": ranges}
     content["sources"] = {f"randomization.{name}": text for name, text in sources.items()}
     content["assumed"] = [f"randomization.{name}" for name in assumed]
-    head = f"# Identified from {log.source}: bounce-mjx train --world FILE\n"
     # The numbers of an end on one line, and sources below one another.
     parts = [
         yaml.safe_dump({key: value}, sort_keys=False, default_flow_style=style, width=100)
         for key, value in content.items()
         for style in [None if key == "env" else False]
     ]
-    return head + "".join(parts)
+    return f"# Identified from {log.source}: bounce-mjx train --world FILE\n{''.join(parts)}"
 
 
 def compare(world: NamedWorld, found: Identified, joint_names: Sequence[str]) -> list[str]:
@@ -297,24 +287,17 @@ def measure_camera(log: Log) -> tuple[float, float] | None:
     return 1.0 / period, float(np.sum(missing) / (len(missing) + np.sum(missing)))
 
 
-def _measure_sensors(found: Identified, log: Log) -> dict[str, tuple[tuple[float, float], str]]:
-    """Ranges of the sensors' noise and of the camera, and how they were measured."""
-    angles = found.noise.angles
-    ranges = {
-        "joint_angle_noise": (
-            (0.8 * float(np.min(angles)), 1.2 * float(np.max(angles))),
-            "Third differences of the joint angles",
-        )
-    }
+def _measure_sensors(found: Identified, log: Log) -> dict[str, tuple[float, float, str]]:
+    """Lower and upper end of the sensors' noise and of the camera's terms, and how they were
+    measured."""
+    angles, balls = ((0.8 * np.min(noise), 1.2 * np.max(noise)) for noise in found.noise)
+    ranges = {"joint_angle_noise": (*angles, "Third differences of the joint angles")}
     if (camera := measure_camera(log)) is not None:
         rate, lost = camera
-        noise = found.noise.balls
+        parabola = "Distances of pictures from a parabola through their neighbours"
         ranges |= {
-            "camera_rate": ((0.97 * rate, 1.03 * rate), "Intervals of the pictures"),
-            "frame_drop": ((0.5 * lost, 1.5 * lost + 0.01), "Missing pictures"),
-            "ball_position_noise": (
-                (0.8 * float(np.min(noise)), 1.2 * float(np.max(noise))),
-                "Distances of pictures from a parabola through their neighbours",
-            ),
+            "camera_rate": (0.97 * rate, 1.03 * rate, "Intervals of the pictures"),
+            "frame_drop": (0.5 * lost, 1.5 * lost + 0.01, "Missing pictures"),
+            "ball_position_noise": (*balls, parabola),
         }
     return ranges
