@@ -174,7 +174,7 @@ def test_an_action_adds_to_a_moving_command() -> None:
     [
         ({"velocity": [1.0] * 6}, "velocity or acceleration is missing"),
         ({"jerk": [1.0] * 6}, "jerk is given without"),
-        ({"velocity": [1.0] * 6, "acceleration": [1.0] * 5}, "differ in length"),
+        ({"velocity": [1.0] * 6, "acceleration": [1.0] * 5}, "acceleration has 5 numbers"),
         ({"torque": [1.0] * 5}, "has 5 numbers"),
         (
             {"velocity": [1.0] * 6, "acceleration": [10.0] * 6, "jerk": [1000.0] * 6},

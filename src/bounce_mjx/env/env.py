@@ -220,7 +220,7 @@ class Env:
         Args:
           rng: key; consumed.
           ranges: ranges for the active terms, within the config's ranges, which are the default.
-            The queues of delayed actions and images are only as long as the config's ranges need.
+            The queues of delayed actions and pictures are only as long as the config's ranges need.
           share: probability that each term is sampled; by default, the config's.
         """
         check_unedited(self.mj_model, self._fingerprint)

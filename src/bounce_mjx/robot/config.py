@@ -74,9 +74,6 @@ class LimitsConfig(StrictModel):
             raise ValueError("velocity or acceleration is missing; give both or neither")
         if self.jerk is not None and self.acceleration is None:
             raise ValueError("jerk is given without velocity and acceleration; give all three")
-        given = [x for x in (self.velocity, self.acceleration, self.jerk, self.torque) if x]
-        if len(set(map(len, given))) > 1:
-            raise ValueError("the lists differ in length; give one number for each acting joint")
         return self
 
 

@@ -60,22 +60,16 @@ class NamedWorld(StrictModel):
     def _check_sources(self):
         given = dict(_leaves(self.settings))
         groups = {key[:i] for key in given for i, char in enumerate(key) if char == "."}
-        for key, source in self.sources.items():
-            if key not in given and key not in groups:
-                raise ValueError(
-                    f"{shorten(key)} has a source, but env has no such key; give env that key, or "
-                    "remove the source"
-                )
-            if not source.strip():
-                raise ValueError(f"{key} has an empty source; write one sentence")
-        for key in self.assumed:
-            if key not in given:
-                raise ValueError(
-                    f"{shorten(key)} is assumed, but env has no such key; give one of "
-                    f"{', '.join(given) or 'none'}"
-                )
-            if not _is_numeric(given[key]):
-                raise ValueError(f"{key} is assumed, but is not a number; remove it from assumed")
+        for name, keys, known in (
+            ("sources", self.sources, {*given, *groups}),
+            ("assumed", self.assumed, given),
+        ):
+            for key in keys:
+                if key not in known:
+                    raise ValueError(
+                        f"{name} has {shorten(key)}, but env has no such key; give env that key, "
+                        f"or remove it from {name}"
+                    )
         for key in given:
             if key.startswith("randomization.") and key.split(".")[1] in CURRICULUM:
                 continue
@@ -136,12 +130,6 @@ def _nest(key: str, value: Any) -> dict[str, Any]:
     for name in reversed(key.split(".")):
         value = {name: value}
     return value
-
-
-def _is_numeric(value: Any) -> bool:
-    if isinstance(value, tuple):
-        return all(map(_is_numeric, value))
-    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _double(key: str, value: Any) -> Any:

@@ -71,9 +71,9 @@ class ObservationConfig(StrictModel):
     """Distances of the last servo targets from the measured joint angles, for the action's base
     target."""
     ball_age: Annotated[History, Quantity(1, "s", "past")] = 0
-    """Time since the camera image of the ball was taken."""
+    """Time since the camera picture of the ball was taken."""
     velocity: Literal["measured", "differences"] = "measured"
-    """Source of ball_velocity: a sensor, or the differences between camera images."""
+    """Source of ball_velocity: a sensor, or the differences between camera pictures."""
 
     @pydantic.model_validator(mode="before")
     @classmethod

@@ -37,6 +37,9 @@ Range = tuple[_End, _End]
 """Lower and upper end, each a number, or a tuple with one number for each entry of the term. A
 command line takes two numbers."""
 
+Sampled = Range | None
+"""A term's range; None for a term that is off."""
+
 World = dict[str, "jax.Array"]
 """Values sampled for one episode, by the names of the active terms."""
 
@@ -122,95 +125,89 @@ class RandomizationConfig(StrictModel):
     """The world that each episode samples: a range for each term, null for off. In a file, a term
     of several joints or axes may have a range for each: two lists, of lower and of upper ends."""
 
-    restitution: Annotated[Range | None, Term((), 0.85, (0.6, 0.98), "contact_damping")] = None
+    restitution: Annotated[Sampled, Term((), 0.85, (0.6, 0.98), "contact_damping")] = None
     """Restitution of the ball on the paddle, 0.6 to 0.98; the model's is 0.85."""
-    restitution_slope: Annotated[Range | None, Term((), 0.0, (0.0, 0.1))] = None
+    restitution_slope: Annotated[Sampled, Term((), 0.0, (0.0, 0.1))] = None
     """Drop of the restitution per m/s of impact speed above 2.45 m/s, the speed of the ITTF's drop
     test from 30.5 cm, s/m; needs restitution, of which 0.4 must be left at 4.5 m/s; slow impacts
     have at most 0.99. Balls bounce less in faster impacts (Hubbard and Stronge 2001, "Bounce of
     hollow balls on flat surfaces")."""
-    ball_mass: Annotated[Range | None, Term((), 1.0, _FACTOR, "ball_mass", scale)] = None
+    ball_mass: Annotated[Sampled, Term((), 1.0, _FACTOR, "ball_mass", scale)] = None
     """Factor of the ball's mass."""
-    ball_radius: Annotated[Range | None, Term((), 1.0, (0.1, 10.0), "ball_radius", scale)] = None
+    ball_radius: Annotated[Sampled, Term((), 1.0, (0.1, 10.0), "ball_radius", scale)] = None
     """Factor of the ball's radius."""
-    air_drag: Annotated[Range | None, Term((), 0.0, (0.0, 10.0))] = None
+    air_drag: Annotated[Sampled, Term((), 0.0, (0.0, 10.0))] = None
     """Deceleration of the ball by the air divided by its squared speed, 1/m; about 0.11 for a
     table-tennis ball."""
-    air_lift: Annotated[Range | None, Term((), 0.0, (0.0, 1.0))] = None
+    air_lift: Annotated[Sampled, Term((), 0.0, (0.0, 1.0))] = None
     """Acceleration of the ball by the Magnus force divided by the cross product of its spin and
     velocity; 0.0056 for a table-tennis ball whose lift coefficient is the ratio of its surface's
     speed to its own. Measured coefficients reach from that down to almost 0 (Miyazaki et al. 2017,
     "Lift crisis of a spinning table tennis ball"). A ball spins where there is contact_friction."""
     contact_friction: Annotated[
-        Range | None, Term((), 0.0, (0.0, 10.0), "contact_friction", replace)
+        Sampled, Term((), 0.0, (0.0, 10.0), "contact_friction", replace)
     ] = None
     """Coefficient of sliding friction between ball and paddle, in place of the model's."""
-    servo_gain: Annotated[Range | None, Term(None, 1.0, _FACTOR, "servo_gain", scale)] = None
+    servo_gain: Annotated[Sampled, Term(None, 1.0, _FACTOR, "servo_gain", scale)] = None
     """Factor of each servo's stiffness."""
-    servo_damping: Annotated[Range | None, Term(None, 1.0, _FACTOR, "servo_damping", scale)] = None
+    servo_damping: Annotated[Sampled, Term(None, 1.0, _FACTOR, "servo_damping", scale)] = None
     """Factor of each servo's damping."""
-    servo_lag: Annotated[Range | None, Term((), 0.0, (0.0, 1.0))] = None
+    servo_lag: Annotated[Sampled, Term((), 0.0, (0.0, 1.0))] = None
     """Time constant of a first-order lag of the servo targets, s."""
-    torque_limit: Annotated[Range | None, Term(None, None, (1e-3, 1e5), "force_limit", limit)] = (
-        None
-    )
+    torque_limit: Annotated[Sampled, Term(None, None, (1e-3, 1e5), "force_limit", limit)] = None
     """Largest torque of each servo, N m; a servo that is weaker keeps its own limit."""
-    joint_damping: Annotated[Range | None, Term(None, 0.0, (0.0, 1e4), "damping", shift)] = None
+    joint_damping: Annotated[Sampled, Term(None, 0.0, (0.0, 1e4), "damping", shift)] = None
     """Viscous damping added to each joint, N m s/rad."""
-    joint_frictionloss: Annotated[
-        Range | None, Term(None, 0.0, (0.0, 1e4), "frictionloss", replace)
-    ] = None
-    """Dry friction of each joint, N m, in place of the model's."""
-    armature: Annotated[Range | None, Term(None, 1.0, _FACTOR, "armature", scale)] = None
-    """Factor of each joint's rotor inertia."""
-    link_mass: Annotated[Range | None, Term(None, 1.0, _FACTOR, "link_mass", scale)] = None
-    """Factor of each link's mass."""
-    paddle_offset: Annotated[
-        Range | None, Term((3,), 0.0, (-0.5, 0.5), "paddle_position", shift)
-    ] = None
-    """Displacement of the paddle along each axis of the last link, m."""
-    paddle_tilt: Annotated[
-        Range | None, Term((2,), 0.0, (-1.0, 1.0), "paddle_rotation", tilt_frame)
-    ] = None
-    """Rotation of the paddle about its own x and y axis, rad."""
-    gravity_tilt: Annotated[Range | None, Term((2,), 0.0, (-1.0, 1.0), "gravity", tilt_vector)] = (
+    joint_frictionloss: Annotated[Sampled, Term(None, 0.0, (0.0, 1e4), "frictionloss", replace)] = (
         None
     )
+    """Dry friction of each joint, N m, in place of the model's."""
+    armature: Annotated[Sampled, Term(None, 1.0, _FACTOR, "armature", scale)] = None
+    """Factor of each joint's rotor inertia."""
+    link_mass: Annotated[Sampled, Term(None, 1.0, _FACTOR, "link_mass", scale)] = None
+    """Factor of each link's mass."""
+    paddle_offset: Annotated[Sampled, Term((3,), 0.0, (-0.5, 0.5), "paddle_position", shift)] = None
+    """Displacement of the paddle along each axis of the last link, m."""
+    paddle_tilt: Annotated[Sampled, Term((2,), 0.0, (-1.0, 1.0), "paddle_rotation", tilt_frame)] = (
+        None
+    )
+    """Rotation of the paddle about its own x and y axis, rad."""
+    gravity_tilt: Annotated[Sampled, Term((2,), 0.0, (-1.0, 1.0), "gravity", tilt_vector)] = None
     """Rotation of gravity about the world's x and y axis, rad."""
-    action_latency: Annotated[Range | None, Term((), 0.0, (0.0, 1.0))] = None
+    action_latency: Annotated[Sampled, Term((), 0.0, (0.0, 1.0))] = None
     """Time from an action to its servo targets, s."""
-    ball_latency: Annotated[Range | None, Term((), 0.0, (0.0, 1.0))] = None
-    """Time from a camera image of the ball to its use, s."""
-    camera_rate: Annotated[Range | None, Term((), None, (1.0, 1e4))] = None
-    """Camera images of the ball per second, Hz; each is used until the next one arrives. Without a
-    rate there is an image at every control step."""
-    frame_drop: Annotated[Range | None, Term((), 0.0, (0.0, 0.99))] = None
-    """Probability that a camera image is lost."""
-    ball_position_noise: Annotated[Range | None, Term((), 0.0, (0.0, 0.5))] = None
+    ball_latency: Annotated[Sampled, Term((), 0.0, (0.0, 1.0))] = None
+    """Time from a camera picture of the ball to its use, s."""
+    camera_rate: Annotated[Sampled, Term((), None, (1.0, 1e4))] = None
+    """Camera pictures of the ball per second, Hz; each is used until the next one arrives. Without
+    a rate there is a picture at every control step."""
+    frame_drop: Annotated[Sampled, Term((), 0.0, (0.0, 0.99))] = None
+    """Probability that a camera picture is lost."""
+    ball_position_noise: Annotated[Sampled, Term((), 0.0, (0.0, 0.5))] = None
     """Standard deviation of the noise of each measured ball coordinate, m."""
-    ball_position_bias: Annotated[Range | None, Term((3,), 0.0, (-0.5, 0.5))] = None
+    ball_position_bias: Annotated[Sampled, Term((3,), 0.0, (-0.5, 0.5))] = None
     """Error of each measured ball coordinate, constant in an episode, m."""
-    ball_velocity_noise: Annotated[Range | None, Term((), 0.0, (0.0, 10.0))] = None
+    ball_velocity_noise: Annotated[Sampled, Term((), 0.0, (0.0, 10.0))] = None
     """Standard deviation of the noise of each component of the measured ball velocity, m/s."""
-    ball_velocity_bias: Annotated[Range | None, Term((3,), 0.0, (-10.0, 10.0))] = None
+    ball_velocity_bias: Annotated[Sampled, Term((3,), 0.0, (-10.0, 10.0))] = None
     """Error of each component of the measured ball velocity, constant in an episode, m/s."""
-    joint_angle_noise: Annotated[Range | None, Term((), 0.0, (0.0, 0.5))] = None
+    joint_angle_noise: Annotated[Sampled, Term((), 0.0, (0.0, 0.5))] = None
     """Standard deviation of the noise of each measured joint angle, rad."""
-    encoder_bias: Annotated[Range | None, Term(None, 0.0, (-0.5, 0.5))] = None
+    encoder_bias: Annotated[Sampled, Term(None, 0.0, (-0.5, 0.5))] = None
     """Error of each encoder's zero, which the servo shares, rad."""
-    joint_velocity_noise: Annotated[Range | None, Term((), 0.0, (0.0, 10.0))] = None
+    joint_velocity_noise: Annotated[Sampled, Term((), 0.0, (0.0, 10.0))] = None
     """Standard deviation of the noise of each measured joint velocity, rad/s."""
-    joint_velocity_bias: Annotated[Range | None, Term(None, 0.0, (-10.0, 10.0))] = None
+    joint_velocity_bias: Annotated[Sampled, Term(None, 0.0, (-10.0, 10.0))] = None
     """Error of each measured joint velocity, constant in an episode, rad/s."""
-    push_speed: Annotated[Range | None, Term((), 0.0, (0.0, 10.0))] = None
+    push_speed: Annotated[Sampled, Term((), 0.0, (0.0, 10.0))] = None
     """Horizontal speed that a push adds to the ball, in a random direction, m/s."""
-    push_interval: Annotated[Range | None, Term((), None, (0.01, 600.0))] = None
+    push_interval: Annotated[Sampled, Term((), None, (0.01, 600.0))] = None
     """Time between two pushes, s; 2 s if only push_speed is given."""
-    command_interval: Annotated[Range | None, Term((), None, (0.01, 600.0))] = None
+    command_interval: Annotated[Sampled, Term((), None, (0.01, 600.0))] = None
     """Time between two samples of the task's commands within an episode, s."""
-    ball_start: Annotated[Range | None, Term((3,), 0.0, (-1.0, 1.0))] = None
+    ball_start: Annotated[Sampled, Term((3,), 0.0, (-1.0, 1.0))] = None
     """Displacement of each coordinate of the ball at a reset, in addition to `env.reset`, m."""
-    joint_start: Annotated[Range | None, Term(None, 0.0, (-3.0, 3.0))] = None
+    joint_start: Annotated[Sampled, Term(None, 0.0, (-3.0, 3.0))] = None
     """Displacement of each joint angle at a reset, in addition to `env.reset`, rad."""
     share: UnitInterval = 1.0
     """Probability that a term with a nominal value is sampled in an episode; otherwise it has that
