@@ -475,40 +475,17 @@ def test_python_of_a_page_runs(page: str, capsys) -> None:
         np.testing.assert_allclose(names["servo_targets"], angles, atol=0.02 + 0.005)
 
 
-def cells(table: str) -> list[list[str]]:
-    """The cells of a Markdown table without its head."""
-    rows = [row.strip().strip("|").split("|") for row in table.strip().splitlines()[2:]]
-    return [[cell.strip() for cell in row] for row in rows]
-
-
-def table_after(text: str, heading: str) -> list[list[str]]:
-    """The first table after a text."""
-    return cells(re.search(r"(?:^\|.*\n)+", text.split(heading, 1)[1], re.MULTILINE)[0])
-
-
-def test_figures_are_those_of_the_measurements() -> None:
-    """Figures that several pages repeat, from RESULTS.md, whose first row of a device counts."""
-    results, notes, readme = (
-        (CHECKOUT / name).read_text(encoding="utf-8")
-        for name in ("benchmarks/RESULTS.md", "benchmarks/notes.md", "README.md")
-    )
-    assert results.count("\n") <= 150
-    rows = table_after(results, "## Time to all five results")
-    cold, second, cold_on_cpu, second_on_cpu = (
-        next(row[1] for row in rows if row[0].startswith(start) and row[4] == device)
-        for device in ("H200", "CPU")
-        for start in ("first start", "second start")
-    )
-    assert f"| {cold} | {cold_on_cpu} |" in readme
-    assert f"| {second} | {second_on_cpu} |" in readme
-
-    measured = table_after(results, "## Against other trainers")
-    assert table_after(readme, "time to all five results") == [
-        [row[0], *row[4:]] for row in measured
-    ]
-    speed = {row[0]: row[2] for row in table_after(notes, "### One H200\n") if row[1] == "fused"}
-    quoted = {row[0]: row[1] for row in table_after(content("physics.md"), "## Speed")}
-    assert quoted == {count: f"{speed[count]} M" for count in quoted}
+def test_tables_of_figures_are_as_drawn() -> None:
+    """README, RESULTS and the pages have the tables of figures.yaml, each somewhere."""
+    figures = runpy.run_path(str(CHECKOUT / "benchmarks/figures.py"))
+    known, shown = figures["tables"](), set()
+    for page in figures["PAGES"]:
+        text = page.read_text(encoding="utf-8")
+        assert figures["drawn"](text, known) == text, f"python benchmarks/figures.py writes {page}"
+        shown |= {name for _, name in figures["TABLE"].findall(text)}
+    assert shown == known.keys()
+    assert (CHECKOUT / "benchmarks/RESULTS.md").read_text("utf-8").count("\n") <= 150
+    assert (CHECKOUT / "benchmarks/notes.md").read_text("utf-8").count("\n") <= 300
 
 
 def test_robot_page_has_every_term_of_the_randomisation_and_every_entry_of_the_file() -> None:
