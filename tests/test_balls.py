@@ -24,13 +24,11 @@ from against_c import (
 from bounce_mjx import task
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
-from bounce_mjx.evaluation import c_episodes
 from bounce_mjx.physics import (
     Control,
     PhysicsParameters,
     PhysicsState,
     make_engine,
-    servo_targets,
 )
 from bounce_mjx.physics.support import unsupported_feature
 from bounce_mjx.robot.model import find_addresses, load_model
@@ -296,36 +294,6 @@ def test_a_world_of_two_balls_sees_each_late():
     np.testing.assert_array_equal(seen[1:, 1], seen[:-1, 0])
     assert {"true/ball_position_5", "true/ball_velocity_5"} <= state.metrics.keys()
     assert env.layout.parts[env.layout.parts.index(("ball_velocity", 6, "m/s"))]
-
-
-@pytest.mark.slow
-def test_c_moves_several_balls_as_the_engine_does():
-    """With a push, and with the forces of the air in each physics step."""
-    drawn = {"push_speed": (1.0, 1.0), "air_drag": (0.5, 0.5), "air_lift": (0.02, 0.02)}
-    env = Env(Two.Config(randomization=drawn))
-    count, num_steps = 2, env.config.num_substeps
-    keys = jax.random.split(jax.random.PRNGKey(0), count)
-    states = jax.vmap(env.reset, out_axes=-1)(keys)
-    physics = states.pipeline_state.physics
-    spins = [i for ball in env.addresses.balls for i in ball.qvel[3:]]
-    physics = physics._replace(qvel=physics.qvel.at[np.array(spins)].set(30.0))
-    push = jnp.arange(6.0).reshape(2, 3, 1) * jnp.ones(count)
-    air = {"air_drag": jnp.full(count, 0.5), "air_lift": jnp.full(count, 0.02)}
-    control = Control(physics.qpos[:6], **air, ball_push=push)
-    targets = jax.vmap(servo_targets, in_axes=(-1, None))(control, num_steps)
-    simulated = c_episodes.full_states(env.mj_model, physics)
-    balls = c_episodes._ball_velocity(env.mj_model)
-    simulated[:, balls] += np.asarray(push).reshape(-1, count).T
-    models, data = [env.mj_model] * count, [mujoco.MjData(env.mj_model)]
-    with mujoco.rollout.Rollout(nthread=0) as pool:
-        simulated = c_episodes._next_states(
-            pool, models, data, simulated, np.asarray(targets), *map(np.asarray, air.values())
-        )
-    expected = c_episodes.physics_states(env.mj_model, simulated)
-    step = jax.vmap(lambda s, c: env.engine.step(MODEL, s, c, num_steps), in_axes=-1, out_axes=-1)
-    for ours, theirs in zip(step(physics, control), expected, strict=True):
-        if theirs is not None:
-            np.testing.assert_allclose(ours, theirs, atol=1e-5)
 
 
 def test_a_task_of_one_ball_refuses_two():

@@ -1,6 +1,5 @@
 """The results of an evaluation are counted, judged and shown as specified, on both engines."""
 
-import dataclasses
 import functools
 import io
 import json
@@ -33,7 +32,6 @@ from bounce_mjx.learning.policy import networks_of
 from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.reports.tables import (
     details_line,
-    results_table,
     seeds_table,
 )
 from bounce_mjx.resources import resource_path
@@ -258,20 +256,6 @@ def show(table) -> str:
     console = Console(width=80, file=io.StringIO())
     console.print(table)
     return console.file.getvalue()
-
-
-def test_a_result_that_is_not_judged_has_its_reason_below_the_table(env):
-    report = judge(env, statistics())
-    changed = {"bound": "0.1 to 1.5 (targets 0.4 only)", "passed": None}
-    results = list(report.results)
-    results[SPEED] = dataclasses.replace(results[SPEED], **changed)
-    rows = show(results_table(Report(tuple(results), report.details), "title")).splitlines()
-    assert rows[2 + SPEED].split()[-4:] == ["0.1", "to", "1.5", "-"]
-    assert rows[-1].strip() == "upward speed: not judged (targets 0.4 only)"
-    # As of a task that had nothing to measure.
-    results[SPEED] = dataclasses.replace(results[SPEED], bound="0.1 to 1.5", value=None)
-    rows = show(results_table(Report(tuple(results), report.details), "title")).splitlines()
-    assert rows[-1].strip() == "upward speed: not judged"
 
 
 def test_upward_speed_is_judged_only_for_low_targets(env):

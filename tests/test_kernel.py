@@ -116,21 +116,6 @@ def test_parameters_enter_the_kernel(env, by_xla, in_kernel, monkeypatch):
     assert np.all(np.abs(after.qvel - by_xla.qvel).max(axis=0) > 1e-3)
 
 
-@pytest.mark.slow
-def test_several_batches_and_shared_targets(env, in_kernel):
-    """Batches of batches, as with several seeds, and an argument that all environments share."""
-    physics, ctrl = moving(env, BATCH)
-    twice = jax.tree.map(lambda x: jnp.stack([x, 0.5 * x]), physics)
-    shared = ctrl[:, 0]
-    after = jax.jit(
-        jax.vmap(jax.vmap(partial(step, env), in_axes=(-1, None), out_axes=-1), in_axes=(0, None))
-    )(twice, shared)
-    one_by_one = jax.jit(jax.vmap(partial(step, env), in_axes=(-1, None), out_axes=-1))
-    for i in range(2):
-        alone = one_by_one(jax.tree.map(lambda x, i=i: x[i], twice), shared)
-        assert_equal(jax.tree.map(lambda x, i=i: x[i], after), alone)
-
-
 # In a separate process, because the number of devices is set before JAX starts.
 ON_DEVICES = """
 import functools, re

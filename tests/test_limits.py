@@ -1,6 +1,5 @@
 """Commands within an arm's limits are those of a simulation, late and lagged, on every engine."""
 
-import json
 from typing import NamedTuple
 
 import jax
@@ -10,14 +9,12 @@ import numpy as np
 import pytest
 
 from bounce_mjx import BounceBall, EnvConfig
-from bounce_mjx.commands.main import main
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.limits import limit_shares
 from bounce_mjx.physics import servo_targets
 from bounce_mjx.robot.setpoints import JointLimits, Setpoint, command, next_setpoint
 from bounce_mjx.task.shown import Recording
-from test_deploy import make_run
 
 VELOCITY, ACCELERATION, JERK = 2.0, 15.0, 7500.0
 LIMITS = {
@@ -154,16 +151,6 @@ def test_the_engines_follow_the_commands_like_c(world: tuple) -> None:
         np.testing.assert_allclose(data.qpos[:6], rollout.qpos[i + 1, :6], atol=1e-8)
 
 
-def test_without_limits_a_target_is_the_actions() -> None:
-    """And limits of the torque alone do not move it."""
-    env = BounceBall(EnvConfig(robot={"limits": {"torque": (90.0,) * 6}}))
-    state = env.reset(jax.random.PRNGKey(0)).pipeline_state
-    assert state.actuation.setpoint is None
-    control, _ = env.control(state, jnp.ones(6))
-    assert control.moving is None
-    np.testing.assert_array_equal(control.ctrl, env.servo_targets(state.physics, jnp.ones(6)))
-
-
 def test_an_action_adds_to_a_moving_command() -> None:
     with pytest.raises(UserError, match="set action.base to target"):
         validate(EnvConfig, {"robot": {"limits": LIMITS}}, "my.yaml")
@@ -197,7 +184,7 @@ def recorded(velocities: np.ndarray) -> Recording:
     return Recording(joint_angles, empty, empty, {}, {}, running, velocities[..., None])
 
 
-@pytest.mark.parametrize("smooth, rate", [(False, 1000), (True, 1000), (True, 500)])
+@pytest.mark.parametrize("smooth, rate", [(False, 1000), (True, 500)])
 def test_shares_of_the_limits(smooth: bool, rate: int) -> None:
     """Full acceleration, then full speed, use the limits up; 10% more acceleration of a joint is
     seen."""
@@ -214,7 +201,7 @@ def test_shares_of_the_limits(smooth: bool, rate: int) -> None:
         # The mean is over 4 ms, so a step of the acceleration has the jerk 15 / 0.004, half of the
         # limit. At 500 Hz, two of the three pieces of the difference's quadratic spline see it:
         # 1/6 and 2/3.
-        assert shares["jerk"] == pytest.approx(0.5 if rate == 1000 else 0.5 * 5 / 6, abs=1e-6)
+        assert shares["jerk"] == pytest.approx(0.5 * 5 / 6, abs=1e-6)
     hasty = velocities.copy()
     hasty[:, 3] = np.minimum(0.011 * ACCELERATION * np.arange(1.0, 40.0), VELOCITY)
     _, acceleration, *_ = limit_shares(config, recorded(hasty), rate)
@@ -223,20 +210,3 @@ def test_shares_of_the_limits(smooth: bool, rate: int) -> None:
     late = velocities.copy()
     late[-5:] = 100.0
     assert limit_shares(config, recorded(late), rate)[0].share == pytest.approx(1.0)
-
-
-@pytest.mark.slow
-def test_eval_shows_the_shares(tmp_path, capsys: pytest.CaptureFixture) -> None:
-    """A random policy wishes more than the limits allow, and stays within them."""
-    limited = {"robot": {"limits": LIMITS}, "action": {"base": "target"}, "action_scale": 0.1}
-    run = make_run(tmp_path / "run", limited | {"episode_seconds": 0.3})
-    file = tmp_path / "results.json"
-    with pytest.raises(SystemExit):
-        main(["eval", str(run), "--episodes", "4", "--limits", "--json", str(file)])
-    assert "limits that commands at 1 kHz use in 32 episodes: velocity " in capsys.readouterr().out
-    shares = {x["quantity"]: x["share"] for x in json.loads(file.read_text())["limits"]}
-    assert shares.keys() == {"velocity", "acceleration", "jerk"}
-    assert max(shares.values()) == pytest.approx(1.0, abs=1e-4)
-    with pytest.raises(SystemExit):
-        main(["eval", "pretrained", "--limits"])
-    assert "has no command limits" in " ".join(capsys.readouterr().err.split())

@@ -181,7 +181,7 @@ def test_a_share_of_the_terms_is_drawn() -> None:
             "falls below 0.4 in an impact at 4.5 m/s; start restitution at 0.605, or narrow",
         ),
         ({"frame_drop": (0.0, 1.0)}, "leaves 0 to 0.99"),
-        ({"drag": (0.0, 0.1)}, "drag; did you mean air_drag?"),
+        ({"drag": (0.0, 0.1)}, "drag; did you mean randomization.air_drag?"),
         ({"shares": {"drag": 0.1}}, "shares has a probability for drag, which is not a term"),
         ({"restitution": [[0.7], [0.8]]}, "is not a range; give two numbers"),
         ({"paddle_tilt": [[0.0] * 3, [0.1] * 3]}, "two lists with one for each of 2 axes"),

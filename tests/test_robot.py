@@ -23,17 +23,6 @@ from bounce_mjx.robot.model import find_addresses, joint_names
 from bounce_mjx.runs.config import load_config, read_preset
 from random_worlds import random_parameters
 
-LEG = '<body pos="{0} {1} 0"><joint name="{2}1" axis="1 0 0"/><geom size=".03" mass=".3"/>'
-LEG += '<body pos="0 0 -.2"><joint name="{2}2" axis="0 1 0"/><geom size=".03" mass=".3"/>'
-LEG += '<body pos="0 0 -.2"><joint name="{2}3" axis="0 1 0"/><geom size=".03" mass=".3"/>'
-LEG += '<site name="{2}foot"/></body></body></body>'
-LEGS = [("0.2", "0.1", "a"), ("0.2", "-0.1", "b"), ("-0.2", "0.1", "c"), ("-0.2", "-0.1", "d")]
-QUADRUPED = mjcf(
-    '<body pos="0 0 .5"><freejoint/><geom size=".1"/>'
-    + "".join(LEG.format(*p) for p in LEGS)
-    + "</body>",
-    motors(" ".join(f"{p[2]}{i}" for p in LEGS for i in (1, 2, 3))),
-)
 FINGERS = "".join(
     f'<body pos="0 {y} 0.05"><joint name="{n}" type="slide" axis="0 1 0" range="0 0.04"/>'
     f'<geom size=".01" mass=".05"/></body>'
@@ -41,22 +30,7 @@ FINGERS = "".join(
 )
 
 SLIDE = '<joint name="{}" type="slide" axis="{}" range="0 0.3"/>'
-SCARA = mjcf(
-    link(
-        hinge("s1", "0 0 1"),
-        "0 0 .4",
-        link(
-            hinge("s2", "0 0 1"),
-            ".3 0 0",
-            link(
-                SLIDE.format("s3", "0 0 1"),
-                ".3 0 0",
-                link(hinge("s4", "0 0 1"), "0 0 0", '<site name="tool"/>'),
-            ),
-        ),
-    ),
-    motors("s1 s2 s3 s4"),
-)
+
 
 TWO_JOINTS = mjcf(
     link(hinge("a", "0 0 1"), "0 0 .1", link(hinge("b", "0 1 0"), "0 0 .3", '<site name="tool"/>')),
@@ -65,8 +39,6 @@ TWO_JOINTS = mjcf(
 
 
 BROKEN = {
-    "quadruped": (QUADRUPED, "afoot", "9 driven joints (b1, b2", "one arm"),
-    "SCARA": (SCARA, "tool", "s1, s2, s3, s4", "tilt"),
     "two joints": (TWO_JOINTS, "tool", "too few joints", "2 (a, b)"),
     "two arms": (
         mjcf(arm() + arm("r_", base="0 1 .2"), motors(f"{ARM_JOINTS} r_j1 r_j2")),
@@ -437,25 +409,6 @@ def test_three_joints_suffice_to_lift_and_tilt(tmp_path) -> None:
     robot = env.config.robot
     speed = env.config.action_scale * np.divide(robot.servo_stiffness, robot.servo_damping)
     np.testing.assert_allclose(speed, [0.6, 2.0, 2.0], rtol=1e-3)
-
-
-FLAGS = '<flag gravity="disable" damper="disable"/>'
-
-
-def test_changes_are_listed(tmp_path) -> None:
-    text = mjcf(arm(), motors(ARM_JOINTS)).replace('damping="0.1"', 'frictionloss="0.2"', 1)
-    text = text.replace("<worldbody>", f"<option>{FLAGS}</option><worldbody>")
-    (tmp_path / "arm.xml").write_text(text)
-    found = adopt(tmp_path / "arm.xml", RobotConfig(site="tool"), 0.01, is_mount_given=False)
-    changes = "\n".join(found.arm.changes)
-    for words in ("own contacts", "joint limits", "added a paddle", "task's (disableflags, "):
-        assert words in changes
-    # Dry friction stays, with limits of MuJoCo's solver that suffice for it.
-    model = compile_spec(found.arm.spec, tmp_path / "arm.xml")
-    losses = [float(model.dof_frictionloss[model.joint(f"j{i}").dofadr[0]]) for i in range(1, 7)]
-    assert losses == [0.2, 0.0, 0.0, 0.0, 0.0, 0.0]
-    assert model.opt.ls_iterations == mujoco.MjOption().ls_iterations
-    assert len(re.findall("with a position servo: kp", changes)) == 6
 
 
 def test_the_config_of_the_packages_arm_has_the_defaults() -> None:

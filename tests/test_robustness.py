@@ -28,10 +28,8 @@ from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Networks, Policy, networks_of
 from bounce_mjx.reports.robustness import (
     load_robustness,
-    misses,
     robustness_figure,
     robustness_table,
-    summary,
 )
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import load_run_config
@@ -391,21 +389,6 @@ def test_table_tells_every_figure(report: RobustnessReport) -> None:
     assert header == ["condition", "strength", "C", "P", "H", "U", "S"]
     described = [line.strip() for line in lines]
     assert "U  upward speed: what upward speed means, m/s" in described
-
-
-def test_the_score_names_its_misses_and_shows_survival_with_the_other_results(
-    report: RobustnessReport,
-) -> None:
-    assert misses(report) == "late 10 ms"
-    report.outcomes[2].failed.append("height")
-    assert misses(report) == "late 5, 10 ms" and report.met == 3
-    report.version = "v2"
-    assert summary(report).startswith("3 of 5 conditions of v2 meet all judged results")
-    survives = outcome("low", 1.0, values=report.outcomes[0].values | {"height": 40.0})
-    assert survives.lasted == 1.0 and report.worst_share(survives) == 0.4
-    assert report.worst_share(report.outcomes[3]) == 0.25
-    report.measured.clear()
-    assert report.worst_share(report.outcomes[3]) == report.outcomes[3].lasted
 
 
 def test_picture_has_a_cell_for_each_condition(report: RobustnessReport) -> None:

@@ -133,21 +133,6 @@ def test_observation_is_the_next_state_and_differs_from_the_final_one_only_at_en
     np.testing.assert_array_equal(same, ~ended)
 
 
-def test_end_starts_a_new_episode(limited):
-    results, states = limited
-    for t in np.flatnonzero(results.truncated.any(axis=1)):
-        after = states[t + 1]
-        np.testing.assert_array_equal(after.clock, 0)
-        np.testing.assert_array_equal(after.episode_return, 0)
-        # The balls of the old episodes have fallen; those of the new ones are back at rest.
-        assert np.all(results.final_observation[t, :, 21] < -1)
-        np.testing.assert_array_equal(results.observation[t, :, 19:25], 0)
-        np.testing.assert_allclose(results.observation[t, :, 8], 0.45, atol=0.0101)
-        np.testing.assert_array_equal(after.env.pipeline_state.last_action, 0)
-        np.testing.assert_array_equal(after.env.pipeline_state.task.n_bounces, 0)
-        np.testing.assert_array_equal(results.episode_length[t], 25)
-
-
 def test_every_episode_has_a_draw_of_its_own(limited):
     results, states = limited
     first, second = results.observation[np.flatnonzero(results.truncated.any(axis=1))]
