@@ -280,23 +280,6 @@ def test_a_hidden_robot_is_identified(hidden) -> None:
 
 
 @pytest.mark.slow
-def test_a_frame_that_is_off_is_no_other_robot(hidden) -> None:
-    """Pictures 5 cm too high were link masses of half and encoders that are off by degrees."""
-    truth, log, right = hidden
-    high = log.ball_positions + [0.0, 0.0, 0.05]
-    found = identify(read_preset(Path("default")).env, log._replace(ball_positions=high))
-    world, others = (x.layout.world(x.fit.vector) for x in (found, right))
-    assert abs(world["ball_position_bias"][2] - others["ball_position_bias"][2] - 0.05) < 5e-3
-    assert abs(world["restitution"] - truth["restitution"]) < 0.01
-    assert abs(world["ball_latency"] - truth["ball_latency"]) < 1e-3
-    assert np.max(np.abs(world["encoder_bias"] - others["encoder_bias"])) < 0.006
-    np.testing.assert_allclose(world["link_mass"], others["link_mass"], atol=0.05)
-    (warning,) = [text for text in sentences(found, NAMES) if text.startswith("warning: ")]
-    assert "ball_position_bias z is 0.05" in warning
-    assert not [text for text in sentences(right, NAMES) if text.startswith("warning: ")]
-
-
-@pytest.mark.slow
 def test_an_identified_world_is_a_named_world(hidden, tmp_path: Path) -> None:
     truth, log, found = hidden
     path = tmp_path / "world.yaml"

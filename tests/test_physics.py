@@ -106,31 +106,6 @@ def test_ten_substeps_are_ten_steps(mj_model, fused_step):
     assert max(difference(together, singly)) < 1e-12
 
 
-@pytest.mark.slow
-@pytest.mark.separate_loops
-@pytest.mark.usefixtures("float64")
-def test_200_steps_are_those_of_mjx(mj_model, fused_step, record_property):
-    """Both engines run freely from falling balls, with contacts."""
-    mjx_step = batched(make_engine(mj_model, "mjx").step)
-    rng = np.random.default_rng(0)
-    state = bouncing_states(mj_model, rng)
-    few = 4
-    mjx_state = PhysicsState(*(x[:few] for x in state[:2]))
-    contacts, error = 0, 0.0
-    for i in range(200):
-        if i % 10 == 0:
-            ctrl = np.asarray(state.qpos[:, :6]) + rng.uniform(-0.03, 0.03, (BATCH, 6))
-        here = PhysicsState(*(np.asarray(x[:few]) for x in state[:2]))
-        contacts += num_contacts(c_steps(mj_model, States(*here[:2], ctrl[:few]))[1])
-        state = fused_step(state, ctrl, 1)
-        mjx_state = mjx_step(mjx_state, ctrl[:few], 1)
-        error = max(error, *difference(PhysicsState(*(x[:few] for x in state[:2])), mjx_state))
-    record_property("largest_difference", error)
-    print(f"200 steps x {few} against MJX: {contacts} contact steps, difference {error:.1e}")
-    assert contacts >= 20
-    assert error < 1e-6
-
-
 def test_mjx_multiplies_in_full_precision(mj_model):
     """The default on a GPU, TF32, has three digits, and a policy that bounces elsewhere failed."""
     constants = mjx_engine.read_model(mj_model)
