@@ -1,5 +1,6 @@
 """Interface of the physics engines, and the choice of an engine for a model."""
 
+import copy
 import functools
 from collections.abc import Callable
 from typing import NamedTuple
@@ -42,6 +43,8 @@ def make_engine(mj_model: mujoco.MjModel, choice: str) -> Engine:
     Raises:
       UserError: the engine does not support the model.
     """
+    # Its programs are traced later, when somebody may have edited the model.
+    mj_model = copy.copy(mj_model)
     name = "fused" if is_fused(mj_model, choice) else "mjx"
     _check(name, lambda engine: unsupported_feature(mj_model, engine))
     reason = f"chosen by --physics {choice}"

@@ -1,7 +1,6 @@
 """The mjx engine: MuJoCo's own JAX implementation, for any model with the task's names."""
 
 import contextlib
-import copy
 from typing import NamedTuple
 
 import jax
@@ -35,7 +34,7 @@ def read_model(mj_model: mujoco.MjModel) -> MjxModel:
     return MjxModel(
         mjx.put_model(mj_model),
         mjx.put_model(_with_frictional_pair(mj_model)),
-        copy.copy(mj_model),
+        mj_model,
         find_addresses(mj_model),
     )
 

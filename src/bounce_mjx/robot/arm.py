@@ -29,6 +29,8 @@ HIDDEN_GROUP = 3
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 # A change of a joint's range that is told, rad or m.
 _NARROWER = 1e-3
+# Without what only its simulations need; a later version may move its files.
+_INSTALLED_AS = {"robosuite": ("--no-deps", "robosuite==1.5.2")}
 _JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 
 
@@ -95,9 +97,10 @@ def _in_package(name: str) -> Path:
     package, _, file = name.partition("/")
     found = importlib.util.find_spec(package) if package.isidentifier() else None
     if found is None or not found.submodule_search_locations:
+        words = _INSTALLED_AS.get(package) or (shorten(package.replace("_", "-")),)
         raise UserError(
             f"the package {shorten(package)!r} is not installed, which package:{shorten(name)} "
-            f"names; install it with: {install_command(shorten(package.replace('_', '-')))}"
+            f"names; install it with: {install_command(*words)}"
         )
     return Path(found.submodule_search_locations[0]) / file
 
