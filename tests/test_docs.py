@@ -10,6 +10,7 @@ import re
 import runpy
 import shlex
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -37,6 +38,7 @@ from bounce_mjx.tasks.bounce_rewards import BounceReward, RewardInputs
 from bounce_mjx.tasks.registry import find_task
 from bounce_mjx.training import hosts
 from bounce_mjx.training.command import TrainCommand
+from bounce_mjx.training.start import Start, changed
 from bounce_mjx.world.randomization import TERMS
 
 CHECKOUT = Path(__file__).resolve().parent.parent
@@ -438,6 +440,22 @@ def test_new_term_of_the_rewards_page_is_a_term(tmp_path: Path) -> None:
     assert terms.keys() == {*term_names(BounceReward), "sideways_velocity"}
 
 
+def short_training(folder: Path) -> Callable:
+    """`train` with few steps; from the second call on, only the settings are read."""
+    real, calls = bounce_mjx.train, []
+    short = dict(num_envs=8, rollout_length=8, num_minibatches=2, block_steps=64, eval_every=128)
+    short |= dict(eval_episodes=4, screening_episodes=0, total_steps=256, episode_seconds=0.5)
+
+    def train(*given, callbacks=(), **settings):
+        calls.append(settings)
+        if len(calls) > 1:
+            return changed(Start().base(), settings)
+        return real(*given, callbacks=callbacks, **settings | short, log_dir=folder)
+
+    return train
+
+
+SLOW_PAGES = "libraries.md", "training.md"
 RUN_ELSEWHERE = {"libraries.md": 3}
 """How many first snippets of a page `test_package.py` runs unchanged."""
 
@@ -445,14 +463,17 @@ RUN_ELSEWHERE = {"libraries.md": 3}
 @pytest.mark.parametrize(
     "page",
     [
-        pytest.param(page.name, marks=[pytest.mark.slow] * (page.name == "libraries.md"))
+        pytest.param(page.name, marks=[pytest.mark.slow] * (page.name in SLOW_PAGES))
         for page in PAGES
         if page.parent == CHECKOUT / "docs" and examples(page.name, "python")
     ],
 )
-def test_python_of_a_page_runs(page: str, capsys) -> None:
+def test_python_of_a_page_runs(
+    page: str, capsys, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """From top to bottom, as a notebook; excerpts are those of their file. Compiled functions are
-    only traced, which takes a tenth of the time."""
+    only traced, which takes a tenth of the time, and a training is short."""
+    monkeypatch.setattr(bounce_mjx, "train", short_training(tmp_path), raising=False)
 
     def traced(function, **_):
         shapes = functools.partial(jax.eval_shape, function)
