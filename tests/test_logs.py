@@ -509,7 +509,7 @@ def test_the_drivers_names_stand_for_the_robots(tmp_path: Path) -> None:
     np.testing.assert_allclose(log.joint_angles[0], 0.01 * np.arange(6.0)[::-1])
     with pytest.raises(UserError, match=r"no column .+ joint_angles.arm_6, .+ --joint-names"):
         read_log(path, model, TOPICS)
-    with pytest.raises(UserError, match=r"--joint-names gives 6 names, 5 of them different, .+ 6"):
+    with pytest.raises(UserError, match=r"--joint-names has 6 names, 5 of them different, .+ 6"):
         read_log(path, model, TOPICS, [*names[:5], names[0]])
 
 

@@ -3,9 +3,10 @@
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
+from rich.console import Console
 
 from bounce_mjx.commands.run_options import OneActorCommand, WorldCommand, parse_with_commands
 from bounce_mjx.config.command_line import progress, stdout
@@ -28,7 +29,7 @@ class EvalCommand(WorldCommand, OneActorCommand):
     seed: NonNegativeInt = DEFAULT_SEED
     """Seed of the resets."""
     nominal: bool = False
-    """Whether the worlds are the model's own; else each episode draws one, as in training."""
+    """Evaluate without domain randomisation; else each episode samples a world, as in training."""
     contacts: bool = False
     """Also count contacts of the arm with itself and the floor, which the physics leaves out, in 32
     episodes."""
@@ -45,10 +46,7 @@ class EvalCommand(WorldCommand, OneActorCommand):
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 0 if all results pass, 1 if one fails, 2 on a mistake."""
     command, given_commands = parse_with_commands(EvalCommand, args, prog="bounce-mjx eval")
-    from bounce_mjx.evaluation.contacts import arm_contacts, describe_contacts
-    from bounce_mjx.evaluation.limits import describe_limits, limit_shares
-    from bounce_mjx.evaluation.policy_evaluation import evaluate_policy, recorded_episodes
-    from bounce_mjx.evaluation.recording import RECORDED_EPISODES
+    from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
     from bounce_mjx.reports.tables import details_line, results_table
     from bounce_mjx.runs.files import check_output, to_json, writable, write_output
     from bounce_mjx.runs.reading import read_actor
@@ -75,7 +73,7 @@ def main(args: Sequence[str]) -> None:
     )
     length = f"{command.episodes:,} episodes of {config.env.episode_seconds:g} s"
     with progress(console, "evaluating", "evaluated") as shown:
-        report, engine = evaluate_policy(
+        report, engine, warnings = evaluate_policy(
             policy,
             config.env,
             actor,
@@ -83,23 +81,36 @@ def main(args: Sequence[str]) -> None:
             started=lambda engine: console.out(f"physics: {engine}  {length}", highlight=False),
             progress=shown,
         )
+    for warning in warnings:
+        console.print(f"warning: {warning}", markup=False, highlight=False, soft_wrap=True)
     console.print(results_table(report, "the results"))
     console.print(details_line(report), highlight=False, soft_wrap=True)
-    found = {}
-    if command.contacts or command.limits:
-        recording = recorded_episodes(policy, config.env, actor, options)
-        for name, wanted, measure, describe in (
-            ("contacts", command.contacts, arm_contacts, describe_contacts),
-            ("limits", command.limits, limit_shares, describe_limits),
-        ):
-            if wanted:
-                found[name] = measure(config.env, recording)
-                described = describe(found[name], RECORDED_EPISODES)
-                console.print(described, markup=False, highlight=False, soft_wrap=True)
+    found = _check_arm(command, (policy, config.env, actor, options), console)
     if command.json_file is not None:
         plain = {"checkpoint": str(checkpoint.folder), "physics": engine, **report.to_dict()}
-        plain |= {"seed": command.seed, "commands": commands, "nominal": command.nominal}
-        plain |= {name: [entry._asdict() for entry in entries] for name, entries in found.items()}
+        plain |= {"seed": command.seed, "commands": commands, "nominal": command.nominal, **found}
         with writable(command.json_file, "give another file with --json"):
             write_output(command.json_file, to_json(plain))
     sys.exit(0 if report.passed else 1)
+
+
+def _check_arm(command: EvalCommand, evaluated: tuple, console: Console) -> dict[str, Any]:
+    """The arm's contacts and the share of its limits in recorded episodes, printed and as data.
+
+    Args:
+      evaluated: the arguments of `recorded_episodes`.
+    """
+    from bounce_mjx.evaluation.contacts import arm_contacts, describe_contacts
+    from bounce_mjx.evaluation.limits import describe_limits, limit_shares
+    from bounce_mjx.evaluation.policy_evaluation import recorded_episodes
+    from bounce_mjx.evaluation.recording import RECORDED_EPISODES
+
+    checks = [("contacts", arm_contacts, describe_contacts)] * command.contacts
+    checks += [("limits", limit_shares, describe_limits)] * command.limits
+    recording, found = recorded_episodes(*evaluated) if checks else None, {}
+    for name, measure, describe in checks:
+        entries = measure(evaluated[1], recording)
+        text = describe(entries, RECORDED_EPISODES)
+        console.print(text, markup=False, highlight=False, soft_wrap=True)
+        found[name] = [entry._asdict() for entry in entries]
+    return found

@@ -1,9 +1,10 @@
 """Estimates a robot's world from its logs: `bounce-mjx identify LOG... --out world.yaml`."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.console import Console
@@ -13,6 +14,9 @@ from bounce_mjx.config.settings import NonNegative, StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.runs.config import read_preset
+
+if TYPE_CHECKING:
+    from bounce_mjx.identify.stages import Identified
 
 
 class TopicsConfig(StrictModel):
@@ -56,7 +60,7 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.identify.log import describe_gaps
     from bounce_mjx.identify.reading import Topics, read_log
     from bounce_mjx.identify.stages import identify, join
-    from bounce_mjx.identify.world import compare, estimates, sentences, to_yaml
+    from bounce_mjx.identify.world import compare, to_yaml
     from bounce_mjx.reports.identification import identification_page
     from bounce_mjx.robot.model import joint_names, load_model
     from bounce_mjx.runs.files import check_output, writable, write_output
@@ -65,46 +69,27 @@ def main(args: Sequence[str]) -> None:
 
     known = None if command.check is None else read_world(command.check)
     page = command.out.with_suffix(".html")
-    if known is None:
-        for path in (command.out, page):
-            check_output(path, "--out")
+    for path in (command.out, page) if known is None else ():
+        check_output(path, "--out")
     config = read_preset(Path("default"), command.robot).env
     if known is not None:
         # Its ranges are of this robot's joints.
         ranges = known.applied({})["randomization"]
         validate(type(config), config.model_dump() | {"randomization": ranges}, str(command.check))
     model = load_model(config.mjcf, config.physics_dt, visual=False, robot=config.robot)
-    names = joint_names(model)
-    topics = Topics(**command.topics.model_dump())
-    console = Console(soft_wrap=True, highlight=False)
+    names, topics = joint_names(model), Topics(**command.topics.model_dump())
+    say = partial(Console(soft_wrap=True, highlight=False).print, markup=False)
     log = join([read_log(path, model, topics, command.joint_names) for path in command.logs])
     for warning in (*log.notes, *describe_gaps(log, names)):
-        console.print(f"warning: {warning}", markup=False)
+        say(f"warning: {warning}")
     set_up_jax(config)
-    found = identify(
-        config,
-        log,
-        command.camera_rotation,
-        progress=lambda line: console.print(f"  {line}", markup=False),
-    )
-    for entry in estimates(found, names):
-        seen = "" if entry.seen else "  (not shown by the log)"
-        interval = f"{entry.low:.5g} to {entry.high:.5g} {entry.unit}".rstrip()
-        console.print(f"{entry.label}: {entry.value:.5g}, {interval}{seen}", markup=False)
-    for sensor, error in found.after.items():
-        held = found.held_out.get(sensor)
-        rest = "" if held is None else f", {held:.2f} in windows held out"
-        before = found.before.get(sensor, float("nan"))
-        console.print(
-            f"{sensor}: error {before:.2f} times the noise before, {error:.2f} after{rest}",
-            markup=False,
-        )
-    for sentence in sentences(found, names):
-        console.print(sentence, markup=False)
+    found = identify(config, log, command.camera_rotation, lambda line: say(f"  {line}"))
+    for line in _describe(found, names):
+        say(line)
     if known is not None:
         changed = compare(known, found, names)
         for line in changed or [f"the robot still matches {command.check}"]:
-            console.print(line, markup=False)
+            say(line)
         sys.exit(1 if changed else 0)
     robot = None if command.robot is None else str(command.robot)
     files = {
@@ -114,4 +99,20 @@ def main(args: Sequence[str]) -> None:
     for path, content in files.items():
         with writable(path, "choose another --out"):
             write_output(path, content)
-        console.print(str(path), markup=False)
+        say(str(path))
+
+
+def _describe(found: "Identified", joint_names: Sequence[str]) -> Iterator[str]:
+    """Lines about each estimate and each sensor, and what the log cannot show."""
+    from bounce_mjx.identify.world import estimates, sentences
+
+    for entry in estimates(found, joint_names):
+        seen = "" if entry.seen else "  (not shown by the log)"
+        interval = f"{entry.low:.5g} to {entry.high:.5g} {entry.unit}".rstrip()
+        yield f"{entry.label}: {entry.value:.5g}, {interval}{seen}"
+    for sensor, error in found.after.items():
+        held = found.held_out.get(sensor)
+        rest = "" if held is None else f", {held:.2f} in windows held out"
+        before = found.before.get(sensor, float("nan"))
+        yield f"{sensor}: error {before:.2f} times the noise before, {error:.2f} after{rest}"
+    yield from sentences(found, joint_names)

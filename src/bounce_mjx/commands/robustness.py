@@ -3,7 +3,9 @@
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from rich.console import Console
 from rich.progress import Progress
 
 from bounce_mjx.commands.run_options import OneActorCommand
@@ -18,6 +20,11 @@ from bounce_mjx.evaluation.config import (
     on_engine,
 )
 from bounce_mjx.resources import POLICIES, resource_path
+from bounce_mjx.runs.config import TrainConfig
+
+if TYPE_CHECKING:
+    from bounce_mjx.evaluation.robustness import RobustnessReport
+    from bounce_mjx.evaluation.suite import Condition
 
 
 class RobustnessCommand(OneActorCommand):
@@ -49,16 +56,7 @@ def main(args: Sequence[str]) -> None:
     not, 2 on a mistake."""
     command = parse(RobustnessCommand, args, prog="bounce-mjx robustness")
     from bounce_mjx.evaluation.robustness import RobustnessReport, measure_conditions
-    from bounce_mjx.evaluation.suite import load_suite, read_suite
-    from bounce_mjx.reports.figures import image
-    from bounce_mjx.reports.robustness import (
-        ROBUSTNESS_FILE,
-        misses,
-        robustness_figure,
-        robustness_table,
-    )
-    from bounce_mjx.runs.config import in_world, named_file
-    from bounce_mjx.runs.files import to_json, writable, write_output
+    from bounce_mjx.runs.files import writable
     from bounce_mjx.runs.folders import MIRROR_LAW
     from bounce_mjx.runs.reading import read_actor
     from bounce_mjx.training.setup import set_up_jax
@@ -68,18 +66,7 @@ def main(args: Sequence[str]) -> None:
     console = stdout()
     checkpoint = command.choose(command.checkpoint, console)
     config = command.config_of(checkpoint)
-    suite = resource_path("configs/robustness.yaml")
-    if command.suite is not None:
-        suite = named_file(command.suite, "configs")
-    world, assumed = None, {}
-    if command.world is not None:
-        there, named = in_world(config, command.world)
-        world, assumed = there.env, named.double_assumed()
-    conditions = load_suite(suite, config.env, world, assumed)
-    version = read_suite(suite).version
-    if command.assumed:
-        conditions, version = conditions[: 1 + len(assumed)], ""
-        suite = f"twice what {command.world} assumes"
+    conditions, suite, version = _read_conditions(command, config)
     set_up_jax(*(on_engine(condition.env, command.physics) for condition in conditions))
     checkpoint, policy, actor = read_actor(checkpoint, config)
     no_run = checkpoint.run in {MIRROR_LAW.run, *map(resource_path, POLICIES.values())}
@@ -91,22 +78,53 @@ def main(args: Sequence[str]) -> None:
     with Progress(console=console, transient=True) as bar:
         task = bar.add_task("conditions", total=len(conditions))
         outcomes = measure_conditions(
-            policy,
-            actor,
-            conditions,
-            options,
-            progress=lambda done: bar.update(task, completed=done),
+            policy, actor, conditions, options, lambda done: bar.update(task, completed=done)
         )
     report = RobustnessReport(
         checkpoint=str(checkpoint.folder),
         steps=checkpoint.steps,
-        suite=str(suite),
+        suite=suite,
         version=version,
         episodes=command.episodes,
         seed=command.seed,
         measured=outcomes[0].measured,
         outcomes=outcomes,
     )
+    _write_report(report, out, console)
+    sys.exit(0 if report.passed else 1)
+
+
+def _read_conditions(
+    command: RobustnessCommand, config: TrainConfig
+) -> tuple[list["Condition"], str, str]:
+    """The conditions of a policy, their suite's name or file, and its version."""
+    from bounce_mjx.evaluation.suite import load_suite, read_suite
+    from bounce_mjx.runs.config import in_world, named_file
+
+    path = resource_path("configs/robustness.yaml")
+    if command.suite is not None:
+        path = named_file(command.suite, "configs")
+    world, assumed = None, {}
+    if command.world is not None:
+        there, named = in_world(config, command.world)
+        world, assumed = there.env, named.doubled()
+    conditions = load_suite(path, config.env, world, assumed)
+    if command.assumed:
+        return conditions[: 1 + len(assumed)], f"twice what {command.world} assumes", ""
+    return conditions, str(path), read_suite(path).version
+
+
+def _write_report(report: "RobustnessReport", out: Path, console: Console) -> None:
+    """Prints a report, and writes it and its pictures into a folder."""
+    from bounce_mjx.reports.figures import image
+    from bounce_mjx.reports.robustness import (
+        ROBUSTNESS_FILE,
+        misses,
+        robustness_figure,
+        robustness_table,
+    )
+    from bounce_mjx.runs.files import to_json, writable, write_output
+
     console.print(robustness_table(report))
     console.print(f"missed: {misses(report)}", markup=False, highlight=False)
     figure = robustness_figure(report)
@@ -116,4 +134,3 @@ def main(args: Sequence[str]) -> None:
         with writable(out, "choose another folder with --out"):
             write_output(out / name, content)
     print(*(out / name for name in files), sep="\n")
-    sys.exit(0 if report.passed else 1)

@@ -30,14 +30,23 @@ def load_policy(
     """
     loaded = DeployedPolicy(*_model(policy, task))
     if joint_names is not None:
-        names, own = tuple(joint_names), loaded.metadata.joint_names
-        if not len(set(names)) == len(names) == len(own):
-            raise UserError(
-                f"joint_names are {joint_names!r}; give {len(own)} different names, those of the "
-                f"joints {', '.join(own)} in this order"
-            )
+        names = check_names(joint_names, loaded.metadata.joint_names, "joint_names")
         loaded.metadata = loaded.metadata._replace(joint_names=names)
     return loaded
+
+
+def check_names(names: Sequence[str], own: Sequence[str], option: str) -> tuple[str, ...]:
+    """A driver's names of a robot's joints, which has its own names for them.
+
+    Raises:
+      UserError: their number differs, or a name is given twice.
+    """
+    if not len(set(names)) == len(names) == len(own):
+        raise UserError(
+            f"{option} has {len(names)} names, {len(set(names))} of them different, and the robot "
+            f"has the {len(own)} joints {', '.join(own)}; give one name for each, in this order"
+        )
+    return tuple(names)
 
 
 def _model(policy: str | os.PathLike, task: str | None) -> tuple[bytes, str]:

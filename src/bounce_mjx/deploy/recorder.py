@@ -1,6 +1,7 @@
 """A log of a robot's run: one CSV file, from which `bounce-mjx identify` estimates its world."""
 
 import csv
+import itertools
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -10,26 +11,9 @@ import numpy as np
 
 from bounce_mjx.errors import UserError
 
+_OF_JOINTS = {"joint_angles": "rad", "joint_velocities": "rad/s", "servo_targets": "rad"}
 # Two pictures closer than this are one, s.
 _SAME_PICTURE = 1e-4
-
-
-def columns(joint_names: Iterable[str], commands: Mapping[str, str] | None = None) -> list[str]:
-    """The header of a log: each column's name and, in brackets, its unit.
-
-    Args:
-      commands: unit of each command by its name.
-    """
-    joints = list(joint_names)
-    return [
-        "time [s]",
-        *(f"joint_angles.{joint} [rad]" for joint in joints),
-        *(f"joint_velocities.{joint} [rad/s]" for joint in joints),
-        *(f"servo_targets.{joint} [rad]" for joint in joints),
-        *(f"ball_position.{axis} [m]" for axis in "xyz"),
-        "ball_time [s]",
-        *(f"{name} [{unit}]" for name, unit in (commands or {}).items()),
-    ]
 
 
 class Recorder:
@@ -45,7 +29,7 @@ class Recorder:
         joint_names: Iterable[str],
         commands: Mapping[str, str] | None = None,
     ):
-        """Makes the file.
+        """Makes the file. Its header names each column and, in brackets, its unit.
 
         Args:
           joint_names: order of the joints in every array, such as `policy.metadata.joint_names`.
@@ -54,7 +38,13 @@ class Recorder:
         Raises:
           UserError: the file exists, or cannot be made.
         """
-        self._joints, self._commands = tuple(joint_names), dict(commands or {})
+        joints, columns = tuple(joint_names), {"time": ["time [s]"]}
+        for name, unit in _OF_JOINTS.items():
+            columns[name] = [f"{name}.{joint} [{unit}]" for joint in joints]
+        columns["ball_position"] = [f"ball_position.{axis} [m]" for axis in "xyz"]
+        columns["ball_time"] = ["ball_time [s]"]
+        columns |= {name: [f"{name} [{unit}]"] for name, unit in (commands or {}).items()}
+        self._sizes = {name: len(titles) for name, titles in columns.items()}
         try:
             # A row reaches the file at once, as a robot's program may end at any time.
             self._file = Path(path).open("x", buffering=1, newline="", encoding="utf-8")
@@ -65,8 +55,8 @@ class Recorder:
                 f"the log {path} cannot be created ({error.strerror}); choose another folder"
             ) from error
         self._rows = csv.writer(self._file, lineterminator="\n")
-        self._rows.writerow(columns(self._joints, self._commands))
-        self._last: tuple[float, np.ndarray] | None = None
+        self._rows.writerow(itertools.chain(*columns.values()))
+        self._last: tuple[float, Any] = -np.inf, None
 
     def step(self, measurements: Mapping[str, Any], servo_targets: Any) -> None:
         """Writes the row of a control step.
@@ -81,14 +71,8 @@ class Recorder:
         Raises:
           UserError: a measurement has another size.
         """
-        count, time = len(self._joints), float(np.ravel(measurements["time"])[0])
-        row = [time]
-        for name in ("joint_angles", "joint_velocities"):
-            row += _cells(name, measurements.get(name), count)
-        row += _cells("servo_targets", servo_targets, count)
-        row += self._new_picture(time, measurements)
-        row += [cell for name in self._commands for cell in _cells(name, measurements.get(name), 1)]
-        self._write(row)
+        picture = self._new_picture(measurements)
+        self._write({**measurements, "servo_targets": servo_targets, **picture})
 
     def picture(self, time: float, position: Any, taken: float | None = None) -> None:
         """Writes a row for a picture that no control step sees, as a later one arrives before it.
@@ -99,9 +83,7 @@ class Recorder:
           taken: time at which it was taken, s; by default, that of its arrival.
         """
         self._last = (time if taken is None else taken), np.array(position, float)
-        joints = [None] * (3 * len(self._joints))
-        picture = [*_cells("ball_position", position, 3), self._last[0]]
-        self._write([time, *joints, *picture, *[None] * len(self._commands)])
+        self._write({"time": time, "ball_position": position, "ball_time": self._last[0]})
 
     def close(self) -> None:
         """Closes the file."""
@@ -113,30 +95,29 @@ class Recorder:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _new_picture(self, time: float, measurements: Mapping[str, Any]) -> list[float | None]:
-        """Cells of the picture, empty if it is none or the last one."""
-        cells = _cells("ball_position", measurements.get("ball_position"), 3)
-        if None in cells:
-            return [None] * 4
-        position, age = np.array(cells), measurements.get("ball_age")
+    def _new_picture(self, measurements: Mapping[str, Any]) -> dict[str, Any]:
+        """The measured picture; without a position if it is none or the last one."""
+        time, age = float(np.ravel(measurements["time"])[0]), measurements.get("ball_age")
+        position = np.array(measurements.get("ball_position"), float)
         taken = time if age is None else time - float(np.ravel(age)[0])
-        if self._last is not None:
-            last, seen = self._last
-            same_time = age is not None and abs(taken - last) < _SAME_PICTURE
-            if same_time or (age is None and np.array_equal(position, seen)):
-                return [None] * 4
+        last, seen = self._last
+        is_old = (
+            np.array_equal(position, seen) if age is None else abs(taken - last) < _SAME_PICTURE
+        )
+        if is_old or not np.all(np.isfinite(position)):
+            return {"ball_position": None}
         self._last = taken, position
-        return [*cells, taken]
+        return {"ball_position": position, "ball_time": taken}
 
-    def _write(self, row: list[float | None]) -> None:
-        self._rows.writerow(["" if x is None else repr(float(x)) for x in row])
-
-
-def _cells(name: str, values: Any, count: int) -> list[float | None]:
-    """A measurement's cells, empty if it is missing or not finite."""
-    if values is None:
-        return [None] * count
-    values = np.ravel(np.asarray(values, float))
-    if len(values) != count:
-        raise UserError(f"{name} has {len(values)} numbers, and the log has {count} cells for it")
-    return values.tolist() if np.all(np.isfinite(values)) else [None] * count
+    def _write(self, values: Mapping[str, Any]) -> None:
+        """Writes a row; the cells of what is missing or not finite are empty."""
+        row = []
+        for name, size in self._sizes.items():
+            numbers = np.ravel(np.array(values.get(name, np.nan), float))
+            if len(numbers) != size and values.get(name) is not None:
+                raise UserError(
+                    f"{name} has {len(numbers)} numbers, and the log has {size} cells for it"
+                )
+            is_given = np.all(np.isfinite(numbers))
+            row += [repr(x) for x in numbers.tolist()] if is_given else [""] * size
+        self._rows.writerow(row)

@@ -25,6 +25,8 @@ _LIFTING = 1.5
 # Frequencies of a sweep, Hz. A delay and a servo's time constant part at the high ones alone.
 _FAST = (0.6, 10.0)
 _RAMP = 0.5
+# Distance from the ends of a joint's range, rad.
+_FROM_END = 0.02
 # Share of a limit that targets use.
 _BELOW_LIMIT = 0.9
 _TOGETHER = (0.53, 0.71, 0.89, 1.13, 1.37, 1.61, 1.83, 2.11)
@@ -63,13 +65,20 @@ def excite(
       UserError: the start pose has a contact with the floor or the table, or a joint cannot move.
     """
     model = load_model(config.mjcf, config.physics_dt, visual=False, robot=config.robot)
-    addresses, n = find_addresses(model), config.num_joints
-    home = np.array(config.default_joint_angles)
-    bounds = _read_bounds(config, max_velocity)
-    ranges = model.jnt_range[list(addresses.arm_joints)]
-    limited = ranges[:, 0] < ranges[:, 1]
-    centre = _lift_paddle(model, home)
-    room = np.where(limited, np.min(np.abs(ranges - centre[:, None]), axis=1) - 0.02, np.inf)
+    addresses, n, dt = find_addresses(model), config.num_joints, config.control_dt
+    home, names = np.array(config.default_joint_angles), joint_names(model)
+    limits = config.robot.limits
+    bounds = np.stack(
+        [
+            np.full(n, np.inf) if limit is None else _BELOW_LIMIT * np.array(limit)
+            for limit in (limits.velocity, limits.acceleration, limits.jerk)
+        ]
+    )
+    bounds[0] = np.minimum(bounds[0], max_velocity)
+    low, high = model.jnt_range[list(addresses.arm_joints)].T
+    low, high = (np.where(low < high, end, x) for end, x in ((low, -np.inf), (high, np.inf)))
+    centre = _lift_paddle(model, home, low + _FROM_END, high - _FROM_END)
+    room = np.minimum(centre - low, high - centre) - _FROM_END
     amplitudes = np.minimum(_LARGEST_AMPLITUDE, room)
     contacts = ContactChecker(config, MARGIN, table_height)
     # Parts of the arm that overlap or nearly touch in its start pose are modelled so.
@@ -80,31 +89,28 @@ def excite(
             f"the start pose has {_contact(contacts, below[0])}; change default_joint_angles or "
             "--table-height"
         )
-    times = np.arange(round(seconds / config.control_dt)) * config.control_dt
-    every = max(round(_CHECKED / config.control_dt), 1)
-    names = joint_names(model)
-    lifting = np.maximum(_LIFTING, np.max(bounds.time_of_step(np.abs(centre - home))))
+    times = np.arange(round(seconds / dt)) * dt
+    lifting = max(_LIFTING, _time_of_step(np.abs(centre - home), bounds))
     if times[-1] < 2.0 * lifting + 1.0 * n:
         raise UserError(
             f"{seconds:g} s are too short to move {n} joints; give at least "
             f"{2.0 * lifting + 1.0 * n:.0f} s"
         )
-    lift = _smooth_step(np.minimum(times, times[-1] - times) / lifting)[:, None] * (centre - home)
-    inner = times[(times >= lifting) & (times <= times[-1] - lifting)]
+    rests = home + np.outer(
+        _smooth_step(np.minimum(times, times[-1] - times) / lifting), centre - home
+    )
+    inner = (times >= lifting) & (times <= times[-1] - lifting)
+    checked = range(0, len(times), max(round(_CHECKED / dt), 1))
     while True:
-        targets = home + lift
-        moving = np.isin(times, inner)
-        targets[moving] += _plan(inner - inner[0], amplitudes, bounds)
+        targets = rests.copy()
+        targets[inner] += _plan(times[inner] - times[inner][0], amplitudes, bounds)
         poses = (
-            (t, pair)
-            for t in range(0, len(times), every)
-            for pair in sorted(contacts.touching(targets[t]) - allowed)
+            (t, pair) for t in checked for pair in sorted(contacts.touching(targets[t]) - allowed)
         )
-        hit = next(poses, None)
-        if hit is None:
+        if (hit := next(poses, None)) is None:
             return Excitation(names, times, targets, np.max(np.abs(targets - home), axis=0))
         step, pair = hit
-        moving = _find_movers(contacts, pair, targets[step], home + lift[step])
+        moving = _find_movers(contacts, pair, targets[step], rests[step])
         amplitudes = np.where(moving, 0.5 * amplitudes, amplitudes)
         if not np.any(moving) or np.min(amplitudes) < _SMALLEST_AMPLITUDE:
             mover = names[int(np.argmax(moving))] if np.any(moving) else "the lifted arm"
@@ -131,62 +137,24 @@ def _contact(contacts: ContactChecker, pair: tuple[int, int]) -> str:
     return "a contact of " + " and ".join(map(contacts.name, pair))
 
 
-def _lift_paddle(model: mujoco.MjModel, home: np.ndarray) -> np.ndarray:
-    """Joint angles [n] at which the paddle is higher, by steps of the pseudo-inverse."""
+def _lift_paddle(
+    model: mujoco.MjModel, home: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """Joint angles [n] within limits [n] at which the paddle is higher, by steps of the
+    pseudo-inverse."""
     addresses, data = find_addresses(model), mujoco.MjData(model)
     body = model.geom_bodyid[addresses.paddle_geom]
-    limits = model.jnt_range[list(addresses.arm_joints)]
-    limited = limits[:, 0] < limits[:, 1]
-    low, high = (np.where(limited, limits[:, i], side) for i, side in ((0, -np.inf), (1, np.inf)))
-    dofs, angles, jacobian = list(addresses.arm_qvel), home.copy(), np.zeros((3, model.nv))
+    angles, jacobian = home.copy(), np.zeros((3, model.nv))
     for _ in range(20):
         data.qpos[list(addresses.arm_qpos)] = angles
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_jac(model, data, jacobian, None, data.geom_xpos[addresses.paddle_geom], body)
-        part = jacobian[:, dofs]
+        part = jacobian[:, list(addresses.arm_qvel)]
         damped = part @ part.T + 1e-3 * np.eye(3)
         step = part.T @ np.linalg.solve(damped, [0.0, 0.0, _LIFT / 20])
-        angles = np.clip(angles + step, low + 0.02, high - 0.02)
+        angles = np.clip(angles + step, low, high)
     return angles
-
-
-class _Bounds(NamedTuple):
-    """Largest derivatives of each joint's target [n]."""
-
-    velocity: np.ndarray
-    acceleration: np.ndarray
-    jerk: np.ndarray
-
-    def amplitude(self, joint: int, rate: np.ndarray | float) -> np.ndarray:
-        """Largest amplitude of a sine with an angular frequency, rad/s."""
-        return np.minimum(
-            np.minimum(self.velocity[joint] / rate, self.acceleration[joint] / rate**2),
-            self.jerk[joint] / rate**3,
-        )
-
-    def shrink(self, joint: int, path: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """A path [T], smaller where its ramps exceed the limits of acceleration and jerk."""
-        share, dt = 1.0, times[1] - times[0]
-        for order, limit in ((2, self.acceleration[joint]), (3, self.jerk[joint])):
-            largest = np.max(np.abs(np.diff(path, order))) / dt**order
-            share = min(share, limit / max(largest, 1e-9))
-        return share * path
-
-    def time_of_step(self, distance: np.ndarray) -> np.ndarray:
-        """Shortest duration [n] of `_smooth_step` over a distance [n]."""
-        by_jerk = np.cbrt(60.0 * distance / self.jerk)
-        by_acceleration = np.sqrt(5.8 * distance / self.acceleration)
-        return np.maximum(np.maximum(1.9 * distance / self.velocity, by_acceleration), by_jerk)
-
-
-def _read_bounds(config: WorldConfig, max_velocity: float | Sequence[float]) -> _Bounds:
-    limits, n = config.robot.limits, config.num_joints
-    velocity, acceleration, jerk = (
-        np.full(n, np.inf) if given is None else _BELOW_LIMIT * np.array(given)
-        for given in (limits.velocity, limits.acceleration, limits.jerk)
-    )
-    return _Bounds(np.minimum(velocity, max_velocity), acceleration, jerk)
 
 
 def _smooth_step(share: np.ndarray) -> np.ndarray:
@@ -195,48 +163,62 @@ def _smooth_step(share: np.ndarray) -> np.ndarray:
     return share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
 
 
-def _plan(times: np.ndarray, amplitudes: np.ndarray, bounds: _Bounds) -> np.ndarray:
-    """Displacements [T, n]: a slot of each joint alone, slow and then fast; then one of all."""
-    n, length = len(amplitudes), times[-1] + times[1] - times[0]
-    alone = 0.7 * length / n
-    moved = np.zeros((len(times), n))
-    for j in range(n):
-        t = times - j * alone
-        slow = (t >= 0.0) & (t < 0.5 * alone)
-        fast = (t >= 0.5 * alone) & (t < alone)
-        by_slow = slow * _slow_sine(t, 0.5 * alone, amplitudes[j], bounds, j)
-        by_fast = fast * _sweep(t - 0.5 * alone, 0.5 * alone, amplitudes[j], bounds, j)
-        moved[:, j] += sum(bounds.shrink(j, part, times) for part in (by_slow, by_fast))
-    t = times - n * alone
-    ramp = _smooth_step(np.minimum(t, length - n * alone - t) / _RAMP)
-    for j in range(n):
+def _time_of_step(distances: np.ndarray, bounds: np.ndarray) -> float:
+    """Shortest duration of `_smooth_step` over a distance of each joint [n], within bounds
+    [3, n]: its derivatives are at most 1.9, 5.8 and 60."""
+    powers = 1.0 / np.arange(1, 4)[:, None]
+    return float(np.max((np.outer([1.9, 5.8, 60.0], distances) / bounds) ** powers))
+
+
+def _plan(times: np.ndarray, amplitudes: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """Displacements [T, n]: a slot of each joint alone, slow and then fast; then one of all.
+
+    Args:
+      bounds: of each joint's velocity, acceleration and jerk [3, n].
+    """
+    n, dt = len(amplitudes), times[1] - times[0]
+    length = times[-1] + dt
+    alone, moved = 0.7 * length / n, np.zeros((len(times), n))
+    for j, limits in enumerate(bounds.T):
+        t, half = times - j * alone, 0.5 * alone
+        for start, wave in ((0.0, _slow_sine), (half, _sweep)):
+            path = wave(t - start, half, amplitudes[j], limits)
+            moved[:, j] += _shrink(path * ((t >= start) & (t < start + half)), dt, limits)
+        t = times - n * alone
+        ramp = (t >= 0.0) * _smooth_step(np.minimum(t, length - n * alone - t) / _RAMP)
         rates = 2.0 * np.pi * np.array(_TOGETHER[j % 4 :: 4])
-        wave = np.sum(np.sin(rates * t[:, None] + j), axis=1) / len(rates)
-        size = 0.5 * min(amplitudes[j], 0.6 * float(bounds.amplitude(j, np.max(rates))))
-        moved[:, j] += bounds.shrink(j, (t >= 0.0) * ramp * size * wave, times)
+        size = 0.5 * min(amplitudes[j], 0.6 * float(_largest_sine(limits, np.max(rates))))
+        waves = np.mean(np.sin(rates * t[:, None] + j), axis=1)
+        moved[:, j] += _shrink(ramp * size * waves, dt, limits)
     return moved
 
 
-def _slow_sine(
-    t: np.ndarray, length: float, amplitude: float, bounds: _Bounds, joint: int
-) -> np.ndarray:
-    """A sine there and back at a quarter of the speed, which shows dry friction."""
+def _largest_sine(limits: np.ndarray, rate: np.ndarray | float) -> np.ndarray:
+    """Largest amplitude of a sine with an angular frequency (rad/s) within a joint's limits [3]."""
+    return np.min([limit / rate**order for order, limit in enumerate(limits, 1)], axis=0)
+
+
+def _shrink(path: np.ndarray, dt: float, limits: np.ndarray) -> np.ndarray:
+    """A path [T], smaller where its ramps exceed the limits [3]."""
+    most = [np.max(np.abs(np.diff(path, order))) / dt**order for order in (1, 2, 3)]
+    return path * min(1.0, *(limits / np.maximum(most, 1e-9)))
+
+
+def _slow_sine(t: np.ndarray, length: float, amplitude: float, limits: np.ndarray) -> np.ndarray:
+    """A sine there and back at a quarter of the speed, from rest to rest, which shows dry
+    friction."""
     rate = 2.0 * np.pi / length
-    size = min(amplitude, _SLOW * float(bounds.amplitude(joint, rate)))
-    # From rest to rest.
+    size = min(amplitude, _SLOW * float(_largest_sine(limits, rate)))
     return size * np.sin(rate * t) * _smooth_step(np.minimum(t, length - t) / (0.25 * length))
 
 
-def _sweep(
-    t: np.ndarray, length: float, amplitude: float, bounds: _Bounds, joint: int
-) -> np.ndarray:
+def _sweep(t: np.ndarray, length: float, amplitude: float, limits: np.ndarray) -> np.ndarray:
     """A sine of rising frequency, whose derivatives stay within the limits."""
     low, high = _FAST
     rate = 2.0 * np.pi * (low + (high - low) * np.clip(t / length, 0.0, 1.0))
     phase = 2.0 * np.pi * (low * t + 0.5 * (high - low) * t * t / length)
     window = _smooth_step(np.minimum(t, length - t) / (0.2 * length))
-    size = np.minimum(amplitude, 0.7 * bounds.amplitude(joint, rate))
-    return size * window * np.sin(phase)
+    return np.minimum(amplitude, 0.7 * _largest_sine(limits, rate)) * window * np.sin(phase)
 
 
 def to_csv(motion: Excitation) -> str:

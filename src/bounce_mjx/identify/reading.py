@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from bounce_mjx.deploy.loading import check_names
 from bounce_mjx.errors import UserError, needed, reason_of, shorten
 from bounce_mjx.identify.log import Log, Rows, align_clocks, check, make_log
 from bounce_mjx.robot.model import find_addresses, joint_names
@@ -50,13 +51,7 @@ def read_log(path: Path, model: mujoco.MjModel, topics: Topics, names: Sequence[
       UserError: as `read_csv`, `read_bag`, `check` and `align_clocks`, or the names do not fit.
     """
     own = joint_names(model)
-    names = tuple(names) or own
-    if not len(set(names)) == len(names) == len(own):
-        raise UserError(
-            f"--joint-names gives {len(names)} names, {len(set(names))} of them different, and "
-            f"the robot has the {len(own)} joints {', '.join(own)}; give the log's name of each, "
-            "in this order"
-        )
+    names = check_names(names or own, own, "--joint-names")
     log = read_bag(path, names, topics) if is_bag(path) else read_csv(path, names)
     check(log, names, model.jnt_range[list(find_addresses(model).arm_joints)])
     return align_clocks(log)
