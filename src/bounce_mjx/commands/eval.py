@@ -73,7 +73,7 @@ def main(args: Sequence[str]) -> None:
     )
     length = f"{command.episodes:,} episodes of {config.env.episode_seconds:g} s"
     with progress(console, "evaluating", "evaluated") as shown:
-        report, engine, warnings = evaluate_policy(
+        report, engine = evaluate_policy(
             policy,
             config.env,
             actor,
@@ -81,8 +81,6 @@ def main(args: Sequence[str]) -> None:
             started=lambda engine: console.out(f"physics: {engine}  {length}", highlight=False),
             progress=shown,
         )
-    for warning in warnings:
-        console.print(f"warning: {warning}", markup=False, highlight=False, soft_wrap=True)
     console.print(results_table(report, "the results"))
     console.print(details_line(report), highlight=False, soft_wrap=True)
     found = _check_arm(command, (policy, config.env, actor, options), console)
