@@ -234,7 +234,7 @@ def test_a_graph_computes_what_jax_computes(function, rows) -> None:
         model.SerializeToString(), providers=["CPUExecutionProvider"]
     )
     (result,) = session.run(["result"], given)
-    expected = np.asarray(jax.vmap(lambda named: function(**named))(given))
+    expected = np.asarray(jax.jit(jax.vmap(lambda named: function(**named)))(given))
     assert result.dtype == expected.dtype
     np.testing.assert_allclose(result, expected, rtol=2e-5, atol=2e-6)
 
@@ -296,7 +296,7 @@ def test_servo_targets_lead_the_measured_angles_as_in_the_environment() -> None:
     policy.metadata = policy.metadata._replace(max_lead=0.03)
     policy.reset()
     rng = np.random.default_rng(0)
-    state = env.reset(jax.random.PRNGKey(0))
+    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
     for step in range(12):
         pipeline = state.pipeline_state
         angles = np.asarray(pipeline.physics.qpos[:6]) + 0.004 * step

@@ -251,7 +251,7 @@ def test_servo_target_is_clipped_to_the_joint_range(env, reset, model):
 def test_action_adds_to_the_last_target_within_its_lead():
     """The arm does not move meanwhile; the targets lead it by at most max_lead and one action."""
     env = BounceBall(EnvConfig(action={"base": "target", "max_lead": 0.05}))
-    state = env.reset(jax.random.key(0)).pipeline_state
+    state = jax.jit(env.reset)(jax.random.key(0)).pipeline_state
     angles = state.physics.qpos[:6]
     for lead in (0.02, 0.04, 0.06, 0.07, 0.07):
         control, actuation = env.control(state, jnp.ones(6))
@@ -532,7 +532,7 @@ LATE = EnvConfig(
 def test_nan_action_ends_the_episode_and_acts_as_zero(config):
     """All entries or one of them, in the command, in the memories and in the observation."""
     env = BounceBall(config)
-    state = env.reset(jax.random.key(3))
+    state = jax.jit(env.reset)(jax.random.key(3))
 
     @jax.jit
     def step_on_the_spot(action):
@@ -559,7 +559,7 @@ def test_gradient_through_steps_with_a_contact_equals_finite_differences():
     a direction of the actions, against central differences of the fourth order."""
     with jax.enable_x64(True):
         env = BounceBall()
-        state = env.reset(jax.random.key(0))
+        state = jax.jit(env.reset)(jax.random.key(0))
         paddle = env.kinematics(state.pipeline_state).paddle_position
         physics = with_ball(state.pipeline_state.physics, paddle + jnp.array([0.01, 0.0, 0.04]))
         physics = physics._replace(qvel=physics.qvel.at[8].set(-1.5))

@@ -80,7 +80,7 @@ def states(rows) -> State:
 
 @functools.cache
 def resting_state() -> State:
-    return BounceBall().reset(jax.random.key(0))
+    return jax.jit(BounceBall().reset)(jax.random.key(0))
 
 
 def count(env, steps, first_step=0) -> Statistics:

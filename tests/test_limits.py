@@ -51,7 +51,7 @@ def rolled_out(smooth: bool, world: dict) -> Rollout:
     actions = np.clip(pushes + rng.normal(0.0, 0.5, (STEPS, 6)), -1.0, 1.0)
     with jax.enable_x64(True):
         env = BounceBall(config)
-        state = env.reset(jax.random.PRNGKey(0))
+        state = jax.jit(env.reset)(jax.random.PRNGKey(0))
 
         def step(state, action):
             now = state.pipeline_state
@@ -74,7 +74,6 @@ def rolled_out(smooth: bool, world: dict) -> Rollout:
 
 LATE, LATER = {"action_latency": (0.017, 0.017)}, {"action_latency": (0.023, 0.023)}
 WORLDS = {
-    "smooth": (True, {}),
     "late": (False, LATER),
     "late, smooth and lagged": (True, LATE | {"servo_lag": (0.008, 0.008)}),
 }

@@ -51,7 +51,7 @@ def test_commands_are_those_of_the_environment(smooth: bool) -> None:
     policy, rng = limited(limits), np.random.default_rng(0)
     with jax.enable_x64(True):
         env = BounceBall(config)
-        state = env.reset(jax.random.PRNGKey(0)).pipeline_state
+        state = jax.jit(env.reset)(jax.random.PRNGKey(0)).pipeline_state
         begin = jax.jit(env.control)
         for i in range(60):
             physics = state.physics

@@ -23,18 +23,11 @@ from against_c import (
     random_states,
     world,
 )
-from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.c_episodes import (
-    episode_models,
     full_states,
-    make_mujoco_evaluator,
     physics_states,
 )
-from bounce_mjx.evaluation.episodes import make_evaluator
-from bounce_mjx.learning import policy as policies
-from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.physics import (
     Control,
     PhysicsParameters,
@@ -182,54 +175,6 @@ def test_a_parameter_of_another_shape_is_refused(mj_model):
         wrong = PhysicsParameters(**{field: jnp.ones((*shape, 2))})
         with pytest.raises(UserError, match=field):
             engine.step(wrong, state, Control(jnp.zeros(mj_model.nu)), 1)
-
-
-def heavy_and_light(key: jax.Array) -> PhysicsParameters:
-    """Environment with balls of 1 to 100 times the mass."""
-    return PhysicsParameters(ball_mass=0.0027 * 100.0 ** jax.random.uniform(key))
-
-
-@pytest.fixture(scope="module")
-def networks():
-    env = BounceBall()
-    return policies.make_networks(
-        PPOConfig(hidden_layers=(16,)), env.observation_size, env.action_size
-    )
-
-
-@pytest.fixture(scope="module")
-def untrained(networks):
-    """Untrained policy."""
-    params = networks.policy_network.init(jax.random.PRNGKey(5))
-    return policies.Policy(init_normalizer(BounceBall().observation_size), params)
-
-
-@pytest.mark.slow
-def test_c_evaluates_each_episode_in_its_own_world(networks, untrained):
-    """C agrees with the fused engine, also on the drag of a bouncing ball, and not all worlds equal
-    the model's."""
-    config = EnvConfig(
-        episode_seconds=0.3,
-        ball_init_pos=(0.58856, 0.0, 0.1),
-        randomization={
-            "air_drag": (5.0, 10.0),
-            "air_lift": (0.0, 0.01),
-            "restitution": (0.7, 0.95),
-            "restitution_slope": (0.05, 0.1),
-        },
-    )
-    key = jax.random.PRNGKey(0)
-    env = BounceBall(config, randomize=heavy_and_light)
-    c = make_mujoco_evaluator(env, networks, 6)(untrained, key)
-    ours = make_evaluator(env, networks, 6)(untrained, key)
-    np.testing.assert_allclose(c.episode_return, ours.episode_return, rtol=1e-3, atol=1e-2)
-
-    masses = jax.vmap(env.reset, out_axes=-1)(jax.random.split(key, 6)).pipeline_state.parameters
-    models = episode_models(env, masses)
-    np.testing.assert_allclose(
-        [model.body("ball_link").mass[0] for model in models], masses.ball_mass, rtol=1e-6
-    )
-    assert len(episode_models(BounceBall(config), MODEL)) == 1
 
 
 def test_c_evaluation_carries_the_whole_state():
