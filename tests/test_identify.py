@@ -10,7 +10,7 @@ from bounce_mjx.commands.main import main
 from bounce_mjx.identify.fit import Fit, Noise, Problem, _eliminate, certainty, minimise
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.reading import read_csv
-from bounce_mjx.identify.simulation import Predicted, make_targets
+from bounce_mjx.identify.simulation import make_targets
 from bounce_mjx.identify.stages import Identified, _align_frame, identify, sensor_noise
 from bounce_mjx.identify.unknowns import Layout, make_layout
 from bounce_mjx.identify.windows import Windows, cut
@@ -150,6 +150,13 @@ def test_whitening_leaves_independent_errors_after_a_bounce() -> None:
     np.testing.assert_allclose(white, np.diag(np.repeat(w.picture_weights[s], 3)), atol=1e-9)
 
 
+def measured_rows(w: Windows, angles: np.ndarray) -> np.ndarray:
+    """Rows of candidates with these angles [C, S, A, n] and the measured balls."""
+    balls = np.broadcast_to(w.balls, (len(angles), *w.balls.shape))
+    parts = [x.reshape(*x.shape[:2], -1) for x in (angles, balls)]
+    return np.concatenate(parts, axis=2)
+
+
 def linear_problem(log: Log, random: np.random.Generator) -> Problem:
     """Windows in which the angles follow the start, and by random shapes two unknowns: that of
     delay in all joints, and of servo_gain each in its own."""
@@ -158,11 +165,10 @@ def linear_problem(log: Log, random: np.random.Generator) -> Problem:
     late, gain = random.normal(size=(2, *shape))
     ramp = w.angle_times[:, :, None]
 
-    def simulate(vectors: np.ndarray, starts: np.ndarray, used: np.ndarray) -> Predicted:
+    def simulate(vectors: np.ndarray, starts: np.ndarray, used: np.ndarray) -> np.ndarray:
         by_late = 0.1 * vectors[:, places["delay"]][:, :, None, None] * late * ramp
         by_gain = 1e-2 * vectors[:, None, None, places["servo_gain"]] * gain * ramp
-        balls = np.broadcast_to(w.balls, (len(vectors), *w.balls.shape))
-        return Predicted(starts[:, :, None, :6] + by_late + by_gain, balls)
+        return measured_rows(w, starts[:, :, None, :6] + by_late + by_gain)
 
     return Problem(simulate, w, layout, Noise(np.full(6, 1e-3), np.full(3, 2e-3)))
 
@@ -176,20 +182,20 @@ def test_intervals_know_that_residuals_of_a_window_are_correlated() -> None:
     layout, w = problem.layout, problem.windows
     truth, weights = layout.mean, problem.weights(pictures=0.0)
     free, place = layout.free(["arm"]), layout.slices()["delay"].start
-    clean = problem.predict(truth, w.starts).angles
-    along = (
-        problem.predict(truth + 0.02 * (np.arange(len(truth)) == place), w.starts).angles - clean
-    )
+    late = truth + 0.02 * (np.arange(len(truth)) == place)
+    clean, moved = (w.split(problem.predict(x, w.starts))[0] for x in (truth, late))
+    along = moved - clean
     estimates, deviations, independent = [], [], []
     for _ in range(40):
         common = random.normal(size=(len(w.first), 1, 1))
         noisy = clean + 1e-3 * random.normal(size=clean.shape) + common * along
         one = problem._replace(windows=w._replace(angles=noisy))
-        fit = minimise(one, truth, w.starts, free, weights, 4)
+        fit = minimise(one, Fit(truth, w.starts), free, weights, 4)
+        information, covariance = certainty(one, fit)
         estimates.append(fit.vector[place])
-        deviations.append(np.sqrt(certainty(one, fit)[1][place, place]))
-        of_noise = np.linalg.inv(fit.information + np.diag(layout.deviation**-2.0))
-        independent.append(np.sqrt(of_noise[place, place]))
+        deviations.append(np.sqrt(covariance[place, place]))
+        by_noise = np.linalg.inv(information + np.diag(layout.deviation**-2.0))
+        independent.append(np.sqrt(by_noise[place, place]))
     assert np.std(estimates) > 1.5 * np.mean(independent)
     np.testing.assert_allclose(np.mean(deviations), np.std(estimates), rtol=0.35)
 
