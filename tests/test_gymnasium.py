@@ -302,6 +302,23 @@ def test_torchrl_wraps_single_and_vectorised_environments(need):
                 assert torch.equal(data["observation"][:, TARGET] != target, ended)
 
 
+def test_skrl_wraps_the_vector(need, vectorised):
+    """Tensors with the numbers of the arrays; skrl's trainers call the rest at every step."""
+    wrap_env, torch = need("skrl.envs.wrappers.torch").wrap_env, need("torch")
+    envs = wrap_env(vectorised, verbose=False)
+    assert (envs.num_envs, envs.observation_space.shape) == (NUM_ENVS, (29,))
+    envs.reset()
+    twin = copy.deepcopy(vectorised)
+    observation, *others, _ = envs.step(torch.full((NUM_ENVS, 6), 0.1))
+    expected = twin.step(np.full((NUM_ENVS, 6), 0.1, np.float32))
+    np.testing.assert_array_equal(observation, expected[0])
+    for given, array in zip(others, expected[1:4], strict=True):
+        assert given.shape == (NUM_ENVS, 1)
+        np.testing.assert_allclose(given[:, 0], array, rtol=1e-6)
+    assert len(envs.render()) == NUM_ENVS
+    twin.close()
+
+
 def test_pictures_show_the_state(single, vectorised):
     single.reset(seed=0)
     first = single.render()

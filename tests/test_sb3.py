@@ -91,7 +91,10 @@ REPLAY_SETTINGS = {"learning_starts": 30, "batch_size": 16}
     "library, algorithm, settings",
     [
         ("stable_baselines3", "PPO", PPO_SETTINGS),
+        ("stable_baselines3", "A2C", {"n_steps": 16}),
         ("stable_baselines3", "SAC", REPLAY_SETTINGS),
+        ("stable_baselines3", "TD3", REPLAY_SETTINGS),
+        ("stable_baselines3", "DDPG", REPLAY_SETTINGS),
         ("sbx", "PPO", PPO_SETTINGS),
     ],
 )

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import onnxruntime
 import pytest
 import torch
 from tensordict import TensorDict
@@ -282,6 +283,21 @@ def test_the_run_of_a_library_acts_like_its_network(trained):
     assert np.abs(expected).max() > 0.01
     np.testing.assert_allclose(actions, expected, atol=1e-5)
     assert find_checkpoint(run).steps == 512
+
+
+@pytest.mark.slow
+def test_rsl_rl_exports_the_policy(trained):
+    """TorchScript and ONNX give the actions of the trained network."""
+    if not (folder := trained.out / "rsl_rl").exists():
+        pytest.skip("skrl exports nothing")
+    observation = torch.randn(8, 29)
+    with torch.no_grad():
+        expected = trained.act(observation)
+        torch.testing.assert_close(torch.jit.load(folder / "policy.pt")(observation), expected)
+    session = onnxruntime.InferenceSession(folder / "policy.onnx")
+    for row, action in zip(observation, expected, strict=True):
+        (given,) = session.run(None, {"obs": row[None].numpy()})
+        np.testing.assert_allclose(given[0], action, rtol=1e-4, atol=1e-5)
 
 
 def linear_policy(sizes: list[int], activation: type[nn.Module] = nn.SiLU) -> Policy:

@@ -38,7 +38,7 @@ from bounce_mjx.physics.scalars import (
 Scalars = Sequence[Scalar]
 ContactForce = Callable[[tuple[Scalar, ...], tuple[Scalar, ...]], tuple[Scalar, ...]]
 
-# Rounds, and sweeps in each. In the states of test_joint_friction.py two rounds reach rounding
+# Rounds, and sweeps in each. In the states of test_friction.py two rounds reach rounding
 # error with the shipped ball, and three with a ball as heavy as the arm. Of 50,000 artificial
 # problems with most joints at their limits, three rounds miss none with the shipped arm, and 2%
 # with an arm of nine joints, by 1e-4 of the largest acceleration at most.
