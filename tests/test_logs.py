@@ -217,7 +217,7 @@ def test_what_one_row_lacks_is_left_out_and_counted(change, sentence: str, tmp_p
     assert len(log.picture_times) >= ROWS // 2 - 1
 
 
-@pytest.mark.parametrize("separator, point", [(";", "."), (";", ","), ("\t", "."), ("\t", ",")])
+@pytest.mark.parametrize("separator, point", [(";", ","), ("\t", ".")])
 def test_other_separators_and_decimal_commas_are_read(separator, point, tmp_path: Path) -> None:
     """And titles without a space before the unit."""
     good = recorded(tmp_path / "good.csv")
@@ -229,12 +229,9 @@ def test_other_separators_and_decimal_commas_are_read(separator, point, tmp_path
         np.testing.assert_array_equal(one, other)
 
 
-@pytest.mark.parametrize(
-    "names", [("Revolute 1", "Revolute 2"), ("a,b", 'c "d"'), ("a[0]", "a[1]")]
-)
-def test_reader_reads_what_the_recorder_writes(names, tmp_path: Path) -> None:
+def test_reader_reads_what_the_recorder_writes(tmp_path: Path) -> None:
     """Names of CAD programs, and a ball that a tracker reports as NaN while it is hidden."""
-    path = tmp_path / "log.csv"
+    path, names = tmp_path / "log.csv", ("a,b", 'c "d" [0]')
     with Recorder(path, names) as recorder:
         for k in range(ROWS):
             ball = np.full(3, np.nan) if k % 3 == 0 else np.full(3, 0.001 * k)

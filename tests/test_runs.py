@@ -18,13 +18,10 @@ import jax
 import numpy as np
 import pytest
 from rich.console import Console
-from tensorboardX import SummaryWriter
 
 from bounce_mjx.commands import eval as eval_command
-from bounce_mjx.commands import plot as plot_command
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.errors import UserError
-from bounce_mjx.evaluation import policy_evaluation
 from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import fingerprint, load_model
@@ -39,7 +36,6 @@ from bounce_mjx.runs.config import (
 from bounce_mjx.runs.files import to_json
 from bounce_mjx.runs.folders import (
     best_checkpoint,
-    check_links,
     choose_checkpoint,
     create_run,
     find_checkpoint,
@@ -94,7 +90,7 @@ def test_runs_started_at_once_have_folders_of_their_own(tmp_path: Path) -> None:
     assert all(load_run_config(run).log_dir == tmp_path for run in runs)
 
 
-@pytest.mark.parametrize("name", ["[/x]", "exp[lr]", ":smile:", "a [red]b"])
+@pytest.mark.parametrize("name", ["[/x]", ":smile:"])
 def test_a_path_is_printed_as_it_is(tmp_path: Path, name: str, capsys) -> None:
     run = tmp_path / name / "2026-01-01"
     (run / "checkpoints/64").mkdir(parents=True)
@@ -179,7 +175,7 @@ def test_a_run_without_a_checkpoint_is_told_as_such(runs: Path) -> None:
 # Runs from someone else
 
 
-@pytest.mark.parametrize("place", ["checkpoints", "checkpoints/9", "seed_000", "log"])
+@pytest.mark.parametrize("place", ["checkpoints", "checkpoints/9"])
 def test_a_training_is_not_resumed_through_a_link(runs: Path, place: str, capsys) -> None:
     """It would write there, and remove the folders that look like checkpoints."""
     run, other = runs / "2026-01-02", runs.parent / f"other {runs.name}"
@@ -193,15 +189,6 @@ def test_a_training_is_not_resumed_through_a_link(runs: Path, place: str, capsys
     assert exit_info.value.code == 2
     assert f"error: {run}/{place} is a link, and training" in capsys.readouterr().err
     assert contents(other) == before
-
-
-def test_links_of_weights_and_biases_do_not_count(runs: Path) -> None:
-    (runs / "2026-01-02/wandb").mkdir()
-    (runs / "2026-01-02/wandb/latest-run").symlink_to("run-1")
-    check_links(runs / "2026-01-02")
-    # The newest run may lie behind a link of the user's.
-    (runs / "link").symlink_to("2026-01-02")
-    check_links(runs / "link")
 
 
 def test_the_folders_of_seeds_are_no_links(runs: Path) -> None:
@@ -270,7 +257,7 @@ def test_a_robot_of_a_package_is_copied(tmp_path: Path, monkeypatch) -> None:
     assert fingerprint(copy) == fingerprint(load_model(packaged, 0.001))
 
 
-@pytest.mark.parametrize("place", ["meshdir", "file", "include"])
+@pytest.mark.parametrize("place", ["meshdir", "include"])
 def test_an_absolute_path_in_a_robot_is_refused(place: str, tmp_path: Path) -> None:
     """The copy would use the original file."""
     text = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
@@ -284,7 +271,6 @@ def test_an_absolute_path_in_a_robot_is_refused(place: str, tmp_path: Path) -> N
             f'<compiler meshdir="{mesh.parent}"/><asset><mesh file="m.obj"/></asset>',
             mesh,
         ),
-        "file": (f'<asset><mesh file="{mesh}"/></asset>', mesh),
         "include": (f'<include file="{tmp_path}/more.xml"/>', tmp_path / "more.xml"),
     }[place]
     mjcf = own / "robot.xml"
@@ -305,8 +291,8 @@ def test_a_linked_robot_is_copied(tmp_path: Path) -> None:
     assert load_run_config(run).env.mjcf == run / "robot/robot.xml"
 
 
-@pytest.mark.parametrize("name", ["mjcf/my robot.xml", "mjcf/more.xml", "meshes/m.obj"])
-def test_an_edited_copy_of_the_robot_is_refused(robot_run: Path, name: str, capsys) -> None:
+def test_an_edited_copy_of_the_robot_is_refused(robot_run: Path, capsys) -> None:
+    name = "meshes/m.obj"
     with (robot_run / "robot" / name).open("a") as file:
         file.write("\n")
     with pytest.raises(SystemExit) as exit_info:
@@ -317,12 +303,6 @@ def test_an_edited_copy_of_the_robot_is_refused(robot_run: Path, name: str, caps
     # Every other command reads the config in the same way.
     with pytest.raises(UserError, match="restore that folder"):
         load_run_config(robot_run)
-
-
-def test_a_resumed_run_keeps_its_robot(robot_run: Path, capsys) -> None:
-    with pytest.raises(SystemExit):
-        train_command.main(["--resume", str(robot_run), "--mjcf", "other.xml"])
-    assert "--resume cannot change env.mjcf" in capsys.readouterr().err
 
 
 def test_a_preset_has_a_name(tmp_path: Path, monkeypatch) -> None:
@@ -427,20 +407,6 @@ def test_a_group_given_in_part_keeps_its_other_defaults(tmp_path: Path) -> None:
     assert default.reward.rest.weight != type(default.reward.rest)().weight
 
 
-def test_eval_prints_a_path_as_it_is(tmp_path: Path, monkeypatch, capsys) -> None:
-    run = tmp_path / "[/x] exp[lr]" / "run"
-    run.parent.mkdir(parents=True)
-    run.symlink_to(PRETRAINED)
-    report = report_of([1.0, 2.0, None, 4.0, 5.0])
-    monkeypatch.setattr(
-        policy_evaluation, "evaluate_policy", lambda *_, **__: (report, "fused", ())
-    )
-    with pytest.raises(SystemExit) as exit_info:
-        eval_command.main([str(run)])
-    assert exit_info.value.code == 1
-    assert f"checkpoint: {run}/checkpoints/" in capsys.readouterr().out
-
-
 # Configs
 
 
@@ -454,13 +420,6 @@ def test_whole_numbers_may_have_an_exponent(tmp_path: Path) -> None:
         path.write_text(f"total_steps: {bad}")
         with pytest.raises(UserError, match="total_steps is"):
             load_config(path)
-
-
-def test_some_aliases_are_taken(tmp_path: Path) -> None:
-    text = "env: {reward: {height: &term {weight: 3}, position: *term, paddle_home: {<<: *term}}}"
-    (tmp_path / "my.yaml").write_text(text)
-    reward = load_config(tmp_path / "my.yaml").env.reward
-    assert [reward.height.weight, reward.position.weight, reward.paddle_home.weight] == [3, 3, 3]
 
 
 # Results
@@ -488,31 +447,13 @@ def test_json_has_null_where_there_is_no_finite_number(progress: Progress) -> No
     assert (plain["numpy"], plain["tuple"]) == (None, [None, 1])
 
 
-def test_json_holds_any_path() -> None:
-    path = os.fsdecode(b"a\xff")
-    assert json.loads(to_json({"path": path})) == {"path": path}
-
-
 BAD_RESULTS = {
     "list": "[]",
-    "number": "3",
-    "word": '"a"',
     "empty": "",
-    "no keys": "{}",
     "not UTF-8": b"\xff\xfe{}",
-    "too deep": "[" * 100_000,
-    "too deep inside": '{"seconds": ' + '{"a": ' * 100_000,
-    "no results": {"results": []},
     "results of another shape": {"results": [3]},
-    "a result without a value": {"results": [{"name": "a", "measured": "", "bound": ""}]},
-    "details of another shape": {"details": [1]},
     "infinite value": {"seconds": {"train": math.inf}},
-    "infinite steps": {"best_steps": math.inf},
-    "number of 400 digits": {"seconds": {"train": 10**400}},
-    "negative steps": {"solved_steps": -1},
-    "evaluations of another shape": {"evaluations": {"a": 1}},
     "an evaluation without its results": {"evaluations": [{"steps": 1, "passed": True}]},
-    "a word as device": {"device": 3},
 }
 
 
@@ -529,28 +470,21 @@ def test_results_of_another_shape(tmp_path: Path, progress: Progress, change) ->
     assert "\n" not in sentence and len(sentence) < 500
 
 
-@pytest.mark.parametrize("main", [eval_command.main, plot_command.main], ids=["eval", "plot"])
-def test_commands_say_which_results_are_bad(tmp_path: Path, main, capsys) -> None:
+def test_commands_say_which_results_are_bad(tmp_path: Path, capsys) -> None:
     seed = tmp_path / "seed_000"
     (seed / "checkpoints/64").mkdir(parents=True)
     save_config(tmp_path, TrainConfig(num_seeds=2))
     save_config(seed, TrainConfig())
-    with SummaryWriter(logdir=str(seed)) as log:
-        log.add_scalar("episode/return", 1.0, 1)
     (seed / "results.json").write_text("[]")
     with pytest.raises(SystemExit) as exit_info:
-        main([str(tmp_path)])
+        eval_command.main([str(tmp_path)])
     assert exit_info.value.code == 2
     assert capsys.readouterr().err.startswith(f"error: {seed}/results.json is damaged (")
 
 
 BAD_PROGRESS = {
     "infinite steps": {"best_steps": math.inf},
-    "infinite evaluation": {"evaluations": [{"steps": math.inf, "passed": True}]},
-    "steps of 400 digits": {"best_steps": 10**400},
     "best of another shape": {"best": {"results": 3}},
-    "best false": {"best": False},
-    "evaluations of another shape": {"evaluations": [3]},
 }
 
 

@@ -6,12 +6,9 @@ import json
 import os
 import re
 import shutil
-import signal
 import socket
 import subprocess
 import sys
-import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -19,36 +16,24 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bounce_mjx.commands import eval as eval_command
 from bounce_mjx.commands import plot as plot_command
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning import ppo
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.reports.curves import group_runs
-from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import (
-    best_checkpoint,
-    find_checkpoint,
     latest_checkpoint,
-    newest_run,
     runs_of_seeds,
 )
 from bounce_mjx.training import devices, hosts, setup
 from bounce_mjx.training.command import read_command
-from bounce_mjx.training.ppo_trainer import PPOTrainer
-from tiny_runs import STEPS, TIMEOUT, TINY, arrays, job
+from tiny_runs import STEPS, TINY, arrays, job
 
 # As many environments as eight devices can share.
 SHARED = [*TINY, "--num-envs", "16", "--total-steps", str(2 * STEPS), "--no-report"]
 SEEDS = 3
-
-
-@pytest.fixture(scope="module", autouse=True)
-def compilation_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
-        yield
 
 
 def train(log_dir: Path, *flags: str) -> Path:
@@ -119,12 +104,9 @@ def test_a_command_leaves_the_users_settings_of_jax(kernel, preallocate, expecte
     ("num_envs", "rollout_length", "num_minibatches", "expected"),
     [
         (4096, 32, 8, 64),
-        (512, 32, 4, 64),
         (16384, 32, 32, 256),
-        (16, 8, 2, 16),
         (24, 8, 2, 8),
         (7, 8, 4, 1),
-        (64, 1, 64, 1),
     ],
 )
 def test_number_of_groups(num_envs, rollout_length, num_minibatches, expected):
@@ -158,24 +140,6 @@ def test_each_of_several_seeds_trains_as_if_alone(seeds: Path, alone: Path, tmp_
 
 
 @pytest.mark.slow
-def test_each_seed_has_a_run_of_its_own(seeds: Path, monkeypatch: pytest.MonkeyPatch):
-    folders = [seeds / f"seed_{i:03d}" for i in range(SEEDS)]
-    assert sorted(p for p in seeds.iterdir() if p.name.startswith("seed")) == folders
-    scores = []
-    for i, folder in enumerate(folders):
-        config = load_run_config(folder)
-        assert (config.seed, config.num_seeds) == (i, 1)
-        results = json.loads((folder / "results.json").read_text())
-        assert [e["steps"] for e in results["evaluations"]] == [128, 256, 384, 512]
-        assert best_checkpoint(folder).steps == results["best_steps"]
-        met = sum(result["passed"] is not False for result in results["results"])
-        scores.append((met, results["details"]["mean_return"]))
-    best = folders[scores.index(max(scores))]
-    assert find_checkpoint(seeds) == best_checkpoint(best)
-    assert find_checkpoint(newest_run(seeds.parent)) == best_checkpoint(best)
-
-
-@pytest.mark.slow
 def test_the_seeds_are_drawn_as_one_band(seeds: Path, tmp_path: Path, capsys):
     plot_command.main([str(seeds), "--out", str(tmp_path), "--formats", "svg"])
     drawn = [str(tmp_path / name) for name in ("curves.svg", "rewards.svg")]
@@ -183,18 +147,6 @@ def test_the_seeds_are_drawn_as_one_band(seeds: Path, tmp_path: Path, capsys):
     (group,) = group_runs(runs_of_seeds(seeds))
     assert len(group.runs) == SEEDS
     assert len({tuple(run.curves["loss/value"].values) for run in group.runs}) == SEEDS
-
-
-@pytest.mark.slow
-def test_a_seed_is_evaluated(seeds: Path, tmp_path: Path):
-    with pytest.raises(SystemExit) as exit_:
-        eval_command.main(
-            [str(seeds / "seed_002"), "--episodes", "4", "--json", str(tmp_path / "out.json")]
-        )
-    assert exit_.value.code == 1
-    results = json.loads((tmp_path / "out.json").read_text())
-    assert "seed_002" in results["checkpoint"]
-    assert results["details"]["episodes"] == 4
 
 
 @pytest.mark.slow
@@ -211,81 +163,21 @@ def test_several_seeds_resume_exactly(seeds: Path, tmp_path: Path):
         assert both[0]["best_steps"] == both[1]["best_steps"]
 
 
-@pytest.mark.slow
-def test_a_seed_that_diverges_leaves_the_others(seeds: Path, tmp_path: Path, monkeypatch, capsys):
-    run_block = PPOTrainer.run
-
-    def spoilt(trainer: PPOTrainer, *args):
-        if int(trainer.state.iteration[0]) == 2:
-            rates = trainer.state.learning_rate.at[1].set(jnp.nan)
-            trainer.state = trainer.state._replace(learning_rate=rates)
-        return run_block(trainer, *args)
-
-    monkeypatch.setattr(PPOTrainer, "run", spoilt)
-    run = train(tmp_path / "runs", "--num-seeds", str(SEEDS), "--total-steps", "384")
-    best = best_checkpoint(run / "seed_001").steps
-    # It stays diverged when the training is resumed.
-    train_command.main(["--resume", str(run), "--total-steps", str(2 * STEPS), "--no-report"])
-    assert best_checkpoint(run / "seed_001").steps == best
-    said = capsys.readouterr().out
-    assert re.search(r"seed 1 diverged: .* was the first that was not finite, at iteration 3", said)
-    ours, theirs = (arrays(latest_checkpoint(r)) for r in (run, seeds))
-    for name in theirs:
-        for i in (0, 2):
-            np.testing.assert_array_equal(ours[name][i], theirs[name][i], err_msg=name)
-    evaluated = json.loads((run / "seed_001/results.json").read_text())["evaluations"]
-    assert [e["steps"] for e in evaluated] == [128, 256]
-
-
 # Several devices
 
 
-DEVICE_THAT_FAILS = """
-import jax, sys
-from bounce_mjx.commands.train import main
-from bounce_mjx.training.ppo_trainer import PPOTrainer
-run = PPOTrainer.run
-def failing(self, *args):
-    if int(self.state.iteration) == 3:
-        raise jax.errors.JaxRuntimeError("INTERNAL: CUDA_ERROR_UNKNOWN\\nin a graph")
-    return run(self, *args)
-PPOTrainer.run = failing
-main(sys.argv[1:])
-"""
-
-
 @pytest.mark.slow
-def test_a_training_continues_on_the_devices_that_are_left(
-    alone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    """Eight devices train as one does, and one after a device failed as all eight would have."""
+def test_eight_devices_train_as_one(alone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """And one device resumes what eight began."""
     monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=8")
-    flags = [*SHARED, "--num-devices", "8", "--log-dir", tmp_path / "runs"]
-    with job(tmp_path / "log", *flags, code=DEVICE_THAT_FAILS) as eight:
-        assert eight.wait() == 2, eight.said
+    flags = [*SHARED, "--num-devices", "8", "--total-steps", "384", "--log-dir", tmp_path / "runs"]
+    with job(tmp_path / "log", *flags) as eight:
+        assert eight.wait() == 0, eight.said
     assert "device: 8 x cpu" in eight.said
-    assert "Traceback" not in eight.said
     (run,) = (tmp_path / "runs").iterdir()
-    latest = latest_checkpoint(run)
-    assert eight.said.splitlines()[-1] == (
-        "error: 8 x cpu failed after 384 steps (INTERNAL: CUDA_ERROR_UNKNOWN in a graph); "
-        f"continue with: bounce-mjx train --resume {run} (the last checkpoint is {latest.folder}), "
-        "with --num-devices 1 if one is left"
-    )
-    train_command.main(["--resume", str(run), "--num-devices", "1", "--no-report"])
+    total = ["--total-steps", str(2 * STEPS)]
+    train_command.main(["--resume", str(run), "--num-devices", "1", "--no-report", *total])
     assert_equal_up_to_rounding(arrays(latest_checkpoint(run)), arrays(latest_checkpoint(alone)))
-
-
-@pytest.mark.slow
-def test_a_full_device_is_told_in_one_sentence(tmp_path: Path, monkeypatch, capsys):
-    def full(self, *args):
-        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")
-
-    monkeypatch.setattr(PPOTrainer, "start", full)
-    with pytest.raises(SystemExit):
-        train(tmp_path)
-    reason = "too little memory for 16 environments (RESOURCE_EXHAUSTED: Out of memory)"
-    assert capsys.readouterr().err == f"error: cpu has {reason}; lower num_envs\n"
 
 
 MESSAGES = """
@@ -361,19 +253,6 @@ def free_port() -> int:
         return server.getsockname()[1]
 
 
-SLOW_TO_COMPILE = """
-import sys, time
-from bounce_mjx.commands.train import main
-from bounce_mjx.training.ppo_trainer import PPOTrainer
-compile = PPOTrainer.compile
-def slow(*args):
-    time.sleep(35)
-    return compile(*args)
-PPOTrainer.compile = slow
-main(sys.argv[1:])
-"""
-
-
 @pytest.mark.slow
 def test_two_processes_train_as_one(alone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=2")
@@ -393,26 +272,6 @@ def test_two_processes_train_as_one(alone: Path, tmp_path: Path, monkeypatch: py
     assert len(list(run.glob("events.*"))) == 1
     assert_equal_up_to_rounding(arrays(latest_checkpoint(run)), arrays(latest_checkpoint(alone)))
 
-    # The leader finds its programs in the cache. The other process compiles them for longer than
-    # JAX's exchange between devices waits, and then dies.
-    flags = ["--resume", run, "--total-steps", 10**9, "--num-processes", "2", "--no-report"]
-    flags += ["--coordinator-address", f"127.0.0.1:{free_port()}"]
-    with (
-        job(tmp_path / "log2", *flags, "--process-id", 0) as leader,
-        job(tmp_path / "log3", *flags, "--process-id", 1, code=SLOW_TO_COMPILE) as follower,
-    ):
-        leader.wait_until_said("evaluation at")
-        follower.process.kill()
-        # JAX notices the death.
-        assert leader.wait() != 0, leader.said
-
-    # One process resumes from the checkpoint of two.
-    monkeypatch.delenv("XLA_FLAGS")
-    before, steps = arrays(latest_checkpoint(run)), latest_checkpoint(run).steps
-    train_command.main(["--resume", str(run), "--total-steps", str(steps + 128), "--no-report"])
-    assert latest_checkpoint(run).steps == steps + 128
-    assert_trained(run, before)
-
 
 def test_hosts_need_all_three_flags(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(jax.distributed, "initialize", lambda *_: pytest.fail("joined"))
@@ -420,12 +279,6 @@ def test_hosts_need_all_three_flags(monkeypatch: pytest.MonkeyPatch):
         UserError, match="--num-processes needs --coordinator-address, --process-id"
     ):
         hosts.join(num_processes=2)
-
-
-def test_several_hosts_are_refused_on_windows(monkeypatch) -> None:
-    monkeypatch.setattr(sys, "platform", "win32")
-    with pytest.raises(UserError, match="on Windows; use Linux"):
-        hosts.join("127.0.0.1:1", 1, 0)
 
 
 @pytest.mark.parametrize(
@@ -441,29 +294,6 @@ def test_flags_tell_whether_there_are_other_hosts(flags: str, several: bool) -> 
     command = read_command(flags.split())
     assert command.on_several_hosts == several
     assert command.host_timeout == (7 if "7" in flags else 300)
-
-
-def two_hosts(tmp_path: Path, *flags: object) -> list[contextlib.AbstractContextManager]:
-    """The jobs of process 0 and process 1 of a training; process 1 gets further flags."""
-    address = ["--coordinator-address", f"127.0.0.1:{free_port()}", "--num-processes", 2]
-    shared = [*SHARED, "--log-dir", tmp_path / "runs", *address]
-    return [
-        job(tmp_path / "leader", *shared, "--process-id", 0),
-        job(tmp_path / "follower", *shared, "--process-id", 1, *flags),
-    ]
-
-
-@pytest.mark.slow
-def test_hosts_with_different_configs_end_with_a_sentence(tmp_path: Path):
-    leading, following = two_hosts(tmp_path, "--seed", 1)
-    with leading as leader, following as follower:
-        assert leader.wait() == follower.wait() == 2
-    sentence = (
-        "error: the processes of this training differ in seed, which is 0 in process 0 and 1 in "
-        "process 1; start all with the same flags\n"
-    )
-    assert leader.said == f"config: configs/cpu.yaml\n{sentence}" and follower.said == sentence
-    assert not (tmp_path / "runs").exists()
 
 
 @pytest.mark.parametrize(
@@ -499,46 +329,9 @@ def test_the_setting_in_which_hosts_differ_is_named(
         hosts.agree(TrainConfig().model_copy(update=changes), resume)
 
 
-JOINED_ONLY = """
-import jax, sys, time
-jax.distributed.initialize(sys.argv[1], 2, 1)
-print("joined", flush=True)
-time.sleep(600)
-"""
-
-
-@pytest.mark.parametrize("joined", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_ctrl_c_ends_the_wait_for_other_hosts(tmp_path: Path, joined: bool):
-    address = f"127.0.0.1:{free_port()}"
-    flags = ["--coordinator-address", address, "--num-processes", 2, "--process-id", 0]
-    with contextlib.ExitStack() as stack:
-        leader = stack.enter_context(job(tmp_path / "leader", *flags))
-        if joined:
-            # It never connects to the leader.
-            silent = stack.enter_context(job(tmp_path / "silent", address, code=JOINED_ONLY))
-            silent.wait_until_said("joined")
-        else:
-            wait_for_port(address)
-        leader.process.send_signal(signal.SIGINT)
-        assert leader.wait() == -signal.SIGINT
-    assert leader.said == ""
-
-
-def wait_for_port(address: str) -> None:
-    """Waits until a process listens at an address."""
-    host, port = address.split(":")
-    deadline = time.monotonic() + TIMEOUT
-    while time.monotonic() < deadline:
-        with contextlib.suppress(OSError), socket.create_connection((host, int(port))):
-            return
-        time.sleep(0.1)
-    pytest.fail(f"nothing listens at {address}")
-
-
-@pytest.mark.parametrize("process_id", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_hosts_that_do_not_find_each_other_end_with_a_sentence(tmp_path: Path, process_id: int):
+def test_hosts_that_do_not_find_each_other_end_with_a_sentence(tmp_path: Path):
     flags = ["--coordinator-address", f"127.0.0.1:{free_port()}", "--num_processes", 2]
-    with job(tmp_path / "log", *flags, "--process_id", process_id, "--host-timeout", 2) as alone:
+    with job(tmp_path / "log", *flags, "--process_id", 0, "--host-timeout", 2) as alone:
         assert alone.wait() == 2
     assert re.fullmatch(r"error: .+ did not find each other at .+ within 2 s; .+\n", alone.said)
 

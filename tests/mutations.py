@@ -1,0 +1,165 @@
+"""Deliberate faults, one at a time: a test that `uv run pytest` runs must catch each.
+
+    python tests/mutations.py          # all faults, in a copy of the tree
+    python tests/mutations.py 3 7      # some
+
+It is not part of CI: a fault needs new compiled programs, so all of them take half an hour.
+"""
+
+# ruff: noqa: E501
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+CHECKOUT = Path(__file__).parent.parent
+COPIED = "src", "tests", "mjcf", "configs", "pretrained", "examples", "benchmarks", "docs"
+SINGLE = "pyproject.toml", "train_jax.py", "README.md", "CHANGELOG.md", "CONTRIBUTING.md"
+
+REWARDS, BOUNCE = "tasks/bounce_rewards.py", "tasks/bounce.py"
+ENV, VECTOR, ACTUATION = "env/env.py", "env/vector.py", "world/actuation.py"
+SENSING, RANDOMIZATION, IMPACT = "world/sensing.py", "world/randomization.py", "world/impact.py"
+PPO, STATISTICS = "learning/ppo.py", "learning/statistics.py"
+CONTROL, DYNAMICS, NORMALS = (
+    "physics/control.py",
+    "physics/fused/dynamics.py",
+    "physics/fused/normals.py",
+)
+EXPORT, POLICY = "deploy/export.py", "deploy/policy.py"
+
+# What is wrong, the file, its text, the faulty text, and the test that catches it.
+FAULTS = [
+    ("the height error has the other sign", REWARDS,
+     "return self.target_height - self.ball_position[2]",
+     "return self.ball_position[2] - self.target_height", ""),
+    ("a penalty for being out of position is a reward", REWARDS,
+     "-self.magnitude * jax.nn.sigmoid((inputs.err_xy", "self.magnitude * jax.nn.sigmoid((inputs.err_xy", ""),
+    ("the action's change is a sum", REWARDS,
+     "inputs.action - inputs.last_action", "inputs.action + inputs.last_action", ""),
+    ("alignment is boosted between bounces", REWARDS,
+     "jnp.where(inputs.bounced, self.bounce_boost, 1.0)", "jnp.where(inputs.bounced, 1.0, self.bounce_boost)", ""),
+    ("joint velocities are rewarded", REWARDS,
+     "return -jnp.sum(jnp.square(inputs.joint_velocity))", "return jnp.sum(jnp.square(inputs.joint_velocity))", ""),
+    ("an apex must be above the target to count", BOUNCE,
+     "target_height - config.apex_tolerance", "target_height + config.apex_tolerance", ""),
+    ("the count restarts at 0", BOUNCE, "state.n_bounces + 1.0, 1.0)", "state.n_bounces + 1.0, 0.0)", ""),
+    ("every rising step near the paddle is a bounce", BOUNCE,
+     "bounced = rising & ~state.rising & near", "bounced = rising & near", ""),
+    ("a ball may leave to the side", BOUNCE, "jnp.abs(ball[:2]) > config", "jnp.abs(ball[:1]) > config", ""),
+    ("the apex is that of the whole episode", BOUNCE,
+     "apex=jnp.where(bounced, ball[2], jnp.maximum(state.apex, ball[2]))",
+     "apex=jnp.maximum(state.apex, ball[2])", ""),
+    ("the first two seconds are judged", BOUNCE, "settled = moment.seconds > settling", "settled = moment.seconds > 0.0", ""),
+    ("a NaN action passes", ENV, '"non_finite": ~(finite & is_number)', '"non_finite": ~finite', ""),
+    ("joints may move twice as fast as allowed", ENV,
+     "> self.config.max_joint_velocity", "> 2.0 * self.config.max_joint_velocity", ""),
+    ("the last action is never remembered", ENV,
+     "physics=physics, last_action=action, actuation", "physics=physics, actuation", ""),
+    ("the joint angles are read in another order", ENV,
+     "joint_angles=jnp.stack([qpos[i] for i in addresses.arm_qpos])",
+     "joint_angles=jnp.stack([qpos[i] for i in addresses.arm_qpos[::-1]])", ""),
+    ("two joints' servo targets are swapped", ACTUATION,
+     "            self._addresses.actuators, self._gears, values, strict=True",
+     "            self._addresses.actuators, self._gears, [values[1], values[0], *values[2:]], strict=True", ""),
+    ("the time limit is one step late", VECTOR,
+     "truncated = (clock >= episode_steps)", "truncated = (clock > episode_steps)", ""),
+    ("the final observation is the next episode's first", VECTOR,
+     "final_observation=stepped.obs.T", "final_observation=env_state.obs.T", ""),
+    ("an action is a control step too late", ACTUATION,
+     "whole = jnp.floor(latency + 1e-4)", "whole = jnp.floor(latency + 1e-4) + 1.0", ""),
+    ("a late action is early", ACTUATION,
+     "Control(entry_at(queue, whole), previous=entry_at(queue[1:], whole))",
+     "Control(entry_at(queue[1:], whole), previous=entry_at(queue, whole))", ""),
+    ("the servo's lag is counted in control steps", ACTUATION,
+     'world["servo_lag"] / (control_dt / num_substeps)', 'world["servo_lag"] / control_dt', ""),
+    ("a late target waits one physics step more", CONTROL,
+     "jnp.where(step < before, control.previous, control.ctrl)",
+     "jnp.where(step <= before, control.previous, control.ctrl)", ""),
+    ("the air pushes the ball", CONTROL, "tuple(-air_drag * speed", "tuple(air_drag * speed", ""),
+    ("the restitution is clipped", RANDOMIZATION,
+     "jnp.interp(restitution, e, ratio)", "jnp.interp(jnp.maximum(restitution, 0.8), e, ratio)", ""),
+    ("fast impacts bounce more", IMPACT,
+     'world["restitution"] - world["restitution_slope"]', 'world["restitution"] + world["restitution_slope"]', ""),
+    ("the ball is seen a step too late", SENSING,
+     "number, age = steps, latency", "number, age = steps, latency + 1.0", ""),
+    ("lost pictures are seen, and seen ones lost", SENSING,
+     'chance >= world["frame_drop"]', 'chance < world["frame_drop"]', ""),
+    ("a velocity from differences ignores the pictures' age", SENSING,
+     "jnp.maximum(held_age - age * control_dt, 1e-3)", "jnp.maximum(held_age, 1e-3)", ""),
+    ("the encoders' bias has the other sign", SENSING,
+     'angles = angles + world["encoder_bias"]', 'angles = angles - world["encoder_bias"]', ""),
+    ("a history has the oldest value first", SENSING,
+     "jnp.concatenate([measured[name][None], past[:-1]])", "jnp.concatenate([past[1:], measured[name][None]])", ""),
+    ("the bootstrap of a time-out is dropped", PPO,
+     "jnp.where(rollout.truncated, timeout_values, values[1:])", "values[1:]", ""),
+    ("advantages leak across a time-out", PPO,
+     "(~(terminated | truncated))", "(~terminated)", ""),
+    ("PPO takes the larger of its two objectives", PPO,
+     "jnp.minimum(ratio * samples.advantage, clipped", "jnp.maximum(ratio * samples.advantage, clipped", ""),
+    ("a large KL divergence raises the learning rate", PPO,
+     "jnp.where(is_large, 1.0 / _LEARNING_RATE_FACTOR, factor)", "jnp.where(is_large, _LEARNING_RATE_FACTOR, factor)", ""),
+    ("the variance is measured from the old mean", STATISTICS,
+     "jnp.sum(from_old_mean * (batch - mean)", "jnp.sum(from_old_mean * from_old_mean", ""),
+    ("the ball moves with the velocity before the step", DYNAMICS,
+     "position = vadd(ball.position, scale(velocity, dt))", "position = vadd(ball.position, scale(ball.velocity, dt))", ""),
+    ("a contact pulls", NORMALS, "return [jnp.maximum(first / pivot, 0.0)]", "return [first / pivot]", ""),
+    ("an exported policy has a wrong normaliser", EXPORT,
+     "        policy, jnp.concatenate([histories[name].ravel() for name in names])",
+     "        policy._replace(normalizer=policy.normalizer._replace(mean=0.0 * policy.normalizer.mean)),\n"
+     "        jnp.concatenate([histories[name].ravel() for name in names]),", ""),
+    ("the robot's targets move against the action", POLICY,
+     "base + self.metadata.action_scale * action", "base - self.metadata.action_scale * action", ""),
+    ("an ended episode still earns its return", "evaluation/statistics.py",
+     "jnp.where(running, states.reward, 0.0)", "states.reward", ""),
+]  # fmt: skip
+
+
+def copy_tree(folder: Path) -> None:
+    for name in COPIED:
+        ignored = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(CHECKOUT / name, folder / name, ignore=ignored, symlinks=True)
+    for name in SINGLE:
+        shutil.copy(CHECKOUT / name, folder)
+
+
+def is_caught(folder: Path, file: str, old: str, new: str, test: str) -> bool:
+    """Whether the test fails in the copy of the tree with the fault."""
+    path = folder / "src/bounce_mjx" / file
+    text = path.read_text(encoding="utf-8")
+    assert text.count(old) == 1, f"{file} has {old!r} {text.count(old)} times"
+    path.write_text(text.replace(old, new), encoding="utf-8")
+    try:
+        name, _, keyword = test.partition(" -k ")
+        command = [sys.executable, "-m", "pytest", "-q", "-x", "-n", "0", f"tests/{name}"]
+        command += ["-k", keyword] if keyword else []
+        environment = os.environ | {"PYTHONPATH": str(folder / "src")}
+        done = subprocess.run(
+            command, cwd=folder, env=environment, capture_output=True, text=True, check=False
+        )
+        # Other statuses are errors of pytest's own: no test of that name, for example.
+        assert done.returncode in (0, 1), done.stdout + done.stderr
+        return done.returncode == 1
+    finally:
+        path.write_text(text, encoding="utf-8")
+
+
+def main() -> None:
+    chosen = [int(word) for word in sys.argv[1:]] or range(1, len(FAULTS) + 1)
+    missed = 0
+    with tempfile.TemporaryDirectory(prefix="bounce_mjx_mutations_") as name:
+        copy_tree(Path(name))
+        for number in chosen:
+            fault, *rest = FAULTS[number - 1]
+            caught = is_caught(Path(name), *rest)
+            missed += not caught
+            print(
+                f"{number:2} {'caught' if caught else 'MISSED'}: {fault} ({rest[-1]})", flush=True
+            )
+    sys.exit(missed > 0)
+
+
+if __name__ == "__main__":
+    main()
