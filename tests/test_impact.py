@@ -11,9 +11,14 @@ from against_c import converged, difference, push_by_air
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.evaluation.c_episodes import episode_models
 from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, edited_model, make_engine
+from bounce_mjx.physics.control import drag
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.world.impact import Impact, damping, first_impact
 from bounce_mjx.world.randomization import physics_parameters
+
+
+def test_the_air_brakes_with_the_square_of_the_speed():
+    np.testing.assert_allclose(drag(0.1, (3.0, 0.0, -4.0)), [-1.5, 0.0, 2.0], rtol=1e-6)
 
 
 def test_lift_turns_a_flight_to_the_side_that_the_spin_says(mj_model):

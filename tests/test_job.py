@@ -1,41 +1,61 @@
-"""The training job with a trainer and evaluations in NumPy: what it evaluates, saves and keeps."""
+"""What a training job evaluates, saves, keeps and says, with a trainer and evaluations in NumPy."""
 
+import concurrent.futures
+import dataclasses
 import errno
 import io
 import itertools
 import json
 import os
+import shutil
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 from rich.console import Console
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report, Result
+from bounce_mjx.interrupt import Interrupted
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.runs import writing
 from bounce_mjx.runs.config import TrainConfig, load_run_config
-from bounce_mjx.runs.folders import Checkpoint, best_checkpoint, latest_checkpoint
+from bounce_mjx.runs.folders import (
+    Checkpoint,
+    best_checkpoint,
+    find_checkpoint,
+    latest_checkpoint,
+    newest_run,
+)
+from bounce_mjx.runs.lock import lock_run
+from bounce_mjx.runs.progress import Progress
 from bounce_mjx.runs.reading import policy_shapes, read_policy, read_record
-from bounce_mjx.training import job
+from bounce_mjx.runs.writing import CheckpointWriter
+from bounce_mjx.training import console, job
 from bounce_mjx.training.callbacks import Event
 from bounce_mjx.training.trainer import Snapshot
+from tiny_runs import contents
 
 BLOCK = 64
+SEEDS = 3
+RETURNS = {1: 5.0, 2: 9.0, 3: 7.0, 4: 8.0}
 
 
 class CountingTrainer:
     """Its state is the number of its iterations, and all numbers of its policy are that number."""
 
-    checked = ("loss",)
+    checked = ("reward", "loss")
+    faults: dict[tuple[int, int], int] = {}
+    """By seed and iteration, the quantity of `checked` that is not finite, from 1."""
 
     def __init__(self, config: TrainConfig, env):
         self.mesh = jax.sharding.Mesh(jax.devices()[:1], ("devices",))
-        self.shapes, self.state = policy_shapes(config), np.int32(0)
+        self.shapes, self.seeds, self.state = policy_shapes(config), config.num_seeds, np.int32(0)
 
     def state_template(self):
         return jax.ShapeDtypeStruct((), np.int32)
@@ -46,63 +66,91 @@ class CountingTrainer:
     def start(self, state=None):
         self.state = np.int32(0) if state is None else state
 
-    def run(self, iterations, stopping):
-        self.state = np.int32(self.state + iterations)
+    def run(self, iterations: int, stopping: Callable[[], bool]):
         names = "fault", "episode/ended", "episode/return", "episode/bounces", "task/non_finite"
-        return {name: np.zeros((1, iterations)) for name in names}
+        metrics = {name: np.zeros((self.seeds, iterations)) for name in names}
+        for (seed, iteration), number in self.faults.items():
+            if self.state < iteration <= self.state + iterations:
+                metrics["fault"][seed, iteration - self.state - 1] = number
+        self.state = np.int32(self.state + iterations)
+        return metrics
 
     def snapshot(self):
         policy = jax.tree.map(lambda x: np.full(x.shape, self.state, x.dtype), self.shapes)
-        return Snapshot([policy], self.state)
+        return Snapshot([policy] * self.seeds, self.state)
+
+
+def before(iteration: int, act: Callable) -> type[CountingTrainer]:
+    """A trainer that calls `act` before it trains an iteration."""
+
+    class Acting(CountingTrainer):
+        def run(self, iterations, stopping):
+            if self.state == iteration - 1:
+                act()
+            return super().run(iterations, stopping)
+
+    return Acting
 
 
 class Scores:
-    """Evaluations whose mean return is given by the number of iterations."""
+    """Evaluations whose mean return is given by the number of iterations, or for each seed."""
 
-    def __init__(self, returns: dict[int, float]):
-        self.returns = returns
+    def __init__(self, returns: dict[int, float], margins: dict[int, float], screening: bool):
+        self.returns, self.margins, self.screening = returns, margins, screening
 
     def __call__(self, config, env, mesh, pool) -> "Scores":
         return self
 
     def select(self, policies) -> list[Report]:
-        iterations = int(np.ravel(jax.tree.leaves(policies)[0])[0])
-        result = Result("stable", "episodes, %", 0.0, ">= 99", False)
-        return [
-            Report(
-                (result,),
-                {"mean_return": self.returns[iterations], "episodes": 1.0, "mean_length_s": 1.0},
-            )
-        ]
+        return [self.report(seed, policy) for seed, policy in enumerate(policies)]
 
-    final = select
+    def report(self, seed: int, policy) -> Report:
+        iterations = int(np.ravel(jax.tree.leaves(policy)[0])[0])
+        margin = self.margins.get(iterations)
+        result = Result("stable", "episodes, %", 0.0, ">= 99", margin is not None, margin)
+        mean_return = float(np.broadcast_to(self.returns[iterations], SEEDS)[seed])
+        details = {"episodes": 1.0, "mean_length_s": 1.0, "mean_return": mean_return}
+        return Report((result,), details, screening=self.screening)
+
+    def final(self, policies) -> list[Report]:
+        return [dataclasses.replace(report, screening=False) for report in self.select(policies)]
 
 
 def train(
     log_dir: Path,
     returns: dict[int, float],
     resume: Path | None = None,
-    scores=Scores,
+    *,
+    trainer: type[CountingTrainer] = CountingTrainer,
+    scores: type[Scores] = Scores,
+    margins: dict[int, float] | None = None,
+    screening: bool = False,
     callbacks=(),
+    said: io.StringIO | None = None,
+    **settings,
 ) -> Path:
     """The folder of a run that evaluates after each block of one iteration."""
     ppo = PPOConfig(num_envs=8, rollout_length=8, num_minibatches=2, hidden_layers=(4,))
-    config = TrainConfig(
-        ppo=ppo, block_steps=BLOCK, eval_every=BLOCK, total_steps=BLOCK * max(returns)
-    ).model_copy(update={"log_dir": log_dir})
-    (seed,) = job.train(
+    given = {"block_steps": BLOCK, "eval_every": BLOCK, "total_steps": BLOCK * max(returns)}
+    given |= {"stop_when_solved": False} | settings
+    config = TrainConfig(ppo=ppo, **given).model_copy(update={"log_dir": log_dir})
+    members = job.train(
         config,
-        Console(file=io.StringIO()),
+        Console(file=said or io.StringIO()),
         resume=resume,
         callbacks=callbacks,
-        make_trainer=CountingTrainer,
-        make_evaluators=scores(returns),
+        make_trainer=trainer,
+        make_evaluators=scores(returns, margins or {}, screening),
     )
-    return seed.run
+    return members[0].run if len(members) == 1 else members[0].run.parent
 
 
-def best_steps(run: Path) -> int:
-    return json.loads((run / "results.json").read_text())["best_steps"]
+def results_of(run: Path) -> dict:
+    return json.loads((run / "results.json").read_text())
+
+
+def evaluated_steps(run: Path) -> list[int]:
+    return [evaluation["steps"] for evaluation in results_of(run)["evaluations"]]
 
 
 def iterations_of(checkpoint: Checkpoint) -> int:
@@ -124,9 +172,12 @@ def fail(monkeypatch: pytest.MonkeyPatch, *saves: int) -> None:
     monkeypatch.setattr(writing, "save_checkpoint", full)
 
 
+# The best and the latest
+
+
 def test_the_newest_and_the_best_state_are_kept(tmp_path: Path) -> None:
     run = train(tmp_path, {1: 5.0, 2: 9.0, 3: 1.0})
-    assert best_steps(run) == 2 * BLOCK
+    assert results_of(run)["best_steps"] == 2 * BLOCK
     assert iterations_of(best_checkpoint(run)) == 2
     assert iterations_of(latest_checkpoint(run)) == 3
 
@@ -134,48 +185,133 @@ def test_the_newest_and_the_best_state_are_kept(tmp_path: Path) -> None:
 def test_a_resumed_training_knows_the_best_policy(tmp_path: Path) -> None:
     run = train(tmp_path, {1: 9.0, 2: 1.0})
     train(tmp_path, {3: 2.0, 4: 3.0, 1: 9.0}, run)
-    assert best_steps(run) == BLOCK and iterations_of(best_checkpoint(run)) == 1
+    assert results_of(run)["best_steps"] == BLOCK and iterations_of(best_checkpoint(run)) == 1
+    assert iterations_of(latest_checkpoint(run)) == 4
     record = read_record(latest_checkpoint(run))
     assert [e["steps"] for e in record.progress["evaluations"]] == [64, 128, 192, 256]
 
 
-def test_a_policy_that_could_not_be_saved_is_not_the_best(tmp_path: Path, monkeypatch) -> None:
-    fail(monkeypatch, 2)
-    run = train(tmp_path, {1: 5.0, 2: 9.0, 3: 7.0})
-    assert best_steps(run) == 3 * BLOCK and iterations_of(best_checkpoint(run)) == 3
+def test_results_that_are_newer_than_the_checkpoint_do_not_count(tmp_path: Path) -> None:
+    """As after a crash that lost the last checkpoint, but not the files written after it."""
+    run, longer = train(tmp_path / "a", {1: 1.0, 2: 2.0}), train(tmp_path / "b", RETURNS)
+    shutil.copy(longer / "results.json", run)
+    train(tmp_path, {1: 1.0, 2: 2.0, 3: 3.0}, run)
+    assert evaluated_steps(run) == [64, 128, 192]
 
 
-def test_a_training_that_ends_without_room_says_so(tmp_path: Path, monkeypatch) -> None:
-    """The last good checkpoint stays, and the training resumes from it."""
-    with monkeypatch.context() as patch:
-        fail(patch, 2, 3)
-        sentence = (
-            r"\(No space left on device\), so the end of the training is lost; make room, and"
-        )
-        with pytest.raises(UserError, match=f"{sentence} continue with: bounce-mjx train --resume"):
-            train(tmp_path, {1: 5.0, 2: 9.0, 3: 7.0})
-    (run,) = tmp_path.iterdir()
-    assert iterations_of(latest_checkpoint(run)) == 1
-    train(tmp_path, {2: 9.0, 3: 7.0}, run)
-    assert best_steps(run) == 2 * BLOCK and iterations_of(best_checkpoint(run)) == 2
+def test_what_a_killed_process_was_writing_is_removed(tmp_path: Path) -> None:
+    run = train(tmp_path, {1: 1.0})
+    folder, (latest,) = run / "checkpoints", (run / "checkpoints").iterdir()
+    shutil.copytree(latest, folder / "128.orbax-checkpoint-tmp")
+    (run / ".unfinished-0123.json").touch()
+    assert latest_checkpoint(run).folder == latest
+    train(tmp_path, {1: 1.0, 2: 2.0}, run)
+    assert not list(run.rglob(".unfinished-*"))
+    assert [path.name for path in folder.iterdir()] == ["128"]
 
 
-def test_an_evaluation_that_was_stopped_is_repeated(tmp_path: Path) -> None:
-    """Its checkpoint has the next number, as the one without it had the steps."""
+def test_a_screening_is_never_better_than_a_full_evaluation(tmp_path: Path) -> None:
+    def report(passed: bool, mean_return: float, screening: bool) -> Report:
+        result = Result("stable", "episodes, %", 0.0, ">= 99", passed)
+        details = {"mean_return": mean_return, "episodes": 2.0}
+        return Report((result,), details, screening=screening)
 
-    class Stopped(Scores):
-        def select(self, policies):
-            os.kill(os.getpid(), signal.SIGTERM)
-            time.sleep(0.5)
-            return super().select(policies)
+    progress = Progress()
+    assert progress.improves(report(False, 5.0, True), 1, 0.0)
+    assert progress.improves(report(False, 1.0, False), 2, 0.0)
+    assert not progress.improves(report(False, 9.0, True), 3, 0.0)
+    assert progress.best_steps == 2
 
-    with pytest.raises(job.TrainingStopped, match="stopped after 64 steps"):
-        train(tmp_path, {1: 5.0}, scores=Stopped)
-    (run,) = tmp_path.iterdir()
-    assert latest_checkpoint(run).steps == BLOCK
-    train(tmp_path, {1: 5.0}, run)
-    best = best_checkpoint(run)
-    assert (best.steps, read_record(best).steps, best_steps(run)) == (BLOCK + 1, BLOCK, BLOCK)
+
+def test_a_failed_screening_is_no_evaluation(tmp_path: Path) -> None:
+    run = train(tmp_path, {1: 1.0, 2: 2.0}, screening=True, said=(said := io.StringIO()))
+    assert said.getvalue().count("screening (1 episodes) at") == 2
+    assert "evaluation at" not in said.getvalue()
+    assert [e["screening"] for e in results_of(run)["evaluations"]] == [True, True]
+    # The end reports all episodes.
+    assert results_of(run)["screening"] is False
+
+
+# The end
+
+
+@pytest.mark.parametrize(("given", "trained"), [(170, 192), (80, 64)])
+def test_a_training_ends_at_the_whole_block_nearest_to_its_steps(
+    tmp_path: Path, given: int, trained: int
+) -> None:
+    run = train(tmp_path, RETURNS, total_steps=given, said=(said := io.StringIO()))
+    assert f"steps: {trained}, in blocks of 64\n" in said.getvalue()
+    assert results_of(run)["trained_steps"] == trained
+
+
+def test_a_training_stops_once_its_results_have_a_margin(tmp_path: Path) -> None:
+    """It tells the first evaluation that met all results, and the end; resumed with more steps, it
+    goes on."""
+    margins = {2: 0.5, 3: 1.0, 4: 1.0}
+    run = train(tmp_path, RETURNS, margins=margins, stop_when_solved=True)
+    results = results_of(run)
+    steps = [results[name] for name in ("solved_steps", "margin_steps", "trained_steps")]
+    assert steps == [128, 192, 192]
+    assert 0.0 < results["solved_seconds"] < sum(results["seconds"].values())
+    assert best_checkpoint(run).steps == 192
+    for stop, said in ((True, "add --total-steps N"), (False, "it continues to 256 steps")):
+        shown = io.StringIO()
+        train(tmp_path, RETURNS, run, margins=margins, stop_when_solved=stop, said=shown)
+        assert f"{run} has met all results after 192 steps; {said}" in shown.getvalue()
+        assert latest_checkpoint(run).steps == (192 if stop else 256)
+    train(tmp_path, RETURNS, run, margins=margins, said=(shown := io.StringIO()))
+    assert f"{run} has been trained to its end, 256 steps;" in shown.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("evaluations", "solved"),
+    [
+        ([(64, None)], False),
+        ([(64, None), (128, 1.0)], True),
+        ([(128, 0.5)], False),
+        # Half as many steps again.
+        ([(128, 0.5), (191, 0.5)], False),
+        ([(128, 0.5), (192, 0.5)], True),
+        ([(128, 0.5), (192, None)], True),
+        ([(128, 0.5), (160, 1.0)], True),
+    ],
+)
+def test_a_training_does_not_wait_long_for_a_margin(evaluations, solved: bool) -> None:
+    progress = Progress()
+    for steps, margin in evaluations:
+        result = Result("stable", "episodes, %", 0.0, ">= 99", margin is not None, margin)
+        progress.improves(Report((result,), {"mean_return": 1.0}), steps, 0.0)
+    assert progress.solved is solved
+
+
+@pytest.mark.parametrize(
+    ("steps", "solved", "expected"),
+    [(100, False, ", 0 s left"), (70, False, ", 180 s left"), (70, True, ", at most 180 s left")],
+)
+def test_the_time_left_is_told(monkeypatch, steps: int, solved: bool, expected: str) -> None:
+    """A training that is resumed after 50 steps needs 120 s for the next 20, evaluations
+    included."""
+    now = 0.0
+    monkeypatch.setattr(console.time, "monotonic", lambda: now)
+    shown = io.StringIO()
+    config = TrainConfig(total_steps=100, stop_when_solved=solved)
+    names = ("episode/return", "episode/bounces", "task/non_finite", "speed/steps_per_second")
+    metrics = {name: np.ones(1) for name in names} | {"task/non_finite": np.zeros(1)}
+    reporter = console.Reporter(Console(file=shown, width=200), config, 50)
+    now = 120.0
+    reporter.block(steps, 1.0, metrics)
+    assert expected in shown.getvalue()
+
+
+def test_settings_that_cannot_be_trained_are_refused_before_a_save(tmp_path: Path) -> None:
+    class Falling(CountingTrainer):
+        def run(self, iterations, stopping):
+            metrics = super().run(iterations, stopping)
+            return metrics | {"episode/ended": np.full((1, iterations), float(BLOCK))}
+
+    with pytest.raises(UserError, match="these settings cannot be trained: an episode lasts 0.01"):
+        train(tmp_path, RETURNS, trainer=Falling)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_callback_sees_blocks_and_evaluations_and_ends_the_training(tmp_path: Path) -> None:
@@ -197,7 +333,7 @@ def test_a_callback_sees_blocks_and_evaluations_and_ends_the_training(tmp_path: 
     run = train(tmp_path, {1: 5.0, 2: 9.0, 3: 7.0}, callbacks=[Tracker()])
     blocks = [(64, 0.0, False), (64, 5.0, True), (128, 0.0, False), (128, 9.0, True)]
     assert seen == [3 * BLOCK, *blocks, "closed"]
-    results = json.loads((run / "results.json").read_text())
+    results = results_of(run)
     assert (results["trained_steps"], results["best_steps"]) == (2 * BLOCK, 2 * BLOCK)
     assert results["fresh_resets"]
 
@@ -214,4 +350,226 @@ def test_an_error_in_a_callback_ends_the_training(tmp_path: Path) -> None:
     (run,) = tmp_path.iterdir()
     assert iterations_of(latest_checkpoint(run)) == 1
     train(tmp_path, {1: 5.0, 2: 9.0}, run)
-    assert best_steps(run) == 2 * BLOCK
+    assert results_of(run)["best_steps"] == 2 * BLOCK
+
+
+# Signals
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_a_signal_saves_and_says_how_to_resume(tmp_path: Path, number: signal.Signals) -> None:
+    signalled = before(2, lambda: os.kill(os.getpid(), number))
+    continues = "stopped after 128 steps; continue with: bounce-mjx train --resume "
+    with pytest.raises(job.TrainingStopped, match=continues):
+        train(tmp_path, RETURNS, trainer=signalled)
+    (run,) = tmp_path.iterdir()
+    assert latest_checkpoint(run).steps == 2 * BLOCK
+    train(tmp_path, RETURNS, run)
+    assert evaluated_steps(run) == [64, 128, 192, 256]
+
+
+def test_a_signal_during_the_compilation_leaves_nothing(tmp_path: Path) -> None:
+    ended = concurrent.futures.Future()
+
+    class Compiling(CountingTrainer):
+        def compile(self, pool):
+            os.kill(os.getpid(), signal.SIGTERM)
+            return ended
+
+    try:
+        with pytest.raises(Interrupted):
+            train(tmp_path, RETURNS, trainer=Compiling)
+    finally:
+        ended.set_result(None)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_block_that_was_stopped_is_completed_first(tmp_path: Path) -> None:
+    """On MJX a block may take minutes."""
+    asked = []
+
+    class Slow(CountingTrainer):
+        def run(self, iterations, stopping):
+            asked.append(iterations)
+            if len(asked) == 1:
+                os.kill(os.getpid(), signal.SIGTERM)
+                while not stopping():
+                    time.sleep(0.01)
+                iterations = 1
+            return super().run(iterations, stopping)
+
+    settings = {"trainer": Slow, "block_steps": 2 * BLOCK, "eval_every": 2 * BLOCK}
+    with pytest.raises(job.TrainingStopped, match="stopped after 64 steps"):
+        train(tmp_path, RETURNS, **settings)
+    (run,) = tmp_path.iterdir()
+    train(tmp_path, RETURNS, run, **settings)
+    assert asked == [2, 1, 2] and evaluated_steps(run) == [128, 256]
+
+
+def test_an_evaluation_that_was_stopped_is_repeated(tmp_path: Path) -> None:
+    """The signal does not wait for it. Its checkpoint has the next number, as the one without it
+    had the steps."""
+
+    class Stopped(Scores):
+        def select(self, policies):
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(0.5)
+            return super().select(policies)
+
+    with pytest.raises(job.TrainingStopped, match="stopped after 64 steps"):
+        train(tmp_path, {1: 5.0}, scores=Stopped)
+    (run,) = tmp_path.iterdir()
+    assert latest_checkpoint(run).steps == BLOCK
+    train(tmp_path, {1: 5.0}, run)
+    best = best_checkpoint(run)
+    assert (best.steps, read_record(best).steps) == (BLOCK + 1, BLOCK)
+    assert results_of(run)["best_steps"] == BLOCK
+
+
+# One writer, and its log
+
+
+def test_a_training_holds_the_lock_of_its_run(tmp_path: Path) -> None:
+    run = train(tmp_path, {1: 1.0})
+    refusals = []
+
+    def look() -> None:
+        with pytest.raises(UserError, match="is in use by another training") as refused:
+            with lock_run(run):
+                pass
+        refusals.append(refused)
+
+    train(tmp_path, {1: 1.0, 2: 2.0}, run, trainer=before(2, look))
+    assert refusals and not list(run.glob(".*"))
+    saved = contents(run)
+    with lock_run(run), pytest.raises(UserError, match=f"{run} is in use by another training"):
+        train(tmp_path, RETURNS, run)
+    assert contents(run) == saved
+
+
+def test_the_log_holds_every_point_of_a_checkpoint(tmp_path: Path, monkeypatch) -> None:
+    """This holds even if the process dies right after the save, because a second SIGTERM does not
+    wait."""
+    logged = []
+    save = CheckpointWriter.save
+
+    def save_and_look(writer, steps, *rest):
+        (run,) = tmp_path.iterdir()
+        log = EventAccumulator(str(run)).Reload()
+        scalars = [log.Scalars(tag) for tag in ("episode/return", "results/mean_return")]
+        # The last that an evaluation adds.
+        points = [*scalars, log.Tensors("results/text_summary")]
+        logged.append((steps, *(tag[-1].step for tag in points)))
+        save(writer, steps, *rest)
+
+    monkeypatch.setattr(CheckpointWriter, "save", save_and_look)
+    train(tmp_path, {1: 1.0, 2: 2.0})
+    assert logged == [(steps,) * 4 for steps in (64, 128)]
+
+
+# Full disks
+
+
+def test_a_training_goes_on_while_it_cannot_save(tmp_path: Path, monkeypatch) -> None:
+    """It says so once, and saves its newest state once there is room again."""
+    fail(monkeypatch, 2)
+    run = train(tmp_path, RETURNS, said=(said := io.StringIO()))
+    for sentence in ("cannot be written (No space left on device)", "the state is saved again"):
+        assert said.getvalue().count(sentence) == 1
+    assert iterations_of(latest_checkpoint(run)) == 4
+
+
+def test_a_policy_that_could_not_be_saved_is_not_the_best(tmp_path: Path, monkeypatch) -> None:
+    fail(monkeypatch, 2)
+    run = train(tmp_path, {1: 5.0, 2: 9.0, 3: 7.0})
+    assert results_of(run)["best_steps"] == 3 * BLOCK and iterations_of(best_checkpoint(run)) == 3
+
+
+def test_a_training_that_ends_without_room_says_so(tmp_path: Path, monkeypatch) -> None:
+    """The last good checkpoint stays, and the training resumes from it."""
+    with monkeypatch.context() as patch:
+        fail(patch, 2, 3)
+        sentence = (
+            r"\(No space left on device\), so the end of the training is lost; make room, and"
+        )
+        with pytest.raises(UserError, match=f"{sentence} continue with: bounce-mjx train --resume"):
+            train(tmp_path, {1: 5.0, 2: 9.0, 3: 7.0})
+    (run,) = tmp_path.iterdir()
+    assert iterations_of(latest_checkpoint(run)) == 1
+    train(tmp_path, {2: 9.0, 3: 7.0}, run)
+    assert results_of(run)["best_steps"] == 2 * BLOCK and iterations_of(best_checkpoint(run)) == 2
+
+
+# Faults
+
+
+class Diverging(CountingTrainer):
+    """In the third iteration, the loss of seed 1 is not finite."""
+
+    faults = {(1, 3): 2}
+
+
+def test_divergence_ends_the_training_and_keeps_the_last_good_state(tmp_path: Path) -> None:
+    class Alone(CountingTrainer):
+        faults = {(0, 3): 2}
+
+    sentence = "loss was the first that was not finite, at iteration 3; the last good checkpoint is"
+    with pytest.raises(UserError, match=sentence):
+        train(tmp_path, RETURNS, trainer=Alone)
+    (run,) = tmp_path.iterdir()
+    assert iterations_of(latest_checkpoint(run)) == 2
+
+
+def test_a_device_that_fails_is_told_with_the_last_checkpoint(tmp_path: Path) -> None:
+    def breaks() -> None:
+        raise jax.errors.JaxRuntimeError("INTERNAL: CUDA_ERROR_UNKNOWN\nin a graph")
+
+    with pytest.raises(UserError) as failed:
+        train(tmp_path, RETURNS, trainer=before(3, breaks))
+    (run,) = tmp_path.iterdir()
+    assert str(failed.value) == (
+        "cpu failed after 128 steps (INTERNAL: CUDA_ERROR_UNKNOWN in a graph); continue with: "
+        f"bounce-mjx train --resume {run} (the last checkpoint is {run}/checkpoints/128)"
+    )
+
+
+def test_a_full_device_is_told_in_one_sentence(tmp_path: Path) -> None:
+    def full() -> None:
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")
+
+    reason = r"too little memory for 8 environments \(RESOURCE_EXHAUSTED: Out of memory\)"
+    with pytest.raises(UserError, match=f"cpu has {reason}; lower num_envs"):
+        train(tmp_path, RETURNS, trainer=before(1, full))
+
+
+# Several seeds
+
+
+def test_each_seed_has_a_run_of_its_own_and_the_best_one_is_found(tmp_path: Path) -> None:
+    returns = {1: (1.0, 7.0, 2.0), 2: (3.0, 1.0, 2.0), 3: (2.0, 1.0, 6.0)}
+    run = train(tmp_path, returns, num_seeds=SEEDS)
+    folders = [run / f"seed_{i:03d}" for i in range(SEEDS)]
+    assert sorted(p for p in run.iterdir() if p.name.startswith("seed")) == folders
+    for i, (folder, best) in enumerate(zip(folders, (2, 1, 3), strict=True)):
+        config = load_run_config(folder)
+        assert (config.seed, config.num_seeds) == (i, 1)
+        assert evaluated_steps(folder) == [64, 128, 192]
+        assert results_of(folder)["best_steps"] == BLOCK * best
+        assert iterations_of(best_checkpoint(folder)) == best
+    assert find_checkpoint(newest_run(tmp_path)) == best_checkpoint(folders[1])
+    # Resumed, each knows its best one.
+    train(tmp_path, returns | {4: (2.5, 9.0, 1.0)}, run, num_seeds=SEEDS)
+    assert [results_of(folder)["best_steps"] for folder in folders] == [128, 256, 192]
+
+
+def test_a_seed_that_diverges_leaves_the_others(tmp_path: Path) -> None:
+    settings = {"num_seeds": SEEDS, "trainer": Diverging}
+    run = train(tmp_path, {1: 1.0, 2: 2.0, 3: 3.0}, said=(said := io.StringIO()), **settings)
+    assert "seed 1 diverged: loss was the first that was not finite, at iteration 3" in (
+        said.getvalue()
+    )
+    # It stays diverged when the training is resumed.
+    train(tmp_path, {1: 1.0, 2: 2.0, 3: 3.0, 4: 4.0}, run, **settings)
+    evaluated = [evaluated_steps(run / f"seed_{i:03d}") for i in range(SEEDS)]
+    assert evaluated == [[64, 128, 192, 256], [64, 128], [64, 128, 192, 256]]
+    assert iterations_of(best_checkpoint(run / "seed_001")) == 2

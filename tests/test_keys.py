@@ -234,6 +234,7 @@ def test_equal_settings_have_equal_programs(kind: Callable) -> None:
     assert kind(CONFIG()) == kind(CONFIG())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", KEYS)
 def test_a_key_has_an_effect_or_is_refused(key: str) -> None:
     part, changed = max(filter(key.startswith, PARTS), key=len), settings(key, other(key))

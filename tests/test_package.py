@@ -15,11 +15,6 @@ CHECKOUT = Path(__file__).resolve().parent.parent
 PACKAGE = CHECKOUT / "src" / "bounce_mjx"
 
 # An editable install puts the checkout on the path of every interpreter of this environment.
-HIDE_CHECKOUT = f"""
-import sys
-from pathlib import Path
-sys.path = [p for p in sys.path if not Path(p).resolve().is_relative_to({str(CHECKOUT / "src")!r})]
-"""
 
 
 @pytest.fixture(scope="module")
@@ -30,28 +25,6 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     subprocess.run(command, cwd=CHECKOUT, check=True, capture_output=True)
     (path,) = folder.glob("*.whl")
     return path
-
-
-@pytest.fixture(scope="module")
-def site(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An empty folder with the wheel installed in it, as `pip install --target` does."""
-    folder = tmp_path_factory.mktemp("site")
-    with zipfile.ZipFile(wheel) as archive:
-        archive.extractall(folder)
-    return folder
-
-
-def run_installed(site: Path, script: str, cwd: Path) -> list[str]:
-    """Runs a script that sees only the installed wheel, and returns the lines that it prints."""
-    done = subprocess.run(
-        [sys.executable, "-c", HIDE_CHECKOUT + script],
-        cwd=cwd,
-        env={**os.environ, "PYTHONPATH": str(site)},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout.splitlines()
 
 
 def test_import_is_light(tmp_path: Path) -> None:
@@ -252,74 +225,6 @@ def test_wheel_has_the_console_script(wheel: Path) -> None:
         (name,) = [n for n in archive.namelist() if n.endswith("/entry_points.txt")]
         text = archive.read(name).decode()
     assert text.split() == ["[console_scripts]", "bounce-mjx", "=", "bounce_mjx.commands.main:main"]
-
-
-@pytest.mark.slow
-def test_installed_environment_runs(site: Path, tmp_path: Path) -> None:
-    script = """
-import jax
-import bounce_mjx
-from bounce_mjx import BounceBall, EnvConfig
-from bounce_mjx.resources import resource_path
-env = BounceBall(EnvConfig(physics="fused"))
-state = env.reset(jax.random.PRNGKey(0))
-following = env.step(state, jax.numpy.ones(env.action_size))
-print(bounce_mjx.__file__)
-print(resource_path("mjcf/bounce_ball.xml"))
-print(env.engine.name, *following.obs.shape, bool(jax.numpy.isfinite(following.obs).all()))
-print(float(abs(following.obs - state.obs).max()) > 0.0)
-print(*bounce_mjx.__all__)
-"""
-    module, mjcf, result, moved, public = run_installed(site, script, tmp_path)
-    assert Path(module) == site / "bounce_mjx" / "__init__.py"
-    assert Path(mjcf) == site / "bounce_mjx" / "mjcf" / "bounce_ball.xml"
-    assert result == "fused 29 True"
-    assert moved == "True"
-    assert {"BounceBall", "EnvConfig"} <= set(public.split())
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.slow
-def test_installed_trainer_finds_its_preset(site: Path, tmp_path: Path) -> None:
-    script = """
-from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config
-from bounce_mjx.runs.folders import choose_checkpoint
-from bounce_mjx.runs.reading import read_policy
-from bounce_mjx.resources import resource_path
-from bounce_mjx.commands.train import read_command
-import jax
-preset = "cpu" if jax.default_backend() == "cpu" else "default"
-print(read_command([]).ppo == load_config(resource_path(f"configs/{preset}.yaml")).ppo)
-print(resource_path(f"configs/{preset}.yaml"))
-"""
-    same, preset = run_installed(site, script, tmp_path)
-    assert same == "True"
-    assert Path(preset).parent == site / "bounce_mjx" / "configs"
-
-
-@pytest.mark.slow
-def test_installed_policy_acts(site: Path, tmp_path: Path) -> None:
-    script = """
-import jax
-from rich.console import Console
-from bounce_mjx import BounceBall, load_policy as load_deployed
-from bounce_mjx.learning.policy import make_networks
-from bounce_mjx.runs.config import TrainConfig, load_run_config
-from bounce_mjx.runs.folders import choose_checkpoint
-from bounce_mjx.runs.reading import read_policy
-checkpoint = choose_checkpoint(None, TrainConfig().log_dir, Console(quiet=True))
-config = load_run_config(checkpoint.run)
-env = BounceBall(config.env)
-state = env.reset(jax.random.PRNGKey(0))
-networks = make_networks(config.ppo, env.observation_size, env.action_size)
-action = networks.act(read_policy(checkpoint, config), state.obs)
-print(checkpoint.run)
-print(*action.shape, bool((abs(action) > 0.0).any()))
-print(len(load_deployed("pretrained").needs))
-"""
-    run, action, needs = run_installed(site, script, tmp_path)
-    assert Path(run) == site / "bounce_mjx" / "pretrained"
-    assert (action, needs) == ("6 True", "5")
 
 
 @pytest.mark.parametrize(

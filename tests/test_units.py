@@ -9,7 +9,6 @@ import pytest
 import yaml
 
 from bounce_mjx import task
-from bounce_mjx.commands import train as train_command
 from bounce_mjx.config.validation import validate
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
@@ -17,7 +16,6 @@ from bounce_mjx.runs.config import train_config
 from bounce_mjx.tasks.registry import find_task
 from bounce_mjx.training.first_block import fault_of
 from bounce_mjx.world.config import Command
-from tiny_runs import TINY
 
 WRONG = """
 default_joint_angles: [0, 40, 110, 0, -60, 0]            # degrees
@@ -25,42 +23,29 @@ ball_init_pos: [588.56, 0, 450]                          # mm
 target_height_range: [400, 600]                          # mm
 target_height_range: [0.02, 0.04]                        # over the floor, not over the paddle
 action_scale: 1.15                                       # degrees
-action: {base: target, max_lead: 8.6}                    # degrees
 control_dt: 10                                           # ms
 episode_seconds: 20000                                   # ms
 max_joint_velocity: 360                                  # degrees a second
 min_ball_height: 50                                      # mm
 max_horizontal_distance: 0.15                            # less than the paddle's own distance
-max_horizontal_distance: 1500                            # mm
-max_height_above_target: 1000                            # mm
-bounce_max_distance: 120                                 # mm
 reset: {joint_angles: 5.7}                               # degrees
-reset: {ball_position: 10}                               # mm
 reward: {height: {scale: 150}}                           # mm
-reward: {target_x: 588.56}                               # mm
 reward: {velocity_matching: {desired_velocity: 500}}     # mm/s
 randomization: {action_latency: [20, 40]}                # ms
 randomization: {ball_latency: [8, 30]}                   # ms
 randomization: {paddle_tilt: [-3, 3]}                    # degrees
 randomization: {paddle_offset: [-5, 5]}                  # mm
-randomization: {joint_start: [-5, 5]}                    # degrees
-randomization: {ball_start: [-30, 30]}                   # mm
 randomization: {ball_radius: [19, 20]}                   # mm, where a factor is due
-randomization: {ball_position_noise: [1, 2]}             # mm
 randomization: {push_speed: [100, 200]}                  # mm/s
 randomization: {push_speed: [0.1, 0.2], push_interval: [2000, 3000]}  # ms
-randomization: {command_interval: [2000, 3000]}          # ms
 robot: {paddle: {half_size: [0.2, 0.2, 0.01], mass: 5}}  # does nothing without robot.site
 robot: {site: s, paddle: {half_size: [50, 65, 3.5]}}     # mm
-robot: {site: s, paddle: {position: [0, 0, 190]}}        # mm
 robot: {site: s, paddle: {mass: 100}}                    # g
 robot: {site: s, ball: {radius: 19}}                     # mm
-robot: {site: s, ball: {mass: 2.7}}                      # g
 robot: {limits: {velocity: [180], acceleration: [9]}}    # degrees a second
 action: {max_lead: 0.3}                                  # does nothing with the base measured
 randomization: {push_interval: [1, 2]}                   # does nothing without push_speed
 max_joint_velocity: true                                 # a switch is no number
-randomization: {restitution: [0.8, true]}                # the same
 """
 
 
@@ -252,16 +237,3 @@ def test_any_other_first_block_is_trained_on(block: dict) -> None:
 def test_a_short_time_limit_is_no_fault() -> None:
     short = FIRST.model_copy(update={"env": config("bounce", episode_seconds=0.05)})
     assert fault_of(first_block(ended=16.0), short) is None
-
-
-@pytest.mark.slow
-def test_training_refuses_before_it_saves(tmp_path, capsys) -> None:
-    """And says what the policy does not see."""
-    noise = ["--randomization.ball-velocity-noise", "0.1", "0.1"]
-    args = [*TINY, "--log-dir", str(tmp_path), "--max-joint-velocity", "0.001", *noise]
-    with pytest.raises(SystemExit):
-        train_command.main([*args, "--observation.velocity", "differences", "--no-report"])
-    said = capsys.readouterr()
-    assert "the policy does not see what ball_velocity_noise changes" in said.out
-    assert "what ends it is max_joint_velocity (0.001 rad/s)" in said.err
-    assert not [*tmp_path.iterdir()]
