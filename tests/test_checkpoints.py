@@ -50,8 +50,10 @@ CONFIG = TrainConfig(
 
 @pytest.fixture(scope="module")
 def state() -> TrainingState:
+    """A state of the right shapes with random numbers."""
     trainer = make_trainer(CONFIG.ppo, BounceBall(CONFIG.env), CONFIG.env.episode_steps)
-    return jax.jit(trainer.init)(jax.random.PRNGKey(0))
+    shapes, rng = jax.eval_shape(trainer.init, jax.random.PRNGKey(0)), np.random.default_rng(0)
+    return jax.tree.map(lambda x: jnp.asarray(100.0 * rng.random(x.shape), x.dtype), shapes)
 
 
 def items_of(state: TrainingState) -> dict:

@@ -19,7 +19,7 @@ from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import best_checkpoint, pretrained_checkpoint
 from bounce_mjx.runs.reading import read_networks, read_policy
 from bounce_mjx.training.warm_start import read_start
-from tiny_runs import STEPS, TINY
+from tiny_runs import STEPS, TINY, shared_run
 
 CRITIC = {"n_bounces", "world/restitution", "world/air_drag"}
 WORLD = {
@@ -156,11 +156,13 @@ MISTAKES = {
 
 @pytest.mark.parametrize("flags, words", MISTAKES.values(), ids=MISTAKES)
 def test_mistakes_give_one_sentence(
-    flags: str, words: str, first: Path, tmp_path: Path, monkeypatch, capfd
+    flags: str, words: str, tmp_path: Path, monkeypatch, capfd
 ) -> None:
+    run = shared_run() if "{run}" in flags else None
+    capfd.readouterr()
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit):
-        train_command.main(flags.format(run=first).split())
+        train_command.main(flags.format(run=run).split())
     error = capfd.readouterr().err
     assert re.fullmatch(r"error: .+\n", error) and words in error, error
     assert not list(tmp_path.iterdir())
