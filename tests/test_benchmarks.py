@@ -120,25 +120,3 @@ def test_networks_in_torch_begin_as_in_jax(benchmark):
         np.testing.assert_allclose(
             torch.linalg.svdvals(linear.weight.detach()), expected, rtol=1e-4
         )
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("torch_libraries")
-def test_adapter_is_measured(tmp_path):
-    command = "adapter.py --num-envs 4 --steps 3 --rounds 2 --out".split()
-    done = subprocess.run(
-        [sys.executable, *command, tmp_path], cwd=BENCHMARKS, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    (record,) = json.loads((tmp_path / "adapter.json").read_text(encoding="utf-8"))["records"]
-    assert set(record["seconds"]) == {"jitted step alone", "TorchVectorEnv", "RslRlVecEnv"}
-    assert all(seconds > 0.0 for seconds in record["seconds"].values())
-
-
-def test_time_in_which_any_kernel_runs(monkeypatch):
-    """Kernels of several streams overlap; a union has each instant once."""
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    from scaling import covered
-
-    assert covered([(5, 7), (0, 2), (1, 3), (1, 2), (6, 6.5)]) == 5
-    assert covered([]) == 0

@@ -13,9 +13,8 @@ import yaml
 from hypothesis import HealthCheck, Phase, example, given, settings
 from hypothesis import strategies as st
 
-from bounce_mjx.commands import eval as eval_command
 from bounce_mjx.commands import train as train_command
-from bounce_mjx.config.command_line import flags_of, parse
+from bounce_mjx.config.command_line import flags_of
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
@@ -26,7 +25,6 @@ from tiny_runs import contents
 
 CONFIG = train_config(Bounce)
 FLAGS = sorted(flags_of(train_config(Bounce, TrainCommand)))
-EVAL_FLAGS = sorted(flags_of(eval_command.EvalCommand))
 
 
 @pytest.fixture(scope="module")
@@ -162,13 +160,6 @@ def test_config_file_of_any_structure(folder: Path, tree, style: bool, unicode: 
 
 
 @pytest.mark.slow
-@cases(80)
-@given(tree=groups(CONFIG))
-def test_config_file_of_known_keys(folder: Path, tree: dict) -> None:
-    read_config(folder, yaml.safe_dump(tree).encode("utf-8", "surrogatepass"))
-
-
-@pytest.mark.slow
 @cases(50)
 @given(data=st.binary() | st.text(alphabet="ab:-[]{}&*!|>'\"%@,?# \n\t01.~<e").map(str.encode))
 def test_config_file_of_any_bytes(folder: Path, data: bytes) -> None:
@@ -222,19 +213,3 @@ def test_training_command_line(folder: Path, args: list[str]) -> None:
     command = read(folder, lambda: train_command.read_command(args))
     if command is not None:
         assert_valid_run(command)
-
-
-@pytest.mark.slow
-@cases(50)
-@given(args=command_lines(EVAL_FLAGS))
-def test_evaluation_command_line(folder: Path, args: list[str]) -> None:
-    (folder / "fuzzed.yaml").write_bytes(b"")
-    read(
-        folder,
-        lambda: parse(
-            eval_command.EvalCommand,
-            args,
-            prog="bounce-mjx eval",
-            description="Measures.",
-        ),
-    )

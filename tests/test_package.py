@@ -93,23 +93,6 @@ except ImportError as error:
     assert re.fullmatch(sentence, done.stdout), done.stdout + done.stderr
 
 
-@pytest.mark.slow
-def test_another_playground_is_refused_in_one_sentence() -> None:
-    """Version 1.0 has the name, and is another program."""
-    script = """
-import sys, types
-sys.modules["mujoco_playground"] = types.ModuleType("mujoco_playground")
-from bounce_mjx.errors import UserError
-try:
-    import bounce_mjx.adapters.playground
-except ImportError as error:
-    print(isinstance(error, UserError), error)
-"""
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert done.stdout.startswith("True MuJoCo Playground cannot be imported"), done.stderr
-    assert done.stdout.endswith("install it with: pip install 'playground<1'\n")
-
-
 # Documented, although they begin with a line: of named tuples, and of the module os.
 DOCUMENTED = {"_replace", "_asdict", "_fields", "_field_defaults", "_exit"}
 
