@@ -27,7 +27,7 @@ from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import Report, judge
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import make_networks
-from bounce_mjx.learning.ppo import make_trainer, policy_of, population
+from bounce_mjx.learning.ppo import PPO, policy_of, population
 from bounce_mjx.runs.config import TrainConfig, read_preset
 from bounce_mjx.training.setup import set_up_jax
 
@@ -114,7 +114,7 @@ def run_trial(trial: "optuna.Trial", command: Command, base: TrainConfig) -> flo
     chosen["decay_steps"] = round(chosen["decay_steps"])
     config = validate(PPOConfig, dict(base.ppo) | chosen, f"trial {trial.number}")
     env = BounceBall(base.env)
-    trainer = population(make_trainer(config, env, env.config.episode_steps))
+    trainer = population(PPO(config, env, env.config.episode_steps))
     networks = make_networks(config, env.observation_size, env.action_size)
     evaluate = jax.jit(jax.vmap(make_evaluator(env, networks, command.episodes), in_axes=(0, None)))
     iterations = max(1, round(base.eval_every / config.batch_steps))

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from bounce_mjx.learning.policy import Policy
-from bounce_mjx.learning.ppo import make_trainer, policy_of
+from bounce_mjx.learning.ppo import PPO, policy_of
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.tasks.bounce_ball import BounceBall
 from bounce_mjx.training.setup import compiler_options
@@ -39,7 +39,7 @@ class OnBlock(Protocol):
 def train_ours(config: TrainConfig, on_block: OnBlock) -> None:
     """This project's trainer."""
     env = BounceBall(config.env)
-    trainer = make_trainer(config.ppo, env, config.env.episode_steps)
+    trainer = PPO(config.ppo, env, config.env.episode_steps)
     iterations = block_iterations(config)
     key = jax.random.PRNGKey(config.seed)
     init = jax.jit(trainer.init, compiler_options=compiler_options(runs_once=True))

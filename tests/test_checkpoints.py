@@ -23,7 +23,7 @@ from bounce_mjx.deploy.export import export_onnx
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy
-from bounce_mjx.learning.ppo import TrainingState, make_trainer, policy_of
+from bounce_mjx.learning.ppo import PPO, TrainingState, policy_of
 from bounce_mjx.resources import POLICIES
 from bounce_mjx.runs import files
 from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config
@@ -51,7 +51,7 @@ CONFIG = TrainConfig(
 @pytest.fixture(scope="module")
 def state() -> TrainingState:
     """A state of the right shapes with random numbers."""
-    trainer = make_trainer(CONFIG.ppo, BounceBall(CONFIG.env), CONFIG.env.episode_steps)
+    trainer = PPO(CONFIG.ppo, BounceBall(CONFIG.env), CONFIG.env.episode_steps)
     shapes, rng = jax.eval_shape(trainer.init, jax.random.PRNGKey(0)), np.random.default_rng(0)
     return jax.tree.map(lambda x: jnp.asarray(100.0 * rng.random(x.shape), x.dtype), shapes)
 

@@ -19,7 +19,7 @@ from bounce_mjx.config.settings import StrictModel, merged
 from bounce_mjx.config.validation import validate
 from bounce_mjx.env.env import Env, State
 from bounce_mjx.errors import UserError
-from bounce_mjx.learning.ppo import make_trainer
+from bounce_mjx.learning.ppo import PPO
 from bounce_mjx.physics import Control
 from bounce_mjx.robot.model import fingerprint
 from bounce_mjx.runs.config import TrainConfig, train_config
@@ -62,7 +62,8 @@ VALUES = {
     "env.robot.limits.jerk": [9000.0] * 6, "env.robot.limits.torque": [20.0] * 6,
     "env.randomization.shares": {"restitution": 0.5}, "env.randomization.warmup_steps": 1000,
     "env.reward.target_y": 0.1, "ppo.training_episode_seconds": 3.0, "ppo.entropy_cost": 0.01,
-    "ppo.critic_metrics": ["ball_xy_error"], "ppo.hidden_layers": [8],
+    "ppo.critic_metrics": ["ball_xy_error"], "ppo.hidden_layers": [8], "ppo.critic_layers": [8],
+    "algorithm": "own.py:Own",
     "ppo.min_learning_rate": 2e-5, "env.randomization.camera_rate": [60, 90],
     "env.randomization.command_interval": [1, 2], "env.physics": "mjx", "ppo.decay_steps": 1000,
 }  # fmt: skip
@@ -86,7 +87,7 @@ NEEDED = {
     "env.randomization.restitution_slope": {"randomization": {"restitution": [0.8, 0.9]}},
     **{f"env.robot.limits.{name}": WITH_LIMITS for name in LIMITS},
     **dict.fromkeys(OF_SITE, ADOPTED),
-    **dict.fromkeys(("num_devices", "warm_start", "env.mjcf", "env.num_balls"), None),
+    **dict.fromkeys(("num_devices", "warm_start", "env.mjcf", "env.num_balls", "algorithm"), None),
     **dict.fromkeys(("env.robot.site", "env.robot.joints"), None),
 }
 # Keys that describe others, and have an effect with them alone.
@@ -174,7 +175,7 @@ def of_learning(config: TrainConfig) -> tuple:
     # A batch stays divisible.
     small |= {name: 2 * small[name] for name in changed if name in small}
     ppo = config.ppo.model_copy(update=small)
-    trainer = make_trainer(ppo, TwoStates(1.0), episode_steps=1000)
+    trainer = PPO(ppo, TwoStates(1.0), episode_steps=1000)
     program = jax.jit(lambda key: trainer.run(trainer.init(key), 1)).trace(jax.random.key(0))
     return text(program), episode_steps(config)
 

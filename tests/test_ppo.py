@@ -12,11 +12,14 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import judge
 from bounce_mjx.learning import policy, ppo
-from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.config import PPOConfig, find_algorithm
 from bounce_mjx.learning.ppo import generalized_advantages
 from bounce_mjx.learning.statistics import normalize
+from bounce_mjx.runs.config import load_run_config
+from bounce_mjx.runs.folders import create_run
 from bounce_mjx.task import Task
 from bounce_mjx.tasks.bounce import Bounce
+from bounce_mjx.training.command import read_command
 
 OBSERVATION = EnvConfig().layout
 
@@ -196,7 +199,7 @@ def test_time_out_bootstraps_the_old_episodes_last_state(terminates, expected):
     """The observation does not tell the two states apart, but a metric of the critic does."""
     config = two_state_config(critic_metrics=("n_bounces",))
     env = TwoStates(0.0, terminates=terminates, hidden=True)
-    trainer = ppo.make_trainer(config, env, episode_steps=2)
+    trainer = ppo.PPO(config, env, episode_steps=2)
     state, metrics = jax.jit(lambda key: trainer.run(trainer.init(key), 500))(jax.random.key(0))
     networks = policy.make_networks(config, env.observation_size, env.action_size)
     seen = jnp.array([[1.0, 1.0, 0.0], [1.0, 1.0, 1.0]])
@@ -223,7 +226,7 @@ def test_the_noise_shrinks_to_its_bound():
         num_envs=64, min_noise_std=0.2, reward_scale=10.0, learning_rate=1e-2, discount=0.0,
         max_learning_rate=1e-2,
     )  # fmt: skip
-    trainer = ppo.make_trainer(config, Precise(1.0), episode_steps=2)
+    trainer = ppo.PPO(config, Precise(1.0), episode_steps=2)
     state, metrics = jax.jit(lambda key: trainer.run(trainer.init(key), 300))(jax.random.key(0))
     assert 0.2 <= metrics["policy/action_std"][-1] < 0.3
     networks = policy.make_networks(config, 2, 1)
@@ -257,7 +260,7 @@ def test_update_uses_the_normalisation_of_the_next_rollout(bound):
     config = two_state_config(
         num_envs=4096, learning_rate=1e-12, min_learning_rate=1e-12, min_noise_std=bound
     )
-    trainer = ppo.make_trainer(config, TwoStates(1.0), episode_steps=2)
+    trainer = ppo.PPO(config, TwoStates(1.0), episode_steps=2)
     before = trainer.init(jax.random.key(0))
     after, metrics = jax.jit(lambda state: trainer.run(state, 1))(before)
 
@@ -280,14 +283,14 @@ def test_update_uses_the_normalisation_of_the_next_rollout(bound):
 
 def test_settings_that_no_training_can_have_are_refused():
     with pytest.raises(UserError, match="rollout_length 2 .* episode of 1 "):
-        ppo.make_trainer(two_state_config(), TwoStates(1.0), episode_steps=1)
+        ppo.PPO(two_state_config(), TwoStates(1.0), episode_steps=1)
     config = two_state_config(critic_metrics=("n_bounces", "n_bounce"))
     with pytest.raises(UserError, match="names n_bounce, .* choose from .*n_bounces"):
-        ppo.make_trainer(config, TwoStates(1.0), episode_steps=2)
+        ppo.PPO(config, TwoStates(1.0), episode_steps=2)
 
 
 def test_episodes_do_not_all_time_out_together():
-    trainer = ppo.make_trainer(two_state_config(), TwoStates(1.0), episode_steps=1000)
+    trainer = ppo.PPO(two_state_config(), TwoStates(1.0), episode_steps=1000)
     steps = np.asarray(trainer.init(jax.random.key(0)).env.clock)
     assert steps.min() >= 0 and steps.max() < 1000
     assert len(np.unique(steps)) > 8
@@ -310,7 +313,7 @@ def env():
 
 @pytest.fixture(scope="module")
 def trainer(tiny, env):
-    return ppo.make_trainer(tiny, env, env.config.episode_steps)
+    return ppo.PPO(tiny, env, env.config.episode_steps)
 
 
 @pytest.fixture(scope="module")
@@ -387,7 +390,7 @@ def test_run_returns_the_same_types_as_its_input(trainer, init):
 
 def test_hidden_layers_are_computed_in_bfloat16_and_outputs_not(tiny, env):
     sizes = env.observation_size, env.action_size
-    for network in policy.make_networks(tiny, *sizes, dtype="bfloat16"):
+    for network in policy.make_networks(tiny, *sizes, dtype="bfloat16")[:2]:
         params = network.init(jax.random.PRNGKey(0))
         assert {x.dtype for x in jax.tree.leaves(params)} == {jnp.dtype(jnp.float32)}
         program = jax.make_jaxpr(network.apply)(params, jnp.zeros((1, env.observation_size)))
@@ -409,6 +412,96 @@ def test_vmap_over_seeds_equals_single_runs(trainer, init, run, after_two):
             vector.observe(chosen.env), vector.observe(one.env), rtol=0, atol=2e-3
         )
         np.testing.assert_allclose(chosen_metrics["reward"], metrics["reward"], rtol=1e-3)
+
+
+def some_samples(trainer, params) -> ppo.Samples:
+    """Samples of another policy than that of the parameters."""
+    rng = np.random.default_rng(0)
+    size = trainer.env.observation_size + len(trainer.critic_metrics)
+    inputs, action = (jnp.float32(rng.normal(size=(64, n))) for n in (size, 6))
+    bound, target = jnp.zeros((64, 1)), jnp.float32(rng.normal(size=64))
+    log_prob = trainer.distribution(params, inputs, bound).log_prob(action)
+    return ppo.Samples(inputs, action, log_prob + 0.3 * target, target, target, bound)
+
+
+def test_a_subclass_adds_a_term_to_the_loss(tiny, env, init):
+    class Decayed(ppo.PPO):
+        def loss(self, params, samples):
+            total, metrics = super().loss(params, samples)
+            squares = sum(jnp.sum(jnp.square(x)) for x in jax.tree.leaves(params))
+            return total + 1.5 * squares, metrics
+
+    params = init(jax.random.key(0)).params
+    plain, decayed = (kind(tiny, env, 100) for kind in (ppo.PPO, Decayed))
+    samples = some_samples(plain, params)
+    gradients = (jax.grad(lambda p, x=x: x.loss(p, samples)[0])(params) for x in (plain, decayed))
+    jax.tree.map(
+        lambda before, after, x: np.testing.assert_allclose(after, before + 3.0 * x, atol=1e-5),
+        *gradients,
+        params,
+    )
+
+
+def test_the_clipped_fraction_is_that_of_the_ratios(trainer, init):
+    params = init(jax.random.key(0)).params
+    samples = some_samples(trainer, params)
+    ratio = np.exp(-0.3 * np.asarray(samples.advantage))
+    expected = np.mean((ratio < 0.8) | (ratio > 1.2))
+    assert 0.1 < expected < 0.9
+    metrics = trainer.loss(params, samples)[1]
+    assert metrics["policy/clip_fraction"] == pytest.approx(expected)
+
+
+def test_a_shared_critic_continues_the_policys_layers(tiny, env):
+    """Both with the chosen activation; the error of the values also trains these layers."""
+    changes = {"shared_critic": True, "activation": "tanh"}
+    trainer = ppo.PPO(tiny.model_copy(update=changes), env, 100)
+    params = jax.jit(trainer.init)(jax.random.key(1)).params
+    inputs = jnp.float32(np.random.default_rng(1).normal(size=(5, 29 + len(Bounce.critic_metrics))))
+    hidden = params.policy["params"]["MLP_0"]["hidden_0"]
+    head = params.value["params"]["hidden_0"]
+    features = np.tanh(inputs[:, :29] @ hidden["kernel"] + hidden["bias"])
+    expected = np.concatenate([features, inputs[:, 29:]], 1) @ head["kernel"] + head["bias"]
+    np.testing.assert_allclose(trainer.values(params, inputs), expected[:, 0], atol=1e-5)
+    mean = trainer.distribution(params, inputs, jnp.zeros((5, 1))).mean
+    last = params.policy["params"]["Dense_0"]
+    np.testing.assert_allclose(mean, features @ last["kernel"] + last["bias"], atol=1e-5)
+    gradient = jax.grad(lambda p: jnp.sum(trainer.values(p, inputs)))(params)
+    assert np.abs(gradient.policy["params"]["MLP_0"]["hidden_0"]["kernel"]).max() > 0
+
+
+def test_a_critic_has_its_own_widths(tiny, env):
+    trainer = ppo.PPO(tiny.model_copy(update={"critic_layers": (5, 3)}), env, 100)
+    values = trainer.networks.value_network.init(jax.random.key(0))["params"]
+    assert [len(values[f"hidden_{i}"]["bias"]) for i in range(3)] == [5, 3, 1]
+
+
+OWN = """
+from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.ppo import PPO
+class Own(PPO):
+    class Config(PPOConfig):
+        own_cost: float = 0.5
+        "Weight."
+"""
+
+
+def test_settings_of_an_own_algorithm_are_keys(tmp_path):
+    """A policy is read without them, and without the code."""
+    (tmp_path / "own.py").write_text(OWN)
+    name = f"{tmp_path / 'own.py'}:Own"
+    flags = ["--config", "cpu", "--algorithm", name, "--own-cost", "2"]
+    config = read_command(flags, "cpu").training
+    assert find_algorithm(config.algorithm)(config.ppo, BounceBall(), 100).config.own_cost == 2.0
+    run = create_run(config.model_copy(update={"log_dir": tmp_path / "runs"}))
+    assert load_run_config(run, algorithm=name).ppo.own_cost == 2.0
+    assert not hasattr(load_run_config(run).ppo, "own_cost")
+    with pytest.raises(UserError, match=r"which is code; name it to run it: --algorithm /.+:Own"):
+        read_command(["--resume", str(run)])
+    with pytest.raises(UserError, match="has no algorithm 'Other'"):
+        read_command(["--algorithm", name.replace("Own", "Other")])
+    with pytest.raises(UserError, match="there is no algorithm 'sac'; give ppo or FILE.py:CLASS"):
+        read_command(["--algorithm", "sac"])
 
 
 def test_the_first_state_needs_no_lapack(trainer):
@@ -442,7 +535,7 @@ def test_ppo_learns_to_bounce():
         num_envs=128, rollout_length=32, num_minibatches=4, hidden_layers=(64, 64),
         learning_rate=1e-3,
     )  # fmt: skip
-    trainer = ppo.make_trainer(config, env, env.config.episode_steps)
+    trainer = ppo.PPO(config, env, env.config.episode_steps)
     untrained = jax.jit(trainer.init)(jax.random.key(0))
     trained, metrics = jax.jit(trainer.run, static_argnums=1)(untrained, 180)
 

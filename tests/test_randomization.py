@@ -17,7 +17,7 @@ from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.c_episodes import episode_models
-from bounce_mjx.learning.ppo import make_trainer
+from bounce_mjx.learning.ppo import PPO
 from bounce_mjx.physics import Control, PhysicsState, edited_model, servo_targets
 from bounce_mjx.world.actuation import add_delay, start_actuation
 from bounce_mjx.world.randomization import (
@@ -124,7 +124,7 @@ def test_a_training_draws_from_the_grown_ranges() -> None:
             return stepped.replace(pipeline_state=state.pipeline_state)
 
     config = two_state_config(hidden_layers=(4,), num_minibatches=1, num_epochs=1)
-    trainer = make_trainer(config, Growing(1.0), episode_steps=2)
+    trainer = PPO(config, Growing(1.0), episode_steps=2)
     state, step = jax.jit(trainer.init)(jax.random.key(0)), jax.jit(lambda s: trainer.run(s, 1)[0])
     np.testing.assert_array_equal(state.env.env.pipeline_state, np.zeros(16))
     for iteration in range(12):  # of 32 steps each, in which all episodes are reset

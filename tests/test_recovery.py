@@ -425,11 +425,11 @@ def from_file(name):
     return float(Path(__file__).with_name(f"{name}.factor").read_text())
 formula = PaddleHomeReward.value
 PaddleHomeReward.value = lambda *args: formula(*args) * from_file("term")
-loss = ppo.loss
+loss = ppo.PPO.loss
 def from_script(*args):
     total, metrics = loss(*args)
     return total + (LOSS - 1.0) * metrics["loss/value"], metrics
-ppo.loss = from_script
+ppo.PPO.loss = from_script
 main(sys.argv[1:])
 names = "compile_requests_use_cache", "cache_hits"
 print("counts:", *(events.count("/jax/compilation_cache/" + name) for name in names))

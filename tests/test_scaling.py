@@ -194,7 +194,7 @@ if sys.argv[1] == "kernel":
 # No other size of the program is a multiple of 104.
 config = PPOConfig(num_envs=104, rollout_length=4, num_minibatches=2, hidden_layers=(8,))
 env = BounceBall()
-trainer = ppo.make_trainer(config, env, 100)
+trainer = ppo.PPO(config, env, 100)
 mesh = devices.make_mesh(8, config)
 shapes = jax.eval_shape(trainer.init, jax.random.PRNGKey(0))
 sharding = devices.state_sharding(mesh, shapes)

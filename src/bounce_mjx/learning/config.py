@@ -1,6 +1,6 @@
 """Settings of the trainer."""
 
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import pydantic
 from pydantic import Field
@@ -14,6 +14,15 @@ from bounce_mjx.config.settings import (
     StrictModel,
     UnitInterval,
 )
+from bounce_mjx.errors import UserError, shorten
+from bounce_mjx.tasks.registry import class_in_file, is_file
+
+if TYPE_CHECKING:
+    from bounce_mjx.learning.ppo import PPO
+
+
+PPO_NAME = "ppo"
+"""Name of the algorithm of this package."""
 
 
 class PPOConfig(StrictModel):
@@ -65,7 +74,14 @@ class PPOConfig(StrictModel):
     evenly between 0 and twice this; 0 for none. Without it the noise shrinks until no environment
     visits the states from which a policy must recover, and the policy forgets them."""
     hidden_layers: Annotated[tuple[Count, ...], Field(min_length=1)] = (128, 128)
-    """Widths of the hidden layers of the policy and of the value network."""
+    """Widths of the hidden layers of the policy, and of the value network by default."""
+    critic_layers: Annotated[tuple[Count, ...], Field(min_length=1)] | None = None
+    """Widths of the hidden layers of the value network; null for those of the policy, or for none
+    on top of a shared part."""
+    shared_critic: bool = False
+    """The value network starts from the last hidden layer of the policy, which both train."""
+    activation: Literal["silu", "relu", "tanh"] = "silu"
+    """Activation of the hidden layers."""
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
     """Type of the hidden layers during training; bfloat16 is faster on a GPU. Parameters, outputs,
     losses, the optimizer and all evaluations are float32."""
@@ -94,3 +110,18 @@ class PPOConfig(StrictModel):
     def batch_steps(self) -> int:
         """Environment steps in one iteration."""
         return self.num_envs * self.rollout_length
+
+
+def find_algorithm(name: str) -> "type[PPO]":
+    """The algorithm of a name, ppo or FILE.py:CLASS.
+
+    Raises:
+      UserError: there is none.
+    """
+    from bounce_mjx.learning.ppo import PPO
+
+    if is_file(name):
+        return class_in_file(name, PPO)
+    if name != PPO_NAME:
+        raise UserError(f"there is no algorithm {shorten(name)!r}; give ppo or FILE.py:CLASS")
+    return PPO

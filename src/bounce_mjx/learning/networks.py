@@ -1,4 +1,4 @@
-"""The policy and the value network: multilayer perceptrons with SiLU and orthogonal weights.
+"""The policy and the value network: multilayer perceptrons with orthogonal weights.
 
 A policy's file stores the parameters under the names of these modules, so the names must not
 change.
@@ -66,14 +66,16 @@ class Gaussian(NamedTuple):
 
 
 class MLP(nn.Module):
-    """Dense layers hidden_0, hidden_1, ... with SiLU between them."""
+    """Dense layers hidden_0, hidden_1, ... with an activation between them."""
 
     widths: tuple[int, ...]
     """Width of each layer."""
     activate_final: bool
-    """Whether SiLU follows the last layer too."""
+    """Whether the activation follows the last layer too."""
     dtype: Any = None
-    """Type in which layers with SiLU are computed; None for that of inputs and parameters."""
+    """Type in which hidden layers are computed; None for that of inputs and parameters."""
+    activation: str = "silu"
+    """Name of the activation in `flax.linen`."""
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
@@ -83,7 +85,7 @@ class MLP(nn.Module):
             dtype = self.dtype if is_hidden else None
             init, name = orthogonal(_GAIN), f"hidden_{i}"
             dense = nn.Dense(width, dtype=dtype, kernel_init=init, name=name)
-            x = nn.silu(dense(x)) if is_hidden else dense(x)
+            x = getattr(nn, self.activation)(dense(x)) if is_hidden else dense(x)
         return x
 
 
@@ -109,11 +111,12 @@ class PolicyNetwork(nn.Module):
     init_noise_std: float
     dtype: Any = None
     """Type in which the hidden layers are computed; None for that of inputs and parameters."""
+    activation: str = "silu"
 
     @nn.compact
     def __call__(self, observation: jax.Array) -> Gaussian:
         """Distribution of the action [..., A] for normalised observations [..., N]."""
-        hidden = MLP(self.hidden_layers, activate_final=True, dtype=self.dtype)(observation)
+        hidden = MLP(self.hidden_layers, True, self.dtype, self.activation)(observation)
         mean_init = orthogonal(_MEAN_GAIN)
         mean = nn.Dense(self.action_size, kernel_init=mean_init)(hidden)
         std = LogParameter(self.action_size, self.init_noise_std, name="std_logparam")()

@@ -36,7 +36,10 @@ class Networks(NamedTuple):
     policy_network: NetworkFunctions
     """Its inputs are observations, its output is a `Gaussian` over actions [..., A]."""
     value_network: NetworkFunctions
-    """Its inputs are the observation and the critic metrics, its output the values [...]."""
+    """Its inputs are the observation (or the features) and the critic metrics, its output the
+    values [...]."""
+    features: Callable[[Any, jax.Array], jax.Array]
+    """(parameters of the policy, normalised observations [..., N]) -> its last hidden layer."""
 
     def act(self, policy: Policy, observation: jax.Array) -> jax.Array:
         """The most likely actions [..., A] for observations [..., N], clipped to [-1, 1]."""
@@ -65,10 +68,13 @@ def make_networks(
       dtype: type in which the hidden layers are computed; by default, that of their inputs and
         parameters.
     """
-    sizes = action_size, config.init_noise_std
-    policy = PolicyNetwork(config.hidden_layers, *sizes, dtype)
-    value = MLP((*config.hidden_layers, 1), activate_final=False, dtype=dtype)
-    critic_size = observation_size + num_critic_metrics
+    layers, activation = config.hidden_layers, config.activation
+    policy = PolicyNetwork(layers, action_size, config.init_noise_std, dtype, activation)
+    hidden = MLP(layers, activate_final=True, dtype=dtype, activation=activation)
+    critic_layers = config.critic_layers or (() if config.shared_critic else layers)
+    value = MLP((*critic_layers, 1), activate_final=False, dtype=dtype, activation=activation)
+    critic_size = layers[-1] if config.shared_critic else observation_size
+    critic_size += num_critic_metrics
     return Networks(
         policy_network=NetworkFunctions(
             init=lambda key: policy.init(key, jnp.zeros((1, observation_size))),
@@ -78,6 +84,7 @@ def make_networks(
             init=lambda key: value.init(key, jnp.zeros((1, critic_size))),
             apply=lambda params, inputs: value.apply(params, inputs)[..., 0],
         ),
+        features=lambda params, inputs: hidden.apply({"params": params["params"]["MLP_0"]}, inputs),
     )
 
 

@@ -1,13 +1,12 @@
 """Proximal policy optimisation, read from top to bottom: collect -> advantages -> update.
 
-`make_trainer` gives two pure functions over one pytree of state: `init(key)` and
+`PPO` has two pure functions over one pytree of state: `init(key)` and
 `run(state, num_iterations)`. Inside `run` everything is a `scan`; nothing returns to Python.
 Arrays have the axes T (control steps of a rollout), B (environments), N (observation), K (critic
 metrics) and A (action); samples have G groups.
 Source: Schulman et al., Proximal Policy Optimization Algorithms (2017).
 """
 
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -41,20 +40,6 @@ _UNROLL = 16
 
 # Quantities that must be finite, in the order in which an iteration computes them.
 CHECKED = ("reward", "observation", "loss/value", "loss/policy", "gradient", "parameters")
-
-
-class PPO(NamedTuple):
-    """What stays the same during training."""
-
-    config: PPOConfig
-    env: AnyEnv
-    episode_steps: int
-    """Control steps after which an episode is truncated."""
-    critic_metrics: tuple[str, ...]
-    """Names of the environment's metrics that the value network sees."""
-    networks: Networks
-    optimizer: optax.GradientTransformation
-    """Gradient of the parameters -> direction of a step, which the learning rate scales."""
 
 
 class Params(NamedTuple):
@@ -125,25 +110,289 @@ class TrainingFunctions(NamedTuple):
     result of `first_fault`."""
 
 
-def make_trainer(config: PPOConfig, env: AnyEnv, episode_steps: int) -> TrainingFunctions:
-    """Builds the trainer of an environment whose episodes are truncated at `episode_steps`.
+class LearnerState(NamedTuple):
+    """What a minibatch step changes."""
 
-    Raises:
-      UserError: a rollout is longer than an episode, or the environment lacks a critic metric.
-    """
-    if config.rollout_length > episode_steps:
-        raise UserError(
-            f"rollout_length {config.rollout_length} is longer than an episode of {episode_steps} "
-            "control steps; choose a shorter rollout or longer episodes"
+    params: jax.Array
+    """All parameters in one array: on a GPU, each array costs kernels in every step."""
+    optimizer: optax.OptState
+    learning_rate: jax.Array
+
+
+class PPO:
+    """Training as two pure functions, `init` and `run`; `jax.jit` them (the second argument of
+    `run` is static). A subclass may change every method (docs/algorithms.md)."""
+
+    Config = PPOConfig
+    """Type of the settings; a subclass may add some, which become keys and flags."""
+
+    def __init__(self, config: PPOConfig, env: AnyEnv, episode_steps: int):
+        """
+        Args:
+          episode_steps: control steps after which an episode is truncated.
+
+        Raises:
+          UserError: a rollout is longer than an episode, or the environment lacks a critic metric.
+        """
+        if config.rollout_length > episode_steps:
+            raise UserError(
+                f"rollout_length {config.rollout_length} is longer than an episode of "
+                f"{episode_steps} control steps; choose a shorter rollout or longer episodes"
+            )
+        self.config, self.env, self.episode_steps = config, env, episode_steps
+        self.critic_metrics = names_of_critic_metrics(config, env)
+        """Names of the environment's metrics that the value network sees."""
+        self.networks = self.make_networks()
+        self.optimizer = self.make_optimizer()
+
+    def make_networks(self) -> Networks:
+        """The networks. That of the policy stays as its config says, for all that acts with it."""
+        sizes = self.env.observation_size, self.env.action_size, len(self.critic_metrics)
+        return make_networks(self.config, *sizes, dtype=self.config.compute_dtype)
+
+    def make_optimizer(self) -> optax.GradientTransformation:
+        """Gradient of the parameters -> direction of a step, which the learning rate scales: Adam
+        on clipped gradients."""
+        clip = optax.clip_by_global_norm(self.config.max_grad_norm)
+        return optax.chain(clip, optax.scale_by_adam(eps=1e-5))
+
+    def init(self, key: jax.Array) -> TrainingState:
+        """The state before the first iteration; consumes the key."""
+        config, env = self.config, self.env
+        key, policy_key, value_key, env_key, clock_key = jax.random.split(key, 5)
+        params = Params(
+            self.networks.policy_network.init(policy_key),
+            self.networks.value_network.init(value_key),
         )
-    critic_metrics = names_of_critic_metrics(config, env)
-    sizes = env.observation_size, env.action_size, len(critic_metrics)
-    networks = make_networks(config, *sizes, dtype=config.compute_dtype)
-    # Adam on clipped gradients.
-    clip = optax.clip_by_global_norm(config.max_grad_norm)
-    optimizer = optax.chain(clip, optax.scale_by_adam(eps=1e-5))
-    ppo = PPO(config, env, episode_steps, critic_metrics, networks, optimizer)
-    return TrainingFunctions(functools.partial(init, ppo), functools.partial(run, ppo))
+        ranges = vector.ranges_after(env, jnp.int32(0), config.batch_steps)
+        env_state = vector.reset(env, env_key, config.num_envs, ranges)
+        # With equal clocks, all episodes would time out together.
+        clock = jax.random.randint(clock_key, (config.num_envs,), 0, self.episode_steps)
+        return TrainingState(
+            params=params,
+            optimizer=self.optimizer.init(ravel_pytree(params)[0]),
+            statistics=statistics.init_statistics(env.observation_size + len(self.critic_metrics)),
+            learning_rate=jnp.float32(config.learning_rate),
+            env=env_state._replace(clock=clock),
+            key=key,
+            iteration=jnp.int32(0),
+        )
+
+    def run(self, state: TrainingState, num_iterations: int) -> tuple[TrainingState, Metrics]:
+        """Iterations; see `TrainingFunctions`."""
+
+        def step(state: TrainingState, _) -> tuple[TrainingState, Metrics]:
+            state, metrics = self.iterate(state._replace(env=unpack(state.env)))
+            return state._replace(env=pack(state.env)), metrics
+
+        state, metrics = jax.lax.scan(
+            step, state._replace(env=pack(state.env)), length=num_iterations
+        )
+        return state._replace(env=unpack(state.env)), metrics
+
+    def iterate(self, state: TrainingState) -> tuple[TrainingState, Metrics]:
+        """One iteration: collect -> advantages -> update."""
+        key, collect_key, update_key = jax.random.split(state.key, 3)
+        env, rollout, ends, metrics = self.collect(state, collect_key)
+        advantage, value_target = self.advantages(state, rollout, ends)
+        # The next rollout normalises by the new statistics, so the networks learn on inputs
+        # normalised by them; otherwise the policy would shift with every change of the statistics.
+        new_statistics = statistics.update(state.statistics, rollout.inputs)
+        samples = Samples(
+            inputs=normalize(rollout.inputs, new_statistics.normalizer),
+            action=rollout.action,
+            log_prob=rollout.log_prob,
+            advantage=advantage,
+            value_target=value_target,
+            noise_bound=jnp.broadcast_to(noise_bounds(self.config), (*value_target.shape, 1)),
+        )
+        state, minibatches = self.update(state, samples, update_key)
+        fault = first_fault(metrics["reward"], new_statistics, minibatches, state.params)
+        metrics |= {name: jnp.mean(values) for name, values in minibatches.items()}
+        metrics |= {
+            "policy/kl": jnp.mean(minibatches["policy/kl"][-1]),
+            "policy/learning_rate": state.learning_rate,
+            "loss/explained_variance": 1.0 - jnp.var(advantage) / jnp.var(value_target),
+            "fault": fault,
+        }
+        return state._replace(
+            statistics=new_statistics, env=env, key=key, iteration=state.iteration + 1
+        ), metrics
+
+    def collect(
+        self, state: TrainingState, key: jax.Array
+    ) -> tuple[vector.VectorState, Rollout, jax.Array, Metrics]:
+        """Runs the policy for T steps.
+
+        Returns:
+          The environments' states after the last step; the rollout; the inputs [2, B, N + K] of the
+          networks after the last step, and at each environment's time-out before its reset (unused
+          for an environment that did not time out); the metrics of the rollout.
+        """
+        config, env = self.config, self.env
+        noise_key, reset_key = jax.random.split(key)
+        # All numbers are sampled at once, because on a GPU each sample costs a kernel or two.
+        shape = (config.rollout_length, config.num_envs, env.action_size)
+        noise = jax.random.normal(noise_key, shape, jnp.float32)
+        ranges = vector.ranges_after(env, state.iteration, config.batch_steps)
+        # One start for each environment: one that ends twice within a rollout starts twice alike.
+        fresh = vector.first_states(env, reset_key, config.num_envs, ranges)
+
+        def step(carry, noise):
+            packed, timeout_inputs = carry
+            env_state = unpack(packed)
+            inputs = self.network_inputs(vector.observe(env_state), env_state.env.metrics)
+            normalized = normalize(inputs, state.statistics.normalizer)
+            policy = self.distribution(state.params, normalized, noise_bounds(config))
+            action = policy.mean + policy.std * noise
+            env_state, result = vector.step_with(env, env_state, action, fresh, self.episode_steps)
+            # An environment times out at most once in a rollout, because no time limit is shorter.
+            final_inputs = self.network_inputs(result.final_observation, result.metrics)
+            timeout_inputs = jnp.where(result.truncated[:, None], final_inputs, timeout_inputs)
+            step = Rollout(
+                inputs=inputs,
+                action=action,
+                log_prob=policy.log_prob(action),
+                reward=(config.reward_scale * result.reward).astype(jnp.float32),
+                terminated=result.terminated,
+                truncated=result.truncated,
+            )
+            metrics = step_metrics(result, num_groups(config), env.task.curves)
+            return (pack(env_state), timeout_inputs), (step, pack(metrics))
+
+        no_inputs = jnp.zeros((config.num_envs, state.statistics.mean.size))
+        (packed, timeout_inputs), (rollout, metrics) = jax.lax.scan(
+            step, (pack(state.env), no_inputs), noise
+        )
+        env_state = unpack(packed)
+        last_inputs = self.network_inputs(vector.observe(env_state), env_state.env.metrics)
+        ends = jnp.stack([last_inputs, timeout_inputs])
+        return env_state, rollout, ends, rollout_metrics(unpack(metrics), self.env.task.curves)
+
+    def network_inputs(self, observation: jax.Array, metrics: Metrics) -> jax.Array:
+        """Inputs of the networks before normalisation [B, N + K]."""
+        columns = [metrics[name][:, None] for name in self.critic_metrics]
+        return jnp.concatenate([observation, *columns], axis=-1, dtype=jnp.float32)
+
+    def distribution(self, params: Params, inputs: jax.Array, noise_bound: jax.Array) -> Gaussian:
+        """The policy's distribution of the action [..., A] for normalised inputs [..., N + K].
+
+        Args:
+          noise_bound: lower bounds of the standard deviation [..., 1]. It is the root of the sum of
+            squares, as a clipped one would have no gradient.
+        """
+        observation = inputs[..., : self.env.observation_size]
+        mean, std = self.networks.policy_network.apply(params.policy, observation)
+        return Gaussian(mean, jnp.sqrt(jnp.square(std) + jnp.square(noise_bound)))
+
+    def values(self, params: Params, inputs: jax.Array) -> jax.Array:
+        """Values [...] of states with normalised inputs [..., N + K]."""
+        if self.config.shared_critic:
+            observation, metrics = jnp.split(inputs, [self.env.observation_size], axis=-1)
+            features = self.networks.features(params.policy, observation)
+            inputs = jnp.concatenate([features, metrics], axis=-1)
+        return self.networks.value_network.apply(params.value, inputs)
+
+    def advantages(
+        self, state: TrainingState, rollout: Rollout, ends: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Advantages and targets of the values [T, B].
+
+        Args:
+          ends: inputs after the last step and at the time-outs (`collect`).
+        """
+        inputs = jnp.concatenate([rollout.inputs, ends])
+        inputs = normalize(inputs, state.statistics.normalizer)
+        values = self.values(state.params, inputs)
+        values, timeout_values = values[:-1], values[-1]
+        advantage = generalized_advantages(
+            rollout.reward,
+            values[:-1],
+            jnp.where(rollout.truncated, timeout_values, values[1:]),
+            rollout.terminated,
+            rollout.truncated,
+            self.config.discount,
+            self.config.gae_lambda,
+        )
+        return advantage, advantage + values[:-1]
+
+    def update(
+        self, state: TrainingState, samples: Samples, key: jax.Array
+    ) -> tuple[TrainingState, Metrics]:
+        """Several epochs of minibatch steps; also metrics of each step [epochs, minibatches]."""
+        config, groups = self.config, num_groups(self.config)
+        samples = jax.tree.map(lambda x: group(x, groups), samples)
+        size = samples.log_prob.shape[1]
+        limit = max_learning_rate(config, state.iteration)
+        flat, unravel = ravel_pytree(state.params)
+
+        def step(learner, minibatch):
+            order, advantage = minibatch
+            batch = jax.tree.map(lambda x: chosen(x, order), samples)._replace(advantage=advantage)
+            # With the groups as an axis of their own, XLA transposes the layers' outputs on a CPU.
+            batch = jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), batch)
+            batch_loss = lambda flat: self.loss(unravel(flat), batch)  # noqa: E731
+            learner, metrics = self.minibatch_step(batch_loss, learner, limit)
+            return learner, pack(metrics)
+
+        def epoch(learner, key):
+            orders = jax.vmap(lambda key: random_order(key, size))(jax.random.split(key, groups))
+            orders = jnp.moveaxis(orders.reshape((groups, config.num_minibatches, -1)), 1, 0)
+            # All minibatches at once: on several devices each reduction is a message, and every
+            # minibatch already has one for its gradient.
+            advantage = jax.vmap(lambda order: chosen(samples.advantage, order))(orders)
+            mean = jnp.mean(advantage, axis=(1, 2), keepdims=True)
+            deviation = jnp.std(advantage, axis=(1, 2), keepdims=True)
+            return jax.lax.scan(step, learner, (orders, (advantage - mean) / (deviation + 1e-8)))
+
+        learner = LearnerState(flat, state.optimizer, state.learning_rate)
+        learner, metrics = jax.lax.scan(epoch, learner, jax.random.split(key, config.num_epochs))
+        return state._replace(
+            params=unravel(learner.params),
+            optimizer=learner.optimizer,
+            learning_rate=learner.learning_rate,
+        ), unpack(metrics)
+
+    def minibatch_step(
+        self, batch_loss: Callable, learner: LearnerState, limit: jax.Array
+    ) -> tuple[LearnerState, Metrics]:
+        """One step of the optimizer.
+
+        Args:
+          batch_loss: parameters in one array -> the loss of the minibatch [], and its parts.
+          limit: upper limit of the learning rate [].
+        """
+        gradient, metrics = jax.grad(batch_loss, has_aux=True)(learner.params)
+        direction, optimizer = self.optimizer.update(gradient, learner.optimizer)
+        rate = learner.learning_rate
+        metrics["loss/gradient_norm"] = optax.tree.norm(gradient)
+        return LearnerState(
+            params=learner.params - rate * direction,
+            optimizer=optimizer,
+            learning_rate=adapt_learning_rate(self.config, rate, metrics["policy/kl"], limit),
+        ), metrics
+
+    def loss(self, params: Params, samples: Samples) -> tuple[jax.Array, Metrics]:
+        """The loss of a minibatch [], and its parts."""
+        config = self.config
+        policy = self.distribution(params, samples.inputs, samples.noise_bound)
+        log_ratio = policy.log_prob(samples.action) - samples.log_prob
+        ratio = jnp.exp(log_ratio)
+        clipped = jnp.clip(ratio, 1.0 - config.clip_epsilon, 1.0 + config.clip_epsilon)
+        policy_loss = -jnp.mean(jnp.minimum(ratio * samples.advantage, clipped * samples.advantage))
+        values = self.values(params, samples.inputs)
+        value_loss = jnp.mean(jnp.square(values - samples.value_target))
+        entropy = jnp.mean(policy.entropy())
+        total = policy_loss + config.value_cost * value_loss - config.entropy_cost * entropy
+        return total, {
+            "loss/policy": policy_loss,
+            "loss/value": value_loss,
+            "policy/entropy": entropy,
+            # Schulman's low-variance estimate of KL(old || new).
+            "policy/kl": jnp.mean(ratio - 1.0 - log_ratio),
+            "policy/clip_fraction": jnp.mean(jnp.abs(ratio - 1.0) > config.clip_epsilon),
+            "policy/action_std": jnp.mean(policy.std),
+        }
 
 
 def names_of_critic_metrics(config: PPOConfig, env: AnyEnv) -> tuple[str, ...]:
@@ -155,28 +404,6 @@ def names_of_critic_metrics(config: PPOConfig, env: AnyEnv) -> tuple[str, ...]:
     known_metrics = jax.eval_shape(lambda: env.reset(jax.random.PRNGKey(0))).metrics
     wanted = config.critic_metrics
     return matching_metrics(env.task.critic_metrics if wanted is None else wanted, known_metrics)
-
-
-def init(ppo: PPO, key: jax.Array) -> TrainingState:
-    """The state before the first iteration; consumes the key."""
-    config, env = ppo.config, ppo.env
-    key, policy_key, value_key, env_key, clock_key = jax.random.split(key, 5)
-    params = Params(
-        ppo.networks.policy_network.init(policy_key), ppo.networks.value_network.init(value_key)
-    )
-    ranges = vector.ranges_after(env, jnp.int32(0), config.batch_steps)
-    env_state = vector.reset(env, env_key, config.num_envs, ranges)
-    # With equal clocks, all episodes would time out together.
-    clock = jax.random.randint(clock_key, (config.num_envs,), 0, ppo.episode_steps)
-    return TrainingState(
-        params=params,
-        optimizer=ppo.optimizer.init(ravel_pytree(params)[0]),
-        statistics=statistics.init_statistics(env.observation_size + len(ppo.critic_metrics)),
-        learning_rate=jnp.float32(config.learning_rate),
-        env=env_state._replace(clock=clock),
-        key=key,
-        iteration=jnp.int32(0),
-    )
 
 
 def warm_started(
@@ -191,103 +418,6 @@ def warm_started(
     return state._replace(params=params, statistics=statistics)
 
 
-def run(ppo: PPO, state: TrainingState, num_iterations: int) -> tuple[TrainingState, Metrics]:
-    """Iterations; see `TrainingFunctions`."""
-
-    def step(state: TrainingState, _) -> tuple[TrainingState, Metrics]:
-        state, metrics = iterate(ppo, state._replace(env=unpack(state.env)))
-        return state._replace(env=pack(state.env)), metrics
-
-    state, metrics = jax.lax.scan(step, state._replace(env=pack(state.env)), length=num_iterations)
-    return state._replace(env=unpack(state.env)), metrics
-
-
-def iterate(ppo: PPO, state: TrainingState) -> tuple[TrainingState, Metrics]:
-    """One iteration: collect -> advantages -> update."""
-    key, collect_key, update_key = jax.random.split(state.key, 3)
-    env, rollout, ends, metrics = collect(ppo, state, collect_key)
-    advantage, value_target = advantages(ppo, state, rollout, ends)
-    # The next rollout normalises by the new statistics, so the networks learn on inputs normalised
-    # by them; otherwise the policy would shift with every change of the statistics.
-    new_statistics = statistics.update(state.statistics, rollout.inputs)
-    samples = Samples(
-        inputs=normalize(rollout.inputs, new_statistics.normalizer),
-        action=rollout.action,
-        log_prob=rollout.log_prob,
-        advantage=advantage,
-        value_target=value_target,
-        noise_bound=jnp.broadcast_to(noise_bounds(ppo.config), (*value_target.shape, 1)),
-    )
-    state, minibatches = update(ppo, state, samples, update_key)
-    fault = first_fault(metrics["reward"], new_statistics, minibatches, state.params)
-    metrics |= {name: jnp.mean(values) for name, values in minibatches.items()}
-    metrics |= {
-        "policy/kl": jnp.mean(minibatches["policy/kl"][-1]),
-        "policy/learning_rate": state.learning_rate,
-        "fault": fault,
-    }
-    return state._replace(
-        statistics=new_statistics, env=env, key=key, iteration=state.iteration + 1
-    ), metrics
-
-
-def collect(
-    ppo: PPO, state: TrainingState, key: jax.Array
-) -> tuple[vector.VectorState, Rollout, jax.Array, Metrics]:
-    """Runs the policy for T steps.
-
-    Returns:
-      The environments' states after the last step; the rollout; the inputs [2, B, N + K] of the
-      networks after the last step, and at each environment's time-out before its reset (unused for
-      an environment that did not time out); the metrics of the rollout.
-    """
-    config, env = ppo.config, ppo.env
-    noise_key, reset_key = jax.random.split(key)
-    # All numbers are sampled at once, because on a GPU each sample costs a kernel or two.
-    shape = (config.rollout_length, config.num_envs, env.action_size)
-    noise = jax.random.normal(noise_key, shape, jnp.float32)
-    ranges = vector.ranges_after(env, state.iteration, config.batch_steps)
-    # One start for each environment: one that ends twice within a rollout starts twice alike.
-    fresh = vector.first_states(env, reset_key, config.num_envs, ranges)
-
-    def step(carry, noise):
-        packed, timeout_inputs = carry
-        env_state = unpack(packed)
-        inputs = network_inputs(ppo, vector.observe(env_state), env_state.env.metrics)
-        normalized = normalize(inputs, state.statistics.normalizer)
-        policy = distribution(ppo, state.params, normalized, noise_bounds(config))
-        action = policy.mean + policy.std * noise
-        env_state, result = vector.step_with(env, env_state, action, fresh, ppo.episode_steps)
-        # An environment times out at most once in a rollout, because no time limit is shorter.
-        final_inputs = network_inputs(ppo, result.final_observation, result.metrics)
-        timeout_inputs = jnp.where(result.truncated[:, None], final_inputs, timeout_inputs)
-        step = Rollout(
-            inputs=inputs,
-            action=action,
-            log_prob=policy.log_prob(action),
-            reward=(config.reward_scale * result.reward).astype(jnp.float32),
-            terminated=result.terminated,
-            truncated=result.truncated,
-        )
-        metrics = step_metrics(result, num_groups(config), env.task.curves)
-        return (pack(env_state), timeout_inputs), (step, pack(metrics))
-
-    no_inputs = jnp.zeros((config.num_envs, state.statistics.mean.size))
-    (packed, timeout_inputs), (rollout, metrics) = jax.lax.scan(
-        step, (pack(state.env), no_inputs), noise
-    )
-    env_state = unpack(packed)
-    last_inputs = network_inputs(ppo, vector.observe(env_state), env_state.env.metrics)
-    ends = jnp.stack([last_inputs, timeout_inputs])
-    return env_state, rollout, ends, rollout_metrics(unpack(metrics), ppo.env.task.curves)
-
-
-def network_inputs(ppo: PPO, observation: jax.Array, metrics: Metrics) -> jax.Array:
-    """Inputs of the networks before normalisation [B, N + K]."""
-    columns = [metrics[name][:, None] for name in ppo.critic_metrics]
-    return jnp.concatenate([observation, *columns], axis=-1, dtype=jnp.float32)
-
-
 def noise_bounds(config: PPOConfig) -> jax.Array:
     """Lower bounds of the action noise of each environment [B, 1]: evenly from 0 to twice
     min_noise_std.
@@ -298,42 +428,6 @@ def noise_bounds(config: PPOConfig) -> jax.Array:
     """
     share = (jnp.arange(config.num_envs) + 0.5) / config.num_envs
     return 2.0 * config.min_noise_std * share[:, None]
-
-
-def distribution(ppo: PPO, params: Params, inputs: jax.Array, noise_bound: jax.Array) -> Gaussian:
-    """The policy's distribution of the action [..., A] for normalised inputs [..., N + K].
-
-    Args:
-      noise_bound: lower bounds of the standard deviation [..., 1]. It is the root of the sum of
-        squares, as a clipped one would have no gradient.
-    """
-    observation = inputs[..., : ppo.env.observation_size]
-    mean, std = ppo.networks.policy_network.apply(params.policy, observation)
-    return Gaussian(mean, jnp.sqrt(jnp.square(std) + jnp.square(noise_bound)))
-
-
-def advantages(
-    ppo: PPO, state: TrainingState, rollout: Rollout, ends: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Advantages and targets of the values [T, B].
-
-    Args:
-      ends: inputs after the last step and at the time-outs (`collect`).
-    """
-    inputs = jnp.concatenate([rollout.inputs, ends])
-    inputs = normalize(inputs, state.statistics.normalizer)
-    values = ppo.networks.value_network.apply(state.params.value, inputs)
-    values, timeout_values = values[:-1], values[-1]
-    advantage = generalized_advantages(
-        rollout.reward,
-        values[:-1],
-        jnp.where(rollout.truncated, timeout_values, values[1:]),
-        rollout.terminated,
-        rollout.truncated,
-        ppo.config.discount,
-        ppo.config.gae_lambda,
-    )
-    return advantage, advantage + values[:-1]
 
 
 def generalized_advantages(
@@ -369,96 +463,7 @@ def generalized_advantages(
     return advantages
 
 
-class LearnerState(NamedTuple):
-    """What a minibatch step changes."""
-
-    params: jax.Array
-    """All parameters in one array: on a GPU, each array costs kernels in every step."""
-    optimizer: optax.OptState
-    learning_rate: jax.Array
-
-
-def update(
-    ppo: PPO, state: TrainingState, samples: Samples, key: jax.Array
-) -> tuple[TrainingState, Metrics]:
-    """Several epochs of minibatch steps; also the metrics of each step [epochs, minibatches]."""
-    config, groups = ppo.config, num_groups(ppo.config)
-    samples = jax.tree.map(lambda x: group(x, groups), samples)
-    size = samples.log_prob.shape[1]
-    limit = max_learning_rate(config, state.iteration)
-    flat, unravel = ravel_pytree(state.params)
-
-    def step(learner, minibatch):
-        order, advantage = minibatch
-        batch = jax.tree.map(lambda x: chosen(x, order), samples)._replace(advantage=advantage)
-        # With the groups as an axis of their own, XLA transposes the layers' outputs on a CPU.
-        batch = jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), batch)
-        batch_loss = lambda flat: loss(ppo, unravel(flat), batch)  # noqa: E731
-        learner, metrics = minibatch_step(ppo, batch_loss, learner, limit)
-        return learner, pack(metrics)
-
-    def epoch(learner, key):
-        orders = jax.vmap(lambda key: random_order(key, size))(jax.random.split(key, groups))
-        orders = jnp.moveaxis(orders.reshape((groups, config.num_minibatches, -1)), 1, 0)
-        # All minibatches at once: on several devices each reduction is a message, and every
-        # minibatch already has one for its gradient.
-        advantage = jax.vmap(lambda order: chosen(samples.advantage, order))(orders)
-        mean = jnp.mean(advantage, axis=(1, 2), keepdims=True)
-        deviation = jnp.std(advantage, axis=(1, 2), keepdims=True)
-        return jax.lax.scan(step, learner, (orders, (advantage - mean) / (deviation + 1e-8)))
-
-    learner = LearnerState(flat, state.optimizer, state.learning_rate)
-    learner, metrics = jax.lax.scan(epoch, learner, jax.random.split(key, config.num_epochs))
-    return state._replace(
-        params=unravel(learner.params),
-        optimizer=learner.optimizer,
-        learning_rate=learner.learning_rate,
-    ), unpack(metrics)
-
-
-def minibatch_step(
-    ppo: PPO, batch_loss: Callable, learner: LearnerState, limit: jax.Array
-) -> tuple[LearnerState, Metrics]:
-    """One step of the optimizer.
-
-    Args:
-      batch_loss: parameters in one array -> the loss of the minibatch [], and its parts.
-      limit: upper limit of the learning rate [].
-    """
-    gradient, metrics = jax.grad(batch_loss, has_aux=True)(learner.params)
-    direction, optimizer = ppo.optimizer.update(gradient, learner.optimizer)
-    rate = learner.learning_rate
-    metrics["loss/gradient_norm"] = optax.tree.norm(gradient)
-    return LearnerState(
-        params=learner.params - rate * direction,
-        optimizer=optimizer,
-        learning_rate=adapt_learning_rate(ppo.config, rate, metrics["policy/kl"], limit),
-    ), metrics
-
-
-def loss(ppo: PPO, params: Params, samples: Samples) -> tuple[jax.Array, Metrics]:
-    """The loss of a minibatch [], and its parts."""
-    config = ppo.config
-    policy = distribution(ppo, params, samples.inputs, samples.noise_bound)
-    log_ratio = policy.log_prob(samples.action) - samples.log_prob
-    ratio = jnp.exp(log_ratio)
-    clipped = jnp.clip(ratio, 1.0 - config.clip_epsilon, 1.0 + config.clip_epsilon)
-    policy_loss = -jnp.mean(jnp.minimum(ratio * samples.advantage, clipped * samples.advantage))
-    values = ppo.networks.value_network.apply(params.value, samples.inputs)
-    value_loss = jnp.mean(jnp.square(values - samples.value_target))
-    entropy = jnp.mean(policy.entropy())
-    total = policy_loss + config.value_cost * value_loss - config.entropy_cost * entropy
-    return total, {
-        "loss/policy": policy_loss,
-        "loss/value": value_loss,
-        "policy/entropy": entropy,
-        # Schulman's low-variance estimate of KL(old || new).
-        "policy/kl": jnp.mean(ratio - 1.0 - log_ratio),
-        "policy/action_std": jnp.mean(policy.std),
-    }
-
-
-def population(trainer: TrainingFunctions) -> TrainingFunctions:
+def population(trainer: PPO) -> TrainingFunctions:
     """A trainer of S independent runs: keys [S, 2] -> states with S as the first axis of every
     array; metrics are [S, I]."""
 

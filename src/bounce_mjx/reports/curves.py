@@ -128,6 +128,7 @@ def _settings(run: Path, config: TrainConfig) -> dict[str, Any]:
     settings = flat(config.model_dump(mode="json", exclude=set(_FREE_KEYS)))
     # The paths of the run's own copies would put every run in a separate group.
     settings["task"] = identify_task(config.task)
+    settings["algorithm"] = identify_task(config.algorithm)
     if config.env.mjcf is not None:
         settings["env.mjcf"] = identify_robot(config.env.mjcf, run)
     return settings

@@ -23,7 +23,7 @@ from bounce_mjx.config.settings import (
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.lazy import jax
-from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.config import PPO_NAME, PPOConfig, find_algorithm
 from bounce_mjx.resources import PRETRAINED, resource_path
 from bounce_mjx.robot.config import is_packaged
 from bounce_mjx.runs.files import check_copy
@@ -61,7 +61,9 @@ class TrainConfig(StrictModel):
     """Name of the task, or FILE.py:CLASS for your own."""
     env: pydantic.SerializeAsAny[WorldConfig]
     """The world and the task."""
-    ppo: PPOConfig = PPOConfig()
+    algorithm: str = PPO_NAME
+    """ppo, or FILE.py:CLASS for a subclass of `bounce_mjx.learning.ppo.PPO`."""
+    ppo: pydantic.SerializeAsAny[PPOConfig] = PPOConfig()
     """The trainer."""
     seed: NonNegativeInt = 0
     """Seed of the run."""
@@ -98,7 +100,7 @@ class TrainConfig(StrictModel):
         """Equal settings are equal, whichever class of `train_config` has them."""
         return isinstance(other, TrainConfig) and dict(self) == dict(other)
 
-    @pydantic.field_validator("task")
+    @pydantic.field_validator("task", "algorithm")
     @classmethod
     def _make_absolute(cls, name: str) -> str:
         """A run's config is read from other folders too."""
@@ -107,7 +109,15 @@ class TrainConfig(StrictModel):
     @pydantic.model_validator(mode="before")
     @classmethod
     def _complete(cls, values: Any) -> Any:
-        """The task and the settings that belong to it determine each other."""
+        """The task and the settings that belong to it determine each other. Whatever acts with a
+        policy needs no settings of its own algorithm, whose code is not run."""
+        if isinstance(values, dict) and isinstance(values.get("ppo"), dict):
+            if (
+                is_file(str(values.get("algorithm")))
+                and cls.model_fields["ppo"].annotation is PPOConfig
+            ):
+                known = {k: v for k, v in values["ppo"].items() if k in PPOConfig.model_fields}
+                values = values | {"ppo": known}
         if not isinstance(values, dict) or not cls.model_fields["env"].is_required():
             return values
         env = values.get("env")
@@ -119,16 +129,23 @@ class TrainConfig(StrictModel):
 
 
 @functools.cache
-def train_config(task: type[Task], base: type[ConfigT] = TrainConfig) -> type[ConfigT]:
-    """The class `base` with the settings of a task: the field `env`, and defaults of others.
+def train_config(
+    task: type[Task], base: type[ConfigT] = TrainConfig, ppo: type[PPOConfig] = PPOConfig
+) -> type[ConfigT]:
+    """The class `base` with the settings of a task and of an algorithm: the fields `env` and `ppo`,
+    and defaults of others.
 
     Args:
       task: the task, as from `find_task`.
-      base: `TrainConfig`, or a command line with a field `env`.
+      base: `TrainConfig`, or the command line that trains.
+      ppo: settings of the algorithm.
     """
     kinds = {"task": str, "log_dir": PlainPath}
     kinds["env"] = Annotated[task.Config, *base.model_fields["env"].metadata]
+    if "ppo" in base.model_fields:
+        kinds["ppo"] = Annotated[ppo, *base.model_fields["ppo"].metadata]
     defaults = {"task": task_name(task), "env": task.Config(), "log_dir": runs_folder(task)}
+    defaults["ppo"] = ppo()
     return pydantic.create_model(
         base.__name__,
         __base__=base,
@@ -148,12 +165,15 @@ def runs_folder(task: type[Task]) -> Path:
     return Path("runs") / (vars(task).get("folder") or task.__name__.lower())
 
 
-def load_run_config(run: Path, task: str | None = None) -> TrainConfig:
+def load_run_config(
+    run: Path, task: str | None = None, algorithm: str | None = None
+) -> TrainConfig:
     """Reads the resolved config of a run.
 
     Args:
       task: the task as the user names it. A run whose task is a file needs the name once in a
         process, because the file is code.
+      algorithm: the algorithm as the user names it; needed only to train on.
 
     Raises:
       UserError: the file is missing or damaged, the run's copy of its robot was edited, or its task
@@ -162,7 +182,9 @@ def load_run_config(run: Path, task: str | None = None) -> TrainConfig:
     path = run / CONFIG_FILE
     values = {"task": DEFAULT} | _read(path)
     values.pop(BASE, None)
-    config = validate(train_config(task_of_run(values["task"], run, task)), values, str(path))
+    ppo = PPOConfig if algorithm is None else find_algorithm(algorithm).Config
+    its_task = task_of_run(values["task"], run, task)
+    config = validate(train_config(its_task, ppo=ppo), values, str(path))
     if config.env.mjcf is not None and not is_packaged(config.env.mjcf):
         check_copy(config.env.mjcf, run / ROBOT, "--mjcf")
     return config
@@ -173,6 +195,7 @@ def load_config(
     robot: Path | None = None,
     task: str | None = None,
     world: Path | None = None,
+    algorithm: str | None = None,
 ) -> TrainConfig:
     """Reads a run's config from a YAML file, with defaults for missing keys. A relative path of an
     MJCF file starts at the folder of the YAML file.
@@ -183,23 +206,28 @@ def load_config(
       robot: config of a robot, whose keys win over those of the file.
       task: the task as the user names it; by default, the file's.
       world: file of a named world, which replaces that of the file and may have a robot.
+      algorithm: the algorithm as the user names it; by default, the file's.
 
     Raises:
       UserError: the file is missing, is not a YAML mapping, has an unknown key or a bad value, or
-        its task is a file that the user has not named.
+        its task or algorithm is a file that the user has not named.
     """
     files = [path] if isinstance(path, Path) else path
     path = " on ".join(map(shown_file, reversed(files)))
     values = functools.reduce(merged, map(_read, files), {})
     values.pop(BASE, None)
-    name = task or values.get("task", DEFAULT)
-    if task is None and is_file(name):
-        raise UserError(
-            f"{path} has its task in the file {name}, which is code; name it yourself to run it: "
-            f"--task {name}"
-        )
-    config_class = train_config(find_task(name))
-    values["task"] = name
+    defaults = {"task": (task, DEFAULT), "algorithm": (algorithm, PPO_NAME)}
+    for key, (given, default) in defaults.items():
+        name = given or values.get(key, default)
+        if given is None and is_file(name):
+            raise UserError(
+                f"{path} has its {key} in the file {name}, which is code; name it yourself to run "
+                f"it: --{key} {name}"
+            )
+        values[key] = name
+    own = values["algorithm"] != PPO_NAME
+    ppo = find_algorithm(values["algorithm"]).Config if own else PPOConfig
+    config_class = train_config(find_task(values["task"]), ppo=ppo)
     named = None if world is None else read_world(world)
     if named is not None and named.robot is not None:
         if robot is not None:
@@ -278,6 +306,7 @@ def read_preset(
     task: str | None = None,
     world: Path | None = None,
     machine: Path | None = None,
+    algorithm: str | None = None,
 ) -> TrainConfig:
     """Reads the config of the files in `preset_files`.
 
@@ -289,13 +318,15 @@ def read_preset(
       world: a named world, which replaces the preset's: a YAML file, or the name of a file in
         configs/worlds/.
       machine: see `preset_files`.
+      algorithm: the algorithm as the user names it; by default, the files'.
 
     Raises:
       UserError: a file is missing or invalid.
     """
     files = preset_files(path, task, machine)
     robot = robot and _named(robot, ROBOTS, "robot")
-    return load_config(files, robot, task, world and _named(world, WORLDS, "world"))
+    world = world and _named(world, WORLDS, "world")
+    return load_config(files, robot, task, world, algorithm)
 
 
 def preset_files(
@@ -394,14 +425,16 @@ def has_plugin() -> bool:
 
 def _read(path: Path, kind: str = "config file", example: str = _EXAMPLE) -> dict[str, Any]:
     """The values of a config file (`read_mapping`), with absolute paths of the MJCF file and of the
-    task's file."""
+    files of the task and the algorithm."""
     values = read_mapping(path, kind, example)
-    name, env = values.get("task", DEFAULT), values.get("env")
-    if not isinstance(name, str):
-        raise UserError(f"{path}: task is {shorten(repr(name))}; give the name of a task")
-    if is_file(name) and not name.startswith("~"):
-        name = str((path.parent / name).absolute())
+    for key in ("task", "algorithm"):
+        name = values.get(key, "")
+        if not isinstance(name, str):
+            raise UserError(f"{path}: {key} is {shorten(repr(name))}; give a name")
+        if is_file(name) and not name.startswith("~"):
+            values = values | {key: str((path.parent / name).absolute())}
+    env = values.get("env")
     mjcf = env.get("mjcf") if isinstance(env, dict) else None
     if isinstance(mjcf, str) and not mjcf.startswith("~") and not is_packaged(Path(mjcf)):
         values = values | {"env": env | {"mjcf": str(path.parent / mjcf)}}
-    return values | {"task": name} if "task" in values else values
+    return values

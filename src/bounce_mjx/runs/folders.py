@@ -3,7 +3,7 @@
     runs/<task>/<time stamp, UTC>/
         config.yaml                     the resolved config
         robot/                          a copy of --mjcf and its files (`runs.robot`)
-        task/                           a copy of the task's file (`runs.task`)
+        task/, algorithm/               copies of the files of own ones (`runs.task`)
         events.out.tfevents.*           TensorBoard scalars
         results.json                    all evaluations, and the time of each activity
         checkpoints/<steps>/            of the newest state, and of the one with the best evaluation
@@ -43,7 +43,7 @@ from bounce_mjx.runs.config import BASE, CONFIG_FILE, TrainConfig, runs_folder
 from bounce_mjx.runs.files import read_json, write_atomically
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.robot import ROBOT, copy_robot
-from bounce_mjx.runs.task import copy_task
+from bounce_mjx.runs.task import copy_code
 from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file
 
 POLICY_OF_TASK = {DEFAULT: PRETRAINED} | {task: task for task in TASK_POLICIES}
@@ -122,7 +122,10 @@ def save_config(run: Path, config: TrainConfig) -> None:
     """Writes the run's resolved config, and copies of its robot and of its task's file unless the
     run has them."""
     if is_file(config.task):
-        config = config.model_copy(update={"task": copy_task(config.task, run)})
+        config = config.model_copy(update={"task": copy_code(config.task, run)})
+    if is_file(config.algorithm):
+        copied = copy_code(config.algorithm, run, "algorithm")
+        config = config.model_copy(update={"algorithm": copied})
     if (mjcf := config.env.mjcf) is not None:
         if not mjcf.is_relative_to((run / ROBOT).absolute()):
             mjcf = copy_robot(mjcf, run).absolute()

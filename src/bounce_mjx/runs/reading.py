@@ -153,9 +153,9 @@ def read_record(checkpoint: Checkpoint) -> Record:
             print(f"warning: {folder} has no {MANIFEST_FILE} to find damage by", file=sys.stderr)
         name = old.RECORD_FILE if old.is_old(folder) else f"{RECORD}/metadata"
         record = read_json(folder / name, Record)
-        is_copy = is_file(run_config.task) and is_file(str(record.config.get("task")))
-        its_task = {"task": run_config.task} if is_copy else {}
-        config = type(run_config).model_validate(record.config | its_task)
+        own = {key: getattr(run_config, key) for key in ("task", "algorithm")}
+        copies = {k: v for k, v in own.items() if is_file(v) and is_file(str(record.config.get(k)))}
+        config = type(run_config).model_validate(record.config | copies)
     except pydantic.ValidationError as error:
         raise _damaged(checkpoint, ValueError(first_mistake(error))) from error
     except (OSError, ValueError) as error:

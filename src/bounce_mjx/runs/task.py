@@ -1,4 +1,5 @@
-"""The copy of a task's file in the run that trains it, in the run's folder `task`.
+"""The copy of a task's file in the run that trains it, in the run's folder `task`; and that of an
+algorithm's file, in `algorithm`.
 
 A run of a task of the package, or of an installed one, has no copy.
 """
@@ -15,8 +16,9 @@ from bounce_mjx.tasks import registry
 TASK = "task"
 
 
-def copy_task(name: str, run: Path) -> str:
-    """Copies the file of a task FILE.py:CLASS into a run's folder, unless the run has a copy.
+def copy_code(name: str, run: Path, folder: str = TASK) -> str:
+    """Copies the file of a task or an algorithm, FILE.py:CLASS, into a run's folder, unless the run
+    has a copy.
 
     Returns:
       The copy's FILE.py:CLASS, relative to the run's folder.
@@ -25,9 +27,9 @@ def copy_task(name: str, run: Path) -> str:
       OSError: the copy cannot be written.
       UserError: the file cannot be read.
     """
-    file = f"{TASK}/{registry.source_file(name).name}"
-    if not (run / TASK).exists():
-        (run / TASK).mkdir()
+    file = f"{folder}/{registry.source_file(name).name}"
+    if not (run / folder).exists():
+        (run / folder).mkdir()
         write_atomically(run / file, registry.read_source(name))
     return f"{file}:{name.rpartition(':')[2]}"
 

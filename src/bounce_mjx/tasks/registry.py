@@ -14,10 +14,13 @@ import sys
 import traceback
 import types
 from pathlib import Path
+from typing import TypeVar
 
 from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.task.task import Task
 from bounce_mjx.world.config import WorldConfig
+
+Kind = TypeVar("Kind")
 
 DEFAULT = "bounce"
 """Name of the task of the original specification."""
@@ -44,7 +47,7 @@ def find_task(name: str) -> type[Task]:
       UserError: there is none, or it cannot be imported.
     """
     if is_file(name):
-        task = _from_file(name)
+        task = class_in_file(name, Task)
         admit(name, task)
         return task
     # Without a look at the installed packages, which takes 10 ms.
@@ -142,7 +145,12 @@ def _registered() -> dict[str, str]:
     return {entry.name: entry.value for entry in entries} | _OWN
 
 
-def _from_file(name: str) -> type[Task]:
+def class_in_file(name: str, base: type[Kind]) -> type[Kind]:
+    """The subclass of `base` in FILE.py:CLASS, whose code runs once in a process.
+
+    Raises:
+      UserError: the file cannot be imported, or has no such class.
+    """
     path, source = source_file(name), read_source(name)
     # The name is the same in every process that reads a pickled environment.
     module = types.ModuleType(f"bounce_mjx_task_{_digest(source)}")
@@ -157,13 +165,13 @@ def _from_file(name: str) -> type[Task]:
             lines = [frame.lineno for frame in frames if frame.filename == str(path)]
             line = getattr(error, "lineno", None) or (lines or [1])[-1]
             raise UserError(
-                f"the task's file {path} cannot be imported ({type(error).__name__} in "
+                f"the {_word(base)}'s file {path} cannot be imported ({type(error).__name__} in "
                 f"line {line}: {shorten(str(error), 300)}); correct it"
             ) from error
-    task = _class_in(sys.modules[module.__name__], name)
-    if task.__module__ == module.__name__:
-        copyreg.pickle(task.Config, _pickled)
-    return task
+    found = _class_in(sys.modules[module.__name__], name, base)
+    if base is Task and found.__module__ == module.__name__:
+        copyreg.pickle(found.Config, _pickled)
+    return found
 
 
 def _pickled(config: WorldConfig) -> tuple:
@@ -176,7 +184,7 @@ def _pickled(config: WorldConfig) -> tuple:
 def _unpickled(name: str, module_name: str) -> WorldConfig:
     """A config without its settings, of the task in a file."""
     module = sys.modules.get(module_name)
-    task = find_task(name) if module is None else _class_in(module, name)
+    task = find_task(name) if module is None else _class_in(module, name, Task)
     if task.__module__ != module_name:
         raise UserError(
             f"the task's file {source_file(name)} is not the one with which the environment was "
@@ -185,17 +193,22 @@ def _unpickled(name: str, module_name: str) -> WorldConfig:
     return task.Config.__new__(task.Config)
 
 
-def _class_in(module: types.ModuleType, name: str) -> type[Task]:
-    """The task of FILE.py:CLASS in the file's module."""
+def _class_in(module: types.ModuleType, name: str, base: type[Kind]) -> type[Kind]:
+    """The subclass of `base` of FILE.py:CLASS in the file's module."""
     classes = {
         key: value
         for key, value in vars(module).items()
-        if isinstance(value, type) and issubclass(value, Task) and value is not Task
+        if isinstance(value, type) and issubclass(value, base) and value is not base
     }
     attribute = name.rpartition(":")[2]
     if attribute not in classes:
         raise UserError(
-            f"the task's file {source_file(name)} has no task {shorten(attribute)!r} (its "
-            f"subclasses of Task: {', '.join(classes) or 'none'}); give FILE.py:CLASS"
+            f"the {_word(base)}'s file {source_file(name)} has no {_word(base)} "
+            f"{shorten(attribute)!r} (its subclasses of {base.__name__}: "
+            f"{', '.join(classes) or 'none'}); give FILE.py:CLASS"
         )
     return classes[attribute]
+
+
+def _word(base: type) -> str:
+    return "task" if base is Task else "algorithm"

@@ -22,7 +22,7 @@ class TrainCommand(TrainConfig, Start):
     """Trains a policy; by default, one that keeps the ball bouncing."""
 
     env: Annotated[pydantic.SerializeAsAny[WorldConfig], tyro.conf.arg(name="")]
-    ppo: Annotated[PPOConfig, tyro.conf.arg(name="")] = PPOConfig()
+    ppo: Annotated[pydantic.SerializeAsAny[PPOConfig], tyro.conf.arg(name="")] = PPOConfig()
     report: bool = True
     """Write report.html into the run's folder after the results are printed."""
     wandb: str | None = None
@@ -71,7 +71,7 @@ def read_command(args: Sequence[str], machine: Path | None = None) -> TrainComma
     """
     start = parse_first(Start, args, prog=PROG)
     base = start.base(machine)
-    own_class = train_config(base.env.task, TrainCommand)
+    own_class = train_config(base.env.task, TrainCommand, type(base.ppo))
     command = parse(own_class, args, prog=PROG, default=own_class(**dict(base)))
     settled = start.settle(command.training, base)
     return command.model_copy(update=dict(settled) | {"resume": start.run})

@@ -203,7 +203,9 @@ class Job:
 
     @property
     def _go_on(self) -> str:
-        flags = [*named_task(self.config), "--resume", str(self.run)]
+        name = self.config.algorithm
+        own = ["--algorithm", name] if is_file(name) else []
+        flags = [*named_task(self.config), *own, "--resume", str(self.run)]
         return f"continue with: bounce-mjx train {shlex.join(flags)}"
 
     def failure(self, error: jax.errors.JaxRuntimeError) -> str:

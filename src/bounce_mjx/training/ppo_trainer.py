@@ -8,11 +8,11 @@ import jax
 import numpy as np
 
 from bounce_mjx.env.env import Env
+from bounce_mjx.learning.config import find_algorithm
 from bounce_mjx.learning.ppo import (
     CHECKED,
     Params,
     TrainingState,
-    make_trainer,
     policy_of,
     population,
     warm_started,
@@ -38,7 +38,7 @@ class PPOTrainer:
         self._config, self._observation_size = config, env.observation_size
         self._compiled_iterations = _iterations_at_once(config, env)
         self.mesh = make_mesh(config.num_devices, config.ppo, config.num_seeds)
-        trainer = make_trainer(config.ppo, env, episode_steps(config))
+        trainer = find_algorithm(config.algorithm)(config.ppo, env, episode_steps(config))
         self._trainer = trainer if config.num_seeds == 1 else population(trainer)
         seeds = config.seed + np.arange(config.num_seeds, dtype=np.uint32)
         self._seeds = seeds[0] if config.num_seeds == 1 else seeds

@@ -12,7 +12,7 @@ from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
 from bounce_mjx.runs.config import TrainConfig, load_run_config, read_preset, runs_folder
 from bounce_mjx.runs.task import is_same_task
-from bounce_mjx.tasks.registry import DEFAULT, find_task
+from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file
 
 
 class Start(StrictModel):
@@ -38,6 +38,7 @@ class Start(StrictModel):
     run that has met all results continues."""
 
     task: str | None = None
+    algorithm: str | None = None
     warm_start: Path | None = None
     log_dir: Path | None = None
     total_steps: Steps | None = None
@@ -54,14 +55,16 @@ class Start(StrictModel):
         if self.resume:
             return self._resumed()
         if not self.warm_start:
-            return read_preset(self.config, self.robot, self.task, self.world, machine)
+            start = self.config, self.robot, self.task, self.world, machine, self.algorithm
+            return read_preset(*start)
         if self.robot:
             raise UserError(
                 "--warm-start and --robot cannot be combined; the policy's own robot is trained on"
             )
         from bounce_mjx.training.warm_start import warm_config
 
-        return warm_config(self.warm_start, self.config, self.task, self.world, machine)
+        start = self.config, self.task, self.world, machine, self.algorithm
+        return warm_config(self.warm_start, *start)
 
     def _resumed(self) -> TrainConfig:
         for flag in ("config", "robot", "world"):
@@ -70,11 +73,18 @@ class Start(StrictModel):
                     f"--{flag} and --resume cannot be combined; a resumed run has its config"
                 )
         run = self.run
-        base = load_run_config(run, self.task)
-        if self.task is not None and not is_same_task(base.task, self.task):
+        base = load_run_config(run, self.task, self.algorithm)
+        for key in ("task", "algorithm"):
+            given, own = getattr(self, key), getattr(base, key)
+            if given is not None and not is_same_task(own, given):
+                raise UserError(
+                    f"--resume cannot change the {key}, and {given} differs from {own}; restore "
+                    "it, name the run's copy, or start a new run"
+                )
+        if is_file(base.algorithm) and self.algorithm is None:
             raise UserError(
-                f"--resume cannot change the task, and {self.task} differs from {base.task}; "
-                "restore it, name the run's copy, or start a new run"
+                f"the run {run} was trained with an algorithm in a file, which is code; name it to "
+                f"run it: --algorithm {base.algorithm}"
             )
         longer = self.total_steps is not None and _is_solved(run)
         return base.model_copy(update={"stop_when_solved": False}) if longer else base
@@ -98,7 +108,7 @@ class Start(StrictModel):
         Raises:
           UserError: it changes a key of the resumed run that must stay the same.
         """
-        config = config.model_copy(update={"task": base.task})
+        config = config.model_copy(update={"task": base.task, "algorithm": base.algorithm})
         if not self.resume:
             return config.model_copy(update={"warm_start": base.warm_start})
         from bounce_mjx.runs.reading import RESUMABLE_KEYS

@@ -25,6 +25,8 @@ from bounce_mjx.runs.reading import policy_shapes, read_networks, read_newest
 from bounce_mjx.task.task import Task
 from bounce_mjx.tasks.registry import DEFAULT, find_task
 
+_NETWORKS = ("hidden_layers", "critic_layers", "shared_critic", "activation")
+
 
 def warm_config(
     policy: Path,
@@ -32,6 +34,7 @@ def warm_config(
     task: str | None,
     world: Path | None,
     machine: Path | None,
+    algorithm: str | None,
 ) -> TrainConfig:
     """The config of a training that starts with a policy: its environment and networks, and the
     other settings of a preset.
@@ -39,7 +42,7 @@ def warm_config(
     Args:
       policy: a run or a policy; `latest` is the newest run in the folder of the task's runs.
       presets: see `preset_files`, as for `machine`.
-      task: the policy's task as the user names it.
+      task: the policy's task as the user names it, as for `algorithm`.
       world: a named world in place of the policy's.
 
     Raises:
@@ -47,8 +50,8 @@ def warm_config(
     """
     checkpoint = _checkpoint(policy, find_task(task or DEFAULT))
     own = load_run_config(checkpoint.run, task)
-    base = read_preset(presets, task=own.task, machine=machine)
-    networks = {key: getattr(own.ppo, key) for key in ("hidden_layers", "critic_metrics")}
+    base = read_preset(presets, task=own.task, machine=machine, algorithm=algorithm)
+    networks = {key: getattr(own.ppo, key) for key in (*_NETWORKS, "critic_metrics")}
     ppo = base.ppo.model_copy(update=networks)
     start = policy if str(policy) in POLICIES else checkpoint.folder
     config = base.model_copy(update={"env": own.env, "ppo": ppo, "warm_start": start})
@@ -74,19 +77,21 @@ def read_start(config: TrainConfig, env: Env) -> tuple[Params, RunningStatistics
     """
     checkpoint = _checkpoint(config.warm_start, config.env.task)
     own = load_run_config(checkpoint.run)
-    if own.env.layout != config.env.layout or policy_shapes(own) != policy_shapes(config):
+    networks = [[getattr(ppo, key) for key in _NETWORKS] for ppo in (own.ppo, config.ppo)]
+    same = networks[0] == networks[1] and policy_shapes(own) == policy_shapes(config)
+    if own.env.layout != config.env.layout or not same:
         raise UserError(
             f"the policy {config.warm_start} has another observation, other actions or other "
             "hidden layers than this training; leave out the flags that change them"
         )
     _, (params, statistics, names) = read_newest(checkpoint, partial(read_networks, config=own))
-    size = own.env.layout.size
     wanted = names_of_critic_metrics(config.ppo, env)
-    known = np.array([True] * size + [name in names for name in wanted])
-    rows = [*range(size), *(size + names.index(n) if n in names else 0 for n in wanted)]
 
     def moved(array: jax.Array, default: float) -> np.ndarray:
         """The rows of the new inputs; `default` in those of unknown ones."""
+        size = len(array) - len(names)
+        known = np.array([True] * size + [name in names for name in wanted])
+        rows = [*range(size), *(size + names.index(n) if n in names else 0 for n in wanted)]
         array = np.asarray(array)[rows]
         return np.where(
             known.reshape(-1, *[1] * (array.ndim - 1)), array, array.dtype.type(default)
