@@ -107,7 +107,7 @@ def _read_conditions(
     world, assumed = None, {}
     if command.world is not None:
         there, named = in_world(config, command.world)
-        world, assumed = there.env, named.doubled()
+        world, assumed = there.env, named.double_assumed()
     conditions = load_suite(path, config.env, world, assumed)
     if command.assumed:
         return conditions[: 1 + len(assumed)], f"twice what {command.world} assumes", ""
