@@ -225,7 +225,7 @@ class Env:
         """
         check_unedited(self.mj_model, self._fingerprint)
         given = self.ranges() if ranges is None else ranges
-        rng, world, clock = self._draw_world(rng, given, share)
+        rng, world, clock = self._sample_world(rng, given, share)
         own_parameters = MODEL_PARAMETERS
         if self._randomize is not None:
             rng, own_rng = jax.random.split(rng)
@@ -333,7 +333,7 @@ class Env:
             metrics=state.metrics | metrics | self._privileged_metrics(now.world, truth),
         )
 
-    def _draw_world(
+    def _sample_world(
         self, rng: jax.Array, given: Ranges, share: float | None
     ) -> tuple[jax.Array, World, Clock | None]:
         """An unused key, the world of an episode, and its clock; the arguments are those of

@@ -1,6 +1,7 @@
 """The mjx engine: MuJoCo's own JAX implementation, for any model with the task's names."""
 
 import contextlib
+import copy
 from typing import NamedTuple
 
 import jax
@@ -9,9 +10,8 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from bounce_mjx.errors import UserError
 from bounce_mjx.physics.control import Control, drag, servo_target
-from bounce_mjx.physics.edited import MIN_FRICTION, edited, edited_model
+from bounce_mjx.physics.edited import MIN_FRICTION, edited
 from bounce_mjx.physics.fused.turning import read_turning
 from bounce_mjx.physics.parameters import PhysicsParameters, PhysicsState
 from bounce_mjx.physics.scalars import scalars_of
@@ -22,28 +22,14 @@ class MjxModel(NamedTuple):
     """Constants of the mjx engine."""
 
     model: mjx.Model
-    frictional: mjx.Model
-    """`model` with frictional contact pairs; MJX cannot change a pair's dimension later."""
     mj_model: mujoco.MjModel
-    """Source of both models."""
+    """Its source."""
     addresses: Addresses
 
 
 def read_model(mj_model: mujoco.MjModel) -> MjxModel:
     """Constants of a compiled model that the engine supports (`support.py`)."""
-    return MjxModel(
-        mjx.put_model(mj_model),
-        mjx.put_model(_with_frictional_pair(mj_model)),
-        mj_model,
-        find_addresses(mj_model),
-    )
-
-
-def _with_frictional_pair(mj_model: mujoco.MjModel) -> mujoco.MjModel:
-    """Copy of the model with sliding friction in the contact pairs of ball and paddle, if any."""
-    with contextlib.suppress(UserError):
-        return edited_model(mj_model, PhysicsParameters(contact_friction=np.zeros(())))
-    return mj_model
+    return MjxModel(mjx.put_model(mj_model), mj_model, find_addresses(mj_model))
 
 
 def step(
@@ -122,7 +108,13 @@ def world_model(constants: MjxModel, parameters: PhysicsParameters) -> mjx.Model
     fields = {x: m.array(x) for x in m.fields if x not in ("geom_sameframe", "pair_dim")}
     if "pair_friction" in fields:
         fields["pair_friction"] = jnp.maximum(fields["pair_friction"], MIN_FRICTION)
-    model = constants.frictional if "pair_dim" in m.fields else constants.model
+    model = constants.model
+    if "pair_dim" in m.fields:
+        # MJX cannot change the dimension of a contact pair in a model that it has.
+        frictional = copy.copy(constants.mj_model)
+        frictional.pair_dim[:] = m.array("pair_dim")
+        with jax.ensure_compile_time_eval():
+            model = mjx.put_model(frictional)
     return model.tree_replace(fields)
 
 

@@ -118,13 +118,10 @@ def _flags(bits: int, kind: type) -> set[str]:
 def _parts(m: mujoco.MjModel, addresses: Addresses) -> Iterator[Feature]:
     """Features of bodies, joints and actuators."""
     joints, paddle = list(addresses.arm_joints), addresses.paddle_geom
-    hinge_or_slide = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
     bodies = m.jnt_bodyid[joints]
     before, parents = np.array([0, *bodies[:-1]]), m.body_weldid[m.body_parentid[bodies]]
     others = m.njnt != len(joints) + len(addresses.balls)
     yield _FUSED, "joints other than the acting ones and the ball's", others
-    turning = np.all(np.isin(m.jnt_type[joints], hinge_or_slide))
-    yield _FUSED, "arm joints that are neither hinges nor slides", not turning
     branches = np.any((bodies != before) & (parents != before))
     yield _FUSED, "an arm that is not one serial chain", branches
     attached = any(np.sum(m.body_weldid == ball.body) != 1 for ball in addresses.balls)
@@ -139,8 +136,7 @@ def _parts(m: mujoco.MjModel, addresses: Addresses) -> Iterator[Feature]:
     yield _FUSED, "actuators other than one position servo on each joint", several
     affine_gain = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE)
     servos = (
-        np.all(m.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
-        and np.all(m.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE)
+        np.all(m.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE)
         and np.all(np.isin(m.actuator_gaintype, affine_gain))
         and np.all(m.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE)
     )

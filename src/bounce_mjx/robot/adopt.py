@@ -53,9 +53,9 @@ def adopt(mjcf: Path, config: RobotConfig, control_dt: float, is_mount_given: bo
 
     Args:
       mjcf: the file, as for `locate`.
-      config: the site, and wishes about the joints and the paddle; its servos are ignored.
+      config: the site, and the joints and the paddle if they are chosen; its servos are ignored.
       control_dt: time between two actions, s.
-      is_mount_given: whether the paddle's position and orientation are wishes; if not, the search
+      is_mount_given: whether the paddle's position and orientation are chosen; if not, the search
         also turns the paddle about the site's z, and lays it flat.
 
     Raises:

@@ -27,7 +27,7 @@ PADDLE_BODY_NAME = "paddle"
 # Viewers show the groups 0 to 2.
 HIDDEN_GROUP = 3
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
-# A change of a joint's range that is told, rad or m.
+# Smallest change of a joint's range that is reported, rad or m.
 _NARROWER = 1e-3
 # Without what only its simulations need; a later version may move its files.
 _INSTALLED_AS = {"robosuite": ("--no-deps", "robosuite==1.5.2")}

@@ -303,7 +303,7 @@ class _Search:
         return full[np.ix_(self._dofs, self._dofs)], hold
 
     def _acceleration(self, force: np.ndarray, hold: np.ndarray) -> float:
-        """Largest upward acceleration of the paddle, of which 1 m/s^2 takes the forces [n]."""
+        """Largest upward acceleration of the paddle; each m/s^2 of it needs the forces [n]."""
         needed = np.abs(force)
         spare = np.where(force > 0.0, self._limits - hold, self._limits + hold)
         moved = needed > 1e-9

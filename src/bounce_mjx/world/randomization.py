@@ -2,7 +2,7 @@
 
 A term is a key of the config with a range (low, high), from which a reset samples every entry of
 the term uniformly. Each end of a term of several entries may be one number for all, or one for each
-entry. A term that is null is inactive and costs nothing.
+entry. A term that is null is off and costs nothing.
 """
 
 from __future__ import annotations

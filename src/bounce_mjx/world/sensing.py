@@ -29,7 +29,7 @@ _TERMS = frozenset(
 _PADDLE_TERMS = frozenset("encoder_bias joint_angle_noise paddle_offset paddle_tilt".split())
 """Terms that make the forward kinematics of the measured joint angles differ from the truth."""
 
-# No picture of an episode is as old as this, s, or has a number as low as its negative.
+# Older than any picture of an episode, s; its negative is below any picture's number.
 _LONG_AGO = 1e6
 
 
@@ -90,7 +90,7 @@ class Sensors:
         length = math.ceil(_oldest_picture(config.randomization) / config.control_dt - 1e-6) + 1
         ball = _position_and_velocity(truth)
         balls = jnp.broadcast_to(ball, (length, *ball.shape))
-        # So long ago that the difference from it is not a velocity.
+        # Too long ago for a velocity from the difference to it.
         before = Picture(
             truth.ball_position, truth.ball_velocity, zero + _LONG_AGO, zero - _LONG_AGO
         )

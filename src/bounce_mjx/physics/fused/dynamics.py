@@ -68,7 +68,7 @@ def step(
     orientation, unless the spin lifts the ball.
     """
     at = model.addresses
-    qpos, qvel = _entries(state.qpos, range(model.nq)), _entries(state.qvel, range(model.nv))
+    qpos, qvel = (_entries(x, range(len(x))) for x in (state.qpos, state.qvel))
     world = _in_any_world(model, parameters)
     turns = world.contacts[0].friction is not None or control.air_lift is not None
     turnings = [

@@ -95,8 +95,6 @@ class FusedModel:
     contacts: tuple[ContactModel, ...]
     """The contact of each ball with the paddle, then those of two balls."""
     addresses: Addresses
-    nq: int
-    nv: int
     mj_model: mujoco.MjModel = dataclasses.field(repr=False, compare=False)
     """Source of the model, to be read again in each world."""
     fingerprint: bytes = b""
@@ -150,8 +148,6 @@ def read_model(
         balls=tuple(_read_ball(m, ball) for ball in addresses.balls),
         contacts=_read_contacts(m),
         addresses=addresses,
-        nq=c.nq,
-        nv=c.nv,
         mj_model=c,
         fingerprint=b"" if jax.tree.leaves(parameters) else fingerprint(c),
         weight=1.0 - (compensated or 0.0),
