@@ -1,5 +1,6 @@
 """A hidden robot on C is identified, and each part of the fit agrees with another computation."""
 
+import re
 import runpy
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from bounce_mjx.identify.stages import Identified, _align_frame, identify, senso
 from bounce_mjx.identify.unknowns import Layout, make_layout
 from bounce_mjx.identify.windows import Windows, cut
 from bounce_mjx.identify.world import compare, estimates, sentences, to_yaml
+from bounce_mjx.reports.identification import identification_page
 from bounce_mjx.robot.model import load_model
 from bounce_mjx.runs.config import read_preset
 from bounce_mjx.world.named import read_world
@@ -299,6 +301,40 @@ def test_estimates_far_from_the_prior_are_warnings() -> None:
     layout = layout._replace(unknowns=dict(layout.unknowns) | {name: wider})
     (frame,) = said(layout.mean, layout)
     assert "ball_position_bias z is 0 m" in frame
+
+
+def unseen() -> Identified:
+    """A log that shows nothing: all deviations are those of the prior."""
+    layout, windows = make_layout(6, False, 0.001), windows_of(flight_log())
+    spread = np.diag(layout.deviation**2)
+    predicted = np.zeros((len(windows.angles), windows.angles[0].size + windows.balls[0].size))
+    known = Fit(layout.mean, np.zeros(0), predicted), np.linalg.inv(spread), spread
+    errors = {"joint_angles": 1.234567, "ball_position": 1.0}
+    return Identified(layout, windows, None, *known, errors, errors, errors, 0)
+
+
+def test_no_interval_leaves_what_is_possible() -> None:
+    """A friction is not below zero, however little the log shows of it."""
+    friction = [entry for entry in estimates(unseen(), NAMES) if "friction" in entry.label]
+    assert friction and all(entry.low >= 0.0 for entry in friction)
+    assert min(e.value - e.low for e in friction) < min(e.high - e.value for e in friction)
+
+
+def test_the_page_begins_with_the_answer() -> None:
+    """What the log leaves open comes last; no figure has more than three digits."""
+    found = unseen()
+    page = identification_page(found, "log.csv", NAMES, Path("world.yaml"))
+    parts = "<b>Found:", "<b>How sure:", "<b>What to do:", "<h2>Estimates", "<h2>What the log"
+    assert sorted(parts, key=page.index) == [*parts]
+    assert "do not train with this world yet" in page
+    right = found._replace(held_out={"joint_angles": 1.0})
+    better = identification_page(right, "log.csv", NAMES, Path("world.yaml"))
+    assert "bounce-mjx identify LOG --check world.yaml" in better
+    listed = estimates(found, NAMES)
+    assert all(entry.label in page for entry in listed)
+    cells = re.findall(r"<td[^>]*>(-?[0-9.]+)(?:e[-+]?[0-9]+)?</td>", page)
+    digits = [cell.strip("-").replace(".", "").lstrip("0") for cell in cells]
+    assert len(cells) > len(listed) and max(map(len, digits)) <= 3
 
 
 @pytest.mark.slow

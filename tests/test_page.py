@@ -27,6 +27,7 @@ from bounce_mjx.evaluation.results import Report
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import latest_checkpoint
 from bounce_mjx.runs.reading import read_policy
+from bounce_mjx.training.watch import TrainingPage, _Panel
 from bounce_mjx.viewers import browser
 from bounce_mjx.viewers.guard import open_server
 from bounce_mjx.viewers.scene import Scene
@@ -35,7 +36,6 @@ from bounce_mjx.viewers.simulation import (
     Simulation,
     make_zero_controller,
 )
-from bounce_mjx.viewers.watch import TrainingPage, _Panel
 from tiny_runs import TINY
 from viewing import CAMERA, INFINITY, NAN, Client, LeanConfig, evaluated, served, wait_until, watch
 
@@ -370,7 +370,7 @@ def test_a_watched_training_tells_the_page(tmp_path: Path, monkeypatch, capsys) 
         def wait(self) -> None:
             told.append(("ended",))
 
-    monkeypatch.setattr("bounce_mjx.viewers.watch.TrainingPage", Page)
+    monkeypatch.setattr("bounce_mjx.training.watch.TrainingPage", Page)
     # The process would end there.
     monkeypatch.setattr(train, "leave", lambda status: None)
     flags = ["--total-steps", "128", "--log-dir", str(tmp_path), "--no-report"]

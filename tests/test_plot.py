@@ -30,7 +30,7 @@ from bounce_mjx.commands import train as train_command
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.reports import page as report_page
-from bounce_mjx.reports.curves import Group, group_runs, mean_and_band, read_curves
+from bounce_mjx.reports.curves import Group, LoggedCurve, group_runs, mean_and_band, read_curves
 from bounce_mjx.reports.figures import (
     curves_figure,
     evaluation_figure,
@@ -115,11 +115,12 @@ def test_a_report_that_cannot_be_written_names_no_flag(
     trained: Path, tmp_path: Path, capsys
 ) -> None:
     run = shutil.copytree(trained, tmp_path / "run")
-    (run / "replay.html").mkdir()
+    (run / "report.html").unlink()
+    (run / "report.html").mkdir()
     with pytest.raises(SystemExit):
         report_command.main([str(run)])
     said = capsys.readouterr().err
-    assert "replay.html cannot be written" in said and "--html" not in said
+    assert "report.html cannot be written" in said and "--html" not in said
 
 
 def test_a_curve_has_the_values_logged_last(tmp_path: Path) -> None:
@@ -209,6 +210,28 @@ def test_the_curves_are_in_the_displayed_units(runs: list[Path]) -> None:
         np.testing.assert_allclose(line.get_ydata(), curve.scale * np.array([*values.values()]))
         assert axes.get_title() == curve.title
     assert "cm" in CURVES[2].title and CURVES[2].scale == 100.0
+
+
+def test_evaluations_are_points_on_the_curves(runs: list[Path]) -> None:
+    """Of a screening too; in the units of the curve."""
+    (group,) = group_runs(runs[3:])
+    points = {
+        "screening/mean_apex_error_m": LoggedCurve(np.array([1000]), np.array([0.2])),
+        "results/mean_apex_error_m": LoggedCurve(np.array([3000, 5000]), np.array([0.03, 0.02])),
+    }
+    run = group.runs[0]._replace(curves=group.runs[0].curves | points)
+    figure = curves_figure([group._replace(runs=[run])])
+    shown = [
+        (x, y)
+        for line in figure.axes[2].lines
+        if line.get_marker() == "o"
+        for x, y in zip(line.get_xdata(), line.get_ydata(), strict=True)
+    ]
+    assert shown == [(1000, 20.0), (3000, 3.0), (5000, 2.0)]
+    words = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert "evaluation, without noise" in words
+    (without,) = curves_figure([group]).legends
+    assert "evaluation, without noise" not in [text.get_text() for text in without.get_texts()]
 
 
 def test_there_is_a_panel_for_every_reward_term(runs: list[Path]) -> None:
@@ -350,11 +373,16 @@ def check_report(run: Path) -> str:
     page = (run / "report.html").read_text(encoding="utf-8")
     sources = re.findall(r'(?:src|href)="([^"]*)"', page)
     replays = [source for source in sources if source.startswith("data:text/html;base64,")]
+    assert len(replays) == 1 and b"<title>bounce_mjx</title>" in base64.b64decode(
+        replays[0].partition(",")[2]
+    )
     assert len(sources) - len(replays) == 3
     for source in set(sources) - set(replays):
         kind, _, data = source.partition(",")
         assert kind == "data:image/svg+xml;base64"
-        xml.etree.ElementTree.fromstring(base64.b64decode(data))
+        root = xml.etree.ElementTree.fromstring(base64.b64decode(data))
+        # On a phone of 390 pixels, a text of 9 points is 9 pixels high.
+        assert float(root.get("width").removesuffix("pt")) < 390
     assert "<script" not in page and "@import" not in page
     results = load_results(run)
     for result in results.best.results:
@@ -399,11 +427,9 @@ def test_report_is_drawn_again(trained: Path, tmp_path: Path, capsys) -> None:
     check_report(run)
     assert other.read_text() == "mine"
     page = (run / "report.html").read_text("utf-8")
-    replay = base64.b64encode((run / "replay.html").read_bytes()).decode()
-    assert page.count(replay) == 1 and len(replay) > 10_000
     assert "Peitian AIR4-560" in page and "MuJoCo 3." in page
     # On a phone, what is wide scrolls by itself.
-    assert page.count("<table>") + page.count("<img ") == page.count('<div class="wide"><')
+    assert page.count("<table>") == page.count('<div class="wide"><')
     assert capsys.readouterr().out.endswith("run/report.html\n")
 
 

@@ -15,6 +15,7 @@ from bounce_mjx.env.env import Env
 from bounce_mjx.resources import resource_path
 from bounce_mjx.task import term_names
 from bounce_mjx.tasks.bounce_rewards import BounceReward
+from bounce_mjx.training.watch import results_list
 from bounce_mjx.viewers.browser import reward_bars
 from bounce_mjx.viewers.controls import direction
 from bounce_mjx.viewers.display import (
@@ -32,7 +33,6 @@ from bounce_mjx.viewers.simulation import (
     Simulation,
     make_zero_controller,
 )
-from bounce_mjx.viewers.watch import results_list
 from bounce_mjx.world.config import WorldConfig
 from viewing import NAN, LeanConfig, StillConfig, at_height, evaluated, watch
 

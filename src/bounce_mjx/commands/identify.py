@@ -94,7 +94,7 @@ def main(args: Sequence[str]) -> None:
     robot = None if command.robot is None else str(command.robot)
     files = {
         command.out: to_yaml(found, log, names, robot),
-        page: identification_page(found, log.source, names),
+        page: identification_page(found, log.source, names, command.out),
     }
     for path, content in files.items():
         with writable(path, "choose another --out"):

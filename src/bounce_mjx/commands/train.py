@@ -50,7 +50,7 @@ def main(args: Sequence[str]) -> None:
         console, page = stdout(quiet=not hosts.is_leader()), None
         if command.watch and hosts.is_leader():
             # Only a training run that is watched pays for this import.
-            from bounce_mjx.viewers.watch import TrainingPage
+            from bounce_mjx.training.watch import TrainingPage
 
             address = command.watch_host, command.watch_port
             page = TrainingPage(command.training, *address, console, command.watch_allow_host)

@@ -58,6 +58,8 @@ def _row(env: Env, states: State, running: jax.Array, step: jax.Array) -> Record
             task=env.task.recorded(now),
             running=running,
             command_velocity=None if setpoint is None else setpoint.velocity,
+            qpos=state.pipeline_state.physics.qpos,
+            metrics=state.metrics,
         )
 
     return jax.vmap(one, in_axes=-1, out_axes=-1)(states, running)

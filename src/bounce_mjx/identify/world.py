@@ -84,6 +84,9 @@ def estimates(found: Identified, joint_names: Sequence[str]) -> list[Estimate]:
     late = layout.slices().get("ball_latency", slice(0, 0))
     for array in (values, low, high):
         array[late] += found.stamp_age
+    for name, place in layout.terms().items():
+        if name in TERMS:
+            low[place], high[place] = (np.clip(x[place], *TERMS[name].bounds) for x in (low, high))
     seen = found.deviation < _UNSEEN * layout.deviation
     columns = (values, low, high, seen, alone)
     words = layout.labels(joint_names), layout.units()
@@ -247,7 +250,8 @@ def compare(world: NamedWorld, found: Identified, joint_names: Sequence[str]) ->
 
 
 def _format(entry: Estimate) -> str:
-    half, unit = 0.5 * (entry.high - entry.low), f" {entry.unit}" if entry.unit else ""
+    half = max(entry.high - entry.value, entry.value - entry.low)
+    unit = f" {entry.unit}" if entry.unit else ""
     if entry.unit == "s":
         return f"{1e3 * entry.value:.1f} +- {1e3 * half:.1f} ms"
     return f"{entry.value:.4g} +- {half:.2g}{unit}"

@@ -40,56 +40,67 @@ _STYLE = {
     # The same figure gives the same file.
     "svg.hashsalt": "bounce_mjx",
 }
+_POINTS = dict(marker="o", markersize=4.0, linestyle="none", markeredgecolor="white")
+PANEL_WIDTH = 2.6
+"""Width of a panel in inches: two of them fit a phone."""
 style = functools.partial(matplotlib.rc_context, _STYLE)
 """The look of all figures, around what draws them."""
 
 
 @style()
-def curves_figure(groups: Sequence[Group], reference: Mapping[str, float] = {}) -> Figure:
-    """The return and the curves of the task over the training.
+def curves_figure(
+    groups: Sequence[Group], reference: Mapping[str, float] = {}, columns: int = 3
+) -> Figure:
+    """The return and the curves of the task over the training, with points for evaluations.
 
     Args:
       reference: values of the policy that comes with the package, by the curve's tag.
+      columns: most panels side by side.
     """
     shown = [Curve(RETURN, "", title="return of an episode")]
     for group in groups:
         shown += [curve for curve in group.task_curves if curve.title and curve not in shown]
-    figure, panels = _panels(len(shown), columns=3, height=2.4)
+    figure, panels = make_panels(len(shown), columns, height=2.4)
+    has_evaluations = False
     for axes, curve in zip(panels, shown, strict=True):
         _draw_curve(axes, groups, curve)
+        has_evaluations |= _draw_evaluations(axes, groups, curve)
         if curve.tag in reference:
             axes.axhline(reference[curve.tag], color=_GREY, linestyle="--", linewidth=1.0)
         axes.set_ylim(bottom=0.0)
         axes.set_xlabel("environment steps")
-    _add_legend(figure, groups, bool(reference))
+    others = [Line2D([], [], color=_GREY, linestyle="--", label="policy of the package")]
+    others = others[: len(reference)]
+    if has_evaluations:
+        others += [Line2D([], [], color=_GREY, label="evaluation, without noise", **_POINTS)]
+    _add_legend(figure, groups, others)
     return figure
 
 
 @style()
-def rewards_figure(groups: Sequence[Group]) -> Figure:
-    """The weighted reward terms over the training."""
+def rewards_figure(groups: Sequence[Group], columns: int = 5) -> Figure:
+    """The weighted reward terms over the training, at most `columns` panels side by side."""
     logged = dict.fromkeys(name for group in groups for run in group.runs for name in run.curves)
     terms = [name for name in logged if name.startswith(_REWARD)]
-    figure, panels = _panels(len(terms), columns=5, height=1.6)
+    figure, panels = make_panels(len(terms), columns, height=1.6)
     for axes, name in zip(panels, terms, strict=True):
         title = name.removeprefix(_REWARD).replace("_", " ")
         _draw_curve(axes, groups, Curve(name, "", title=title))
-    figure.suptitle(
-        "weighted reward terms over environment steps, mean of a control step", fontsize=10
-    )
+    title = "weighted reward terms over environment steps,\nmean of a control step"
+    figure.suptitle(title, fontsize=10)
     _add_legend(figure, groups)
     return figure
 
 
 @style()
-def evaluation_figure(env: Env, recording: Recording) -> Figure:
+def evaluation_figure(env: Env, recording: Recording, width: float = 10.0) -> Figure:
     """The heights of ball and paddle over the first recorded episode, and what the task draws of
-    all recorded episodes."""
+    all recorded episodes, in a figure of a width in inches."""
     recording = jax.device_get(recording)
     plots = env.task.plots(recording)
     rows = 1 + -(-len(plots) // 2)
-    figure = Figure(figsize=(10.0, 2.8 * rows), layout="constrained")
-    grid = figure.add_gridspec(rows, 2, width_ratios=(1.5, 1.0))
+    figure = Figure(figsize=(width, 2.8 * rows), layout="constrained")
+    grid = figure.add_gridspec(rows, 2, width_ratios=(1.2, 1.0))
     _draw_heights(figure.add_subplot(grid[0, :]), env, recording)
     for i, plot in enumerate(plots):
         axes = figure.add_subplot(grid[1 + i // 2, i % 2])
@@ -111,7 +122,7 @@ def image(figure: Figure, suffix: str) -> bytes:
 
 @style()
 def pixels(figure: Figure) -> np.ndarray:
-    """A figure as a picture [height, width, 3] (uint8)."""
+    """A figure as an image [height, width, 3] (uint8)."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return np.array(canvas.buffer_rgba())[..., :3]
@@ -126,11 +137,12 @@ def _with_colours(groups: Sequence[Group]) -> list[tuple[Group, str]]:
     return [(group, _COLOURS[i % len(_COLOURS)]) for i, group in enumerate(groups)]
 
 
-def _panels(count: int, columns: int, height: float) -> tuple[Figure, list[Axes]]:
+def make_panels(count: int, columns: int, height: float) -> tuple[Figure, list[Axes]]:
     """A figure with a number of panels in rows of a height in inches."""
     columns = max(1, min(columns, count))
     rows = max(1, -(-count // columns))
-    figure = Figure(figsize=(10.0, height * rows + 0.6), layout="constrained")
+    size = PANEL_WIDTH * columns, height * rows + 0.6
+    figure = Figure(figsize=size, layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes in grid.flat[count:]:
         axes.remove()
@@ -164,16 +176,30 @@ def _draw_curve(axes: Axes, groups: Sequence[Group], shown: Curve) -> None:
     axes.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
 
 
-def _add_legend(figure: Figure, groups: Sequence[Group], has_reference: bool = False) -> None:
+def _draw_evaluations(axes: Axes, groups: Sequence[Group], shown: Curve) -> bool:
+    """A point for each evaluation of the quantity, in which actions are not sampled; whether there
+    is one."""
+    name = "mean_return" if shown.tag == RETURN else f"mean_{shown.metric}_m"
+    found = False
+    for group, colour in _with_colours(groups):
+        for run in group.runs:
+            for curve in (run.curves.get(f"{kind}/{name}") for kind in ("screening", "results")):
+                if curve is not None:
+                    axes.plot(curve.steps, shown.scale * curve.values, color=colour, **_POINTS)
+                    found = True
+    return found
+
+
+def _add_legend(figure: Figure, groups: Sequence[Group], others: Sequence[Line2D] = ()) -> None:
     handles = [
         Line2D([], [], color=colour, linewidth=1.6, label=literal(group.label))
         for group, colour in _with_colours(groups)
     ]
     if any(run.solved_steps is not None for group in groups for run in group.runs):
         handles.append(Line2D([], [], color=_GREY, linestyle=":", label="all results met"))
-    if has_reference:
-        handles.append(Line2D([], [], color=_GREY, linestyle="--", label="policy of the package"))
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(3, len(handles)))
+    handles += others
+    columns = max(1, round(figure.get_figwidth() / PANEL_WIDTH))
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(columns, len(handles)))
 
 
 def _draw_heights(axes: Axes, env: Env, recording: Recording) -> None:

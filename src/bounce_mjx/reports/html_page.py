@@ -1,8 +1,8 @@
-"""The parts of an HTML page: its frame, pictures and tables."""
+"""The parts of an HTML page: its frame, figures and tables."""
 
 import base64
 import html
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from matplotlib.figure import Figure
 
@@ -13,8 +13,10 @@ body { font: 15px/1.5 system-ui, sans-serif; max-width: 68rem; margin: 2rem auto
   color: #222; background: #fff; }
 h1 { margin-bottom: 0; } h2 { margin: 2rem 0 0.5rem; font-size: 1.15rem; }
 .wide { overflow-x: auto; }
-img { width: 100%; min-width: 44rem; }
-iframe { width: 100%; height: 30rem; border: 1px solid #ddd; }
+.figures { display: grid; gap: 0 2rem; align-items: start;
+  grid-template-columns: repeat(auto-fit, minmax(min(100%, 26rem), 1fr)); }
+figure { margin: 0; } img { width: 100%; } figcaption { font-size: 13px; }
+iframe { width: 100%; height: 28rem; border: 1px solid #ddd; }
 table { border-collapse: collapse; }
 th, td { padding: 0.2rem 0.9rem 0.2rem 0; text-align: left; border-bottom: 1px solid #ddd; }
 .pass { color: #00704f; font-weight: bold; } .fail { color: #b00020; font-weight: bold; }
@@ -43,10 +45,21 @@ def page(title: str, body: str) -> str:
 """
 
 
-def picture(title: str, figure: Figure) -> str:
-    """A figure below its title."""
-    source = data_url("image/svg+xml", image(figure, "svg"))
-    return f'<h2>{title}</h2>\n<div class="wide"><img alt="{title}" src="{source}"></div>\n'
+def figures_html(figures: Mapping[str, Figure], captions: Mapping[str, str] = {}) -> str:
+    """Figures below their titles, side by side where the page is wide enough.
+
+    Args:
+      captions: sentences below some of them, by the title.
+    """
+    parts = []
+    for title, figure in figures.items():
+        source = data_url("image/svg+xml", image(figure, "svg"))
+        caption = html.escape(captions.get(title, ""))
+        parts.append(
+            f'<figure><h2>{title}</h2><img alt="{title}" src="{source}">'
+            f"<figcaption>{caption}</figcaption></figure>\n"
+        )
+    return f'<div class="figures">{"".join(parts)}</div>'
 
 
 def data_url(kind: str, content: bytes) -> str:

@@ -17,12 +17,13 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.policy_evaluation import recorded_episodes
 from bounce_mjx.reports.curves import group_runs
 from bounce_mjx.reports.figures import (
+    PANEL_WIDTH,
     RETURN,
     curves_figure,
     evaluation_figure,
     rewards_figure,
 )
-from bounce_mjx.reports.html_page import data_url, page, picture, table
+from bounce_mjx.reports.html_page import data_url, figures_html, page, table
 from bounce_mjx.reports.robustness import load_robustness, robustness_figure
 from bounce_mjx.reports.tables import details_line, figure_text, result_cells, robot_name
 from bounce_mjx.resources import POLICIES, resource_path
@@ -32,10 +33,18 @@ from bounce_mjx.runs.folders import POLICY_OF_TASK, Checkpoint
 from bounce_mjx.runs.progress import Evaluation, Results, load_results
 from bounce_mjx.runs.reading import read_actor
 from bounce_mjx.task.shown import Recording
+from bounce_mjx.viewers.page import replay_first_episode
 
 REPORT_FILE = "report.html"
-REPLAY_FILE = "replay.html"
-"""A replay of the best checkpoint, which `bounce-mjx report` records."""
+# Panels side by side in a figure that fits a phone, and its width in inches.
+_COLUMNS = 2
+_WIDTH = _COLUMNS * PANEL_WIDTH
+_CAPTIONS = {
+    "Learning curves": "Lines are the training, whose actions are sampled around the policy's "
+    "(exploration); points are evaluations, whose actions are not. Errors rise first: the policy "
+    "tries more before it knows how far each action goes, and its sampled actions scatter most at "
+    "the start."
+}
 
 
 def record_checkpoint(checkpoint: Checkpoint) -> Recording:
@@ -64,17 +73,19 @@ def write_report(run: Path, recording: Recording) -> tuple[Path, Figure]:
     config = load_run_config(run)
     groups = group_runs([run])
     env = Env(config.env)
-    evaluation = evaluation_figure(env, recording)
+    evaluation = evaluation_figure(env, recording, _WIDTH)
     robustness = load_robustness(run)
     figures = {
-        "Learning curves": curves_figure(groups, _reference(config)),
+        "Learning curves": curves_figure(groups, _reference(config), _COLUMNS),
         "The best checkpoint": evaluation,
-        **({} if robustness is None else {"Perturbed worlds": robustness_figure(robustness)}),
-        "Reward terms": rewards_figure(groups),
+        "Reward terms": rewards_figure(groups, _COLUMNS),
     }
+    if robustness is not None:
+        figures["Perturbed worlds"] = robustness_figure(robustness, columns=1)
+    replay = replay_first_episode(env, recording)
     path = run / REPORT_FILE
     try:
-        write_atomically(path, _html(run, config, env.engine.name, results, figures))
+        write_atomically(path, _html(run, config, env.engine.name, results, figures, replay))
     except OSError as error:
         raise UserError(
             f"{path} cannot be written ({error.strerror}); make the folder writable"
@@ -101,13 +112,14 @@ def _reference(config: TrainConfig) -> dict[str, float]:
 
 
 def _html(
-    run: Path, config: TrainConfig, engine: str, results: Results, figures: dict[str, Figure]
+    run: Path,
+    config: TrainConfig,
+    engine: str,
+    results: Results,
+    figures: dict[str, Figure],
+    replay: str,
 ) -> str:
     report = results.best
-    pictures = "".join(picture(title, figure) for title, figure in figures.items())
-    if (run / REPLAY_FILE).is_file():
-        source = data_url("text/html", (run / REPLAY_FILE).read_bytes())
-        pictures += f'<h2>Replay</h2>\n<iframe title="Replay" src="{source}"></iframe>\n'
     seconds = results.seconds
     phases = [[name, f"{value:.1f}"] for name, value in seconds.items()]
     names = [result.name for result in report.results]
@@ -124,7 +136,9 @@ the robot {html.escape(robot_name(config.env))}. The best of {len(evaluations)} 
 <p>Trained on {html.escape(results.device)} with bounce_mjx {html.escape(results.version or "?")};
 {engine} physics, MuJoCo {mujoco.__version__}, JAX {jax.__version__}.</p>
 {table(["result", "measured", "value", "bound", ""], map(result_cells, report.results))}
-{pictures}
+<h2>The policy in its first recorded episode</h2>
+<iframe title="Replay" src="{data_url("text/html", replay.encode())}"></iframe>
+{figures_html(figures, _CAPTIONS)}
 <h2>Where the time went</h2>
 {table(["phase", "seconds"], [*phases, ["total", f"{sum(seconds.values()):.1f}"]])}
 <h2>All evaluations</h2>

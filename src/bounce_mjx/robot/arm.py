@@ -16,7 +16,7 @@ import numpy as np
 from bounce_mjx.errors import UserError, install_command, needed, reason_of, shorten
 from bounce_mjx.files import check_name
 from bounce_mjx.resources import resource_path
-from bounce_mjx.robot.config import RobotConfig
+from bounce_mjx.robot.config import PaddleConfig, RobotConfig
 
 BALL_BODY_NAME = "ball_link"
 PADDLE_GEOM_NAME = "blocker"
@@ -29,6 +29,7 @@ HIDDEN_GROUP = 3
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 # Smallest change of a joint's range that is reported, rad or m.
 _NARROWER = 1e-3
+_HANDLE_RADIUS = 0.011
 # Without what only its simulations need; a later version may move its files.
 _INSTALLED_AS = {"robosuite": ("--no-deps", "robosuite==1.5.2")}
 _JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
@@ -518,16 +519,29 @@ def _add_paddle(paddle: mujoco.MjsBody, config: RobotConfig, default: mujoco.Mjs
         rgba=[0.72, 0.05, 0.07, 1.0],
         **common,
     )
-    if np.linalg.norm(blade.position) > 2e-2:
+    length = _handle_length(blade)
+    if length > 0.0:
+        end = length * np.array(blade.position) / np.linalg.norm(blade.position)
         paddle.add_geom(
             type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-            fromto=[0.0, 0.0, 0.0, *blade.position],
-            size=[0.011, 0.0, 0.0],
+            fromto=[0.0, 0.0, 0.0, *end],
+            size=[_HANDLE_RADIUS, 0.0, 0.0],
             mass=0.0,
             group=2,
             rgba=[0.76, 0.57, 0.36, 1.0],
             **common,
         )
+
+
+def _handle_length(blade: PaddleConfig) -> float:
+    """Distance from the site to the centre of the handle's round end, which enters the blade by
+    a quarter of its thickness, m."""
+    distance = np.linalg.norm(blade.position)
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, np.array(blade.quaternion))
+    along = np.abs(np.array(blade.position) @ rotation.reshape(3, 3)) / max(distance, 1e-9)
+    inside = np.min(blade.half_size / np.maximum(along, 1e-9))
+    return float(distance - inside - _HANDLE_RADIUS + 0.5 * min(blade.half_size))
 
 
 def limit_words(limit: float | None) -> str:

@@ -40,6 +40,10 @@ class Recording(NamedTuple):
     command_velocity: jax.Array | None = None
     """Velocities of the joints' commands at the end of the step [T, n, K], rad/s; None if the
     commands do not move within limits."""
+    qpos: jax.Array | None = None
+    """Generalised positions after the step [T, nq, K], in MuJoCo's order."""
+    metrics: dict[str, jax.Array] = {}
+    """Metrics of the step [T, K]."""
 
 
 class Curve(NamedTuple):

@@ -19,7 +19,6 @@ from bounce_mjx.errors import reason_of
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.learning.policy import make_networks, untrained_policy
-from bounce_mjx.reports.tables import figure_text
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.task.shown import Curve
 from bounce_mjx.training.callbacks import Event
@@ -189,9 +188,10 @@ def results_list(report: Report, steps: int, met_at: dict[str, int]) -> str:
             False: ("&#10007;", "#c92a2a"),
             None: ("-", "#444"),
         }[result.passed]
+        value = "-" if result.value is None else f"{result.value:.2f}"
         rows.append(
             f'<tr><td style="color:{colour}">{mark}</td><td>{html.escape(result.name)}</td>'
-            f'<td style="text-align:right">{figure_text(result.value)}</td>'
+            f'<td style="text-align:right">{value}</td>'
             f"<td>{html.escape(result.bound.partition(' (')[0])}</td>"
             f"<td>{'' if since is None else f'since {since:,}'}</td></tr>"
         )
