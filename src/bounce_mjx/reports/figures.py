@@ -40,7 +40,7 @@ _STYLE = {
     # The same figure gives the same file.
     "svg.hashsalt": "bounce_mjx",
 }
-_POINTS = dict(marker="o", markersize=4.0, linestyle="none", markeredgecolor="white")
+_POINTS = dict(marker="o", markersize=4.0, linestyle="none")
 PANEL_WIDTH = 2.6
 """Width of a panel in inches: two of them fit a phone."""
 style = functools.partial(matplotlib.rc_context, _STYLE)
@@ -223,9 +223,7 @@ def _draw_heights(axes: Axes, env: Env, recording: Recording) -> None:
         axes.set_ylim(bottom=0.0)
     axes.set_title("height over the first recorded episode, m", loc="left")
     axes.set_xlabel("time, s")
-    axes.legend(
-        loc="lower right", ncols=2 + len(levels[0]), bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0
-    )
+    axes.legend(loc="upper center", ncols=2 + len(levels[0]), bbox_to_anchor=(0.5, -0.2))
 
 
 def _draw_histogram(axes: Axes, plot: Histogram) -> None:
