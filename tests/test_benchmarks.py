@@ -6,14 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
-import numpy as np
 import pytest
-
-from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.learning.policy import make_networks
-from bounce_mjx.learning.statistics import init_statistics, normalize, update
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 TINY = (
@@ -91,32 +84,3 @@ def test_trainers_are_compared(tmp_path):
     assert len(rows) == len(methods)
     assert all("0 of 1" in row for row in rows)
     assert (tmp_path / "jax_vs_torch.png").read_bytes().startswith(b"\x89PNG")
-
-
-@pytest.mark.usefixtures("torch_libraries")
-def test_networks_in_torch_begin_as_in_jax(benchmark):
-    """The statistics over batches and the normalised inputs are equal, also for an input that never
-    varied; the weights are orthogonal with the same gains, so they have the same singular values.
-    """
-    import torch
-    from torch_networks import InputNormalizer, make_mlp
-
-    rng = np.random.default_rng(0)
-    normalizer, statistics = InputNormalizer(3), init_statistics(3)
-    for count in (5, 40, 7):
-        batch = rng.normal([2.0, -300.0, 0.0], [1.0, 20.0, 0.0], (count, 3)).astype(np.float32)
-        seen = normalizer(torch.tensor(batch), train=True)
-        statistics = update(statistics, jnp.asarray(batch))
-        expected = normalize(batch, statistics.normalizer)
-        np.testing.assert_allclose(seen, expected, rtol=1e-3, atol=1e-4)
-    np.testing.assert_allclose(normalizer.std, statistics.std, rtol=1e-4)
-
-    config = PPOConfig(hidden_layers=(16, 12))
-    params = make_networks(config, 29, 6).policy_network.init(jax.random.PRNGKey(0))["params"]
-    linears = list(make_mlp(config, 29, 6, output_gain=0.01))[::2]
-    layers = [*params["MLP_0"].values(), params["Dense_0"]]
-    for linear, layer in zip(linears, layers, strict=True):
-        expected = jnp.linalg.svd(layer["kernel"], compute_uv=False)
-        np.testing.assert_allclose(
-            torch.linalg.svdvals(linear.weight.detach()), expected, rtol=1e-4
-        )

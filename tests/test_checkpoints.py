@@ -1,7 +1,6 @@
 """Checkpoints are plain data; each loads unchanged or is refused in one sentence."""
 
 import concurrent.futures
-import hashlib
 import json
 import os
 import random
@@ -9,7 +8,6 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -106,15 +104,6 @@ def assert_refused(run: Path, state: TrainingState, *words: str) -> None:
 
 def test_what_is_written_is_read(run: Path, state: TrainingState) -> None:
     assert_identical(load_both(run, state), (policy_of(state, OBSERVATION.size), state))
-
-
-def test_policy_alone_can_be_written_and_is_not_resumed(tmp_path: Path, state) -> None:
-    run = create_run(CONFIG.model_copy(update={"log_dir": tmp_path}))
-    save_checkpoint(run, CONFIG, 64, {"policy": policy_of(state, OBSERVATION.size)})
-    checkpoint = find_checkpoint(run)
-    assert_identical(read_policy(checkpoint, CONFIG), policy_of(state, OBSERVATION.size))
-    with pytest.raises(UserError, match="holds no training state of this version"):
-        read_training(checkpoint, state)
 
 
 def assert_read_by_orbax(folder: Path, policy: Policy) -> None:
@@ -347,58 +336,6 @@ def test_nothing_is_read_that_could_run(run: Path) -> None:
             assert b"cposix\nsystem" not in data and not data.startswith(b"\x80\x04")
 
 
-class Payload:
-    """Object whose unpickling runs code."""
-
-    def __init__(self, target: Path):
-        self.target = target
-
-    def __reduce__(self):
-        return os.mkdir, (str(self.target),)
-
-
-def payload(target: Path) -> bytes:
-    import pickle
-
-    return pickle.dumps(Payload(target))
-
-
-def test_code_in_any_file_is_not_run(written: Path, tmp_path: Path, state: TrainingState) -> None:
-    """Nor in one whose manifest is made to fit."""
-    target = tmp_path / "ran"
-    names = sorted(p.relative_to(written) for p in written.rglob("*") if p.is_file())
-    tagged = f'!!python/object/apply:os.mkdir ["{target}"]\n'.encode()
-    for name in names:
-        for data in (payload(target), tagged):
-            run = shutil.copytree(written, tmp_path / "run")
-            (run / name).write_bytes(data)
-            if name.name != files.MANIFEST_FILE:
-                files.seal(step_of(run))
-            try:
-                loaded = load_both(run, state)
-            except UserError:
-                pass
-            else:
-                assert_identical(loaded, (policy_of(state, OBSERVATION.size), state))
-            assert not target.exists(), name
-            shutil.rmtree(run)
-
-
-def edit_json(path: Path, change: Callable[[dict], None]) -> None:
-    plain = json.loads(path.read_text())
-    change(plain)
-    path.write_text(json.dumps(plain))
-
-
-def test_manifest_leads_nowhere(run: Path, state: TrainingState) -> None:
-    name = "../../../../secret"
-    (run.parent / "secret").write_text("secret")
-    entry = {"size": 6, "sha256": hashlib.sha256(b"secret").hexdigest()}
-    manifest = step_of(run) / files.MANIFEST_FILE
-    edit_json(manifest, lambda plain: plain["files"].update({name: entry}))
-    assert_refused(run, state, "damaged", "is missing")
-
-
 @pytest.mark.parametrize(
     ("name", "target"), [("record/metadata", "/dev/zero"), ("policy/d", "policy")]
 )
@@ -407,13 +344,6 @@ def test_links_are_not_followed(run: Path, state: TrainingState, name: str, targ
     shutil.rmtree(path) if path.is_dir() else path.unlink()
     path.symlink_to(target)
     assert_refused(run, state, "damaged", "is not a regular file")
-
-
-def test_a_checkpoint_that_is_a_link_is_refused(run: Path, state: TrainingState) -> None:
-    """It may lead to a large tree, of which every file would be hashed."""
-    step_of(run).rename(run.parent / "elsewhere")
-    step_of(run).symlink_to(run.parent / "elsewhere")
-    assert_refused(run, state, "damaged", "64 is not a regular file")
 
 
 def test_pipe_does_not_block(run: Path, state: TrainingState) -> None:

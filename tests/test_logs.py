@@ -466,27 +466,6 @@ def test_a_bag_that_cannot_be_read_is_refused_with_a_hint(tmp_path: Path) -> Non
             read_bag(path, JOINTS, TOPICS)
 
 
-def test_a_ros_1_bag_is_read(tmp_path: Path) -> None:
-    rosbag1 = pytest.importorskip("rosbags.rosbag1")
-    typesys = pytest.importorskip("rosbags.typesys")
-    store, kind = typesys.get_typestore(typesys.Stores.ROS1_NOETIC), "sensor_msgs/msg/JointState"
-    time, header, joints = (
-        store.types[name] for name in ("builtin_interfaces/msg/Time", "std_msgs/msg/Header", kind)
-    )
-    with rosbag1.Writer(tmp_path / "run.bag") as bag:
-        topics = [bag.add_connection(t, kind, typestore=store) for t in TOPICS[:2]]
-        for k in range(5):
-            none, stamp = np.zeros(0), header(k, time(100 + k, 0), "")
-            message = joints(stamp, list(JOINTS), np.array([0.1 * k, 0.2]), none, none)
-            for topic in topics:
-                raw = store.serialize_ros1(message, kind)
-                bag.write(topic, 10**9 * (100 + k), raw)
-    assert is_bag(tmp_path / "run.bag")
-    log = read_bag(tmp_path / "run.bag", JOINTS, TOPICS)
-    np.testing.assert_allclose(log.joint_angles, [[0.1 * k, 0.2] for k in range(5)])
-    np.testing.assert_allclose(log.times, [100.0, 101.0, 102.0, 103.0, 104.0])
-
-
 def test_the_drivers_names_stand_for_the_robots(tmp_path: Path) -> None:
     model, path = load_model(None, 0.001), tmp_path / "log.csv"
     names = [f"arm_{i}" for i in range(6, 0, -1)]

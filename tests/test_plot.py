@@ -1,13 +1,11 @@
 """Learning curves, pictures, the report of a run, and the TensorBoard log."""
 
 import base64
-import dataclasses
 import errno
 import importlib.util
 import io
 import json
 import math
-import os
 import re
 import shutil
 import struct
@@ -37,7 +35,6 @@ from bounce_mjx.reports.figures import (
     image,
     rewards_figure,
 )
-from bounce_mjx.reports.tables import results_markdown
 from bounce_mjx.runs.config import TrainConfig, load_config, train_config
 from bounce_mjx.runs.folders import save_config
 from bounce_mjx.runs.progress import load_results
@@ -162,15 +159,6 @@ def test_a_log_of_any_content_is_read_or_refused(tmp_path: Path) -> None:
     record = size + masked_checksum(size) + message + masked_checksum(message)
     log.write_bytes(log.read_bytes() + record)
     with pytest.raises(UserError, match="the TensorBoard log in .*/run is damaged"):
-        read_curves(run)
-    log.unlink()
-    os.mkfifo(log)
-    with pytest.raises(UserError, match="not a regular file; remove it"):
-        read_curves(run)
-    log.unlink()
-    log.touch()
-    os.truncate(log, 2**40)
-    with pytest.raises(UserError, match="longer than 256 MB"):
         read_curves(run)
 
 
@@ -543,18 +531,3 @@ def test_a_run_that_weights_and_biases_refuses_leaves_no_folder(
         train_command.main([*TINY, "--wandb", "bounce", "--log-dir", str(tmp_path)])
     assert "--wandb bounce is refused (no account)" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
-
-
-def test_weights_and_biases_is_optional(monkeypatch, capsys) -> None:
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(SystemExit) as exit_info:
-        train_command.main(["--wandb", "bounce"])
-    assert exit_info.value.code == 2
-    assert "pip install 'bounce_mjx[wandb]'" in capsys.readouterr().err
-
-
-def test_a_result_that_is_not_judged_is_marked(trained: Path) -> None:
-    report = load_results(trained).best
-    speed = dataclasses.replace(report.results[3], passed=None)
-    text = results_markdown(dataclasses.replace(report, results=(*report.results[:3], speed)))
-    assert text.splitlines()[-1].endswith("| not judged |")

@@ -309,7 +309,7 @@ def test_paddle_and_gravity_are_moved_and_turned_as_described(drawn_model) -> No
 # Actions
 
 
-def simulated_targets(asked: np.ndarray, delay: int, lag: float, n: int) -> np.ndarray:
+def simulated_targets(asked: np.ndarray, delay: int, lag: float | None, n: int) -> np.ndarray:
     """Servo targets of each physics step by brute force: the targets [T] of control steps with n
     physics steps arrive `delay` physics steps late and pass a filter with the time constant `lag`,
     in physics steps."""
@@ -321,18 +321,19 @@ def simulated_targets(asked: np.ndarray, delay: int, lag: float, n: int) -> np.n
     return np.array(outputs)
 
 
-@pytest.mark.parametrize("lag", [0.0, 7.3])
+@pytest.mark.parametrize("lag", [None, 0.0, 7.3])
 @pytest.mark.usefixtures("float64")
-def test_late_and_lagging_targets_are_those_of_a_simulation(lag: float) -> None:
+def test_late_and_lagging_targets_are_those_of_a_simulation(lag: float | None) -> None:
     """Delays of any number of physics steps, up to three control steps."""
     n, dt = 10, 0.01
-    config = RandomizationConfig(action_latency=(0.0, 0.031), servo_lag=(0.0, 0.01))
+    lags = {} if lag is None else {"servo_lag": (0.0, 0.01)}
+    config = RandomizationConfig(action_latency=(0.0, 0.031), **lags)
     asked = np.random.default_rng(0).uniform(-1, 1, 20)
 
     @jax.jit
     @jax.vmap
     def run(latency):
-        world = {"action_latency": latency, "servo_lag": jnp.asarray(lag * dt / n)}
+        world = {"action_latency": latency} | {x: jnp.asarray(lag * dt / n) for x in lags}
 
         def step(memory, target):
             control, memory = add_delay(world, memory, Control(target[None]), dt, n)
