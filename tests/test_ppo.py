@@ -236,18 +236,15 @@ def test_the_noise_shrinks_to_its_bound():
 
 def test_the_objective_is_the_smaller_of_the_two():
     """Schulman et al. 2017, equation 7, at ratios of 0.5 and 1.5."""
-    config = two_state_config(num_envs=4)
-    networks = policy.make_networks(config, 2, 1)
-    algorithm = ppo.PPO(config, TwoStates(1.0), 2, (), networks, None)
-    keys = jax.random.split(jax.random.key(0))
-    params = ppo.Params(networks.policy_network.init(keys[0]), networks.value_network.init(keys[1]))
+    trainer = ppo.PPO(two_state_config(num_envs=4), TwoStates(1.0), episode_steps=2)
+    params = trainer.init(jax.random.key(0)).params
     inputs, action, bound = jnp.ones((4, 2)), jnp.full((4, 1), 0.3), jnp.zeros((4, 1))
     ratio, advantage = np.array([0.5, 0.5, 1.5, 1.5]), np.array([1.0, -1.0, 2.0, -3.0])
-    new = ppo.distribution(algorithm, params, inputs, bound).log_prob(action)
+    new = trainer.distribution(params, inputs, bound).log_prob(action)
     samples = ppo.Samples(inputs, action, new - np.log(ratio), advantage, jnp.zeros(4), bound)
-    epsilon = config.clip_epsilon
+    epsilon = trainer.config.clip_epsilon
     expected = -np.mean([0.5, -(1.0 - epsilon), 2.0 * (1.0 + epsilon), -4.5])
-    _, parts = ppo.loss(algorithm, params, samples)
+    _, parts = trainer.loss(params, samples)
     np.testing.assert_allclose(parts["loss/policy"], expected, rtol=1e-5)
 
 
