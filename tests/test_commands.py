@@ -24,11 +24,13 @@ from bounce_mjx.commands import train as train_command
 from bounce_mjx.commands.main import COMMANDS
 from bounce_mjx.commands.main import main as console_script
 from bounce_mjx.config import command_line
-from bounce_mjx.config.command_line import parse
+from bounce_mjx.config.command_line import flags_of, parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.resources import resource_path
-from bounce_mjx.runs.config import TrainConfig, load_config
+from bounce_mjx.runs.config import TrainConfig, load_config, train_config
 from bounce_mjx.runs.folders import choose_checkpoint
+from bounce_mjx.tasks.registry import find_task
+from bounce_mjx.training.command import TrainCommand
 from bounce_mjx.training.setup import set_up_jax
 from tiny_runs import STEPS, TINY, TRAIN_SCRIPT, contents, shared_run
 
@@ -330,6 +332,23 @@ def test_help_shows_plain_forms_and_no_empty_default(command: str, monkeypatch, 
     assert f"usage: bounce-mjx {command} " in shown
     for oddity in ("None}", "{None", "[[", "...]]", "(default: )", "(default: None)", "{True"):
         assert oddity not in shown
+
+
+def test_the_help_of_a_training_is_one_screen_and_the_whole_help_has_every_flag(capsys) -> None:
+    pages = []
+    for flag in ("--help", "--help-all"):
+        with pytest.raises(SystemExit):
+            console_script(["train", "--config", "cpu", "--seed", "3", flag])
+        pages.append(capsys.readouterr().out)
+    lines = pages[0].splitlines()
+    assert len(lines) <= 45 and max(map(len, pages[1].splitlines())) <= 100
+    assert "--num-envs INT          Environments that run in parallel (default: 512)" in pages[0]
+    shown = {*re.findall(r"^  (--[\w.-]+)", pages[1], re.MULTILINE)}
+    known = {*flags_of(train_config(find_task("bounce"), TrainCommand))}
+    assert shown <= known
+    plain = {flag.replace("--no-", "--").replace(".no-", ".") for flag in known}
+    assert {flag.replace("--no-", "--").replace(".no-", ".") for flag in shown} == plain
+    assert pages[1].index("\nppo:\n") < pages[1].index("--learning-rate FLOAT")
 
 
 def test_help_shows_the_form_of_each_kind_of_value(monkeypatch) -> None:

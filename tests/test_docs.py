@@ -182,7 +182,7 @@ def test_shown_commands_are_understood(command, monkeypatch: pytest.MonkeyPatch)
 def known_flags() -> set[str]:
     """The flags of every command of the package, and of the maintainers' one."""
     ship = runpy.run_path(str(CHECKOUT / "benchmarks/ship.py"))
-    flags = {"--help", *cli.flags_of(ship["ShipCommand"])}
+    flags = {"--help", "--help-all", *cli.flags_of(ship["ShipCommand"])}
     flags |= set(cli.flags_of(train_config(Bounce, TrainCommand)))
     for info in pkgutil.iter_modules(commands_package.__path__):
         module = importlib.import_module(f"bounce_mjx.commands.{info.name}")

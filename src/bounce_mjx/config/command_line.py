@@ -2,7 +2,9 @@
 
 import contextlib
 import difflib
+import functools
 import re
+import textwrap
 import time
 import types
 import typing
@@ -32,6 +34,9 @@ CommandT = TypeVar("CommandT", bound=pydantic.BaseModel)
 
 # Lines about the progress are left out where less time than this is left.
 _SILENT_SECONDS = 10.0
+
+# Column at which the texts of a help page start.
+_HELP_COLUMN = 26
 
 # Columns: more than any table or line has.
 _NO_WRAP = 100_000
@@ -225,6 +230,31 @@ def _form(kind: Any) -> str:
     return kind.__name__.upper()
 
 
+def help_page(command: pydantic.BaseModel, keys: Sequence[str] = ()) -> str:
+    """The flags of a command that has their defaults: each with its text, by group of settings; or
+    those of some dotted keys, in this order, each with its first sentence."""
+    paths = {".".join(name for name, _ in path): path for path in leaves(type(command))}
+    groups = [*dict.fromkeys(["", *(key.rpartition(".")[0] for key in paths)])]
+    lines, group = [], None
+    for key in keys or sorted(paths, key=lambda key: groups.index(key.rpartition(".")[0])):
+        if not keys and key.rpartition(".")[0] != group:
+            group = key.rpartition(".")[0]
+            lines.append(f"\n{group or 'training'}:")
+        field, value = paths[key][-1][1], functools.reduce(getattr, key.split("."), command)
+        form = "" if field.annotation is bool else f" {_form(field.annotation)}"
+        text = " ".join((field.description or "").split())
+        text = re.split(r"(?<=[\w)])[.;] ", text)[0].rstrip(".") if keys else text
+        if value is not False and value not in (None, (), {}):
+            value = " ".join(map(str, value)) if isinstance(value, tuple) else value
+            text += f" (default: {value})"
+        flag, margin = _flag(paths[key]), " " * _HELP_COLUMN
+        flag = f"  {_switch_off(flag) if value is True else flag}{form}"
+        wrapped = textwrap.fill(text, 100, initial_indent=margin, subsequent_indent=margin)
+        fits = len(flag) < _HELP_COLUMN - 1
+        lines.append(flag + (wrapped[len(flag) :] if fits else f"\n{wrapped}"))
+    return "\n".join(lines).lstrip("\n")
+
+
 def flags_of(command_class: type[pydantic.BaseModel]) -> list[str]:
     """The flags of a command."""
     flags = []
@@ -233,9 +263,13 @@ def flags_of(command_class: type[pydantic.BaseModel]) -> list[str]:
         if tyro.conf.Positional not in field.metadata:
             flags.append(_flag(path))
             if field.annotation is bool:
-                group, dot, name = flags[-1].removeprefix("--").rpartition(".")
-                flags.append(f"--{group}{dot}no-{name}")
+                flags.append(_switch_off(flags[-1]))
     return flags
+
+
+def _switch_off(flag: str) -> str:
+    """The flag that switches another one off: --reset.no-noise of --reset.noise."""
+    return re.sub(r"^(--(?:.*\.)?)", r"\1no-", flag)
 
 
 def _flag(path: Sequence[tuple[str, FieldInfo]]) -> str:

@@ -86,7 +86,7 @@ class TrainConfig(StrictModel):
     eval_seed: NonNegativeInt = 10_000
     """Seed of the evaluations during training."""
     stop_when_solved: bool = False
-    """End once an evaluation meets all results with a margin, so that 64 other episodes should meet
+    """End once an evaluation meets all results with a margin. Then 64 other episodes should meet
     them too: means over steps and events by two standard errors of 64 episodes, shares of episodes
     with at most half of the failures that are allowed. At the latest it ends after 1.5 times the
     steps of the first evaluation that meets all."""

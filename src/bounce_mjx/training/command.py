@@ -1,5 +1,6 @@
 """The flags of the command that trains."""
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -8,7 +9,7 @@ import pydantic
 import tyro
 from pydantic import Field
 
-from bounce_mjx.config.command_line import parse, parse_first
+from bounce_mjx.config.command_line import help_page, parse, parse_first
 from bounce_mjx.config.settings import Count, HostName, NonNegativeInt
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.runs.config import TrainConfig, train_config
@@ -16,6 +17,11 @@ from bounce_mjx.training.start import Start
 from bounce_mjx.world.config import WorldConfig
 
 PROG = "bounce-mjx train"
+
+_SHORT_HELP = (
+    "task config robot world warm_start resume seed num_seeds total_steps stop_when_solved "
+    "log_dir report watch wandb algorithm ppo.num_envs ppo.learning_rate ppo.hidden_layers"
+).split()
 
 
 class TrainCommand(TrainConfig, Start):
@@ -68,10 +74,18 @@ def read_command(args: Sequence[str], machine: Path | None = None) -> TrainComma
     Raises:
       UserError: a flag or the preset is wrong, or a flag changes a key of the resumed run that must
         stay the same.
+      SystemExit: the flags include --help or --help-all, which it has printed.
     """
-    start = parse_first(Start, args, prog=PROG)
+    helps = {"-h", "--help", "--help-all"}.intersection(args)
+    start = parse_first(Start, [word for word in args if word not in helps], prog=PROG)
     base = start.base(machine)
     own_class = train_config(base.env.task, TrainCommand, type(base.ppo))
+    if helps:
+        shown = help_page(own_class(**dict(base)), () if "--help-all" in helps else _SHORT_HELP)
+        print(f"usage: {PROG} [FLAGS]\n\n{TrainCommand.__doc__ or ''}\n\n{shown}")
+        if "--help-all" not in helps:
+            print("\n--help-all lists every flag; each key of the config is one (docs/config.md).")
+        sys.exit()
     command = parse(own_class, args, prog=PROG, default=own_class(**dict(base)))
     settled = start.settle(command.training, base)
     return command.model_copy(update=dict(settled) | {"resume": start.run})
