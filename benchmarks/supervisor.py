@@ -21,7 +21,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from bounce_mjx import load_policy
 from bounce_mjx.deploy.chain import Chain
-from bounce_mjx.deploy.faults import EARLIER, FLYING, allowed, faults, picture_age
+from bounce_mjx.deploy.faults import EARLIER, FLYING, faults, make_bounds, picture_age
 from bounce_mjx.deploy.metadata import Metadata
 from bounce_mjx.env.env import Env, State
 from bounce_mjx.evaluation.episodes import reset_episodes
@@ -154,7 +154,7 @@ def delays(
 def judge(name: str, given: argparse.Namespace, rng: np.random.Generator) -> None:
     """Prints the first alarms of a policy's episodes, and the times from faults."""
     metadata = load_policy(name).metadata
-    bounds = allowed(metadata, picture_age(metadata), 2.0, None)
+    bounds = make_bounds(metadata, picture_age(metadata), 2.0, None)
     run = recorder(name, min(_BATCH, given.episodes), given.latencies)
     alarms, late, lasted = Counter(), {}, 0
     for batch in range(-(-given.episodes // _BATCH)):

@@ -66,7 +66,7 @@ def main(args: Sequence[str]) -> None:
         values = {"task": command.task, **values}
     config = validate(train_config(task), values, str(command.mjcf))
     env = Env(config.env)
-    for line in described(adoption):
+    for line in describe(adoption):
         console.print(line, markup=False)
     console.print(f"physics: {env.engine.name} ({env.engine.reason})", markup=False)
     out = command.out or Path(f"{command.mjcf.stem}.yaml")
@@ -104,7 +104,7 @@ def env_values(mjcf: Path, adoption: "Adoption", config_class: type[WorldConfig]
     }
 
 
-def described(adoption: "Adoption") -> list[str]:
+def describe(adoption: "Adoption") -> list[str]:
     """Lines about an adopted arm: its pose, its servos, and the changes to the user's model."""
     from bounce_mjx.robot.arm import limit_words
 

@@ -29,12 +29,12 @@ def main(args: Sequence[str]) -> None:
     """Runs the command line."""
     parse(DoctorCommand, args, prog="bounce-mjx doctor")
     print("```")
-    for name, text in described():
+    for name, text in describe():
         print(f"{name}: {text}", flush=True)
     print("```")
 
 
-def described() -> Iterator[tuple[str, str]]:
+def describe() -> Iterator[tuple[str, str]]:
     """The lines, each a name and a text."""
     yield "bounce_mjx", f"{bounce_mjx.__version__} in {Path(bounce_mjx.__file__).parent}"
     yield "python", f"{platform.python_version()} ({sys.executable}) on {platform.platform()}"
@@ -44,10 +44,10 @@ def described() -> Iterator[tuple[str, str]]:
     chosen = {name: value for name, value in os.environ.items() if name.startswith(_VARIABLES)}
     yield "variables", ", ".join(f"{n}={v}" for n, v in sorted(chosen.items())) or "none"
     yield "processors", f"{os.cpu_count()}"
-    yield "devices", _tried(_devices)
-    yield "cache", _tried(_cache)
-    yield "pictures", _tried(_opengl)
-    yield "videos", _tried(_ffmpeg)
+    yield "devices", _try(_devices)
+    yield "cache", _try(_cache)
+    yield "pictures", _try(_opengl)
+    yield "videos", _try(_ffmpeg)
     for extra, packages in sorted(extras().items()):
         missing = [package for package in packages if version_of(package) is None]
         command = install_command(f"{_DISTRIBUTION}[{extra}]")
@@ -75,15 +75,15 @@ def extras() -> dict[str, list[str]]:
 def _packages(distribution: str, extra: str) -> Iterator[str]:
     """The packages of an installed package's extra, with those of the extras that it includes."""
     for requirement in importlib.metadata.requires(distribution) or []:
-        name, included, of_extra = _REQUIREMENT.match(requirement).groups()
-        if of_extra == extra:
+        name, included, marked = _REQUIREMENT.match(requirement).groups()
+        if marked == extra:
             yield name
             if version_of(name) is not None:
                 for inner in included.split(",") if included else ():
                     yield from _packages(name, inner)
 
 
-def _tried(describe: Callable[[], str]) -> str:
+def _try(describe: Callable[[], str]) -> str:
     """A description, or why there is none: a broken installation is what this command is for, so
     each description imports its libraries itself."""
     try:

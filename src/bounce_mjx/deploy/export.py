@@ -28,7 +28,7 @@ from bounce_mjx.deploy.metadata import (
     to_entries,
 )
 from bounce_mjx.errors import UserError, needed
-from bounce_mjx.learning.policy import Policy, make_networks
+from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.robot.arm import joint_name
 from bounce_mjx.robot.model import find_addresses, joint_names, load_model
 from bounce_mjx.runs.config import TrainConfig, load_run_config
@@ -70,8 +70,14 @@ def export_onnx(checkpoint: Checkpoint) -> bytes:
     config = load_run_config(checkpoint.run)
     checkpoint, policy, _ = read_actor(checkpoint, config)
     metadata = policy_metadata(config, checkpoint.steps)
+    networks = make_networks(config.ppo, config.env.layout.size, config.env.num_joints)
+    names = [part.name for part in _inputs(config.env)]
+
+    def act(histories: dict[str, jax.Array]) -> jax.Array:
+        return networks.act(policy, jnp.concatenate([histories[name].ravel() for name in names]))
+
     with jax.enable_x64(False):
-        function, inputs = _control_step(config.env, _network(config, policy))
+        function, inputs = _control_step(config.env, act)
         graph = onnx_graph(function, inputs, f"the task {config.env.task.__name__}")
     texts = {
         part.name: f"the newest first; {part.unit or 'no unit'}" for part in _inputs(config.env)
@@ -99,7 +105,10 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
       UserError: the MJCF file is missing, its paddle hangs on a joint that is not a hinge with a
         servo, or a command has the name of a measurement.
     """
-    env, limits = config.env, config.env.robot.limits
+    env, given = config.env, config.env.robot.limits
+    limits = None
+    if given.velocity is not None:
+        limits = CommandLimits(given.velocity, given.acceleration, given.jerk)
     if taken := env.commands.keys() & UNITS.keys():
         raise UserError(
             f"the command {min(taken)} has the name of a measurement; give it another name in "
@@ -122,12 +131,10 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         velocity=env.observation.velocity,
         estimator=None,
         control_dt=env.control_dt,
-        action=_ACTION if limits.velocity is None else _ACTION + _LIMITED,
+        action=_ACTION if limits is None else _ACTION + _LIMITED,
         action_scale=env.action_scale,
         max_lead=env.action.max_lead if env.action.base == "target" else None,
-        limits=None
-        if limits.velocity is None
-        else CommandLimits(limits.velocity, limits.acceleration, limits.jerk),
+        limits=limits,
         joint_ranges=tuple(
             (low, high) if low < high else None
             for low, high in m.jnt_range[list(addresses.arm_joints)].tolist()
@@ -200,15 +207,6 @@ def _hinges(
     centre = data.geom_xpos[addresses.paddle_geom] - anchor
     normal = data.xmat[body].reshape(3, 3) @ upper_face(m, default_joint_angles)[0]
     return tuple(links), tuple(centre.tolist()), tuple(normal.tolist())
-
-
-def _network(config: TrainConfig, policy: Policy) -> Callable[[dict[str, jax.Array]], jax.Array]:
-    """Histories [history, size] by the inputs' names -> action [J]."""
-    names = [part.name for part in _inputs(config.env)]
-    networks = make_networks(config.ppo, config.env.layout.size, config.env.num_joints)
-    return lambda histories: networks.act(
-        policy, jnp.concatenate([histories[name].ravel() for name in names])
-    )
 
 
 def _floats(*shape: int) -> jax.ShapeDtypeStruct:

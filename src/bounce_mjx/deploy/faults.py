@@ -48,7 +48,7 @@ class Rest(NamedTuple):
     """Distance of this mean from the angle by which no arm moves visibly [K], rad."""
 
 
-def largest(metadata: Metadata, term: str, default: float = 0.0, end: int = 1) -> float:
+def largest_term(metadata: Metadata, term: str, default: float = 0.0, end: int = 1) -> float:
     """Largest absolute value of a randomisation term over axes and joints; with the end 0, its
     least one."""
     found = [r for name, r in metadata.randomization.items() if name.split("[")[0] == term]
@@ -59,15 +59,15 @@ def largest(metadata: Metadata, term: str, default: float = 0.0, end: int = 1) -
 def picture_age(metadata: Metadata) -> float:
     """Age beyond which a picture is too old: the training's largest latency and five of its longest
     intervals, s."""
-    rate = largest(metadata, "camera_rate", 1.0 / metadata.control_dt, end=0)
-    return min(max(largest(metadata, "ball_latency") + 5.0 / rate, 0.1), 1.0)
+    rate = largest_term(metadata, "camera_rate", 1.0 / metadata.control_dt, end=0)
+    return min(max(largest_term(metadata, "ball_latency") + 5.0 / rate, 0.1), 1.0)
 
 
-def allowed(metadata: Metadata, age: float, steps_late: float, box: Any) -> dict[str, Any]:
+def make_bounds(metadata: Metadata, age: float, steps_late: float, box: Any) -> dict[str, Any]:
     """The bounds of a policy's worlds, with the settings of a supervisor (`box` [2, 3], m), by the
     first fact of the rule that each is for."""
     limits, dt, ball = metadata.limits, metadata.control_dt, metadata.ball
-    noise = 1.5 * _LARGEST_NOISE * largest(metadata, "ball_position_noise")
+    noise = 1.5 * _LARGEST_NOISE * largest_term(metadata, "ball_position_noise")
     return {
         "elapsed": steps_late * dt,
         "idle": steps_late,
@@ -84,18 +84,20 @@ def allowed(metadata: Metadata, age: float, steps_late: float, box: Any) -> dict
 
 def _rest(metadata: Metadata) -> Rest:
     """What the slowest arm of the training's worlds would have done; any faster arm moves more."""
-    still = _STILL + 0.8 * _LARGEST_NOISE * largest(metadata, "joint_angle_noise")
+    still = _STILL + 0.8 * _LARGEST_NOISE * largest_term(metadata, "joint_angle_noise")
     visible = max(STUCK_SHARE * metadata.action_scale, 0.6 * still)
     dt = metadata.control_dt
-    slow = largest(metadata, "servo_damping", 1.0) / largest(metadata, "servo_gain", 1.0, end=0)
+    slow = largest_term(metadata, "servo_damping", 1.0) / largest_term(
+        metadata, "servo_gain", 1.0, end=0
+    )
     lag = slow * np.max(np.divide(metadata.servo_damping, metadata.servo_stiffness))
-    kept = math.exp(-dt / (lag + largest(metadata, "servo_lag") + 1e-6))
-    late = math.ceil((largest(metadata, "action_latency") + _LATER) / dt - 1e-6)
+    kept = math.exp(-dt / (lag + largest_term(metadata, "servo_lag") + 1e-6))
+    late = math.ceil((largest_term(metadata, "action_latency") + _LATER) / dt - 1e-6)
     steps = max(round(_STUCK_SECONDS / dt) - late, math.ceil(_ASKED_SECONDS / dt))
     since = np.arange(steps)[:, None] - np.arange(steps)
     pull = np.tril((1.0 - kept) * kept ** np.abs(since))
     settled = np.sum(pull, axis=1)
-    offset = _SAG + largest(metadata, "encoder_bias")
+    offset = _SAG + largest_term(metadata, "encoder_bias")
     return Rest(steps + late, still, offset, pull / settled[:, None], visible / settled)
 
 

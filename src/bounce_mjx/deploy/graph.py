@@ -58,13 +58,13 @@ _OPERATIONS = {
     "logistic": ("f", "Sigmoid"),
     "lt": ("fi", "Less"),
     "ne": ("fib", lambda g, e, x, y: g.node("Not", g.node("Equal", x, y))),
-    "reduce_and": ("b", lambda g, e, x: g.cast(g.reduced("Min", e, g.cast(x, np.int32)), bool)),
-    "reduce_max": ("fi", lambda g, e, x: g.reduced("Max", e, x)),
-    "reduce_min": ("fi", lambda g, e, x: g.reduced("Min", e, x)),
-    "reduce_or": ("b", lambda g, e, x: g.cast(g.reduced("Max", e, g.cast(x, np.int32)), bool)),
+    "reduce_and": ("b", lambda g, e, x: g.cast(g.reduce("Min", e, g.cast(x, np.int32)), bool)),
+    "reduce_max": ("fi", lambda g, e, x: g.reduce("Max", e, x)),
+    "reduce_min": ("fi", lambda g, e, x: g.reduce("Min", e, x)),
+    "reduce_or": ("b", lambda g, e, x: g.cast(g.reduce("Max", e, g.cast(x, np.int32)), bool)),
     "reduce_sum": ("fi", lambda g, e, x: g.node("ReduceSum", x, np.array(_axes(e)), keepdims=0)),
     "rem": ("f", lambda g, e, x, y: g.node("Mod", x, y, fmod=1)),
-    "select_n": ("fib", lambda g, e, *operands: g.selected(e, *operands)),
+    "select_n": ("fib", lambda g, e, *operands: g.select(e, *operands)),
     "square": ("fi", lambda g, e, x: g.node("Mul", x, x)),
 }
 
@@ -134,10 +134,10 @@ def _sources(equation: JaxprEqn, indices: Mapping[int, np.ndarray]) -> tuple[lis
         size = math.prod(atom.aval.shape)
         operands.append(np.arange(count, count + size, dtype=np.int32).reshape(atom.aval.shape))
         count += size
-    return _evaluated(equation, operands), count
+    return _evaluate(equation, operands), count
 
 
-def _evaluated(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
+def _evaluate(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
     """The results of an operation on constants, also within a trace."""
     with jax.ensure_compile_time_eval():
         results = equation.primitive.bind(*map(jax.numpy.asarray, operands), **equation.params)
@@ -172,13 +172,13 @@ class _Graph:
             inner = equation.params[_INLINED[name]]
             return self.run(inner.jaxpr, inner.consts, operands)
         if not any(isinstance(value, str) for value in operands):
-            return _evaluated(equation, operands)
+            return _evaluate(equation, operands)
         if name in _MOVES:
-            return self._moved(equation, operands)
+            return self._move(equation, operands)
         types, counterpart = _OPERATIONS.get(name, ("", ""))
         if not {atom.aval.dtype for atom in atoms} <= {_TYPES[letter] for letter in types}:
             self._refuse(equation)
-        aligned = [self._aligned(*pair, equation) for pair in zip(operands, atoms, strict=True)]
+        aligned = [self._align(*pair, equation) for pair in zip(operands, atoms, strict=True)]
         if isinstance(counterpart, str):
             return [self.node(counterpart, *aligned)]
         return [counterpart(self, equation, *aligned)]
@@ -190,20 +190,20 @@ class _Graph:
             "arithmetic, comparisons, jnp.where and fixed indices"
         )
 
-    def _aligned(self, value: Value, atom: Var | Literal, equation: JaxprEqn) -> Value:
+    def _align(self, value: Value, atom: Var | Literal, equation: JaxprEqn) -> Value:
         """An operand, with further axes if it is one number for a whole array."""
         ndim = equation.outvars[0].aval.ndim
         if isinstance(value, np.ndarray) or atom.aval.ndim or not ndim:
             return value
         return self.node("Reshape", value, np.array([-1] + [1] * ndim))
 
-    def _moved(self, equation: JaxprEqn, operands: list[Value]) -> list[Value]:
+    def _move(self, equation: JaxprEqn, operands: list[Value]) -> list[Value]:
         """Results that hold the operands' numbers at other places."""
         indices, numbers = {}, []
         for i, (value, atom) in enumerate(zip(operands, equation.invars, strict=True)):
             if i not in _INDICES.get(equation.primitive.name, ()):
                 size = math.prod(atom.aval.shape)
-                numbers += [self._flat(value, size, operands)] if size else []
+                numbers += [self._flatten(value, size, operands)] if size else []
             elif isinstance(value, str):
                 self._refuse(equation)
             else:
@@ -222,7 +222,7 @@ class _Graph:
                 results.append(self.node("Gather", joined, source.astype(np.int64), axis=1))
         return results
 
-    def _flat(self, value: Value, size: int, operands: list[Value]) -> str:
+    def _flatten(self, value: Value, size: int, operands: list[Value]) -> str:
         """The numbers of one of the operands [N, size]."""
         if isinstance(value, str):
             return self.node("Reshape", value, np.array([-1, size]))
@@ -253,11 +253,11 @@ class _Graph:
         """ONNX's number of a type."""
         return self.helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
 
-    def reduced(self, kind: str, equation: JaxprEqn, x: Value) -> str:
+    def reduce(self, kind: str, equation: JaxprEqn, x: Value) -> str:
         """Least (Min) or greatest (Max) entries."""
         return self.node(f"Reduce{kind}", x, axes=_axes(equation), keepdims=0)
 
-    def selected(self, equation: JaxprEqn, condition: Value, *cases: Value) -> str:
+    def select(self, equation: JaxprEqn, condition: Value, *cases: Value) -> str:
         """The second case where the condition holds, else the first."""
         if len(cases) != 2 or equation.invars[0].aval.dtype != bool:
             self._refuse(equation)
@@ -274,15 +274,15 @@ class _Graph:
         if isinstance(y, np.ndarray) and ndims == [1, 2] and sum_y == (0,):
             # The layer of a network, which onnxruntime computes faster than other sums.
             return self.node("MatMul", x, y)
-        of_x, of_y = (
+        names_x, names_y = (
             list(letters[:ndim])
             for letters, ndim in zip(("abcdefgh", "ijklmnop"), ndims, strict=True)
         )
         for i, j in zip((*sum_x, *each_x), (*sum_y, *each_y), strict=True):
-            of_y[j] = of_x[i]
-        result = [of_x[i] for i in each_x]
-        result += [name for i, name in enumerate(of_x) if i not in (*sum_x, *each_x)]
-        result += [name for j, name in enumerate(of_y) if j not in (*sum_y, *each_y)]
+            names_y[j] = names_x[i]
+        result = [names_x[i] for i in each_x]
+        result += [name for i, name in enumerate(names_x) if i not in (*sum_x, *each_x)]
+        result += [name for j, name in enumerate(names_y) if j not in (*sum_y, *each_y)]
         rows_x, rows_y = ("Z" * isinstance(value, str) for value in (x, y))
-        terms = f"{rows_x}{''.join(of_x)},{rows_y}{''.join(of_y)}->Z{''.join(result)}"
+        terms = f"{rows_x}{''.join(names_x)},{rows_y}{''.join(names_y)}->Z{''.join(result)}"
         return self.node("Einsum", x, y, equation=terms)

@@ -36,21 +36,21 @@ class Histories:
         self._ball = measured.get("ball_position", self._ball_velocity)
         self._age = float(measured["ball_age"][0]) if "ball_age" in measured else 0.0
         start = {"ball_velocity": self._ball_velocity}
-        self.newest = start | self._completed(measured, self._no_joints)
+        self.newest = start | self._complete(measured, self._no_joints)
         """Newest value of each quantity, also of those that the policy does not see."""
         self.values = {i.name: np.tile(self.newest[i.name], (i.history, 1)) for i in inputs}
         """Last values of each input [history, size], the newest first."""
 
     def add(self, measured: Measurements, action: np.ndarray) -> None:
         """Adds the measurements of the next control step, and the action [J] of the step before."""
-        self.newest = self._completed(measured, action)
+        self.newest = self._complete(measured, action)
         if "ball_position" in measured and self._metadata.velocity == "differences":
             self.newest["ball_velocity"] = self._difference(measured)
         for name, past in self.values.items():
             past[1:] = past[:-1].copy()
             past[0] = self.newest[name]
 
-    def _completed(self, measured: Measurements, action: np.ndarray) -> Measurements:
+    def _complete(self, measured: Measurements, action: np.ndarray) -> Measurements:
         """The measurements, and the quantities that depend on nothing else."""
         angles = measured.get("joint_angles", self._no_joints)
         return {

@@ -56,7 +56,7 @@ def _model(policy: str | os.PathLike, task: str | None) -> tuple[bytes, str]:
         return path.read_bytes(), f"the policy {policy}"
     path = Path(policy)
     if path.is_dir():
-        return _exported(path, task), str(path)
+        return _export(path, task), str(path)
     try:
         return path.read_bytes(), str(path)
     except OSError as error:
@@ -66,7 +66,7 @@ def _model(policy: str | os.PathLike, task: str | None) -> tuple[bytes, str]:
         ) from error
 
 
-def _exported(run: Path, task: str | None) -> bytes:
+def _export(run: Path, task: str | None) -> bytes:
     """The ONNX file of a run's policy."""
     try:
         from bounce_mjx.deploy.export import export_onnx

@@ -33,7 +33,7 @@ class Motion:
         """Begins a control step where the last one ended, the first one at the measured angles
         [J]."""
         if self._end is None:
-            self.rest(self.clipped(angles))
+            self.rest(self.clip(angles))
         self._start = self._end
 
     def withdraw(self) -> None:
@@ -87,6 +87,6 @@ class Motion:
         step = speed * self._duration
         return self._start.position + np.clip(left, -step, step)
 
-    def clipped(self, angles: np.ndarray) -> np.ndarray:
+    def clip(self, angles: np.ndarray) -> np.ndarray:
         """Angles [J] within the joints' ranges."""
         return np.clip(angles, self._low, self._high)

@@ -113,7 +113,7 @@ class DeployedPolicy:
             unit or frame; or the time is more than 1 s from the last. The policy's state does
             not change. Or the network gives no finite action; then call `reset`.
         """
-        measured = self.checked(measurements)
+        measured = self.check(measurements)
         self._refuse_impossible(measured)
         angles = measured.get("joint_angles")
         if angles is not None and self.metadata.max_lead is not None:
@@ -256,7 +256,7 @@ class DeployedPolicy:
             users["ball_position"] |= users.pop("ball_velocity")
         return tuple(name for name in users if users[name] & reads)
 
-    def checked(
+    def check(
         self, measurements: Mapping[str, Any], needs: Sequence[str] | None = None
     ) -> Measurements:
         """Copies of the measurements as arrays, with defaults for optional ones.
@@ -322,7 +322,7 @@ class DeployedPolicy:
                     f"({self.units[name]}); give one near this range"
                 )
         angles = measured.get("joint_angles", np.array(self.metadata.default_joint_angles))
-        outside = np.abs(angles - self._motion.clipped(angles))
+        outside = np.abs(angles - self._motion.clip(angles))
         worst = np.argmax(outside)
         if outside[worst] > _OUTSIDE:
             raise UserError(

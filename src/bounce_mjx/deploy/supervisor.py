@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from bounce_mjx.deploy.chain import Chain
-from bounce_mjx.deploy.faults import EARLIER, FASTEST, FLYING, allowed, first_fault, picture_age
+from bounce_mjx.deploy.faults import EARLIER, FASTEST, FLYING, first_fault, make_bounds, picture_age
 from bounce_mjx.deploy.histories import Measurements
 from bounce_mjx.errors import UserError
 
@@ -58,7 +58,7 @@ class Supervisor:
         corners = np.array(box, float)
         if corners.shape != (2, 3) or not np.all(corners[0] < corners[1]):
             raise UserError(f"the box is {box}; give its lowest and its highest x, y and z, m")
-        self._allowed = allowed(metadata, age, max_steps_late, corners)
+        self._allowed = make_bounds(metadata, age, max_steps_late, corners)
         self._home_speed, self._chain = home_speed, Chain(metadata)
         self.state: State = "homing"
         self.fault: str | None = None
@@ -132,7 +132,7 @@ class Supervisor:
     def _angles(self, measurements: Mapping[str, Any]) -> np.ndarray:
         """The measured joint angles [J], whatever else is measured."""
         given = {k: v for k, v in measurements.items() if k == "joint_angles"}
-        return self._policy.checked(given, ("joint_angles",))["joint_angles"]
+        return self._policy.check(given, ("joint_angles",))["joint_angles"]
 
     def _is_fine(self, facts: dict[str, Any]) -> bool:
         """Brakes if the facts break a rule, and says whether they keep all."""
@@ -166,7 +166,7 @@ class Supervisor:
     def _follow(self, measurements: Mapping[str, Any]) -> None:
         """A step of the policy."""
         policy = self._policy
-        measured = policy.checked(measurements, dict.fromkeys((*policy.needs, "joint_angles")))
+        measured = policy.check(measurements, dict.fromkeys((*policy.needs, "joint_angles")))
         if not self._is_fine(self._facts(measured)):
             return
         last = policy.step_number

@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Callable
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -65,10 +64,11 @@ def make_recording_mujoco_evaluator(
         return begin(env, reset_episodes(env, key, episodes, ranges), recorded)
 
     @jax.jit
-    def decide(policy: Policy, states: State) -> tuple[jax.Array, Actuation, _Inputs]:
+    def decide(policy: Policy, states: State) -> tuple[jax.Array, Actuation, Control, jax.Array]:
         now, actions = states.pipeline_state, actor.act(policy, states.obs.T).T
         control, actuation = jax.vmap(env.control, in_axes=-1, out_axes=-1)(now, actions)
-        return actions, actuation, _inputs(env, now, control)
+        targets = jax.vmap(servo_targets, in_axes=(-1, None))(control, env.config.num_substeps)
+        return actions, actuation, control, targets
 
     @jax.jit
     def finish(
@@ -84,8 +84,9 @@ def make_recording_mujoco_evaluator(
         with rollout.Rollout(nthread=_NUM_THREADS) as pool:
             physics = _Physics(env, now.states, pool)
             for step in range(env.config.episode_steps):
-                actions, actuation, inputs = decide(policy, now.states)
-                now = finish(now, actions, actuation, physics.step(inputs))
+                actions, actuation, control, targets = decide(policy, now.states)
+                after = physics.step(control, targets, now.states.pipeline_state)
+                now = finish(now, actions, actuation, after)
                 if step % 100 < 99:
                     continue
                 if not np.any(now.statistics.running):
@@ -95,32 +96,6 @@ def make_recording_mujoco_evaluator(
         return now.statistics, now.recording
 
     return evaluate
-
-
-class _Inputs(NamedTuple):
-    """What acts on the physics of N episodes in a control step."""
-
-    targets: jax.Array
-    """Servo targets [N, substeps, nu]."""
-    push: jax.Array | None
-    """Velocities that are added to the balls' [3 B, N], m/s."""
-    contact_damping: jax.Array | None
-    """Where an impact changes it [N], 1/s."""
-    air_drag: jax.Array | None
-    """That of `Control` [N]."""
-    air_lift: jax.Array | None
-    """Likewise."""
-
-
-def _inputs(env: Env, states: EnvState, control: Control) -> _Inputs:
-    """The inputs of states and a control, batch last."""
-    return _Inputs(
-        targets=jax.vmap(servo_targets, in_axes=(-1, None))(control, env.config.num_substeps),
-        push=control.ball_push,
-        contact_damping=None if states.impact is None else states.parameters.contact_damping,
-        air_drag=control.air_drag,
-        air_lift=control.air_lift,
-    )
 
 
 class _Physics:
@@ -137,20 +112,31 @@ class _Physics:
         self._data = [mujoco.MjData(self._models[0]) for _ in range(_NUM_THREADS)]
         self._states = full_states(env.mj_model, now.physics)
 
-    def step(self, inputs: _Inputs) -> PhysicsState:
-        """The physics [..., N] after one more control step."""
-        given = jax.tree.map(lambda x: np.asarray(x, np.float64), inputs)
-        if given.contact_damping is not None:
+    def step(self, control: Control, targets: jax.Array, now: EnvState) -> PhysicsState:
+        """The physics [..., N] after one more control step.
+
+        Args:
+          control: that of the step [..., N].
+          targets: its servo targets [N, substeps, nu].
+          now: the states before it; an impact may have changed the contact's damping.
+        """
+        push, drag, lift, targets, damping = (
+            None if x is None else np.asarray(x, np.float64)
+            for x in (
+                control.ball_push, control.air_drag, control.air_lift, targets,
+                None if now.impact is None else now.parameters.contact_damping,
+            )
+        )  # fmt: skip
+        if damping is not None:
             pairs = contact_pairs(self._mj_model)
-            for model, damping in zip(self._models, given.contact_damping, strict=True):
-                model.pair_solref[pairs, 1] = -damping
-        if given.push is not None:
-            push = given.push.reshape(-1, len(self._states)).T
+            for model, value in zip(self._models, damping, strict=True):
+                model.pair_solref[pairs, 1] = -value
+        if push is not None:
+            push = push.reshape(-1, len(self._states)).T
             self._states[:, _ball_velocity(self._mj_model)] += push
         self._states = _next_states(
-            self._pool, self._models, self._data, self._states,
-            given.targets, given.air_drag, given.air_lift,
-        )  # fmt: skip
+            self._pool, self._models, self._data, self._states, targets, drag, lift
+        )
         return physics_states(self._mj_model, self._states)
 
 

@@ -30,9 +30,9 @@ class EvaluationOptions(NamedTuple):
     physics: Physics = "config"
     nominal: bool = False
     """Whether the worlds are the model's own, with the task's default commands where the policy was
-    trained with them; else both are drawn as in the training."""
+    trained with them; else both are sampled as in the training."""
     commands: dict[str, float] = {}
-    """Commands by name with one value for all episodes; the others are drawn."""
+    """Commands by name with one value for all episodes; the others are sampled."""
 
 
 DEFAULT_OPTIONS = EvaluationOptions()

@@ -76,31 +76,18 @@ def recorded_episodes(
 def _prepare(
     config: WorldConfig, options: EvaluationOptions
 ) -> tuple[Env, dict[str, tuple[float, float]], Ranges | None]:
-    """The environment, the changed ranges of commands, and the ranges of its resets."""
-    env, commands = Env(_with_options(config, options)), _commands(config, options)
+    """The environment in the options' world, the ranges of commands that differ from the config's,
+    and the ranges of its resets."""
+    given = {name: (value, value) for name, value in options.commands.items()}
+    neutral = neutral_commands(config) if options.nominal else {}
+    own = {name: (command.low, command.high) for name, command in config.commands.items()}
+    commands = {name: ends for name, ends in (neutral | given).items() if ends != own[name]}
+    world = config.randomization
+    if options.nominal:
+        world = RandomizationConfig()
+    elif given.keys() >= own.keys():
+        # Nothing is left to change within an episode.
+        world = world.model_copy(update={"command_interval": None})
+    env = Env(on_engine(config.model_copy(update={"randomization": world}), options.physics))
     ranges = jax.tree.map(lambda end: jnp.asarray(end, jnp.float32)[None], env.ranges() | commands)
     return env, commands, ranges if commands else None
-
-
-def _with_options(env: WorldConfig, options: EvaluationOptions) -> WorldConfig:
-    """The config with the options' world and engine."""
-    changes = {}
-    if options.nominal:
-        changes["randomization"] = RandomizationConfig()
-    elif options.commands.keys() >= env.commands.keys():
-        # Nothing is left to change within an episode.
-        constant = {"command_interval": None}
-        changes["randomization"] = env.randomization.model_copy(update=constant)
-    return on_engine(env.model_copy(update=changes), options.physics)
-
-
-def _commands(env: WorldConfig, options: EvaluationOptions) -> dict[str, tuple[float, float]]:
-    """Ranges of the commands that differ from the config's."""
-    ranges = {name: (value, value) for name, value in options.commands.items()}
-    if options.nominal:
-        ranges = neutral_commands(env) | ranges
-    return {
-        name: ends
-        for name, ends in ranges.items()
-        if ends != (env.commands[name].low, env.commands[name].high)
-    }

@@ -190,8 +190,8 @@ def _spanning_config(conditions: Sequence[Condition], physics: Physics) -> World
             )
     # A program spans what its conditions, which are within the limits, do not: a term that one of
     # them lacks.
-    drawn = RandomizationConfig().model_copy(update=spans)
-    world = env.model_copy(update={"randomization": drawn})
+    sampled = RandomizationConfig().model_copy(update=spans)
+    world = env.model_copy(update={"randomization": sampled})
     return on_engine(world, physics)
 
 

@@ -157,7 +157,7 @@ def neutral_range(name: str, env: WorldConfig) -> Bounds | None:
         low = high = _NEVER
     else:
         low = high = TERMS[name].nominal
-    return None if low is None else _shaped(name, env.num_joints, low, high)
+    return None if low is None else _broadcast(name, env.num_joints, low, high)
 
 
 def neutral_commands(env: WorldConfig) -> dict[str, tuple[float, float]]:
@@ -212,7 +212,7 @@ def _condition(
     plain = world.model_copy(update=without)
     env = _with_changes(plain, _fill_in(perturbation.settings, value), source)
     if perturbation.trained_ranges:
-        drawn, commands = trained.randomization, {n: c[:2] for n, c in trained.commands.items()}
+        sampled, commands = trained.randomization, {n: c[:2] for n, c in trained.commands.items()}
     else:
         ends = {term: _ends(x, source) for term, x in _fill_in(perturbation.terms, value).items()}
         commands = {
@@ -220,9 +220,11 @@ def _condition(
             for name in ends.keys() & env.commands.keys()
         }
         own = {name: getattr(world.randomization, name) for name in world.randomization.terms}
-        drawn = validate(type(env), dict(env) | {"randomization": own | ends}, source).randomization
-    ranges = {name: getattr(drawn, name) for name in drawn.terms} | commands
-    ranges = {name: _shaped(name, env.num_joints, *ends) for name, ends in ranges.items()}
+        sampled = validate(
+            type(env), dict(env) | {"randomization": own | ends}, source
+        ).randomization
+    ranges = {name: getattr(sampled, name) for name in sampled.terms} | commands
+    ranges = {name: _broadcast(name, env.num_joints, *ends) for name, ends in ranges.items()}
     contained = not differing_keys(env, trained.model_copy(update=without)) and all(
         _contains(trained, name, bounds) for name, bounds in ranges.items()
     )
@@ -276,7 +278,7 @@ def _ends(entry: Any, source: str) -> tuple[Any, Any]:
     return low, high
 
 
-def _shaped(term: str, num_joints: int, low: Any, high: Any) -> Bounds:
+def _broadcast(term: str, num_joints: int, low: Any, high: Any) -> Bounds:
     """Ends of a range in the term's shape."""
     shape = _shape(term, num_joints)
     return tuple(np.broadcast_to(np.asarray(end, np.float64), shape) for end in (low, high))
@@ -290,10 +292,10 @@ def _shape(term: str, num_joints: int) -> tuple[int, ...]:
 def _contains(trained: WorldConfig, term: str, bounds: Bounds) -> bool:
     """Whether the training range of a term or of a command contains other bounds."""
     if term in trained.commands:
-        drawn = trained.commands[term][:2]
+        sampled = trained.commands[term][:2]
     else:
-        drawn = getattr(trained.randomization, term) or neutral_range(term, trained)
-    if drawn is None:
+        sampled = getattr(trained.randomization, term) or neutral_range(term, trained)
+    if sampled is None:
         return False
-    (low, high), tolerance = map(np.asarray, drawn), 1e-9
+    (low, high), tolerance = map(np.asarray, sampled), 1e-9
     return bool(np.all(low <= bounds[0] + tolerance) and np.all(bounds[1] <= high + tolerance))

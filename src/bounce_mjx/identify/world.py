@@ -189,7 +189,7 @@ def to_yaml(found: Identified, log: Log, joint_names: Sequence[str], robot: str 
     """YAML text of the identified world: ranges for training, with their sources.
 
     The range of each entry of a term covers what the log allows while all other unknowns have their
-    estimates, with a margin of half: independent draws from the whole intervals of terms that the
+    estimates, with a margin of half: independent samples from the whole intervals of terms that the
     log cannot separate would be worlds that contradict it. A term that the log does not show is
     assumed.
 

@@ -33,7 +33,7 @@ from bounce_mjx.world.config import WorldConfig
 _jax_process: int | None = None
 
 Commands = dict[str, float | np.ndarray]
-"""Some of the task's commands, each [] or [B]; NaN draws it."""
+"""Some of the task's commands, each [] or [B]; NaN samples it."""
 
 
 class UnexpectedArgument(UserError, TypeError):
@@ -206,8 +206,8 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         if not mask.all():
             self._check_started()
         if self._episodes is None:
-            drawn = self.np_random.integers(2**32, size=self.num_envs)
-            seeds = [d if s is None else s for s, d in zip(seeds, drawn, strict=True)]
+            sampled = self.np_random.integers(2**32, size=self.num_envs)
+            seeds = [d if s is None else s for s, d in zip(seeds, sampled, strict=True)]
         seeded = np.array([s is not None for s in seeds])
         numbers = np.array([(s or 0) % 2**32 for s in seeds], np.uint32)
         given = dict.fromkeys(self.config.commands, np.nan) | commands
@@ -305,19 +305,19 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         names = sorted(self._episodes.env.metrics)
         metrics = dict(zip(names, result.metrics.astype(np.float64), strict=True))
         if self.autoreset_mode is not AutoresetMode.SAME_STEP:
-            return _masked(metrics, ~skipped)
+            return _mask(metrics, ~skipped)
         self._returns += reward
         self._lengths += 1
         durations = np.round(time.perf_counter() - self._starts, 6)
         statistics = {"r": self._returns.copy(), "l": self._lengths.copy(), "t": durations}
-        info, ended = _masked(metrics, ~self._ended), self._ended.copy()
+        info, ended = _mask(metrics, ~self._ended), self._ended.copy()
         if ended.any():
             self._begin_statistics(ended)
             final_obs = np.full(self.num_envs, None, object)
             for i in np.flatnonzero(ended):
                 final_obs[i] = result.final_observation[i]
-            final_info = _masked(metrics, ended) | {
-                "episode": _masked(statistics, ended),
+            final_info = _mask(metrics, ended) | {
+                "episode": _mask(statistics, ended),
                 "_episode": ended,
             }
             info |= {"final_obs": final_obs, "_final_obs": ended}
@@ -369,7 +369,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """Starts an episode.
 
         Args:
-          options: the task's commands of this episode by name, instead of drawn ones.
+          options: the task's commands of this episode by name, instead of sampled ones.
 
         Returns:
           The first observation [N] and an empty info.
@@ -410,7 +410,7 @@ def checked_actions(actions: Any, shape: tuple[int, ...]) -> np.ndarray:
     return array
 
 
-def _masked(values: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]:
+def _mask(values: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]:
     if not mask.any():
         return {}
     masked = {}

@@ -1,7 +1,7 @@
 """B episodes on JAX that start and end separately, and their compiled functions.
 
-Each environment has its own stream of random numbers, so that it draws the same episodes in a batch
-of any size. Batches of equal configs and sizes share their programs.
+Each environment has its own stream of random numbers, so that it samples the same episodes in a
+batch of any size. Batches of equal configs and sizes share their programs.
 """
 
 import functools
@@ -84,21 +84,21 @@ def _start(
 
     Args:
       seeds: [B]; where `seeded` [B] is false, the environment continues its random numbers.
-      commands: each [B]; NaN draws one.
+      commands: each [B]; NaN samples one.
     """
     keys = jax.vmap(jax.random.PRNGKey)(seeds)
     if episodes is not None:
         keys = jnp.where(seeded[:, None], keys, episodes.key)
     keys, now = _split(keys)
 
-    def first(key: jax.Array, commands: dict[str, jax.Array]) -> State:
+    def reset_one(key: jax.Array, commands: dict[str, jax.Array]) -> State:
         ranges = task.ranges()
         for name, own in task.config.commands.items():
             ends, given = (own.low, own.high), commands[name]
             ranges[name] = tuple(jnp.where(jnp.isnan(given), end, given) for end in ends)
         return task.reset(key, ranges)
 
-    env = jax.vmap(first, out_axes=-1)(now, commands)
+    env = jax.vmap(reset_one, out_axes=-1)(now, commands)
     started = Episodes(env, jnp.zeros(seeds.shape, jnp.int32), keys)
     return started if episodes is None else _choose(mask, started, episodes)
 

@@ -88,9 +88,9 @@ class TorchVectorEnv:
         self._carried: _Carried | None = None
 
     def reset(self, seed: int | None = None) -> tuple[torch.Tensor, torch.Tensor]:
-        """Starts a new episode in every environment; a `seed` seeds all following resets. It draws
-        other episodes than the same seed of Gymnasium's environments, which have a stream of random
-        numbers each.
+        """Starts a new episode in every environment; a `seed` seeds all following resets. It
+        samples other episodes than the same seed of Gymnasium's environments, which have a stream
+        of random numbers each.
 
         Returns:
           The observations [B, N] and the critic metrics [B, K].
