@@ -1,6 +1,7 @@
 """The live page: what its controls do, and that no client can do more."""
 
 import contextlib
+import dataclasses
 import io
 import re
 import socket
@@ -23,10 +24,10 @@ from bounce_mjx import BounceBall
 from bounce_mjx.commands import train
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
-from bounce_mjx.evaluation.results import Report
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import latest_checkpoint
 from bounce_mjx.runs.reading import read_policy
+from bounce_mjx.training.callbacks import Event
 from bounce_mjx.training.watch import TrainingPage, _Panel
 from bounce_mjx.viewers import browser
 from bounce_mjx.viewers.guard import open_server
@@ -335,9 +336,11 @@ def test_the_page_of_a_training_shows_its_newest_policy(
     training = TrainingPage(TrainConfig(), "127.0.0.1", 8500, Console(file=printed, width=200))
     wait_until(lambda: "watch: " in printed.getvalue())
     client = Client(re.search(r"http://\S+", printed.getvalue())[0])
-    means = {"episode/return": 1.0, "episode/bounces": NAN, "task/apex_error": 0.02}
-    training.block(500_000, means | {"speed/steps_per_second": 2e6})
-    training.evaluation(500_000, evaluated(True, False), np.float32(0.5))
+    means = {"episode/return": 1.0, "task/apex_error": 0.02, "speed/steps_per_second": 2e6}
+    block = Event(Path("run"), TrainConfig(), 500_000, means)
+    training(block)
+    report = evaluated(True, False)
+    training(dataclasses.replace(block, metrics={}, report=report, policy=np.float32(0.5)))
     wait_until(lambda: exchangeable.policy == 0.5)
     for told in ("500,000 of 50,000,000 steps", "1 of 2 results met"):
         while not any(told in text for text in client.texts):
@@ -360,12 +363,12 @@ def test_a_watched_training_tells_the_page(tmp_path: Path, monkeypatch, capsys) 
         def __init__(self, config: TrainConfig, host: str, port: int, console: Console, allowed):
             told.append(("served", host, port, allowed))
 
-        def block(self, steps: int, means: dict[str, float]) -> None:
-            told.append(("block", steps, means["speed/steps_per_second"] > 0.0))
-
-        def evaluation(self, steps: int, report: Report, policy) -> None:
-            told.append(("evaluation", steps, len(report.results)))
-            shown.append(policy)
+        def __call__(self, event: Event) -> None:
+            if event.report is None:
+                told.append(("block", event.steps, event.metrics["speed/steps_per_second"] > 0.0))
+            else:
+                told.append(("evaluation", event.steps, len(event.report.results)))
+                shown.append(event.policy)
 
         def wait(self) -> None:
             told.append(("ended",))
