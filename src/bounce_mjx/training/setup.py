@@ -144,7 +144,7 @@ def join_loops(*configs: WorldConfig) -> None:
         return
     models = {(c.physics, c.mjcf, c.physics_dt, c.robot, c.num_balls) for c in configs}
     if all(
-        is_fused(load_model(mjcf, dt, robot=robot, num_balls=balls), choice)
+        is_fused(load_model(mjcf, dt, visual=False, robot=robot, num_balls=balls), choice)
         for choice, mjcf, dt, robot, balls in models
     ):
         os.environ["XLA_FLAGS"] = JOINED_LOOPS if flags is None else f"{flags} {JOINED_LOOPS}"
