@@ -75,7 +75,7 @@ def estimates(found: Identified, joint_names: Sequence[str]) -> list[Estimate]:
     layout, width = found.layout, _HALF_WIDTH * found.deviation * misfit(found)
     world = layout.world(found.fit.vector)
     values = np.concatenate([np.ravel(world[name]) for name in layout.terms()])
-    low, high = values - width, values + width
+    low, high = (layout.clip(end) for end in (values - width, values + width))
     alone = _HALF_WIDTH * misfit(found) / np.sqrt(np.diag(np.linalg.inv(found.covariance)))
     for name, ends in _estimate_delays(found).items():
         place = layout.terms()[name]
