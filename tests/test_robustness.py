@@ -474,5 +474,5 @@ def test_a_perturbation_of_one_task_is_skipped_for_others(tmp_path: Path) -> Non
     assert [c.trained for c in (low, high)] == [True, False]
     with pytest.raises(UserError, match="unknown key randomization.target_height; "):
         suite(tmp_path, dict(name="target", terms={"target_height": 0.5}), trained=dribble)
-    with pytest.raises(UserError, match="apex .0.001, 0.001. leaves 0.01 to inf"):
+    with pytest.raises(UserError, match="apex is 0.001, but must be a finite number >= 0.01"):
         suite(tmp_path, dict(name="apex", terms={"apex": 0.001}), trained=dribble)
