@@ -1,4 +1,5 @@
-"""Checkpoints are plain data; each loads unchanged or is refused in one sentence."""
+"""Checkpoints are plain data that orbax alone reads; each loads unchanged or is refused in one
+sentence."""
 
 import concurrent.futures
 import json

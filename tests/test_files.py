@@ -1,4 +1,4 @@
-"""Files and folders in which someone else may have had a hand."""
+"""Files are written whole and never through a link, and a cache is private to its user."""
 
 import os
 import subprocess

@@ -1,5 +1,5 @@
-"""A training survives interruptions between any two steps, signals, full disks and numbers that are
-not finite. The resumed training reaches exactly the state of an undisturbed one."""
+"""A real training that is signalled, killed or resumed reaches exactly the state of an undisturbed
+one (`test_job.py` has the job's own logic)."""
 
 import concurrent.futures
 import contextlib
