@@ -125,6 +125,16 @@ def copy_tree(folder: Path) -> None:
         shutil.copy(CHECKOUT / name, folder)
 
 
+def status(folder: Path, tests: list[str]) -> int:
+    """Exit status of pytest for some tests in the copy of the tree."""
+    files, keywords = zip(*(test.split(" -k ") for test in tests), strict=True)
+    names = sorted({f"tests/{file}" for file in files})
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-n", "0", *names]
+    command += ["-k", " or ".join(sorted(set(keywords)))]
+    environment = os.environ | {"PYTHONPATH": str(folder / "src")}
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True).returncode
+
+
 def is_caught(folder: Path, file: str, old: str, new: str, test: str) -> bool:
     """Whether the test fails in the copy of the tree with the fault."""
     path = folder / "src/bounce_mjx" / file
@@ -132,31 +142,24 @@ def is_caught(folder: Path, file: str, old: str, new: str, test: str) -> bool:
     assert text.count(old) == 1, f"{file} has {old!r} {text.count(old)} times"
     path.write_text(text.replace(old, new), encoding="utf-8")
     try:
-        name, _, keyword = test.partition(" -k ")
-        command = [sys.executable, "-m", "pytest", "-q", "-x", "-n", "0", f"tests/{name}"]
-        command += ["-k", keyword] if keyword else []
-        environment = os.environ | {"PYTHONPATH": str(folder / "src")}
-        done = subprocess.run(
-            command, cwd=folder, env=environment, capture_output=True, text=True, check=False
-        )
-        # Other statuses are errors of pytest's own: no test of that name, for example.
-        return done.returncode == 1
+        # Other statuses than 1 are errors of pytest's own: no test of that name, for example.
+        return status(folder, [test]) == 1
     finally:
         path.write_text(text, encoding="utf-8")
 
 
 def main() -> None:
-    chosen = [int(word) for word in sys.argv[1:]] or range(1, len(FAULTS) + 1)
+    chosen = [FAULTS[int(word) - 1] for word in sys.argv[1:]] or FAULTS
     missed = 0
     with tempfile.TemporaryDirectory(prefix="bounce_mjx_mutations_") as name:
         copy_tree(Path(name))
-        for number in chosen:
-            fault, *rest = FAULTS[number - 1]
-            caught = is_caught(Path(name), *rest)
+        tests = [fault[-1] for fault in chosen]
+        assert status(Path(name), tests) == 0, "a test fails without a fault"
+        print("all tests pass without a fault", flush=True)
+        for fault in chosen:
+            caught = is_caught(Path(name), *fault[1:])
             missed += not caught
-            print(
-                f"{number:2} {'caught' if caught else 'MISSED'}: {fault} ({rest[-1]})", flush=True
-            )
+            print(f"{'caught' if caught else 'MISSED'}: {fault[0]} ({fault[-1]})", flush=True)
     sys.exit(missed > 0)
 
 
