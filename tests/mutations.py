@@ -107,9 +107,8 @@ FAULTS = [
      "position = vadd(ball.position, scale(velocity, dt))", "position = vadd(ball.position, scale(ball.velocity, dt))", "test_physics.py -k random_states"),
     ("a contact pulls", NORMALS, "return [jnp.maximum(first / pivot, 0.0)]", "return [first / pivot]", "test_physics.py -k random_states"),
     ("an exported policy has a wrong normaliser", EXPORT,
-     "        policy, jnp.concatenate([histories[name].ravel() for name in names])",
-     "        policy._replace(normalizer=policy.normalizer._replace(mean=0.0 * policy.normalizer.mean)),\n"
-     "        jnp.concatenate([histories[name].ravel() for name in names]),", "test_deploy.py -k onnx_equals"),
+     "networks.act(policy, jnp",
+     "networks.act(policy._replace(normalizer=policy.normalizer._replace(mean=0.0 * policy.normalizer.mean)), jnp", "test_deploy.py -k onnx_equals"),
     ("the robot's targets move against the action", POLICY,
      "base + self.metadata.action_scale * action", "base - self.metadata.action_scale * action", "test_deploy.py -k servo_targets_lead"),
     ("an ended episode still earns its return", "evaluation/statistics.py",
