@@ -217,6 +217,9 @@ class RandomizationConfig(StrictModel):
     """Probabilities of single terms, by name, in place of `share`."""
     warmup_steps: Annotated[int, pydantic.BeforeValidator(whole_number), Field(ge=0)] = 0
     """Environment steps over which the ranges grow from the nominal values."""
+    first_command_range: UnitInterval = 1.0
+    """Range of the commands at the start of a training, around the middle of their whole range and
+    as a share of it; it grows to the whole range over warmup_steps."""
 
     def __hash__(self) -> int:
         """Configs are keys of compiled programs; pydantic's own hash cannot take `shares`."""
@@ -230,6 +233,8 @@ class RandomizationConfig(StrictModel):
             )
         if self.restitution_slope is not None and self.restitution is None:
             raise ValueError("restitution_slope is given without restitution; give both")
+        if self.first_command_range < 1.0 and not self.warmup_steps:
+            raise ValueError("first_command_range is given without warmup_steps; give both")
         if self.push_interval is not None and self.push_speed is None:
             raise ValueError("push_interval is given without push_speed; give both, or neither")
         for name in self.terms:
