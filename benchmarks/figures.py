@@ -40,8 +40,9 @@ def _table(table: str | dict[str, Any], figures: dict[str, dict[str, Any]]) -> s
     rows = [
         [str(figures[name].get(key, "")) for key in columns.values()] for name in table["figures"]
     ]
-    head = [[name.strip() for name in columns], ["---"] * len(columns)]
-    return "".join("| " + " | ".join(row) + " |\n" for row in [*head, *rows])
+    head = [name.strip() for name in columns]
+    lines = ["| " + " | ".join(row) + " |\n" for row in [head, *rows]]
+    return "".join([lines[0], "|" + "---|" * len(columns) + "\n", *lines[1:]])
 
 
 def main() -> None:

@@ -13,31 +13,23 @@ from bounce_mjx.world.randomization import Term
 
 _HEAD = """# Config reference
 
-Look up any setting of a training: its key, default, meaning and range. In a YAML file
-([training](training.md#a-file-of-your-own)) the keys are nested groups, one per section
-here. A flag is the full name without `env.` or `ppo.`, with hyphens: `--num-envs` for
-`ppo.num_envs`, `--reward.height.weight` for `env.reward.height.weight`. [Other
-tasks](tasks.md#write-a-task) have other keys in `env`.
+Look up any setting of a training: its key, default, meaning and range. In a [YAML
+file](training.md#a-file-of-your-own) the keys are nested groups, one per section here. A flag is
+the full name without `env.` or `ppo.`, with hyphens: `--num-envs` for `ppo.num_envs`,
+`--reward.height.weight` for `env.reward.height.weight`.
 
 Later wins: the defaults, a preset, your file, a robot (`--robot`), the flags. Unknown keys,
-values out of range and settings without effect are refused. Numbers are finite; whole numbers are
-below 2^31, steps at most 10^12, and may have an exponent (`1e6`). On the command line, a list is
-`256 256` or `256,256`, and a switch `--stop-when-solved`, `--no-stop-when-solved` or
-`--stop-when-solved=false`.
-
-Rules across keys:
+values out of range and settings without effect are refused. A list is `256 256` or `256,256` on
+the command line, and a switch `--stop-when-solved`, `--no-stop-when-solved` or
+`--stop-when-solved=false`. Whole numbers are below 2^31, steps at most 10^12 (`1e6` is one too).
 
 - `env.control_dt` is a multiple of `env.physics_dt`, and at most `env.episode_seconds`.
-- An episode does not end where it starts: `env.ball_init_pos` is above `env.min_ball_height`,
-  less than `env.max_height_above_target` over the lowest target, and within
-  `env.max_horizontal_distance`.
-- The joint ranges contain `env.default_joint_angles`; ball and targets are above the paddle
-  there.
-- `ppo.num_minibatches` divides `ppo.num_envs` × `ppo.rollout_length`, and a rollout is at most as
-  long as an episode. `ppo.min_learning_rate` is at most the two upper limits.
+- An episode must not end where it starts (`env.ball_init_pos`), and the ball and the targets are
+  above the paddle in `env.default_joint_angles`.
+- `ppo.num_minibatches` divides `ppo.num_envs` × `ppo.rollout_length`; a rollout is at most an
+  episode.
 
-`python docs/config_reference.py > docs/config.md` writes this page from the types of the
-settings.
+`python docs/config_reference.py > docs/config.md` writes this page.
 """
 
 _CONFIG = train_config(find_task(DEFAULT))
@@ -62,7 +54,7 @@ def _groups(model: type[StrictModel], prefix: str) -> Iterator[tuple[type[Strict
 
 
 def _section(model: type[StrictModel], prefix: str) -> str:
-    entries = []
+    entries, values = [], []
     schema = model.model_json_schema()
     for name, field in model.model_fields.items():
         plain = schema["properties"][name]
@@ -72,12 +64,18 @@ def _section(model: type[StrictModel], prefix: str) -> str:
         terms = [mark for mark in field.metadata if isinstance(mark, Term)]
         span = "{:g} to {:g}".format(*terms[0].bounds) if terms else _range(plain)
         kind = "" if terms or "enum" in plain else _type(plain, plain.get("default") is None)
-        value = (", " if kind == "list" else " ").join(part for part in (kind, span) if part)
-        default = _default(plain.get("default"))
-        entries.append(f"- `{name}: {default}` {text}" + (f" ({value})\n" if value else "\n"))
+        values.append((", " if kind == "list" else " ").join(p for p in (kind, span) if p))
+        text = "" if text == "Weight of the term." else f" {text}"
+        entries.append(f"- `{name}: {_default(plain.get('default'))}`{text}")
     title = f"`{prefix.removesuffix('.')}`" if prefix else "The run"
     text = " ".join((model.__doc__ or "").split())
-    return f"\n## {title}\n\n{text}\n\n" + "".join(entries)
+    # Most quantities of the observation have the same range.
+    most = max(values, key=values.count, default="")
+    common = most if values.count(most) > 10 else ""
+    text += f" Where nothing else is said, a value is {common}." if common else ""
+    ends = [f" ({value})" if value and value != common else "" for value in values]
+    lines = [f"{entry}{end}\n" for entry, end in zip(entries, ends, strict=True)]
+    return f"\n## {title}\n\n{text}\n\n" + "".join(lines)
 
 
 def _type(plain: dict[str, Any], in_full: bool) -> str:

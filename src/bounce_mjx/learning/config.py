@@ -33,9 +33,8 @@ class PPOConfig(StrictModel):
     rollout_length: Count = 32
     """Control steps of each environment in one iteration."""
     training_episode_seconds: Duration | None = None
-    """Time limit of training episodes, s; null for the environment's limit. With a shorter
-    limit the training sees more resets and more sampled worlds; a time-out is bootstrapped and does
-    not count as a termination."""
+    """Time limit of training episodes, s; null for the environment's limit. A shorter one shows
+    more resets and worlds; a time-out is bootstrapped."""
     num_epochs: Count = 4
     """Passes over the data of one iteration."""
     num_minibatches: Count = 8
@@ -71,8 +70,8 @@ class PPOConfig(StrictModel):
     """Standard deviation of the action noise at the start."""
     min_noise_std: NonNegative = 0.0
     """Lower bound of that standard deviation, averaged over the environments, whose bounds lie
-    evenly between 0 and twice this; 0 for none. Without it the noise shrinks until no environment
-    visits the states from which a policy must recover, and the policy forgets them."""
+    evenly between 0 and twice this; 0 for none. Without it a long training forgets how to
+    recover."""
     hidden_layers: Annotated[tuple[Count, ...], Field(min_length=1)] = (128, 128)
     """Widths of the hidden layers of the policy, and of the value network by default."""
     critic_layers: Annotated[tuple[Count, ...], Field(min_length=1)] | None = None
@@ -83,11 +82,11 @@ class PPOConfig(StrictModel):
     activation: Literal["silu", "relu", "tanh"] = "silu"
     """Activation of the hidden layers."""
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
-    """Type of the hidden layers during training; bfloat16 is faster on a GPU. Parameters, outputs,
-    losses, the optimizer and all evaluations are float32."""
+    """Type of the hidden layers during training; bfloat16 is faster on a GPU. The rest is
+    float32."""
     critic_metrics: tuple[str, ...] | None = None
-    """Metrics of the environment that are inputs of the value network in addition to the
-    observation; null for those that the task names, because its reward depends on them."""
+    """Metrics of the environment that the value network sees too; null for those that the task
+    names."""
 
     @pydantic.model_validator(mode="after")
     def _check_batch_and_learning_rates(self):

@@ -81,8 +81,7 @@ class RobotConfig(StrictModel):
     """Adoption of an arm whose MJCF has no paddle and no ball."""
 
     site: str | None = None
-    """Site or body of the arm that holds the paddle; null for an MJCF that is a whole scene, with
-    the ball's body ball_link and the paddle's geom blocker."""
+    """Site or body of the arm that holds the paddle; null for an MJCF that is a whole scene."""
     joints: tuple[str, ...] | None = None
     """Acting joints; null for all hinges and slides from the world to the site."""
     paddle: PaddleConfig = PaddleConfig()

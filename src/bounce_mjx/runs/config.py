@@ -71,8 +71,8 @@ class TrainConfig(StrictModel):
     """Independent training runs in one program, with the seeds `seed`, `seed` + 1, ... and a folder
     for each."""
     num_devices: Count | None = None
-    """Devices that share the environments (with several seeds: the seeds). The default is one, or
-    all on several hosts. It affects results only by rounding."""
+    """Devices that share the environments (with several seeds: the seeds); null for one, or all on
+    several hosts."""
     total_steps: Steps = 50_000_000
     """Environment steps to train for, rounded to whole blocks, at least one."""
     block_steps: Steps = 1_000_000
@@ -87,12 +87,10 @@ class TrainConfig(StrictModel):
     """Seed of the evaluations during training."""
     stop_when_solved: bool = False
     """End once an evaluation meets all results with a margin. Then 64 other episodes should meet
-    them too: means over steps and events by two standard errors of 64 episodes, shares of episodes
-    with at most half of the failures that are allowed. At the latest it ends after 1.5 times the
-    steps of the first evaluation that meets all."""
+    them too. It ends at the latest after 1.5 times the steps of the first one that meets all."""
     warm_start: PlainPath | None = None
-    """The run with whose policy and value network the training starts, or the name of a policy that
-    comes with the package. Its environment and hidden layers take the place of the preset's."""
+    """The run, or the policy of the package, with whose networks, environment and hidden layers the
+    training starts."""
     log_dir: PlainPath
     """Folder in which the run creates its own, named by the time (UTC)."""
 

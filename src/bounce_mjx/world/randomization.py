@@ -128,10 +128,8 @@ class RandomizationConfig(StrictModel):
     restitution: Annotated[Sampled, Term((), 0.85, (0.6, 0.98), "contact_damping")] = None
     """Restitution of the ball on the paddle, 0.6 to 0.98; the model's is 0.85."""
     restitution_slope: Annotated[Sampled, Term((), 0.0, (0.0, 0.1))] = None
-    """Drop of the restitution per m/s of impact speed above 2.45 m/s, the speed of the ITTF's drop
-    test from 30.5 cm, s/m; needs restitution, of which 0.4 must be left at 4.5 m/s; slow impacts
-    have at most 0.99. Balls bounce less in faster impacts (Hubbard and Stronge 2001, "Bounce of
-    hollow balls on flat surfaces")."""
+    """Drop of the restitution per m/s of impact speed above 2.45 m/s, s/m; needs restitution, of
+    which 0.4 must be left at 4.5 m/s (Hubbard and Stronge 2001, "Bounce of hollow balls")."""
     ball_mass: Annotated[Sampled, Term((), 1.0, _FACTOR, "ball_mass", scale)] = None
     """Factor of the ball's mass."""
     ball_radius: Annotated[Sampled, Term((), 1.0, (0.1, 10.0), "ball_radius", scale)] = None
@@ -141,9 +139,8 @@ class RandomizationConfig(StrictModel):
     table-tennis ball."""
     air_lift: Annotated[Sampled, Term((), 0.0, (0.0, 1.0))] = None
     """Acceleration of the ball by the Magnus force divided by the cross product of its spin and
-    velocity; 0.0056 for a table-tennis ball whose lift coefficient is the ratio of its surface's
-    speed to its own. Measured coefficients reach from that down to almost 0 (Miyazaki et al. 2017,
-    "Lift crisis of a spinning table tennis ball"). A ball spins where there is contact_friction."""
+    velocity; 0 to 0.0056 for a table-tennis ball (Miyazaki et al. 2017, "Lift crisis of a spinning
+    table tennis ball"). A ball spins where there is contact_friction."""
     contact_friction: Annotated[
         Sampled, Term((), 0.0, (0.0, 10.0), "contact_friction", replace)
     ] = None
@@ -179,8 +176,7 @@ class RandomizationConfig(StrictModel):
     ball_latency: Annotated[Sampled, Term((), 0.0, (0.0, 1.0))] = None
     """Time from a camera picture of the ball to its use, s."""
     camera_rate: Annotated[Sampled, Term((), None, (1.0, 1e4))] = None
-    """Camera pictures of the ball per second, Hz; each is used until the next one arrives. Without
-    a rate there is a picture at every control step."""
+    """Camera pictures of the ball per second, Hz; null for one at every control step."""
     frame_drop: Annotated[Sampled, Term((), 0.0, (0.0, 0.99))] = None
     """Probability that a camera picture is lost."""
     ball_position_noise: Annotated[Sampled, Term((), 0.0, (0.0, 0.5))] = None
@@ -211,8 +207,7 @@ class RandomizationConfig(StrictModel):
     """Displacement of each joint angle at a reset, in addition to `env.reset`, rad."""
     share: UnitInterval = 1.0
     """Probability that a term with a nominal value is sampled in an episode; otherwise it has that
-    value. A small share allows wide ranges of single terms, even if no policy can handle all their
-    extremes together."""
+    value."""
     shares: dict[str, UnitInterval] | None = None
     """Probabilities of single terms, by name, in place of `share`."""
     warmup_steps: Annotated[int, pydantic.BeforeValidator(whole_number), Field(ge=0)] = 0
