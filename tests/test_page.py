@@ -87,9 +87,9 @@ HOSTILE = {
     "height, m": (1e9, -1.0, NAN, -INFINITY, "high", [0.5, 0.6], 0.6),
     "speed, m/s": (1e9, NAN, INFINITY, None, 1.0),
     "pause": (1, 0.0, "yes", None, [], NAN, False),
-    "drawn at each reset": (1, "no", {}, True),
+    "sampled at each reset": (1, "no", {}, True),
     "reset": ("", 3, None, [], True),
-    "towards": ("sideways", "", 3, None, [], "x" * 2000, "up"),
+    "push": ("sideways", "", 3, None, [], "x" * 2000, "ball up"),
 }
 
 
@@ -239,6 +239,7 @@ def test_keys_act(page) -> None:
     client.control("push the ball right")
     assert client.sliders["height, m"] == (0.3, 0.8, 0.01)
     assert client.lines == ["s", "ball", "target", "paddle"]
+    client.set(client.control("height, m"), 0.5)
     client.press("target height up")
     wait_until(lambda: did["target"][-1] == pytest.approx(0.55))
     client.press("slower")
@@ -265,7 +266,7 @@ def test_the_last_seconds_are_saved_as_they_were_seen(
     wait_until(lambda: len(did["target"]) > 20)
     client.press("pause")
     wait_until(lambda: stands_still(did))
-    client.set(client.control("save the last 10 s"), True)
+    client.set(client.control("save a replay of the last 10 s"), True)
     while not client.download:
         client.receive()
     assert client.download == b"<html>"
@@ -298,6 +299,7 @@ def test_the_page_shows_the_commands_of_any_task(monkeypatch) -> None:
         assert 'rgb(230,26,26)">&#9632;</b> high wall<' in legend
         assert legend.count("dot") == 1
         assert any(">calm<" in text for text in client.texts)
+        client.set(client.control("angle, rad"), 0.0)
         client.press("lean angle up")
         wait_until(lambda: leaning.command == {"lean_angle": 0.1})
         wait_until(lambda: "twice 0.2   pace 2" in client.labels())
@@ -306,6 +308,29 @@ def test_the_page_shows_the_commands_of_any_task(monkeypatch) -> None:
         wait_until(lambda: leaning.command == {"lean_angle": 0.2})
         client.set(client.control("pace"), 3.0)
         wait_until(lambda: leaning.command == {"lean_angle": 0.2, "pace": 3.0})
+        client.set(client.control("gait"), "slow run")
+        wait_until(lambda: leaning.command.get("gait") == 1.0)
+
+
+def test_a_slider_shows_the_sampled_value_that_holds(page, mirrored: Simulation) -> None:
+    """From the start, and after each reset; it stays sampled, and a key moves it from there."""
+    client, did = page
+    slider = client.control("height, m")
+
+    def is_shown() -> bool:
+        client.receive()
+        height = mirrored.frame.command["target_height"][0]
+        return abs(client.values.get(slider, 0.0) - height) < 0.5 * 0.01 + 1e-6
+
+    for _ in range(2):
+        client.set(client.control("reset the robots"), True)
+        wait_until(is_shown)
+        assert did["target"][-1] is None
+    shown = client.values[slider]
+    client.press("pause")
+    client.press("target height up")
+    wait_until(lambda: mirrored.command.get("target_height") == pytest.approx(shown + 0.05))
+    client.press("pause")
 
 
 @pytest.fixture

@@ -328,5 +328,5 @@ def test_a_moved_slider_changes_the_world_at_once(played: Simulation, monkeypatc
         for value in (1e9, -1e9, NAN, INFINITY, "much", [1], None):
             client.set(client.control("restitution"), value)
         assert {world["restitution"] for world in worlds if world} == {(0.85,)}
-        client.set(client.control("nominal world"), True)
+        client.set(client.control("make the world nominal"), True)
         wait_until(lambda: worlds[-1] == NOMINAL)

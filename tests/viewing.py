@@ -218,12 +218,14 @@ class Still(task.Task):
 
 
 class LeanConfig(WorldConfig):
-    """A command that may be negative, and a fixed one without a unit."""
+    """A command that may be negative, a fixed one without a unit, and a choice."""
 
     @property
     def commands(self) -> dict[str, task.Command]:
         angle = task.Command(-0.2, 0.2, "rad", least=-0.3, greatest=0.3, step=0.1)
-        return {"lean_angle": angle, "pace": task.Command(2.0, 2.0, span=(1.0, 3.0), step=1.0)}
+        pace = task.Command(2.0, 2.0, span=(1.0, 3.0), step=1.0)
+        gait = task.Command(0.0, 2.0, "", 0.0, 2.0, step=1.0, names=("walk", "slow run"))
+        return {"lean_angle": angle, "pace": pace, "gait": gait}
 
 
 class Lean(Still):

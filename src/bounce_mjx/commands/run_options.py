@@ -158,7 +158,10 @@ def parse_with_commands(
     # Without --task, the run may be of any task.
     names = [task or DEFAULT] if task or words <= {*known, "--help"} else registered_tasks()
     commands = {
-        name: Annotated[float | None, tyro.conf.arg(metavar=command.unit.upper() or None)]
+        name: Annotated[
+            (str if command.names else float) | None,
+            tyro.conf.arg(metavar="|".join(command.names) or command.unit.upper() or None),
+        ]
         for task in names
         for name, command in find_task(task).Config().commands.items()
         if flag_of(name) not in known

@@ -101,6 +101,7 @@ class LivePage:
             scene.update(frames or [simulation.frame])
             if frames and time.monotonic() >= next_plot:
                 self._update_plots()
+                controls.show_values()
                 next_plot = time.monotonic() + 1.0 / _PLOT_RATE
             if controls.following.value:
                 scene.follow(simulation.frame)

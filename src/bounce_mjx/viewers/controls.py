@@ -9,7 +9,7 @@ import viser
 
 from bounce_mjx.viewers.options import SPEED_RANGE, PageStart
 from bounce_mjx.viewers.simulation import Simulation
-from bounce_mjx.viewers.world import sliders_for
+from bounce_mjx.viewers.world import WorldSlider, sliders_for
 from bounce_mjx.world.config import Command
 
 _PUSH_RANGE = (0.05, 1.0)
@@ -19,7 +19,61 @@ _SPEED_STEP = 0.1
 _STEPS_PER_KEY = 5
 # Decimals that a page keeps.
 _DECIMALS = 6
-_DRAWN = "drawn at each reset"
+_SAMPLED = "sampled at each reset"
+
+
+class _Setting:
+    """A slider, or a choice by names, for a value that is sampled as long as `sampled` is on."""
+
+    def __init__(
+        self,
+        handle: viser.GuiSliderHandle | viser.GuiDropdownHandle,
+        sampled: viser.GuiCheckboxHandle,
+    ):
+        self._handle, self.sampled = handle, sampled
+        self._shown: float | None = None
+        handle.on_update(self._take)
+
+    def _take(self, event: viser.GuiEvent) -> None:
+        """What a user sets is not sampled; what `show` sets is."""
+        if event.client is not None:
+            self.sampled.value = False
+
+    @property
+    def value(self) -> float:
+        """The value; a choice's number."""
+        if isinstance(self._handle, viser.GuiDropdownHandle):
+            names = self._handle.options
+            return float(names.index(self._handle.value)) if self._handle.value in names else 0.0
+        return _bounded(self._handle)
+
+    def show(self, value: float) -> None:
+        """Shows a sampled value that holds, in the slider's steps."""
+        if isinstance(self._handle, viser.GuiDropdownHandle):
+            shown = min(int(value), len(self._handle.options) - 1)
+        else:
+            shown = round(round(value / self._handle.step) * self._handle.step, _DECIMALS)
+        # A user may be moving it.
+        if shown != self._shown:
+            self._shown = shown
+            self._set(shown)
+
+    def set(self, value: float) -> None:
+        """Sets a value."""
+        self.sampled.value = False
+        self._set(value)
+
+    def move(self, change: float) -> None:
+        """Adds to the value, within the limits."""
+        if isinstance(self._handle, viser.GuiDropdownHandle):
+            self.set((self.value + np.sign(change)) % len(self._handle.options))
+        else:
+            ends = self._handle.min, self._handle.max
+            self.set(round(float(np.clip(self.value + change, *ends)), _DECIMALS))
+
+    def _set(self, value: float) -> None:
+        is_choice = isinstance(self._handle, viser.GuiDropdownHandle)
+        self._handle.value = self._handle.options[int(value)] if is_choice else value
 
 
 class Controls:
@@ -36,57 +90,68 @@ class Controls:
         self._num_shown = gui.add_slider(
             "robots", 1, max(2, most), 1, start.num_shown, disabled=most == 1
         )
-        self.following = gui.add_checkbox("follow the ball", False)
-        reset = gui.add_button("reset", icon=viser.Icon.REFRESH)
+        self.following = gui.add_checkbox("camera follows the ball", False)
+        reset = gui.add_button("reset the robots", icon=viser.Icon.REFRESH)
         reset.on_click(self._reset)
-        self.save = gui.add_button("save the last 10 s", icon=viser.Icon.DOWNLOAD)
+        self.save = gui.add_button("save a replay of the last 10 s", icon=viser.Icon.DOWNLOAD)
         self._commands = {
             name: self._add_command(gui, name, command)
             for name, command in simulation.env.config.commands.items()
         }
         with gui.add_folder("push the ball"):
             self._push_speed = gui.add_slider("speed, m/s", *_PUSH_RANGE, 0.05, 0.2)
-            push = gui.add_button_group("towards", _DIRECTIONS)
-        push.on_click(lambda event: self._push(push.value, event))
-        self._sliders = {}
+            push = gui.add_button_group("push", [f"ball {towards}" for towards in _DIRECTIONS])
+        push.on_click(lambda event: self._push(push.value.removeprefix("ball "), event))
+        self._world: dict[WorldSlider, _Setting] = {}
         self._add_world(gui)
         # Ctrl-K lists them. The arrows and W, A, S, D, Q and E move viser's camera.
         for label, key, act in self._keys():
             gui.add_command(label, hotkey=key).on_trigger(act)
+        self.show_values()
 
-    def _add_command(
-        self, gui: viser.GuiApi, name: str, command: Command
-    ) -> tuple[viser.GuiCheckboxHandle, viser.GuiSliderHandle]:
-        """Whether the command is drawn at each reset, and its value if not."""
+    def _add_command(self, gui: viser.GuiApi, name: str, command: Command) -> _Setting:
         given = self._simulation.command.get(name)
         start = 0.5 * (command.low + command.high) if given is None else given
         start, *ends = (
             round(float(end), _DECIMALS)
             for end in (start, command.low, command.high, *(command.span or ()))
         )
-        low, high = min(start, *ends), max(start, *ends)
         label = words(name)
         # The folder has the whole name, as the panel is narrow.
         short = label.split()[-1] + (f", {command.unit}" if command.unit else "")
         with gui.add_folder(label):
-            drawn = gui.add_checkbox(_DRAWN, given is None)
-            slider = gui.add_slider(short, low, high, command.step / _STEPS_PER_KEY, start)
-        slider.on_update(lambda _: setattr(drawn, "value", False))
-        return drawn, slider
+            sampled = gui.add_checkbox(_SAMPLED, given is None)
+            if command.names:
+                handle = gui.add_dropdown(short, command.names)
+            else:
+                low, high = min(start, *ends), max(start, *ends)
+                handle = gui.add_slider(short, low, high, command.step / _STEPS_PER_KEY, start)
+        setting = _Setting(handle, sampled)
+        if command.names:
+            setting.show(start)
+        return setting
 
     def _add_world(self, gui: viser.GuiApi) -> None:
         """The world's sliders, of those terms that the simulation lets move."""
         sliders = sliders_for(self._simulation.env.config.randomization)
         if not sliders:
             return
-        is_drawn = self._simulation.world is None
+        is_sampled = self._simulation.world is None
         with gui.add_folder("world"):
-            self._drawn = gui.add_checkbox(_DRAWN, is_drawn, visible=is_drawn)
+            sampled = gui.add_checkbox(_SAMPLED, is_sampled, visible=is_sampled)
             for slider in sliders:
                 handle = gui.add_slider(slider.label, *slider.limits, slider.step, slider.nominal)
-                handle.on_update(lambda _: setattr(self._drawn, "value", False))
-                self._sliders[slider] = handle
-            gui.add_button("nominal world").on_click(self._make_nominal)
+                self._world[slider] = _Setting(handle, sampled)
+            gui.add_button("make the world nominal").on_click(self._make_nominal)
+
+    def show_values(self) -> None:
+        """Shows the sampled values that hold in the first environment."""
+        for name, setting in self._commands.items():
+            if setting.sampled.value:
+                setting.show(float(self._simulation.frame.command[name][0]))
+        for slider, setting in self._world.items():
+            if setting.sampled.value:
+                setting.show(self._simulation.world_value(slider.term) / slider.scale)
 
     @property
     def num_shown(self) -> int:
@@ -120,11 +185,9 @@ class Controls:
         self._requests.put(self._simulation.reset)
 
     def _move(self, steps: float) -> None:
-        """Moves the first command's slider by a number of the command's steps."""
-        name, (drawn, slider) = next(iter(self._commands.items()))
-        change = steps * self._simulation.env.config.commands[name].step
-        slider.value = float(np.clip(slider.value + change, slider.min, slider.max))
-        drawn.value = False
+        """Moves the first command by a number of its steps."""
+        name, setting = next(iter(self._commands.items()))
+        setting.move(steps * self._simulation.env.config.commands[name].step)
 
     def _accelerate(self, change: float) -> None:
         self._speed.value = float(np.clip(round(self._speed.value + change, 1), *SPEED_RANGE))
@@ -138,21 +201,20 @@ class Controls:
             self._requests.put(lambda: self._simulation.push(velocity))
 
     def _make_nominal(self, _: object) -> None:
-        for slider, handle in self._sliders.items():
-            handle.value = slider.nominal
-        self._drawn.value = False
+        for slider, setting in self._world.items():
+            setting.set(slider.nominal)
 
     def apply(self) -> None:
         """Applies the settings and the requests to the simulation."""
         self._simulation.command = {
-            name: _bounded(slider)
-            for name, (drawn, slider) in self._commands.items()
-            if not drawn.value
+            name: setting.value
+            for name, setting in self._commands.items()
+            if not setting.sampled.value
         }
-        if self._sliders:
-            positions = {slider: _bounded(handle) for slider, handle in self._sliders.items()}
-            world = {slider.term: slider.world_value(x) for slider, x in positions.items()}
-            self._simulation.world = None if self._drawn.value else world
+        if self._world:
+            world = {x.term: x.world_value(setting.value) for x, setting in self._world.items()}
+            is_sampled = next(iter(self._world.values())).sampled.value
+            self._simulation.world = None if is_sampled else world
         while not self._requests.empty():
             self._requests.get()()
 

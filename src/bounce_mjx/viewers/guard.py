@@ -165,7 +165,7 @@ def _is_valid(data: str | bytes) -> bool:
                 return not others
             case {"type": "GuiUpdateMessage", "uuid": str(), "updates": {"value": value, **others}}:
                 # viser would read a number from a text.
-                is_word = isinstance(value, str) and value.isalpha()
+                is_word = isinstance(value, str) and value.replace(" ", "").isalpha()
                 return not others and (is_word or abs(value) <= _MAX_NUMBER)
     return False
 

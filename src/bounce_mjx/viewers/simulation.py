@@ -159,6 +159,10 @@ class Simulation:
         given = {name: np.full_like(frame.command[name], x) for name, x in self.command.items()}
         return frame._replace(command=frame.command | given)
 
+    def world_value(self, term: str) -> float:
+        """The first entry of a term of the world in the first environment."""
+        return float(np.ravel(self._states.pipeline_state.world[term][..., 0])[0])
+
     def reset(self) -> None:
         """Starts a new episode in every environment."""
         self._frame = self._reset(np.ones(self.num_envs, bool))
@@ -241,6 +245,10 @@ class SideBySide(Simulation):
         shared = set.intersection(*(set(frame.metrics) for frame in frames))
         frames = [f._replace(metrics={name: f.metrics[name] for name in shared}) for f in frames]
         return jax.tree.map(lambda *values: np.concatenate(values), *frames)
+
+    def world_value(self, term: str) -> float:
+        """See `Simulation.world_value`."""
+        return self._simulations[0].world_value(term)
 
     def reset(self) -> None:
         """See `Simulation.reset`."""

@@ -50,6 +50,8 @@ class Command(NamedTuple):
     """Range that a viewer offers; by default, and at least, the range from which it is sampled."""
     step: float = 0.05
     """Change by a key of a viewer."""
+    names: tuple[str, ...] = ()
+    """Names of the values 0 to 1, 1 to 2, ..., if they are choices; a user may give a name."""
 
     def checked(self, value: Any, label: str) -> float:
         """A user's value as a number.
@@ -60,6 +62,8 @@ class Command(NamedTuple):
         Raises:
           UserError: it is not a number within the limits.
         """
+        if isinstance(value, str) and value in self.names:
+            return float(self.names.index(value))
         try:
             number = math.nan if isinstance(value, bool) else float(value)
         except (TypeError, ValueError):
@@ -68,7 +72,8 @@ class Command(NamedTuple):
             return number
         limits = [f">= {self.least:g}"] * math.isfinite(self.least)
         limits += [f"<= {self.greatest:g}"] * math.isfinite(self.greatest)
-        wanted = " ".join(["a finite number", " and ".join(limits)]).rstrip()
+        number_words = " ".join(["a finite number", " and ".join(limits)]).rstrip()
+        wanted = ", ".join([*self.names, f"or {number_words}"]) if self.names else number_words
         unit = f" ({self.unit})" if self.unit else ""
         raise UserError(f"{label} is {shorten(repr(value))}, but must be {wanted}{unit}")
 
