@@ -30,6 +30,7 @@ from bounce_mjx.runs.config import (
     TrainConfig,
     load_config,
     load_run_config,
+    preset_files,
     read_preset,
 )
 from bounce_mjx.runs.files import to_json
@@ -366,7 +367,7 @@ def test_files_of_the_user_lie_on_each_other(presets: Path) -> None:
         command = train_command.read_command(flags.split())
         assert command.ppo.learning_rate == rate and command.ppo.discount == 0.9
         assert command.ppo.num_envs == read_preset(None).ppo.num_envs
-        cpu, *given = command.config
+        cpu, *given = preset_files(command.config, command.task)
         assert cpu == resource_path("configs/cpu.yaml")
         assert " ".join(map(str, given)) == flags.replace("--config=", "").replace("--config ", "")
     (presets / "more.yaml").write_text("base: robust")
