@@ -476,8 +476,8 @@ def test_the_chunks_of_an_evaluation_are_its_episodes(straight: Path) -> None:
             Evaluators(each, env, make_mesh(1, config.ppo), pool)
             for each in (config, config.model_copy(update={"screening_episodes": 0}))
         )
-    (expected,) = whole.final(policy)
-    (report,) = chunked.final(policy)
+    (expected,) = whole.final([policy])
+    (report,) = chunked.final([policy])
     assert report.details == pytest.approx(expected.details)
     jax.tree.map(
         lambda ours, theirs: np.testing.assert_allclose(ours, theirs, atol=1e-5),
@@ -485,7 +485,7 @@ def test_the_chunks_of_an_evaluation_are_its_episodes(straight: Path) -> None:
         expected.recording,
     )
 
-    (screening,) = chunked.select(policy)
+    (screening,) = chunked.select([policy])
     _, key = jax.random.split(jax.random.PRNGKey(np.uint32(config.eval_seed)))
     networks = make_networks(config.ppo, env.observation_size, env.action_size)
     evaluate = make_evaluator(env, networks, config.eval_episodes)
