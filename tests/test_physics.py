@@ -159,10 +159,27 @@ INERTIAL = '<inertial pos="0.1 0 0.02" quat="1 2 3 4" mass="0.5" diaginertia="0.
 SIDE_LINK = f'<body pos="0.02 0 0.01" euler="0.3 0 1">{INERTIAL}<joint name="side"/></body>'
 WELDED = f'<body pos="0.02 0 0.01" euler="0.3 0 1">{INERTIAL}'
 
-# Models that the fused engine supports, each as one edit of the MJCF; test_arms.py has the rest.
+# Models that the fused engine supports, each as one edit of the MJCF.
 SUPPORTED = {
+    "damping": ('<joint armature="0.02"', '<joint armature="0.02" damping="5"'),
     "no armature": ('<joint armature="0.02"', '<joint armature="0"'),
+    "axis y": ('name="Joint2" axis="0 0 1"', 'name="Joint2" axis="0 1 0"'),
+    "axis skew": ('name="Joint3" axis="0 0 1"', 'name="Joint3" axis="1 -2 0.5"'),
+    "axis backward": ('name="Joint5" axis="0 0 1"', 'name="Joint5" axis="0 0 -1"'),
+    "ref": ('name="Joint4"', 'name="Joint4" ref="0.3"'),
+    "skew base": ('<body name="Link1" pos="0 0 0.1">', '<body name="Link1" euler="0.1 -0.2 0.3">'),
     "tilted gravity": ('gravity="0 0 -9.81"', 'gravity="1 -2 -9"'),
+    "ctrlrange": ('<position kp="20000"', '<position ctrlrange="-0.5 0.5" kp="20000"'),
+    "forcerange": ('<position kp="20000"', '<position forcerange="-300 80" kp="20000"'),
+    "forcerange and gear": (
+        '<position kp="20000"',
+        '<position forcerange="-30 9" gear="-2" kp="20000"',
+    ),
+    "gear": ('<position kp="20000"', '<position gear="-2" kp="20000"'),
+    "affine actuator": (
+        '<position name="act2" joint="Joint2"/>',
+        '<general name="act2" joint="Joint2" gainprm="100" biastype="affine" biasprm="3 -80 -10"/>',
+    ),
     "solref": ('solref="-98696 -31.4"', 'solref="0.02 1"'),
     "short solref": ('solref="-98696 -31.4"', 'solref="0.0005 0.1"'),
     "undamped solref": ('solref="-98696 -31.4"', 'solref="-98696 0"'),
@@ -171,15 +188,35 @@ SUPPORTED = {
     "solimp power 1.5": ('solimp="0.95 0.99 0.001"', 'solimp="0.5 0.99 0.02 0.6 1.5"'),
     "solimp out of range": ('solimp="0.95 0.99 0.001"', 'solimp="0 1 0.02 0 0.5"'),
     "heavy ball": ('size="0.019" mass="0.0027"', 'size="0.019" mass="0.3"'),
+    "joint offset": ('name="Joint2"', 'name="Joint2" pos="0.01 -0.02 0.03"'),
+    "slide": ('name="Joint2"', 'name="Joint2" type="slide"'),
+    "spring": ("<joint ", '<joint stiffness="500" springref="0.3" '),
+    "joint force range": ("<joint ", '<joint actuatorfrcrange="-40 60" '),
+    "gravity compensation of a link": ('<body name="Link3"', '<body name="Link3" gravcomp="2"'),
     "gravity compensation of either sign": (
         ARM_BODY,
         ARM_BODY.replace('<body name="Link3"', '<body name="Link3" gravcomp="2"').replace(
             '<body name="Link5"', '<body name="Link5" gravcomp="-1"'
         ),
     ),
+    "gravity compensation": (ARM_BODY, ARM_BODY.replace("<body ", '<body gravcomp="0.7" ')),
+    "gravity compensation by actuators": (
+        ARM_BODY,
+        ARM_BODY.replace("<body ", '<body gravcomp="0.7" ').replace(
+            "<joint ", '<joint actuatorgravcomp="true" actuatorfrcrange="-20 15" '
+        ),
+    ),
     "gravity compensation of the ball": (
         '<body name="ball_link"',
         '<body gravcomp="0.5" name="ball_link"',
+    ),
+    "welded body": ('<body name="Link4"', f'{WELDED}{WELDED}</body></body><body name="Link4"'),
+    "welded paddle": (PADDLE, f"{WELDED}{PADDLE}</body>"),
+    "pedestal": (ARM_BODY, f'<body pos="0.1 0 0.2" euler="0 0.3 0">{ARM_BODY}</body>'),
+    "affine gain": (
+        '<position name="act2" joint="Joint2"/>',
+        '<general name="act2" joint="Joint2" gear="-2" gaintype="affine" gainprm="100 30 -20" '
+        'biastype="affine" biasprm="3 -80 -10" ctrlrange="-0.5 0.5"/>',
     ),
     "Euler": (
         OPTIONS,
@@ -191,9 +228,14 @@ SUPPORTED = {
         OPTIONS,
         OPTIONS.replace("implicitfast", "Euler").replace("<joint ", '<joint damping="5" '),
     ),
+    "turned paddle": ('quat="0.707107 0 -0.707107 0"', 'quat="0.6 0.1 -0.7 0.2"'),
 }
 # Models that move like the shipped one.
 EQUIVALENT = {
+    "negative gravity compensation of a link": (
+        '<body name="Link3"',
+        '<body name="Link3" gravcomp="-1"',
+    ),
     "negative gravity compensation": (
         ARM_BODY + BALL_BODY,
         (ARM_BODY + BALL_BODY).replace("<body ", '<body gravcomp="-1" '),
@@ -250,17 +292,29 @@ def test_supported_models_step_as_mujoco_does(mj_model, name):
 UNSUPPORTED = {
     # edit, required part of the message
     "RK4": ('integrator="implicitfast"', 'integrator="RK4"', "integrator rk4 "),
+    "implicit": ('integrator="implicitfast"', 'integrator="implicit"', "integrator implicit "),
+    "discrete": ('integrator="implicitfast"', 'integrator="discrete"', "integrator discrete "),
+    "flex": (
+        "</worldbody>",
+        '</worldbody><deformable><flex name="f" dim="1" body="Link5 Link6" element="0 1"/>'
+        "</deformable>",
+        "flex",
+    ),
     "density": ("<option ", '<option density="1.2" ', "density"),
+    "viscosity": ("<option ", '<option viscosity="1e-5" ', "viscosity"),
+    "wind": ("<option ", '<option wind="1 0 0" ', "wind"),
     "actuator group": ("<option ", '<option actuatorgroupdisable="0" ', "actuatorgroupdisable"),
     **{
         f"no {flag}": ("<flag ", f'<flag {flag}="disable" ', f"({flag})")
         for flag in "constraint contact damper gravity clampctrl actuation refsafe".split()
     },
+    "two flags": ("<flag ", '<flag gravity="disable" contact="disable" ', "(contact, gravity)"),
     **{
         flag: ("<flag ", f'<flag {flag}="enable" ', f"({flag})")
         for flag in ("override", "sleep", "diagexact")
     },
     "condim 4": ('condim="1"', 'condim="4"', "condim 4"),
+    "condim 6": ('condim="1"', 'condim="6"', "condim 6"),
     "second pair": ("</contact>", '<pair geom1="floor" geom2="ball"/></contact>', "another ball"),
     "no pair": (piece("<pair ", "  </contact>"), "", "contact pair"),
     "pair with the floor": (
@@ -270,6 +324,8 @@ UNSUPPORTED = {
     ),
     "colliding geoms": ('<geom contype="0"', '<geom contype="1"', "contype"),
     "margin": ("<pair ", '<pair margin="0.001" ', "margin"),
+    "gap": ("<pair ", '<pair gap="0.001" ', "gap"),
+    "adhesion": ("<pair ", '<pair adhesion="1" ', "adhesion"),
     "mixed solref": ('solref="-98696 -31.4"', 'solref="-98696 1"', "solref"),
     "solref with a zero": ('solref="-98696 -31.4"', 'solref="0.02 0"', "solref"),
     "solimp width": ('solimp="0.95 0.99 0.001"', 'solimp="0.95 0.99 0"', "solimp"),
@@ -298,7 +354,14 @@ UNSUPPORTED = {
         "paddle that is not a box",
     ),
     "ellipsoid ball": ('type="sphere" size="0.019"', 'type="ellipsoid" size=".02 .02 .01"', "ball"),
+    "ball off its body": ('type="sphere"', 'pos="0 0 0.01" type="sphere"', "ball"),
+    "uneven ball": (
+        "<freejoint ",
+        '<inertial pos="0 0 0" mass="0.0027" diaginertia="3.9e-7 3.9e-7 3.8e-7"/><freejoint ',
+        "homogeneous sphere",
+    ),
     "ball spring": ("<freejoint ", '<joint type="free" stiffness="0.1" ', "ball"),
+    "ball damping": ("<freejoint ", '<joint type="free" damping="0.1" ', "ball"),
     "equality": (
         "<actuator>",
         '<equality><joint joint1="Joint2" joint2="Joint3"/></equality><actuator>',
@@ -312,6 +375,7 @@ UNSUPPORTED = {
     "actuator dynamics": ("<position ", '<position timeconst="0.01" ', "position servos"),
     "actuator delay": ("<position ", '<position delay="0.005" nsample="9" ', "delay"),
     "actuator damping": ("<position ", '<position damping="1" ', "damping"),
+    "actuator armature": ("<position ", '<position armature="0.1" ', "armature"),
     "motor": ('<position name="act2"', '<motor name="act2"', "position servos"),
     "another actuator": (
         "</actuator>",
@@ -323,9 +387,11 @@ UNSUPPORTED = {
 
 # Features that MJX also ignores or refuses.
 UNSUPPORTED_BY_BOTH = (
-    *("density", "actuator group", "override", "sleep", "diagexact", "mixed solref"),
-    *("solref with a zero", "solimp width", "stiffness polynomial", "damping polynomial"),
-    *("ellipsoid ball", "actuator delay", "actuator damping"),
+    *("implicit", "discrete", "density", "viscosity", "wind", "actuator group"),
+    *("override", "sleep", "diagexact", "adhesion", "mixed solref", "solref with a zero"),
+    *("solimp width", "flex"),
+    *("stiffness polynomial", "damping polynomial", "ellipsoid ball"),
+    *("actuator delay", "actuator damping", "actuator armature"),
 )
 
 
