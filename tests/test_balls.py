@@ -24,11 +24,13 @@ from against_c import (
 from bounce_mjx import task
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation import c_episodes
 from bounce_mjx.physics import (
     Control,
     PhysicsParameters,
     PhysicsState,
     make_engine,
+    servo_targets,
 )
 from bounce_mjx.physics.support import unsupported_feature
 from bounce_mjx.robot.model import find_addresses, load_model
@@ -102,7 +104,7 @@ def num_pressed(model: mujoco.MjModel, states: States) -> np.ndarray:
 @pytest.mark.parametrize(
     ("num_balls", "friction"),
     # Newton's method is slow for the last one.
-    [(3, None), (2, 0.3), (2, (0.02, 0.2))],
+    [(2, None), (3, None), (2, 0.3), (2, 1.5), (2, (0.02, 0.2))],
 )
 @pytest.mark.usefixtures("float64")
 def test_one_step_of_several_balls_is_mujocos(num_balls, friction, record_property):
@@ -151,7 +153,7 @@ def drop(model: mujoco.MjModel, data: mujoco.MjData, ball: int, rng: np.random.G
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("num_balls", "friction"), [(3, None), (2, 0.3)], ids=["three", "friction"]
+    ("num_balls", "friction"), [(2, None), (3, None), (2, 0.3)], ids=["two", "three", "friction"]
 )
 @pytest.mark.usefixtures("float64")
 def test_several_balls_stay_with_mujoco_for_2000_steps(num_balls, friction, record_property):
@@ -233,6 +235,21 @@ def test_the_gradient_of_touching_balls_is_that_of_finite_differences():
         assert np.mean(np.abs(found - expected) / scale < 1e-3) > 0.9
 
 
+@pytest.mark.slow
+@pytest.mark.separate_loops
+@pytest.mark.usefixtures("float64")
+def test_mjx_agrees_on_several_balls():
+    model, count = balls_model(2), 8
+    states = hostile_states(model, 64, seed=4)
+    some = np.flatnonzero(num_pressed(model, states) >= 2)[:count]
+    expected, _ = c_steps(model, States(*(x[some] for x in states)))
+    step = jax.jit(jax.vmap(lambda s, u: make_engine(model, "mjx").step(MODEL, s, Control(u), 1)))
+    after = step(PhysicsState(*(x[some] for x in states[:2])), states.ctrl[some])
+    fastest = np.max(np.abs(expected.qvel), axis=1, keepdims=True)
+    # MJX's solver stops at errors up to 2e-5.
+    assert np.max(np.abs(np.asarray(after.qvel) - expected.qvel) / fastest) < 1e-4
+
+
 class Two(Rest):
     """A task with two balls, which fly side by side."""
 
@@ -279,6 +296,54 @@ def test_a_world_of_two_balls_sees_each_late():
     np.testing.assert_array_equal(seen[1:, 1], seen[:-1, 0])
     assert {"true/ball_position_5", "true/ball_velocity_5"} <= state.metrics.keys()
     assert env.layout.parts[env.layout.parts.index(("ball_velocity", 6, "m/s"))]
+
+
+@pytest.mark.slow
+def test_noise_and_pushes_differ_between_the_balls():
+    noisy = {"ball_position_noise": (0.01, 0.01), "ball_position_bias": (0.1, 0.1)}
+    pushed = {"push_speed": (1.0, 1.0), "push_interval": (0.05,) * 2, "ball_latency": None}
+    env = Env(Two.Config(randomization=noisy | pushed))
+    truths, observations, _ = after_resting(env, 40)
+    at = np.array([truth.ball_position for truth in truths])
+    error = observations[:, env.layout["ball_position"]].reshape(at.shape) - at - 0.1
+    assert 0.005 < np.std(error) < 0.02
+    assert abs(np.corrcoef(error[:, 0].ravel(), error[:, 1].ravel())[0, 1]) < 0.4
+    velocity = np.array([truth.ball_velocity for truth in truths])
+    pushes = np.diff(velocity[..., :2], axis=0)
+    pushed = np.linalg.norm(pushes, axis=2) > 0.5
+    assert np.sum(pushed[:, 0]) >= 5 and np.all(pushed[:, 0] == pushed[:, 1])
+    np.testing.assert_allclose(np.linalg.norm(pushes[pushed], axis=1), 1.0, atol=1e-3)
+    assert np.ptp(pushes[pushed[:, 0]][:, 0] - pushes[pushed[:, 0]][:, 1]) > 0.5
+
+
+@pytest.mark.slow
+def test_c_moves_several_balls_as_the_engine_does():
+    """With a push, and with the forces of the air in each physics step."""
+    drawn = {"push_speed": (1.0, 1.0), "air_drag": (0.5, 0.5), "air_lift": (0.02, 0.02)}
+    env = Env(Two.Config(randomization=drawn))
+    count, num_steps = 2, env.config.num_substeps
+    keys = jax.random.split(jax.random.PRNGKey(0), count)
+    states = jax.vmap(env.reset, out_axes=-1)(keys)
+    physics = states.pipeline_state.physics
+    spins = [i for ball in find_addresses(env.mj_model).balls for i in ball.qvel[3:]]
+    physics = physics._replace(qvel=physics.qvel.at[np.array(spins)].set(30.0))
+    push = jnp.arange(6.0).reshape(2, 3, 1) * jnp.ones(count)
+    air = {"air_drag": jnp.full(count, 0.5), "air_lift": jnp.full(count, 0.02)}
+    control = Control(physics.qpos[:6], **air, ball_push=push)
+    targets = jax.vmap(servo_targets, in_axes=(-1, None))(control, num_steps)
+    simulated = c_episodes.full_states(env.mj_model, physics)
+    balls = c_episodes._ball_velocity(env.mj_model)
+    simulated[:, balls] += np.asarray(push).reshape(-1, count).T
+    models, data = [env.mj_model] * count, [mujoco.MjData(env.mj_model)]
+    with mujoco.rollout.Rollout(nthread=0) as pool:
+        simulated = c_episodes._next_states(
+            pool, models, data, simulated, np.asarray(targets), *map(np.asarray, air.values())
+        )
+    expected = c_episodes.physics_states(env.mj_model, simulated)
+    step = jax.vmap(lambda s, c: env.engine.step(MODEL, s, c, num_steps), in_axes=-1, out_axes=-1)
+    for ours, theirs in zip(step(physics, control), expected, strict=True):
+        if theirs is not None:
+            np.testing.assert_allclose(ours, theirs, atol=1e-5)
 
 
 def test_a_task_of_one_ball_refuses_two():

@@ -352,3 +352,42 @@ def test_pipe_does_not_block(run: Path, state: TrainingState) -> None:
     path.unlink()
     os.mkfifo(path)
     assert_refused(run, state, "damaged", "is not a regular file")
+
+
+class Payload:
+    """Object whose unpickling runs code."""
+
+    def __init__(self, target: Path):
+        self.target = target
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.target),)
+
+
+def payload(target: Path) -> bytes:
+    import pickle
+
+    return pickle.dumps(Payload(target))
+
+
+@pytest.mark.parametrize("sealed", [False, True], ids=["as found", "with a valid manifest"])
+def test_code_in_any_file_is_not_run(
+    written: Path, tmp_path: Path, state: TrainingState, sealed: bool
+) -> None:
+    target = tmp_path / "ran"
+    names = sorted(p.relative_to(written) for p in written.rglob("*") if p.is_file())
+    tagged = f'!!python/object/apply:os.mkdir ["{target}"]\n'.encode()
+    for name in names:
+        for data in (payload(target), tagged):
+            run = shutil.copytree(written, tmp_path / "run")
+            (run / name).write_bytes(data)
+            if sealed and name.name != files.MANIFEST_FILE:
+                files.seal(step_of(run))
+            try:
+                loaded = load_both(run, state)
+            except UserError:
+                pass
+            else:
+                assert_identical(loaded, (policy_of(state, OBSERVATION.size), state))
+            assert not target.exists(), name
+            shutil.rmtree(run)
