@@ -523,7 +523,7 @@ def test_divergence_ends_the_training_and_keeps_the_last_good_state(
     assert exit_info.value.code == 2
     sentence = capfd.readouterr().err
     assert re.fullmatch(r"error: .+\n", sentence)
-    assert "loss/policy was the first that was not finite, at iteration 4;" in sentence
+    assert "loss/policy became infinite or NaN at iteration 4;" in sentence
     assert f"the last good checkpoint is {latest_checkpoint(run).folder}" in sentence
     assert_same_training(run, half)
 

@@ -290,12 +290,12 @@ def _robot_for(task: type[Task], robot: Path) -> dict[str, Any]:
     known = validate(train_config(its_task), values, str(robot)).env
     if issubclass(task, its_task):
         return values
-    of_world = {k: v for k, v in values.get("env", {}).items() if k in WorldConfig.model_fields}
+    world_keys = {k: v for k, v in values.get("env", {}).items() if k in WorldConfig.model_fields}
     # Imports JAX, which a command line alone does not need.
     from bounce_mjx.robot.model import paddle_home
 
     home = paddle_home(known.mjcf, known.robot, known.default_joint_angles)
-    return values | {"env": of_world | task.Config.settings_at(home)}
+    return values | {"env": world_keys | task.Config.settings_at(home)}
 
 
 def read_preset(

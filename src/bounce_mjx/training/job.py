@@ -406,7 +406,7 @@ class Job:
 
     def _is_due(self) -> bool:
         done = self._is_done()
-        # A policy that is good already is the first that counts as best.
+        # The policy of a warm start is the one to beat.
         trained = self.steps > 0 or self.first is not None
         at_evaluation = trained and (done or self.steps % self.eval_steps == 0)
         nothing = any(member.progress.best is None for member in self._healthy())
@@ -544,8 +544,8 @@ class Job:
                 continue
             first = int(np.argmax(block_faults != 0))
             member.progress.fault = (
-                f"{self.trainer.checked[int(block_faults[first]) - 1]} was the first that was not "
-                f"finite, at iteration {before + first + 1}"
+                f"{self.trainer.checked[int(block_faults[first]) - 1]} became infinite or NaN at "
+                f"iteration {before + first + 1}"
             )
             if self.config.num_seeds > 1:
                 self.reporter.say(f"seed {member.config.seed} diverged: {member.progress.fault}")

@@ -44,7 +44,7 @@ def show(
     Args:
       shown: one, or several with the same task and robot side by side, on the page or in its
         recording. The labels of several are A, B, ...
-      commands: values of the task's commands; the others are drawn.
+      commands: values of the task's commands; the others are sampled.
 
     Raises:
       UserError: a file cannot be written, or the viewer does not work here, or it shows only one
@@ -165,14 +165,14 @@ def _simulate(
     if has_sliders and len(shown) == 1 and envs[0].engine.name == "fused":
         num_envs = MAX_ENVS
     # Policies side by side are compared in one world.
-    is_drawn = all(one.config.randomization.terms for one in shown)
+    is_sampled = all(one.config.randomization.terms for one in shown)
     simulations = []
     for one, env in zip(shown, envs, strict=True):
         ranges = reset_ranges(one.config) if has_sliders else None
         controller = one.make_controller(env)
         simulation = Simulation(env, controller, num_envs, options.seed, ranges, one.policy)
         simulation.command = commands
-        simulation.world = None if is_drawn else {}
+        simulation.world = None if is_sampled else {}
         simulations.append(simulation)
     return SideBySide(simulations) if len(simulations) > 1 else simulations[0]
 

@@ -129,10 +129,10 @@ class Simulation:
         self.policy = policy
         """The policy that acts; another one of the same shapes may replace it between two steps."""
         self.command: dict[str, float] = {}
-        """Commands of all environments that are set; the others are drawn."""
+        """Commands of all environments that are set; the others are sampled."""
         self.world: dict[str, Sequence[float]] | None = None
         """Entries of some terms of the world that are on, in all environments, with the others
-        nominal; None for the world drawn at each reset."""
+        nominal; None for a world sampled at each reset."""
         self._controller = controller
         self._ranges = ranges
         self._key = jax.random.PRNGKey(seed)
@@ -338,10 +338,10 @@ def _apply(env: Env, states: State, changes: _Changes) -> State:
     return states.replace(pipeline_state=changed, obs=observation)
 
 
-def _replace_given(given: World, drawn: World) -> World:
+def _replace_given(given: World, sampled: World) -> World:
     """Drawn values by name, some of which are replaced; nan replaces none."""
-    return drawn | {
-        name: jnp.where(jnp.isnan(value), drawn[name], value) for name, value in given.items()
+    return sampled | {
+        name: jnp.where(jnp.isnan(value), sampled[name], value) for name, value in given.items()
     }
 
 
