@@ -339,7 +339,7 @@ def test_a_file_of_the_user_lies_on_the_preset_of_its_task(presets: Path) -> Non
     cpu = read_preset(Path("cpu")).ppo
     assert given == cpu.model_copy(update={"learning_rate": 0.001}) != cpu
     assert read_file(presets, "task: track") == read_preset(Path("cpu"), task="track")
-    assert read_file(presets, "base: robust") == read_preset(Path("robust"))
+    assert read_file(presets, "base: randomized") == read_preset(Path("randomized"))
     alone = read_file(presets, "base: null\nseed: 3")
     assert alone == TrainConfig(seed=3)
     with pytest.raises(UserError, match="given.yaml: base is 'nope'; give the name of a preset"):
@@ -370,7 +370,7 @@ def test_files_of_the_user_lie_on_each_other(presets: Path) -> None:
         cpu, *given = preset_files(command.config, command.task)
         assert cpu == resource_path("configs/cpu.yaml")
         assert " ".join(map(str, given)) == flags.replace("--config=", "").replace("--config ", "")
-    (presets / "more.yaml").write_text("base: robust")
+    (presets / "more.yaml").write_text("base: randomized")
     with pytest.raises(UserError, match="more.yaml lies on my.yaml, so its base is not used"):
         read_preset([Path("my.yaml"), Path("more.yaml")])
 

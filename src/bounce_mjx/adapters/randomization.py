@@ -48,7 +48,7 @@ DEFAULT = RandomizationConfig(
     servo_gain=(0.8, 1.2),
     gravity_tilt=(-0.035, 0.035),
 )
-"""The terms of `configs/robust.yaml` that change the model."""
+"""The terms of `configs/randomized.yaml` that change the model."""
 
 
 def domain_randomize(
