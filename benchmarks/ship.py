@@ -140,7 +140,7 @@ def write_policy(
     Raises:
       UserError: the folder cannot be written.
     """
-    report, physics, _ = evaluation
+    report, physics = evaluation
     policy = read_policy(checkpoint, trained_with)
     start = read_networks(checkpoint, trained_with)[:2] if networks else None
     made_by = load_results(checkpoint.run)

@@ -9,6 +9,7 @@ from rich.console import Console
 
 import viewing
 from bounce_mjx import BounceBall, EnvConfig
+from bounce_mjx.baselines.mirror import MirrorLaw
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.resources import resource_path
@@ -59,8 +60,10 @@ def env(mirrored: Simulation) -> BounceBall:
 
 @pytest.fixture(scope="module")
 def recording(mirrored: Simulation) -> EnvFrame:
-    """A recording that is one step longer than an episode."""
-    return mirrored.record(SECONDS + mirrored.env.dt)
+    """A recording from the first reset that is one step longer than an episode."""
+    env = mirrored.env
+    simulation = Simulation(env, make_policy_controller(MirrorLaw(env)), 2, seed=0)
+    return simulation.record(SECONDS + env.dt)
 
 
 def test_frames_describe_one_state(env: BounceBall, recording: EnvFrame) -> None:

@@ -85,7 +85,7 @@ def read_command(args: Sequence[str], machine: Path | None = None) -> TrainComma
         print(f"usage: {PROG} [FLAGS]\n\n{TrainCommand.__doc__ or ''}\n\n{shown}")
         if "--help-all" not in helps:
             print("\n--help-all lists every flag; each key of the config is one (docs/config.md).")
-        sys.exit()
+        sys.exit(0)
     command = parse(own_class, args, prog=PROG, default=own_class(**dict(base)))
     settled = start.settle(command.training, base)
     return command.model_copy(update=dict(settled) | {"resume": start.run})

@@ -161,6 +161,7 @@ class Job:
         self.state: Any = None
         self.steps = 0
         self.ended = False
+        self.logs: concurrent.futures.Future[list[TensorBoardLog]] | None = None
         self.writers: list[CheckpointWriter] = []
         self.seed_writers: list[CheckpointWriter] = []
 
@@ -240,6 +241,9 @@ class Job:
     def _remove_unstarted(self, error: type[BaseException] | None, *_) -> None:
         """Removes the folder of a new run without a checkpoint or a block that can be trained."""
         if error is not None and not self.keeps_folder and hosts.is_leader():
+            if self.logs is not None:
+                # A log that is opened later would make the folder again.
+                concurrent.futures.wait([self.logs])
             shutil.rmtree(self.run, ignore_errors=True)
 
     def _seed_runs(self) -> list[SeedRun]:

@@ -21,8 +21,8 @@ class Start(StrictModel):
     config: Annotated[
         tuple[Path, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="PATH")
     ] = ()
-    """Preset: the name of a YAML file in configs/, such as cpu, randomized or finetune; a task's own
-    preset of that name, such as configs/track/cpu.yaml, has priority. The default is default on an
+    """Preset: the name of a YAML file in configs/, such as cpu or finetune; a task's own preset of
+    that name, such as configs/track/cpu.yaml, has priority. The default is default on an
     accelerator, and cpu on a CPU. A YAML file of yours lies on that default, or on the preset that
     its key base names. Given again, each file lies on those before it."""
     robot: Path | None = None
