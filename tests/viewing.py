@@ -51,9 +51,17 @@ def mirrored() -> Simulation:
     return Simulation(env, make_policy_controller(MirrorLaw(env)), 2, seed=0)
 
 
-@functools.cache
 def exchangeable() -> Simulation:
-    """One robot under a policy that is one constant action for all joints."""
+    """One robot under a policy that is one constant action for all joints, from a new reset with
+    the policy 0, whatever another file's tests left."""
+    simulation = _exchangeable()
+    simulation.command, simulation.world, simulation.policy = {}, None, np.float32(0.0)
+    simulation.reset()
+    return simulation
+
+
+@functools.cache
+def _exchangeable() -> Simulation:
     env = mirrored().env
 
     def controller(policy, states, key):
