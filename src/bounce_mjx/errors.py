@@ -1,11 +1,12 @@
 """The exception that a user's mistake raises, and how a command reports it."""
 
 import contextlib
+import difflib
 import io
 import os
 import shlex
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 from bounce_mjx.interrupt import leave
 
@@ -111,3 +112,9 @@ def reason_of(error: Exception) -> str:
 def shorten(text: str, length: int = 100) -> str:
     """A user's text, cut to fit into a sentence."""
     return text if len(text) <= length else f"{text[: length - 3]}..."
+
+
+def suggest(name: str, known: Iterable[str]) -> str:
+    """A question about the known name that is nearest to a mistaken one; empty if none is near."""
+    near = difflib.get_close_matches(name, known, n=1)
+    return f"did you mean {near[0]}?" if near else ""

@@ -3,7 +3,6 @@
 `bounce-mjx train|eval|robustness|play|view|adopt|plot|report|export|...`
 """
 
-import difflib
 import gc
 import importlib
 import os
@@ -11,7 +10,7 @@ import sys
 from collections.abc import Sequence
 
 import bounce_mjx
-from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.errors import UserError, exit_on_user_error, suggest
 from bounce_mjx.interrupt import end_on_ctrl_c
 
 COMMANDS = {
@@ -57,8 +56,7 @@ def main(args: Sequence[str] | None = None) -> None:
             print(f"bounce_mjx {bounce_mjx.__version__}")
             return
         if name not in COMMANDS:
-            near = difflib.get_close_matches(name, COMMANDS, n=1)
-            advice = f"did you mean {near[0]}?" if near else f"choose {', '.join(COMMANDS)}"
+            advice = suggest(name, COMMANDS) or f"choose {', '.join(COMMANDS)}"
             raise UserError(f"unknown command {name}; {advice} (see bounce-mjx --help)")
         if opengl := os.environ.get("MUJOCO_GL"):
             # Where this library is missing, MuJoCo's import would fail, also in a command that

@@ -1,7 +1,6 @@
 """Command lines made from the types of settings: tyro reads words, and pydantic their values."""
 
 import contextlib
-import difflib
 import functools
 import re
 import textwrap
@@ -28,7 +27,7 @@ from tyro.constructors import (
 
 from bounce_mjx.config.settings import is_group, leaves
 from bounce_mjx.config.validation import describe
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import UserError, suggest
 
 CommandT = TypeVar("CommandT", bound=pydantic.BaseModel)
 
@@ -115,9 +114,8 @@ def parse(
     values, unknown = _read(command_class, args, prog, **options)
     if unknown:
         word = unknown[0].partition("=")[0].replace("_", "-")
-        near = difflib.get_close_matches(word, flags_of(command_class), n=1)
-        advice = f"; did you mean {near[0]}?" if near else ""
-        raise UserError(f"unknown argument {unknown[0]}{advice} (see {prog} --help)")
+        advice = "; ".join(filter(None, [unknown[0], suggest(word, flags_of(command_class))]))
+        raise UserError(f"unknown argument {advice} (see {prog} --help)")
     return _validate(command_class, values, prog)
 
 

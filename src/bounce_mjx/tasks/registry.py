@@ -5,7 +5,6 @@ a run's copy of a file that the user has named is the same task.
 """
 
 import copyreg
-import difflib
 import hashlib
 import importlib
 import importlib.metadata
@@ -16,7 +15,7 @@ import types
 from pathlib import Path
 from typing import TypeVar
 
-from bounce_mjx.errors import UserError, reason_of, shorten
+from bounce_mjx.errors import UserError, reason_of, shorten, suggest
 from bounce_mjx.task.task import Task
 from bounce_mjx.world.config import WorldConfig
 
@@ -53,8 +52,7 @@ def find_task(name: str) -> type[Task]:
     # Without a look at the installed packages, which takes 10 ms.
     known = _OWN if name in _OWN else _registered()
     if name not in known:
-        near = difflib.get_close_matches(name, known, n=1)
-        advice = f"did you mean {near[0]}?" if near else "give FILE.py:CLASS or a known name"
+        advice = suggest(name, known) or "give FILE.py:CLASS or a known name"
         raise UserError(
             f"there is no task {shorten(name)!r} (known: {', '.join(sorted(known))}); {advice}"
         )

@@ -1,6 +1,5 @@
 """The config of a training: that of its start, and what the user changes in it."""
 
-import difflib
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,7 +8,7 @@ import tyro
 from bounce_mjx.config.files import differing_keys
 from bounce_mjx.config.settings import Steps, StrictModel, merged
 from bounce_mjx.config.validation import validate
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import UserError, suggest
 from bounce_mjx.runs.config import TrainConfig, load_run_config, read_preset, runs_folder
 from bounce_mjx.runs.task import is_same_task
 from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file
@@ -141,8 +140,7 @@ def changed(base: TrainConfig, settings: dict[str, Any]) -> TrainConfig:
     known = [*values, *values["ppo"], *values["env"]]
     for key, value in settings.items():
         if key not in known:
-            near = difflib.get_close_matches(key, known, n=1)
-            advice = f"did you mean {near[0]}?" if near else "see docs/config.md"
+            advice = suggest(key, known) or "see docs/config.md"
             raise UserError(f"train: unknown setting {key}; {advice}")
         groups = [group for group in ("ppo", "env") if key in values[group]]
         nested = {groups[0]: {key: value}} if groups and key not in values else {key: value}

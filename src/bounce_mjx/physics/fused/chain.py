@@ -202,12 +202,6 @@ def mass_matrix(links: Sequence[Link], pose: Pose) -> SquareMatrix:
     return matrix
 
 
-def point_jacobian(links: Sequence[Link], pose: Pose, point: Vec3, direction: Vec3) -> list[Scalar]:
-    """Velocity of a point fixed to the last link along a direction, per unit velocity of each
-    joint; point and direction are in the world."""
-    return [dot(direction, velocity) for velocity in point_velocities(links, pose, point)]
-
-
 def point_velocities(links: Sequence[Link], pose: Pose, point: Vec3) -> Iterator[Vec3]:
     """Velocity of a point fixed to the last link, per unit velocity of each joint; all in the
     world."""
