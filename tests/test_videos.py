@@ -1,5 +1,6 @@
 """The commands play and view: videos, the native window, their flags and mistakes."""
 
+import io
 import os
 import re
 import shutil
@@ -9,13 +10,19 @@ import time
 from pathlib import Path
 
 import imageio_ffmpeg
+import jax
 import numpy as np
 import pytest
+from PIL import Image, ImageSequence
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from bounce_mjx.commands import play, view
 from bounce_mjx.errors import UserError
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import pretrained_checkpoint
+from bounce_mjx.runs.reading import read_policy
+from bounce_mjx.training.callbacks import Event
+from bounce_mjx.training.video import EvaluationVideo
 from bounce_mjx.viewers import native, offscreen, show
 from bounce_mjx.viewers.browser import LivePage
 from bounce_mjx.viewers.offscreen import choose_backend
@@ -73,6 +80,30 @@ def read_video(path: Path) -> tuple[float, np.ndarray]:
     stream = re.search(r"Stream .* (\d+)x(\d+).* ([\d.]+) fps", done.stderr.decode())
     width, height = int(stream[1]), int(stream[2])
     return float(stream[3]), np.frombuffer(done.stdout, np.uint8).reshape(-1, height, width, 3)
+
+
+def test_evaluations_are_filmed_for_tensorboard(opengl, tmp_path: Path) -> None:
+    """Each evaluated policy is a GIF of the reset and what follows; a block is none."""
+    checkpoint = pretrained_checkpoint()
+    config = load_run_config(checkpoint.run)
+    policy = read_policy(checkpoint, config)
+    blind = jax.tree.map(np.zeros_like, policy)
+    film = EvaluationVideo(seconds=0.6, size=(64, 48), fps=10)
+    film.start(tmp_path, config)
+    film(Event(tmp_path, config, 32, {}))
+    for steps, shown in ((64, policy), (128, blind)):
+        film(Event(tmp_path, config, steps, {}, policy=shown))
+    log = EventAccumulator(str(tmp_path / "video"))
+    log.Reload()
+    assert [event.step for event in log.Images("policy")] == [64, 128]
+    videos = []
+    for event in log.Images("policy"):
+        with Image.open(io.BytesIO(event.encoded_image_string)) as gif:
+            assert (gif.format, gif.size, gif.n_frames) == ("GIF", (64, 48), 6)
+            videos.append([np.asarray(x.convert("RGB"), int) for x in ImageSequence.Iterator(gif)])
+    good, still = np.array(videos)
+    assert np.abs(good[-1] - good[0]).max() > 50
+    assert np.abs(good[-1] - still[-1]).max() > 50
 
 
 VIDEOS = {

@@ -62,6 +62,10 @@ def main(args: Sequence[str]) -> None:
         callbacks = [] if page is None else [page]
         if command.wandb is not None:
             callbacks.append(WeightsAndBiases(command.wandb))
+        if command.video:
+            from bounce_mjx.training.video import EvaluationVideo
+
+            callbacks.append(EvaluationVideo())
         try:
             run = train(
                 config=command.training,

@@ -33,6 +33,8 @@ class TrainCommand(TrainConfig, Start):
     """Write report.html into the run's folder after the results are printed."""
     wandb: str | None = None
     """Project of Weights & Biases to log to, in addition to TensorBoard; needs the extra wandb."""
+    video: bool = False
+    """Show each evaluated policy as a video in TensorBoard, under Images; the training waits."""
     distributed: bool = False
     """Train together with the same command on other hosts, started by Slurm, Open MPI or
     Kubernetes."""

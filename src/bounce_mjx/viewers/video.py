@@ -104,6 +104,7 @@ class VideoWriter:
           Interrupted: Ctrl-C came; no file is left.
         """
         frames = resample(recording, simulation.env.dt, self.fps)
+        shown = captioned(simulation.env, frames, self._size, self.fps, self._zoom)
         advice = "give another file with --video"
         with writable(self._path, advice), new_file(self._path) as new:
             encoder = subprocess.Popen(
@@ -112,7 +113,7 @@ class VideoWriter:
             try:
                 # A broken pipe means that the encoder failed; it prints the reason.
                 with contextlib.suppress(BrokenPipeError), StopRequest() as stop:
-                    for i, picture in enumerate(self._pictures(simulation.env, frames)):
+                    for i, picture in enumerate(shown):
                         stop.check()
                         encoder.stdin.write(picture.tobytes())
                         progress((i + 1) / len(frames.time))
@@ -132,15 +133,26 @@ class VideoWriter:
         ffmpeg = [self._ffmpeg, "-y", "-loglevel", "error"]
         return [*ffmpeg, *pictures.split(), *encoding, str(path)]
 
-    def _pictures(self, env: Env, frames: EnvFrame) -> Iterator[np.ndarray]:
-        """One picture [height, width, 3] for each frame."""
-        trail = Trail(1.0 / self.fps)
-        with Renderer(env, *self._size, zoom=self._zoom) as renderer:
-            for i in range(len(frames.time)):
-                frame = frame_at(frames, i)
-                trail.add(frame)
-                picture = renderer.render(*environment_pose(frame, 0), trail.points[:, 0])
-                yield caption(picture, frame_readings(env, frame), frame.ball[0, 2])
+
+def captioned(
+    env: Env, frames: EnvFrame, size: tuple[int, int], fps: float, zoom: float = 1.0
+) -> Iterator[np.ndarray]:
+    """The first environment in each of F frames of a rate, with a caption and the ball's path.
+
+    Args:
+      size: width and height in pixels.
+      zoom: see `camera_pose`.
+
+    Returns:
+      F pictures, each [height, width, 3] (uint8).
+    """
+    trail = Trail(1.0 / fps)
+    with Renderer(env, *size, zoom=zoom) as renderer:
+        for i in range(len(frames.time)):
+            frame = frame_at(frames, i)
+            trail.add(frame)
+            picture = renderer.render(*environment_pose(frame, 0), trail.points[:, 0])
+            yield caption(picture, frame_readings(env, frame), frame.ball[0, 2])
 
 
 def caption(picture: np.ndarray, readings: dict[str, str], height: float) -> np.ndarray:

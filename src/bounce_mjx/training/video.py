@@ -1,0 +1,67 @@
+"""A callback that films the policy for TensorBoard."""
+
+import io
+from pathlib import Path
+
+from PIL import Image
+
+from bounce_mjx.env.env import Env
+from bounce_mjx.learning.policy import make_networks
+from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.training.callbacks import Event
+from bounce_mjx.training.log import TensorBoardLog
+from bounce_mjx.viewers.offscreen import choose_opengl
+from bounce_mjx.viewers.simulation import Simulation, make_policy_controller, resample
+from bounce_mjx.viewers.video import captioned
+
+
+class EvaluationVideo:
+    """A callback that shows each evaluated policy as a GIF in TensorBoard, under Images, in the log
+    RUN/video. The training waits for it: seconds where no GPU renders."""
+
+    def __init__(
+        self, seconds: float = 4.0, size: tuple[int, int] = (320, 240), fps: int = 10
+    ) -> None:
+        """
+        Args:
+          seconds: simulated time from the reset.
+          size: width and height in pixels.
+          fps: frames per second.
+        """
+        self._seconds, self._size, self._fps = seconds, size, fps
+        self._simulation: Simulation | None = None
+        self._logs: dict[Path, TensorBoardLog] = {}
+
+    def start(self, run: Path, config: TrainConfig) -> None:
+        """
+        Raises:
+          UserError: no OpenGL library works.
+        """
+        choose_opengl()
+        # TensorBoard stops reading a file once its folder has a newer one.
+        self._logs[run] = TensorBoardLog(run / "video")
+
+    def __call__(self, event: Event) -> None:
+        if event.policy is None:
+            return
+        if self._simulation is None:
+            env = Env(event.config.env)
+            actor = make_networks(event.config.ppo, env.observation_size, env.action_size)
+            controller = make_policy_controller(actor)
+            self._simulation = Simulation(env, controller, 1, seed=0, policy=event.policy)
+        self._simulation.policy = event.policy
+        self._simulation.reset()
+        recording = self._simulation.record(self._seconds)
+        frames = resample(recording, self._simulation.env.dt, self._fps)
+        pictures = captioned(self._simulation.env, frames, self._size, self._fps)
+        first, *others = map(Image.fromarray, pictures)
+        gif = io.BytesIO()
+        duration = 1000 / self._fps
+        first.save(gif, "GIF", save_all=True, append_images=others, duration=duration, loop=0)
+        log = self._logs[event.run]
+        width, height = self._size
+        shape = {"width": width, "height": height, "colorspace": 3}
+        image = log.summary.Summary.Image(**shape, encoded_image_string=gif.getvalue())
+        value = log.summary.Summary.Value(tag="policy", image=image)
+        log.add(log.summary.Summary(value=[value]), event.steps)
+        log.flush()
