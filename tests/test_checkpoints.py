@@ -1,11 +1,8 @@
 """Checkpoints are plain data that orbax alone reads; each loads unchanged or is refused in one
 sentence."""
 
-import concurrent.futures
-import json
 import os
 import random
-import re
 import shutil
 import subprocess
 import sys
@@ -23,7 +20,6 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.learning.ppo import PPO, TrainingState, policy_of
-from bounce_mjx.resources import POLICIES
 from bounce_mjx.runs import files
 from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config
 from bounce_mjx.runs.folders import (
@@ -31,17 +27,15 @@ from bounce_mjx.runs.folders import (
     create_run,
     find_checkpoint,
     latest_checkpoint,
-    pretrained_checkpoint,
     stored_checkpoints,
 )
 from bounce_mjx.runs.reading import read_policy, read_training
-from bounce_mjx.runs.writing import CheckpointWriter, save_checkpoint
+from bounce_mjx.runs.writing import save_checkpoint
 from bounce_mjx.tasks.bounce import BounceConfig
 from bounce_mjx.tasks.bounce_ball import BounceBall
 
 OBSERVATION = BounceConfig().layout
 
-SOURCES = Path(bounce_mjx.__file__).parent
 CONFIG = TrainConfig(
     ppo=PPOConfig(num_envs=8, rollout_length=8, num_minibatches=2, hidden_layers=(16,))
 )
@@ -129,13 +123,6 @@ def test_orbax_alone_reads_a_checkpoint(written: Path, state: TrainingState) -> 
     assert_read_by_orbax(step_of(written), policy_of(state, OBSERVATION.size))
 
 
-@pytest.mark.parametrize("name", POLICIES)
-def test_orbax_alone_reads_a_policy_of_the_package(name: str) -> None:
-    checkpoint = pretrained_checkpoint(name)
-    policy = read_policy(checkpoint, load_run_config(checkpoint.run))
-    assert_read_by_orbax(checkpoint.folder, policy)
-
-
 def test_the_latest_and_the_best_checkpoint_are_kept(tmp_path: Path, state) -> None:
     """Each save opens the folder anew, as after a restart."""
     run, items = create_run(CONFIG.model_copy(update={"log_dir": tmp_path})), items_of(state)
@@ -203,20 +190,6 @@ def test_a_policy_that_is_not_finite_is_refused(part: str, tmp_path: Path, state
     ):
         with pytest.raises(UserError, match=f"not finite, {name}.*give another checkpoint"):
             reads()
-
-
-def test_a_folder_that_was_moved_is_made_again(tmp_path: Path, state: TrainingState) -> None:
-    run, moved = write_run(tmp_path, state), tmp_path / "moved"
-    run.rename(moved)
-    changed = state._replace(iteration=state.iteration + 128)
-    with concurrent.futures.ThreadPoolExecutor(1) as pool:
-        writer = CheckpointWriter(run, CONFIG, pool)
-        writer.save(128, items_of(changed), {})
-        assert writer.problem() is None
-    assert find_checkpoint(moved).steps == 64
-    assert load_run_config(run) == CONFIG
-    template = jax.eval_shape(lambda: state)
-    assert read_training(find_checkpoint(run), template)[0].iteration == changed.iteration
 
 
 def test_a_failed_write_prints_no_traceback_and_the_next_one_succeeds(tmp_path: Path) -> None:
@@ -309,51 +282,6 @@ def test_checkpoint_of_another_run_is_refused(run: Path, state: TrainingState) -
 # Malicious checkpoints
 
 
-def test_nothing_is_read_that_could_run(run: Path) -> None:
-    """No reader of runs, configs and models can execute its input, and no file of a run has a
-    format that could hold code. Only the registry runs code: the file of a task that the user
-    names."""
-    banned = (
-        r"\b(c?pickle|cloudpickle|dill|joblib|marshal|shelve)\b|\beval\(|\bexec\(|__import__"
-        r"|allow_pickle\s*=\s*True|yaml\.(unsafe_|full_)load\b|yaml\.load\((?!.+, _Loader\))"
-        r"|yaml\.Loader|Unsafe|FullLoader"
-    )
-    for path in set(SOURCES.rglob("*.py")) - {SOURCES / "tasks/registry.py"}:
-        for number, line in enumerate(path.read_text().splitlines(), 1):
-            assert not re.search(banned, line), f"{path}:{number}: {line}"
-    for path in step_of(run).rglob("*"):
-        if not path.is_file():
-            continue
-        data = path.read_bytes()
-        if path.name in ("metadata", "metrics", "_METADATA", "_CHECKPOINT_METADATA"):
-            json.loads(data)
-        elif path.suffix == ".json":
-            json.loads(data)
-        elif path.name != "commit_success.txt":
-            # OCDBT: https://google.github.io/tensorstore/kvstore/ocdbt
-            magic = {0x0CDB3A2A, 0x0CDB1234, 0x0CDB20DE}
-            raw = path.parent.name == "d" and int.from_bytes(data[:4], "big") not in magic
-            assert raw or int.from_bytes(data[:4], "big") in magic, path
-            assert b"cposix\nsystem" not in data and not data.startswith(b"\x80\x04")
-
-
-@pytest.mark.parametrize(
-    ("name", "target"), [("record/metadata", "/dev/zero"), ("policy/d", "policy")]
-)
-def test_links_are_not_followed(run: Path, state: TrainingState, name: str, target: str) -> None:
-    path = step_of(run) / name
-    shutil.rmtree(path) if path.is_dir() else path.unlink()
-    path.symlink_to(target)
-    assert_refused(run, state, "damaged", "is not a regular file")
-
-
-def test_pipe_does_not_block(run: Path, state: TrainingState) -> None:
-    path = step_of(run) / "record/metadata"
-    path.unlink()
-    os.mkfifo(path)
-    assert_refused(run, state, "damaged", "is not a regular file")
-
-
 class Payload:
     """Object whose unpickling runs code."""
 
@@ -370,10 +298,8 @@ def payload(target: Path) -> bytes:
     return pickle.dumps(Payload(target))
 
 
-@pytest.mark.parametrize("sealed", [False, True], ids=["as found", "with a valid manifest"])
-def test_code_in_any_file_is_not_run(
-    written: Path, tmp_path: Path, state: TrainingState, sealed: bool
-) -> None:
+def test_code_in_any_file_is_not_run(written: Path, tmp_path: Path, state: TrainingState) -> None:
+    """Also with a valid manifest."""
     target = tmp_path / "ran"
     names = sorted(p.relative_to(written) for p in written.rglob("*") if p.is_file())
     tagged = f'!!python/object/apply:os.mkdir ["{target}"]\n'.encode()
@@ -381,7 +307,7 @@ def test_code_in_any_file_is_not_run(
         for data in (payload(target), tagged):
             run = shutil.copytree(written, tmp_path / "run")
             (run / name).write_bytes(data)
-            if sealed and name.name != files.MANIFEST_FILE:
+            if name.name != files.MANIFEST_FILE:
                 files.seal(step_of(run))
             try:
                 loaded = load_both(run, state)

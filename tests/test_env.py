@@ -106,14 +106,6 @@ def assert_identical(first, second):
 # Attributes and observation
 
 
-def test_attributes(env):
-    assert (env.observation_size, env.action_size, env.dt) == (29, 6, 0.01)
-    assert env.config == EnvConfig() and env.backend == "fused"
-    assert isinstance(env.mj_model, mujoco.MjModel) and env.mj_model.opt.timestep == 0.001
-    coarse = BounceBall(EnvConfig(physics_dt=0.002, control_dt=0.02))
-    assert (coarse.dt, coarse.mj_model.opt.timestep) == (0.02, 0.002)
-
-
 @pytest.fixture(scope="module")
 def walked(reset, step):
     """A state in motion, with a spinning ball so that no entry of the observation is trivial."""
@@ -226,13 +218,6 @@ def test_noise_free_reset_has_the_paddle_at_home():
 
 
 # Actions
-
-
-def test_servo_target_is_measured_angle_plus_scaled_action(env, reset):
-    physics = reset(jax.random.key(0)).pipeline_state.physics
-    action = np.array([1, -1, 0.5, -0.25, 0, 0.75], np.float32)
-    targets = env.servo_targets(physics, jnp.array(action))
-    np.testing.assert_allclose(targets, physics.qpos[:6] + 0.02 * action, rtol=0, atol=1e-6)
 
 
 def test_servo_target_is_clipped_to_the_joint_range(env, reset, model):

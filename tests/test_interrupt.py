@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 
 from bounce_mjx.interrupt import StopRequest
-from tiny_runs import TINY
 
 TIMEOUT = 120.0
 # A shell reports it as status 130.
@@ -26,28 +25,6 @@ def test_the_innermost_request_receives_the_signal() -> None:
         with StopRequest() as stop:
             os.kill(os.getpid(), signal.SIGINT)
         assert stop.requested and not outer.requested
-
-
-@pytest.mark.parametrize("moment", ["bounce_mjx.training.hosts", "bounce_mjx.training.run"])
-def test_ctrl_c_counts_while_a_training_starts(moment: str, tmp_path: Path) -> None:
-    """It comes right after an import, of which the second is the last one."""
-    process = subprocess.Popen(
-        [sys.executable, "-X", "importtime", "-m", "bounce_mjx", "train", *TINY],
-        cwd=tmp_path,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    with process:
-        complaints = []
-        for line in process.stderr:
-            if not line.startswith("import time:"):
-                complaints.append(line)
-            elif line.split()[-1] == moment:
-                time.sleep(0.005)
-                process.send_signal(signal.SIGINT)
-        assert process.wait(TIMEOUT) == BY_CTRL_C
-    assert not complaints
-    assert not list(tmp_path.rglob("config.yaml"))
 
 
 def test_ctrl_c_leaves_the_cursor_visible() -> None:

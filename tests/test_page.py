@@ -149,15 +149,6 @@ def test_no_client_can_end_or_stall_the_server(page, capfd) -> None:
     assert capfd.readouterr() == ("", "")
 
 
-def test_an_invalid_camera_is_ignored(page) -> None:
-    """One camera position is not a number, and one is the point that the camera looks at."""
-    client, did = page
-    for position, number in ((NAN, 2), (0.0, 1)):
-        client.look(position=[position, 0.0, 0.0])
-        client.set(client.control("robots"), number)
-        wait_until(lambda number=number: did["shown"][-1] == number)
-
-
 def handshake(address: str, host: str | None, origin: str | None) -> int:
     """The status of the answer to a page that opens a WebSocket."""
     where = urllib.parse.urlsplit(address)

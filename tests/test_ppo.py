@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from bounce_mjx import BounceBall, EnvConfig
-from bounce_mjx.env import vector
 from bounce_mjx.env.env import State
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.episodes import make_evaluator
@@ -77,30 +76,6 @@ def test_advantages_equal_their_definition(discount, lam):
     actual = generalized_advantages(**rollout, discount=discount, gae_lambda=lam)
     expected = advantages_by_definition(*rollout.values(), discount, lam)
     np.testing.assert_allclose(actual, expected, rtol=1e-4, atol=1e-4)
-
-
-def test_advantages_by_hand():
-    """Errors: 1 + 1/2 - 1 = 0.5, 2 + 10/2 - 1 = 6, 3 + 1/2 - 1 = 2.5, 4 + 2/2 - 1 = 4; each
-    advantage is its error plus a quarter of the next advantage."""
-    for terminated_at, truncated_at, expected in (
-        ([], [], [2.21875, 6.875, 3.5, 4.0]),
-        # The second step keeps its error of 6 and gets nothing from the third.
-        ([], [1], [2.0, 6.0, 3.5, 4.0]),
-        # Without a value to follow, the second error is 2 - 1 = 1.
-        ([1], [], [0.75, 1.0, 3.5, 4.0]),
-        # The last error is 4 - 1 = 3.
-        ([3], [], [2.203125, 6.8125, 3.25, 3.0]),
-    ):
-        actual = generalized_advantages(
-            reward=jnp.array([[1.0], [2.0], [3.0], [4.0]]),
-            value=jnp.ones((4, 1)),
-            next_value=jnp.array([[1.0], [10.0], [1.0], [2.0]]),
-            terminated=jnp.array(np.isin(np.arange(4), terminated_at)[:, None]),
-            truncated=jnp.array(np.isin(np.arange(4), truncated_at)[:, None]),
-            discount=0.5,
-            gae_lambda=0.5,
-        )
-        np.testing.assert_allclose(actual[:, 0], expected, rtol=1e-6)
 
 
 # Learning rate
@@ -250,36 +225,6 @@ def test_the_objective_is_the_smaller_of_the_two():
     np.testing.assert_allclose(parts["loss/policy"], expected, rtol=1e-5)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("bound", [0.3])
-def test_update_uses_the_normalisation_of_the_next_rollout(bound):
-    """If the policy does not change, the KL divergence of an update is the divergence between the
-    policy on the rollout's own normalised observations and on the same observations normalised with
-    the statistics that include the rollout."""
-    config = two_state_config(
-        num_envs=4096, learning_rate=1e-12, min_learning_rate=1e-12, min_noise_std=bound
-    )
-    trainer = ppo.PPO(config, TwoStates(1.0), episode_steps=2)
-    before = trainer.init(jax.random.key(0))
-    after, metrics = jax.jit(lambda state: trainer.run(state, 1))(before)
-
-    networks = policy.make_networks(config, 2, 1)
-    (old, deviation), (new, _) = (
-        networks.policy_network.apply(
-            before.params.policy, normalize(jnp.eye(2), state.statistics.normalizer)
-        )
-        for state in (before, after)
-    )
-    bounds = 2.0 * bound * (jnp.arange(4096) + 0.5) / 4096
-    precision = jnp.mean(1.0 / (jnp.square(deviation)[..., None] + jnp.square(bounds)), axis=-1)
-    of_states = jnp.sum(jnp.square(new - old) * precision / 2.0, axis=-1)
-    # All environments start in the first state; half of them then time out and are in the first
-    # state again.
-    divergence = 0.75 * of_states[0] + 0.25 * of_states[1]
-    assert divergence > 1e-5
-    np.testing.assert_allclose(metrics["policy/kl"][0], divergence, rtol=0.1)
-
-
 def test_settings_that_no_training_can_have_are_refused():
     with pytest.raises(UserError, match="rollout_length 2 .* episode of 1 "):
         ppo.PPO(two_state_config(), TwoStates(1.0), episode_steps=1)
@@ -343,17 +288,6 @@ def test_training_is_a_function_of_its_key(init, run, after_two):
         assert np.any(np.asarray(a) != np.asarray(b)) and np.any(np.asarray(a) != before)
 
 
-def test_counters(tiny, init, after_two):
-    assert init(jax.random.key(0)).iteration == 0
-    state, metrics = after_two
-    assert state.iteration == 2
-    assert all(value.shape == (2,) for value in metrics.values())
-    samples = 2 * tiny.num_envs * tiny.rollout_length
-    # The normaliser counts the observations that it has seen.
-    assert int(state.statistics.count) == samples
-    np.testing.assert_array_equal(metrics["task/non_finite"], 0)
-
-
 def test_policy_sees_only_the_observation(tiny, after_two):
     state, _ = after_two
     assert state.statistics.mean.shape == (29 + len(Bounce.critic_metrics),)
@@ -366,27 +300,6 @@ def test_policy_sees_only_the_observation(tiny, after_two):
     assert np.all(np.abs(actions) <= 1) and len(np.unique(actions)) == 18
 
 
-@pytest.mark.slow
-def test_two_iterations_equal_one_and_one(init, run, after_two):
-    at_once, metrics = after_two
-    state, first_metrics = run(init(jax.random.key(0)), 1)
-    resumed, second_metrics = run(state, 1)
-    assert_identical(resumed, at_once)
-    joined = jax.tree.map(lambda *x: np.concatenate(x), first_metrics, second_metrics)
-    assert_identical(joined, metrics)
-
-
-def test_run_returns_the_same_types_as_its_input(trainer, init):
-    """Otherwise a jitted `run` would be compiled again for its own result."""
-    state = init(jax.random.key(0))
-    result, _ = jax.eval_shape(lambda s: trainer.run(s, 1), state)
-    types = [
-        [(x.shape, x.dtype, x.weak_type) for x in map(jax.typeof, jax.tree.leaves(tree))]
-        for tree in (state, result)
-    ]
-    assert types[0] == types[1]
-
-
 def test_hidden_layers_are_computed_in_bfloat16_and_outputs_not(tiny, env):
     sizes = env.observation_size, env.action_size
     for network in policy.make_networks(tiny, *sizes, dtype="bfloat16")[:2]:
@@ -395,22 +308,6 @@ def test_hidden_layers_are_computed_in_bfloat16_and_outputs_not(tiny, env):
         program = jax.make_jaxpr(network.apply)(params, jnp.zeros((1, env.observation_size)))
         products = [e for e in program.eqns if e.primitive.name == "dot_general"]
         assert [e.outvars[0].aval.dtype for e in products] == [jnp.bfloat16, jnp.float32]
-
-
-@pytest.mark.slow
-def test_vmap_over_seeds_equals_single_runs(trainer, init, run, after_two):
-    keys = jnp.stack([jax.random.key(0), jax.random.key(1)])
-    many_states = jax.jit(jax.vmap(trainer.init))(keys)
-    many, many_metrics = jax.jit(jax.vmap(lambda s: trainer.run(s, 2)))(many_states)
-    for i, (one, metrics) in enumerate((after_two, run(init(keys[1]), 2))):
-        chosen, chosen_metrics = jax.tree.map(lambda x, i=i: x[i], (many, many_metrics))
-        # Adam magnifies the rounding of gradients near zero to at most a step of the learning rate.
-        for a, b in zip(jax.tree.leaves(chosen.params), jax.tree.leaves(one.params), strict=True):
-            np.testing.assert_allclose(a, b, rtol=0, atol=2e-4)
-        np.testing.assert_allclose(
-            vector.observe(chosen.env), vector.observe(one.env), rtol=0, atol=2e-3
-        )
-        np.testing.assert_allclose(chosen_metrics["reward"], metrics["reward"], rtol=1e-3)
 
 
 def some_samples(trainer, params) -> ppo.Samples:
@@ -454,16 +351,6 @@ def test_the_examples_term_weighs_the_change_of_the_action(tiny, env, init):
     assert float(after - before) == pytest.approx(expected, rel=1e-3)
 
 
-def test_the_clipped_fraction_is_that_of_the_ratios(trainer, init):
-    params = init(jax.random.key(0)).params
-    samples = some_samples(trainer, params)
-    ratio = np.exp(-0.3 * np.asarray(samples.advantage))
-    expected = np.mean((ratio < 0.8) | (ratio > 1.2))
-    assert 0.1 < expected < 0.9
-    metrics = trainer.loss(params, samples)[1]
-    assert metrics["policy/clip_fraction"] == pytest.approx(expected)
-
-
 def test_a_shared_critic_continues_the_policys_layers(tiny, env):
     """Both with the chosen activation; the error of the values also trains these layers."""
     changes = {"shared_critic": True, "activation": "tanh"}
@@ -480,12 +367,6 @@ def test_a_shared_critic_continues_the_policys_layers(tiny, env):
     np.testing.assert_allclose(mean, features @ last["kernel"] + last["bias"], atol=1e-5)
     gradient = jax.grad(lambda p: jnp.sum(trainer.values(p, inputs)))(params)
     assert np.abs(gradient.policy["params"]["MLP_0"]["hidden_0"]["kernel"]).max() > 0
-
-
-def test_a_critic_has_its_own_widths(tiny, env):
-    trainer = ppo.PPO(tiny.model_copy(update={"critic_layers": (5, 3)}), env, 100)
-    values = trainer.networks.value_network.init(jax.random.key(0))["params"]
-    assert [len(values[f"hidden_{i}"]["bias"]) for i in range(3)] == [5, 3, 1]
 
 
 OWN = """

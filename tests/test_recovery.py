@@ -28,7 +28,6 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from bounce_mjx.commands import train as train_command
-from bounce_mjx.config.files import differing_keys
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import judge
@@ -42,12 +41,11 @@ from bounce_mjx.runs.folders import (
     stored_checkpoints,
 )
 from bounce_mjx.runs.lock import lock_run
-from bounce_mjx.runs.reading import RESUMABLE_KEYS, read_actor, read_policy, read_record
+from bounce_mjx.runs.reading import read_actor, read_policy, read_record
 from bounce_mjx.runs.writing import save_checkpoint
 from bounce_mjx.tasks.bounce_ball import BounceBall
 from bounce_mjx.training import job as training_job
 from bounce_mjx.training import ppo_trainer
-from bounce_mjx.training.command import TrainCommand
 from bounce_mjx.training.devices import make_mesh
 from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.ppo_trainer import PPOTrainer
@@ -103,52 +101,19 @@ def run(half: Path, tmp_path: Path) -> Path:
 # Resuming
 
 
-def test_checkpoint_holds_the_whole_training_state(straight: Path) -> None:
-    checkpoint = latest_checkpoint(straight)
-    names = set(arrays(checkpoint))
-    for group in (
-        "params.policy",
-        "params.value",
-        "optimizer",
-        "statistics",
-        "env.env",
-        "env.clock",
-    ):
-        assert any(name.startswith(group) for name in names), group
-    assert {"key", "iteration", "learning_rate"} <= names
-    record = read_record(checkpoint)
-    assert record.steps == STEPS
-    config = load_run_config(straight)
-    assert type(config).model_validate(record.config) == config
-    assert record.progress["evaluations"] == evaluations(straight)
-
-
 def test_resumed_training_is_the_same(run: Path, straight: Path) -> None:
     resume(run, "--total-steps", str(STEPS))
     assert_same_training(run, straight)
 
 
-def test_help_lists_what_a_resumed_run_may_change() -> None:
-    text = " ".join(TrainCommand.model_fields["resume"].description.split())
-    for key in RESUMABLE_KEYS:
-        assert key.split(".")[-1].replace("_", "-") in text, key
-
-
-@pytest.mark.parametrize(
-    ("key", "old", "new"),
-    [("ppo.discount", "discount: 0.98", "discount: 0.9")],
-)
-def test_edited_config_is_refused_by_name(run: Path, capfd, key: str, old: str, new: str) -> None:
+def test_edited_config_is_refused_by_name(run: Path, capfd) -> None:
     config = run / "config.yaml"
-    text = config.read_text()
-    before = load_run_config(run)
-    config.write_text(re.sub(rf"\b{old}", new, text, count=1))
-    assert differing_keys(before, load_run_config(run)) == {key}
+    config.write_text(config.read_text().replace("discount: 0.98", "discount: 0.9", 1))
     with pytest.raises(SystemExit) as exit_info:
         resume(run)
     assert exit_info.value.code == 2
     sentence = capfd.readouterr().err
-    assert f"which differs in {key};" in sentence
+    assert "which differs in ppo.discount;" in sentence
     assert re.fullmatch(r"error: .+\n", sentence)
 
 
@@ -178,18 +143,6 @@ def test_a_signal_saves_and_says_how_to_resume(tmp_path: Path, straight: Path) -
         straight = train(tmp_path / "straight", total)
     train_command.main([*resume_command(said), "--total-steps", str(total)])
     assert_same_training(run, straight)
-
-
-@pytest.mark.slow
-def test_a_signal_while_compiling_ends_at_once_and_leaves_nothing(tmp_path: Path) -> None:
-    # Unusual layers, so that the programs are not in the cache.
-    args = [*TINY, "--hidden-layers", 24, 24, "--total-steps", 256, "--log-dir", tmp_path / "runs"]
-    with job(tmp_path / "log", *args) as training:
-        training.wait_until_said("device:")
-        training.process.send_signal(signal.SIGTERM)
-        assert training.wait() == 130, training.said
-    assert "Traceback" not in training.said
-    assert not list((tmp_path / "runs").iterdir())
 
 
 @pytest.mark.slow
@@ -410,26 +363,11 @@ def test_the_best_is_reported_on_fresh_resets(straight: Path, capfd) -> None:
 # Starts
 
 
-# The factor of a reward term is read from a file, and that of the loss from the script itself,
-# which patches both functions.
-CHANGED = """
-import sys
-from pathlib import Path
-import jax
+COUNTED = """
+import sys, jax
 from bounce_mjx.commands.train import main
-from bounce_mjx.learning import ppo
-from bounce_mjx.tasks.bounce_rewards import PaddleHomeReward
 events = []
 jax.monitoring.register_event_listener(lambda event, **_: events.append(event))
-def from_file(name):
-    return float(Path(__file__).with_name(f"{name}.factor").read_text())
-formula = PaddleHomeReward.value
-PaddleHomeReward.value = lambda *args: formula(*args) * from_file("term")
-loss = ppo.PPO.loss
-def from_script(*args):
-    total, metrics = loss(*args)
-    return total + (LOSS - 1.0) * metrics["loss/value"], metrics
-ppo.PPO.loss = from_script
 main(sys.argv[1:])
 names = "compile_requests_use_cache", "cache_hits"
 print("counts:", *(events.count("/jax/compilation_cache/" + name) for name in names))
@@ -437,32 +375,20 @@ print("counts:", *(events.count("/jax/compilation_cache/" + name) for name in na
 
 
 @pytest.mark.slow
-def test_only_an_equal_training_finds_its_programs(
+def test_a_second_start_compiles_nothing_and_trains_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its second start compiles nothing and trains the same. A change in what a user's code reads
-    trains something else, with the same cache."""
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "cache"))
-    script = tmp_path / "changed.py"
-
-    def start(name: str, **changed: str) -> tuple[int, int, bytes]:
-        factors = dict.fromkeys(("term", "loss"), "1.0") | changed
-        (tmp_path / "term.factor").write_text(factors["term"])
-        script.write_text(CHANGED.replace("LOSS", factors["loss"]))
-        flags = [*TINY, "--total-steps", "64", "--no-report"]
-        flags += ["--log-dir", tmp_path / name]
-        with job(tmp_path / f"{name}.log", *flags, script=script) as process:
+    flags = [*TINY, "--total-steps", "64", "--no-report", "--log-dir"]
+    runs = []
+    for name in ("first", "second"):
+        with job(tmp_path / f"{name}.log", *flags, tmp_path / name, code=COUNTED) as process:
             assert process.wait() == 0, process.said
-        (counts,) = re.findall(r"^counts: (\d+) (\d+)$", process.said, re.MULTILINE)
-        (run,) = (tmp_path / name).iterdir()
-        trained = arrays(latest_checkpoint(run))
-        return *map(int, counts), b"".join(trained[key].tobytes() for key in sorted(trained))
-
-    _, _, trained = start("first")
-    requests, hits, again = start("second")
-    assert hits == requests > 0 and again == trained
-    for changed in ("term", "loss"):
-        assert start(changed, **{changed: "0.5"})[2] != trained
+        runs += (tmp_path / name).iterdir()
+    ((requests, hits),) = re.findall(r"^counts: (\d+) (\d+)$", process.said, re.MULTILINE)
+    assert hits == requests != "0"
+    first, second = (arrays(latest_checkpoint(run)) for run in runs)
+    jax.tree.map(np.testing.assert_array_equal, first, second)
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from bounce_mjx.commands import view as view_command
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.adopt import adopt, check_as_alone
-from bounce_mjx.robot.arm import _add_paddle, build_arm, compile_spec, locate, read_spec
+from bounce_mjx.robot.arm import build_arm, compile_spec, locate, read_spec
 from bounce_mjx.robot.config import RobotConfig
 from bounce_mjx.robot.model import find_addresses, joint_names
 from bounce_mjx.runs.config import load_config, read_preset
@@ -360,14 +360,6 @@ def test_a_start_pose_lies_inside_the_limits(tmp_path) -> None:
         assert np.all(angles >= low + noise) and np.all(angles <= high - noise)
 
 
-def test_a_joint_with_a_pid_actuator_gets_a_servo(tmp_path) -> None:
-    """A <pid> has several controls, which shift those of the motors after it."""
-    pid = '<pid joint="j1" kp="10" forcerange="-70 70"/>'
-    (tmp_path / "arm.xml").write_text(mjcf(arm(), pid + motors(ARM_JOINTS[3:], 50.0)))
-    found = adopt(tmp_path / "arm.xml", RobotConfig(site="tool"), 0.01, is_mount_given=True)
-    assert [servo.force_limit for servo in found.servos] == [70.0] + [50.0] * 5
-
-
 def test_adopting_ends_by_itself_and_view_shows_the_arm(tmp_path, monkeypatch, capsys) -> None:
     shown = []
     monkeypatch.setattr(view_command, "main", shown.append)
@@ -422,31 +414,3 @@ def test_a_robot_is_read_on_top_of_a_preset(written, tmp_path) -> None:
     own = load_config(written["small"]).env
     assert config.env == own.model_copy(update={"episode_seconds": 3.0}) and config.seed == 4
     assert own.action_scale != 0.5
-
-
-@pytest.mark.parametrize(
-    "position, quaternion",
-    [
-        ((0.0, 0.0, 0.03), (1.0, 0.0, 0.0, 0.0)),
-        ((0.0, 0.0, 0.19), (0.7071067811865476, 0.0, -0.7071067811865476, 0.0)),
-        ((0.0, 0.05, 0.1), (0.9238795325112867, 0.3826834323650898, 0.0, 0.0)),
-    ],
-    ids=["flat on the flange", "held by its edge", "tilted"],
-)
-def test_a_handle_ends_in_its_paddle(position, quaternion) -> None:
-    """It reaches the blade from its side, and nothing of it is on the other side."""
-    spec = mujoco.MjSpec()
-    paddle = spec.worldbody.add_body(name="paddle")
-    config = RobotConfig(site="tool", paddle={"position": position, "quaternion": quaternion})
-    _add_paddle(paddle, config, spec.default)
-    model = spec.compile()
-    blade, handle = range(2)
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    radius, half = model.geom_size[handle, :2]
-    axis = data.geom_xmat[handle].reshape(3, 3)[:, 2]
-    axis = axis * np.sign(axis @ data.geom_xpos[blade])
-    tip = data.geom_xpos[handle] + (half + radius) * axis
-    inside = (tip - data.geom_xpos[blade]) @ data.geom_xmat[blade].reshape(3, 3)
-    assert np.all(np.abs(inside) <= config.paddle.half_size)
-    assert (tip - data.geom_xpos[blade]) @ axis < 0.0
