@@ -1,18 +1,10 @@
 """The comparison of the trainers on a tiny scale, and the summary of its records."""
 
-import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
-TINY = (
-    "--num-envs 8 --rollout-length 8 --num-minibatches 2 --num-epochs 1 --hidden-layers 16 "
-    "--total-steps 192 --eval-every 64 --eval-episodes 4 --episode-seconds 0.2 --seeds 0"
-).split()
 
 
 @pytest.fixture
@@ -59,28 +51,3 @@ def test_the_newest_run_counts_even_if_it_is_incomplete(benchmark):
     assert summary["rsl_rl"]["return"] == [400.0]
     assert summary["rsl_rl"]["solved_process"] == [410.0]
     assert summary["rsl_rl"]["rate"] == [50.0]
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("torch_libraries")
-def test_trainers_are_compared(tmp_path):
-    """Each trainer runs in its own process; together they give one table, one plot, and one line
-    per evaluation."""
-    methods = "ours", "rsl_rl", "skrl"
-    command = [sys.executable, "jax_vs_torch.py", *TINY, "--out", tmp_path, "--methods", *methods]
-    done = subprocess.run(
-        command,
-        cwd=BENCHMARKS,
-        capture_output=True,
-        text=True,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )
-    assert done.returncode == 0, done.stderr
-    lines = (tmp_path / "jax_vs_torch.jsonl").read_text(encoding="utf-8").splitlines()
-    records = [json.loads(line) for line in lines]
-    for method in methods:
-        assert [r["steps"] for r in records if r["method"] == method] == [64, 128, 192]
-    rows = (tmp_path / "jax_vs_torch.md").read_text(encoding="utf-8").splitlines()[4:]
-    assert len(rows) == len(methods)
-    assert all("0 of 1" in row for row in rows)
-    assert (tmp_path / "jax_vs_torch.png").read_bytes().startswith(b"\x89PNG")

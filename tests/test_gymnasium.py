@@ -248,13 +248,6 @@ def test_use_before_reset_or_with_a_wrong_action_gives_one_sentence(vectorised):
         vector.step(np.zeros(6))
 
 
-def test_equal_environments_share_their_programs():
-    first, second = make_vec(), make_vec(AutoresetMode.SAME_STEP)
-    other = make_vec(physics_dt=0.002)
-    assert first._programs is second._programs
-    assert first._programs is not other._programs
-
-
 def test_copies_and_pickles_continue_the_episodes(vectorised, single):
     for env in (vectorised, single.unwrapped):
         env.reset(seed=3)

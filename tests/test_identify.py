@@ -12,7 +12,7 @@ from bounce_mjx.identify.fit import Fit, Noise, Problem, _eliminate, certainty, 
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.reading import read_csv
 from bounce_mjx.identify.simulation import make_targets
-from bounce_mjx.identify.stages import Identified, _align_frame, identify, sensor_noise
+from bounce_mjx.identify.stages import Identified, _align_frame, identify
 from bounce_mjx.identify.unknowns import Layout, make_layout
 from bounce_mjx.identify.windows import Windows, cut
 from bounce_mjx.identify.world import compare, estimates, sentences, to_yaml
@@ -82,19 +82,6 @@ def test_windows_hold_each_bounce_once_and_each_measurement_at_most_once() -> No
     assert np.max(w.picture_times) < w.steps * 0.001
 
 
-def test_a_window_starts_where_the_ball_and_the_arm_were() -> None:
-    log = flight_log()
-    w = windows_of(log)
-    s = int(np.flatnonzero(w.has_ball)[2])
-    t = w.origin + 0.001 * w.first[s]
-    since = (t % 0.6) - 0.3
-    height = 0.1 + 4.905 * (0.09 - since**2)
-    np.testing.assert_allclose(w.starts[s, 12:15], [0.6, 0.0, height], atol=2e-3)
-    np.testing.assert_allclose(w.starts[s, 15:18], [0.0, 0.0, -9.81 * since], atol=2e-2)
-    np.testing.assert_allclose(w.starts[s, :6], 0.1 * np.sin(2.0 * t + np.arange(6)), atol=1e-4)
-    np.testing.assert_allclose(w.starts[s, 6:12], 0.2 * np.cos(2.0 * t + np.arange(6)), atol=5e-3)
-
-
 @pytest.mark.parametrize("latency, lag", [(0.0237, 0.0), (0.0082, 0.015)])
 def test_targets_are_late_and_lagged(latency: float, lag: float) -> None:
     """Against a simulation with steps a hundred times as short."""
@@ -112,44 +99,6 @@ def test_targets_are_late_and_lagged(latency: float, lag: float) -> None:
         state = mean if lag == 0.0 else mean + (state - mean) * np.exp(-0.001 / lag)
         expected.append(state)
     np.testing.assert_allclose(found[: len(expected)], expected, atol=2e-3)
-
-
-@pytest.mark.parametrize("latency, lag", [(0.03, 0.0), (0.012, 0.0007)])
-def test_the_vector_has_the_delay_of_latency_and_lag_and_its_variance(latency, lag) -> None:
-    """Against the moments of the filter's answer to an impulse."""
-    layout, dt = make_layout(6, True, 0.001), 0.001
-    vector = layout.vector({"action_latency": latency, "servo_lag": lag})
-    share = -np.expm1(-dt / lag) if lag else 1.0
-    times = dt * np.arange(2000)
-    answer = share * (1.0 - share) ** np.arange(2000)
-    mean = answer @ times
-    places = layout.slices()
-    np.testing.assert_allclose(vector[places["delay"]], latency + mean, atol=1e-9)
-    variance = answer @ (times - mean) ** 2
-    np.testing.assert_allclose(vector[places["delay_variance"]], variance, atol=1e-11)
-    world = layout.world(vector)
-    assert abs(world["action_latency"] - latency) < 1e-6
-    assert abs(world["servo_lag"] - lag) < 6e-5
-
-
-def test_whitening_leaves_independent_errors_after_a_bounce() -> None:
-    """W C W' is the identity for the covariance C of noise and a bounce's common error."""
-    w, noise = windows_of(flight_log()), Noise(np.full(6, 1e-3), np.full(3, 2e-3))
-    problem = Problem(None, w, make_layout(6, True, 0.001), noise)
-    weights, count = problem.weights(), w.balls.shape[1]
-    s = int(np.flatnonzero(w.has_ball)[0])
-    eye = np.zeros((3 * count, *weights.shape))
-    eye[np.arange(3 * count), s, -3 * count + np.arange(3 * count)] = 1.0
-    predicted = w.measured + eye * problem.deviations
-    whitening = problem.whiten(predicted, weights)[:, s, -3 * count :].T
-    after = np.maximum(w.picture_times[s] - w.bounces[s], 0.0) * w.picture_weights[s]
-    covariance = np.diag(np.repeat(w.picture_weights[s], 3))
-    for axis, deviation in enumerate((0.02, 0.02, 0.1)):
-        common = np.zeros((count, 3))
-        common[:, axis] = after * deviation / 2e-3
-        covariance += np.outer(common.ravel(), common.ravel())
-    white = whitening @ covariance @ whitening.T
-    np.testing.assert_allclose(white, np.diag(np.repeat(w.picture_weights[s], 3)), atol=1e-9)
 
 
 def measured_rows(w: Windows, angles: np.ndarray) -> np.ndarray:
@@ -200,17 +149,6 @@ def test_intervals_know_that_residuals_of_a_window_are_correlated() -> None:
         independent.append(np.sqrt(by_noise[place, place]))
     assert np.std(estimates) > 1.5 * np.mean(independent)
     np.testing.assert_allclose(np.mean(deviations), np.std(estimates), rtol=0.35)
-
-
-def test_noise_of_the_sensors_is_that_of_a_moving_robot() -> None:
-    random, log = np.random.default_rng(2), flight_log(30.0)
-    noisy = log._replace(
-        joint_angles=log.joint_angles + 1e-3 * random.normal(size=log.joint_angles.shape),
-        ball_positions=log.ball_positions + 2e-3 * random.normal(size=log.ball_positions.shape),
-    )
-    noise = sensor_noise(noisy)
-    np.testing.assert_allclose(noise.angles, 1e-3, rtol=0.15)
-    np.testing.assert_allclose(noise.balls, 2e-3, rtol=0.15)
 
 
 def test_a_world_has_the_range_of_each_joint_and_axis(tmp_path: Path) -> None:

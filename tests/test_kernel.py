@@ -1,10 +1,7 @@
 """The GPU kernel of the physics computes what XLA's own program computes; rows keep every bit."""
 
-import subprocess
-import sys
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -95,15 +92,6 @@ def by_xla(env: BounceBall) -> PhysicsState:
 
 
 @pytest.mark.slow
-def test_a_batch_equals_the_xla_program(env, by_xla, in_kernel):
-    program = jax.jit(batched(env)).trace(*moving(env, BATCH))
-    assert "pallas_call" in str(program.jaxpr)
-    after = program.lower().compile()(*moving(env, BATCH))
-    assert_equal(after, by_xla)
-    assert np.abs(after.qvel - moving(env, BATCH)[0].qvel).max() > 1.0
-
-
-@pytest.mark.slow
 def test_parameters_enter_the_kernel(env, by_xla, in_kernel, monkeypatch):
     """The kernel takes more inputs than coordinates and targets: all physics parameters of each
     environment."""
@@ -114,51 +102,6 @@ def test_parameters_enter_the_kernel(env, by_xla, in_kernel, monkeypatch):
     monkeypatch.setattr(dynamics, "elementwise", kernel.elementwise)
     assert_equal(after, jax.jit(in_worlds(env))(*args))
     assert np.all(np.abs(after.qvel - by_xla.qvel).max(axis=0) > 1e-3)
-
-
-# In a separate process, because the number of devices is set before JAX starts.
-ON_DEVICES = """
-import functools, re
-import jax, jax.numpy as jnp, numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from bounce_mjx import BounceBall
-from bounce_mjx.gpu import elementwise as kernel
-from bounce_mjx.gpu import rows
-from bounce_mjx.physics.fused import dynamics
-from test_kernel import assert_equal, batched, moving
-
-dynamics.elementwise = functools.partial(kernel.elementwise, interpret=True)
-env = BounceBall()
-args = moving(env, 16 * 8)
-alone = jax.jit(batched(env))(*args)
-stacked = jax.tree.map(lambda x: jnp.stack([x, x]), args)
-mesh = Mesh(np.array(jax.devices()), ("environments",))
-for program, args, axes in (
-    (batched(env), args, (None, "environments")),
-    (jax.vmap(batched(env)), stacked, (None, None, "environments")),
-):
-    sharding = NamedSharding(mesh, PartitionSpec(*axes))
-    compiled = jax.jit(program, in_shardings=sharding).lower(*args).compile()
-    after = compiled(*args)
-    assert after.qpos.sharding.is_equivalent_to(sharding, after.qpos.ndim)
-    assert_equal(jax.tree.map(lambda x: x.reshape(-1, *x.shape[-2:])[-1], after), alone)
-    print(len(re.findall(r"all-(?:gather|reduce|to-all)|collective-", compiled.as_text())))
-"""
-
-
-@pytest.mark.slow
-def test_devices_keep_their_shard(monkeypatch):
-    """Eight devices that share the batch of one seed or of two exchange nothing."""
-    monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=8")
-    done = subprocess.run(
-        [sys.executable, "-c", ON_DEVICES],
-        cwd=Path(__file__).parent,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == ["0", "0"]
 
 
 def test_the_kernel_has_the_derivative_of_the_function():
@@ -176,19 +119,6 @@ def test_the_kernel_has_the_derivative_of_the_function():
         given = gradient(x, y)
         np.testing.assert_allclose(given[0], y**3 + np.cos(x), rtol=1e-5, atol=1e-6)
         np.testing.assert_allclose(given[1], 3.0 * x * y**2, rtol=1e-5, atol=1e-6)
-
-
-def test_a_step_in_the_kernel_has_a_gradient(env, in_kernel):
-    """Of a control step of several environments; the kernel does not take part in it."""
-    physics, ctrl = moving(env, 3)
-
-    def total(ctrl: jax.Array) -> jax.Array:
-        return jnp.sum(batched(env)(physics, ctrl).qvel ** 2)
-
-    assert "pallas_call" in str(jax.make_jaxpr(total)(ctrl))
-    gradient = jax.make_jaxpr(jax.grad(total))(ctrl)
-    assert "pallas_call" not in str(gradient)
-    assert gradient.out_avals[0].shape == ctrl.shape
 
 
 def test_one_environment_and_float64_are_compiled_by_xla(env, in_kernel):
@@ -246,13 +176,6 @@ def test_rows_hold_every_type(monkeypatch):
     for name, expected in tree.items():
         assert twice[name].dtype == expected.dtype
         np.testing.assert_array_equal(twice[name][1], expected)
-
-
-def test_rows_leave_other_types_alone(monkeypatch):
-    monkeypatch.setattr(rows, "has_kernels", lambda: True)
-    for other in (jax.random.key(0), jnp.zeros(1, jnp.bfloat16)):
-        tree = {"float": jnp.zeros(1), "other": other}
-        assert rows.pack(tree) is tree
 
 
 def test_there_is_no_kernel_on_a_cpu(monkeypatch):

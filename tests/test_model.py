@@ -11,7 +11,7 @@ import pytest
 from against_c import XML
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.errors import UserError
-from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, make_engine
+from bounce_mjx.physics import PhysicsState
 from bounce_mjx.robot.model import find_addresses, load_model
 
 SERVO_2 = '<position name="act2" joint="Joint2"/>'
@@ -46,19 +46,6 @@ def test_models_without_position_servos_are_refused(tmp_path, name):
     assert str(mjcf) in str(error.value)
 
 
-def test_the_model_without_visuals_moves_the_same():
-    """The model without the visual parts takes a fraction of the memory."""
-    pictured, plain = (load_model(None, 0.001, visual=visual) for visual in (True, False))
-    assert mujoco.mj_sizeModel(plain) < 0.1 * mujoco.mj_sizeModel(pictured)
-    after = []
-    for model in (pictured, plain):
-        data = mujoco.MjData(model)
-        data.qpos[:6], data.qpos[8] = EnvConfig().default_joint_angles, 0.08
-        mujoco.mj_step(model, data, nstep=100)
-        after.append(np.concatenate([data.qpos, data.qvel]))
-    np.testing.assert_array_equal(*after)
-
-
 @pytest.mark.parametrize(
     ("solref", "longest"),
     [("-98696 -31.4", 0.0025), ("-1e6 -60", 0.0031416 / 4), ("0.02 0.1", 0.0062832 / 4)],
@@ -90,20 +77,6 @@ def test_an_edited_model_is_an_error():
     env.mj_model.opt.gravity[2] = -1.0
     with pytest.raises(UserError, match="env.mj_model was edited"):
         jax.eval_shape(env.reset, key)
-
-
-def test_an_engine_keeps_the_model_that_it_was_built_from():
-    """Also in programs that are traced after an edit, and for equal models, which share them."""
-    models = [load_model(None, 0.001) for _ in range(2)]
-    engines = [make_engine(model, "fused") for model in models]
-    at, control = find_addresses(models[0]), Control(jnp.zeros(6))
-    qpos = jnp.asarray(models[0].qpos0).at[at.ball_qpos[2]].add(1.0)
-    start = PhysicsState(qpos, jnp.zeros(models[0].nv))
-    for model in models:
-        model.opt.gravity[2] = -1.0
-    for engine in engines:
-        after = engine.step(PhysicsParameters(), start, control, 3)
-        assert after.qvel[at.ball_qvel[2]] == pytest.approx(-9.81 * 0.003)
 
 
 def env_of(tmp_path, *edits: tuple[str, str]) -> BounceBall:

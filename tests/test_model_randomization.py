@@ -128,13 +128,6 @@ def test_entries_act_as_in_mujoco(mj_model):
     assert_same_step(fused_steps(mj_model, parameters, states), expected)
 
 
-def test_dry_friction_acts_where_it_differs(mj_model, base):
-    """The other joints have none, and their program none of its solver."""
-    loss = np.zeros((2, mj_model.nv))
-    loss[1, 2] = 0.5
-    assert set(read(mj_model, base, dof_frictionloss=loss).entries) == {"dof_frictionloss[2]"}
-
-
 REFUSED = {
     "axis": ("jnt_axis", r"jnt_axis\[0, 2\]"),
     "floor": ("geom_size", r"geom_size\[\d+, 0\]"),
@@ -160,16 +153,6 @@ def test_changes_without_an_effect_are_refused_by_name(field, word, mj_model, ba
                 )
             },
         )
-
-
-def test_an_entry_of_no_model_is_refused(mj_model):
-    engine = make_engine(mj_model, "fused")
-    start = PhysicsState(jnp.asarray(mj_model.qpos0), jnp.zeros(mj_model.nv))
-    for name in ("dof_dampng[2]", "dof_damping[99]", "dof_damping", "geom_size[1]"):
-        with pytest.raises(UserError, match="no entry of an MjModel"):
-            engine.step(
-                PhysicsParameters(entries={name: 1.0}), start, Control(jnp.zeros(mj_model.nu)), 1
-            )
 
 
 def test_values_that_are_traced_are_refused(mj_model, base):

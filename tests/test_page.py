@@ -267,16 +267,6 @@ def test_the_last_seconds_are_saved_as_they_were_seen(
     client.press("pause")
 
 
-def test_the_panel_names_the_policy_the_markers_and_the_keys(page) -> None:
-    client, _ = page
-    client.control("push the ball right")
-    (legend,) = {text for text in client.texts if "path of the ball" in text}
-    assert "target height" in legend and "paddle home" in legend and "Ctrl-K" in legend
-    assert "".join(client.keys) == "spaceRTGMNIKJL"
-    # A title is no markup.
-    assert any("exp[lr] &lt;b&gt;" in text for text in client.texts)
-
-
 def test_the_page_shows_the_commands_of_any_task(monkeypatch) -> None:
     env = Env(LeanConfig(physics="fused"))
     leaning = Simulation(env, make_zero_controller(env), 2, seed=0)

@@ -29,7 +29,6 @@ from bounce_mjx.physics import (
     PhysicsState,
     make_engine,
     mjx_engine,
-    scalars,
 )
 from bounce_mjx.physics.support import unsupported_feature
 from bounce_mjx.robot.model import Addresses, find_addresses
@@ -90,20 +89,6 @@ def test_2000_random_action_steps_are_mujocos(mj_model, fused_step, record_prope
     print(f"2,000 steps x {BATCH}: {contacts} contact steps, {drops} drops, difference {error:.1e}")
     assert contacts >= 1000
     assert error < 1e-9
-
-
-@pytest.mark.usefixtures("float64")
-def test_ten_substeps_are_ten_steps(mj_model, fused_step):
-    """The engine updates the ball's orientation once for all substeps."""
-    state = bouncing_states(mj_model, np.random.default_rng(0))
-    state.qpos[:, 8] -= 0.03  # many of the ten steps are then in contact
-    ctrl = state.qpos[:, :6] + 0.01
-    singly = state
-    for _ in range(10):
-        singly = fused_step(singly, ctrl, 1)
-    together = fused_step(state, ctrl, 10)
-    assert CEngine(mj_model, state).step(ctrl, 10) > 20
-    assert max(difference(together, singly)) < 1e-12
 
 
 def test_mjx_multiplies_in_full_precision(mj_model):
@@ -451,12 +436,3 @@ def test_mjx_refuses_features_that_it_ignores(name):
     old, new, feature = MJX_ONLY[name]
     with pytest.raises(UserError, match=feature):
         make_engine(edited(old, new), "mjx")
-
-
-def test_sine_and_cosine_are_numpys():
-    """In float32, over all angles of an arm and far beyond."""
-    angle = np.linspace(-1000.0, 1000.0, 1_000_001, dtype=np.float32)
-    sine, cosine = jax.jit(scalars.sine_cosine)(angle)
-    # Two units in the last place of a number just below 1.
-    np.testing.assert_allclose(sine, np.sin(angle.astype(float)), rtol=0, atol=1.2e-7)
-    np.testing.assert_allclose(cosine, np.cos(angle.astype(float)), rtol=0, atol=1.2e-7)

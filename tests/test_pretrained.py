@@ -1,7 +1,6 @@
 """The shipped policies meet their results, are found by name, and are what the script ships."""
 
 import json
-import shutil
 from pathlib import Path
 
 import jax
@@ -15,7 +14,7 @@ from bounce_mjx.commands.train import read_command
 from bounce_mjx.deploy.export import export_onnx
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.config import EvaluationOptions
-from bounce_mjx.evaluation.policy_evaluation import PolicyEvaluation, evaluate_policy
+from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import make_networks, networks_of
 from bounce_mjx.resources import (
@@ -24,7 +23,6 @@ from bounce_mjx.resources import (
     TASK_POLICIES,
     resource_path,
 )
-from bounce_mjx.runs import folders
 from bounce_mjx.runs.config import (
     TrainConfig,
     in_world,
@@ -183,61 +181,3 @@ def test_it_is_used_if_there_is_no_run(tmp_path: Path, monkeypatch, console, cap
     assert chosen.folder.absolute() == folder.absolute()
     assert str(LOG_DIR / "2026-01-02") in capsys.readouterr().out
     assert choose_checkpoint(FOLDER, LOG_DIR, console) == pretrained_checkpoint()
-
-
-def test_the_policies_have_names(tmp_path: Path, monkeypatch, console) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert choose_checkpoint(Path("pretrained"), LOG_DIR, console) == pretrained_checkpoint()
-    monkeypatch.setattr(folders, "resource_path", lambda name: tmp_path / "package" / name)
-    robust = tmp_path / "package" / "pretrained" / "robust"
-    shutil.copytree(FOLDER, robust)
-    assert choose_checkpoint(Path("robust"), LOG_DIR, console).run == robust
-
-
-@pytest.fixture
-def ship(monkeypatch):
-    """The module of the script that ships."""
-    monkeypatch.syspath_prepend(str(Path(__file__).parent.parent / "benchmarks"))
-    import ship
-
-    return ship
-
-
-@pytest.fixture
-def measure(monkeypatch, ship, measured: Report):
-    """A function (report) that makes `ship` measure this report."""
-
-    def replace(report: Report) -> None:
-        evaluation = PolicyEvaluation(report, "fused")
-        monkeypatch.setattr(ship, "evaluate_policy", lambda *_, **__: evaluation)
-
-    replace(measured)
-    return replace
-
-
-@pytest.mark.slow
-def test_shipping_keeps_the_policy(tmp_path: Path, ship, measure, shipped: dict) -> None:
-    out = tmp_path / "pretrained"
-    for _ in range(2):  # into a new folder, and over an older one
-        ship.main([str(FOLDER), "--out", str(out)])
-    assert list(tmp_path.iterdir()) == [out]
-    config = load_run_config(out)
-    assert config == load_run_config(FOLDER)
-    policies = (read_policy(best_checkpoint(run), config) for run in (out, FOLDER))
-    jax.tree.map(np.testing.assert_array_equal, *policies)
-    onnx_file = f"{FOLDER.name}.onnx"
-    assert (out / onnx_file).read_bytes() == export_onnx(pretrained_checkpoint())
-    made = json.loads((out / "results.json").read_text())
-    assert made.keys() == shipped.keys()
-    assert [made[key] for key in ("command", "seed", "device", "best_steps")] == [
-        shipped[key] for key in ("command", "seed", "device", "best_steps")
-    ]
-
-
-def test_shipping_replaces_only_folders_that_it_wrote(tmp_path: Path, ship, capsys) -> None:
-    (tmp_path / "mine").write_text("mine")
-    with pytest.raises(SystemExit) as exit_info:
-        ship.main([str(FOLDER), "--out", str(tmp_path)])
-    assert exit_info.value.code == 2
-    assert f"--out {tmp_path}" in capsys.readouterr().err
-    assert (tmp_path / "mine").read_text() == "mine"

@@ -216,22 +216,6 @@ def test_a_wrong_range_is_one_sentence(values: dict, words: str) -> None:
     assert words in str(error.value) and "\n" not in str(error.value)
 
 
-def test_off_is_the_program_without_randomisation() -> None:
-    """The settings of the warm-up do not matter; an active term changes the program."""
-
-    def program(**settings) -> tuple[str, int]:
-        env = BounceBall(EnvConfig(randomization=settings))
-        state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
-        jaxpr = jax.make_jaxpr(env.step)(state, jnp.zeros(6))
-        return str(jaxpr), len(jaxpr.in_avals)
-
-    off, inputs = program()
-    assert "shift_right_logical" not in off
-    assert program(warmup_steps=1000, share=0.5) == (off, inputs)
-    on, more = program(ball_position_noise=(0.0, 0.01))
-    assert "shift_right_logical" in on and more > inputs
-
-
 @pytest.mark.parametrize("restitution", [None, 0.4, 0.6, 0.72, 0.9, 0.96])
 def test_drops_bounce_as_asked(mj_model, restitution: float | None) -> None:
     """On MuJoCo's C engine: ratio of the speeds after and before an impact on the held paddle,

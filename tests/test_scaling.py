@@ -16,16 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bounce_mjx.commands import plot as plot_command
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning import ppo
 from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.reports.curves import group_runs
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import (
     latest_checkpoint,
-    runs_of_seeds,
 )
 from bounce_mjx.training import devices, hosts, setup
 from bounce_mjx.training.command import read_command
@@ -69,11 +66,6 @@ def assert_equal_up_to_rounding(ours: dict[str, np.ndarray], theirs: dict[str, n
             np.testing.assert_allclose(ours[name], theirs[name], rtol=0, atol=1e-3, err_msg=name)
 
 
-def assert_trained(run: Path, before: dict[str, np.ndarray]) -> None:
-    after = arrays(latest_checkpoint(run))
-    assert any((after[n] != before[n]).any() for n in after if n.startswith("params"))
-
-
 @pytest.mark.parametrize(
     ("kernel", "preallocate", "expected"),
     [(None, None, (True, "false")), ("false", "true", (False, "true"))],
@@ -100,22 +92,6 @@ def test_a_command_leaves_the_users_settings_of_jax(kernel, preallocate, expecte
 # Shuffling in groups
 
 
-@pytest.mark.parametrize(
-    ("num_envs", "rollout_length", "num_minibatches", "expected"),
-    [
-        (4096, 32, 8, 64),
-        (16384, 32, 32, 256),
-        (24, 8, 2, 8),
-        (7, 8, 4, 1),
-    ],
-)
-def test_number_of_groups(num_envs, rollout_length, num_minibatches, expected):
-    config = PPOConfig(
-        num_envs=num_envs, rollout_length=rollout_length, num_minibatches=num_minibatches
-    )
-    assert ppo.num_groups(config) == expected
-
-
 def test_groups_hold_the_samples_of_their_environments():
     length, batch, groups = 3, 8, 4
     environment_ids = jnp.broadcast_to(jnp.arange(batch), (length, batch))
@@ -137,16 +113,6 @@ def test_each_of_several_seeds_trains_as_if_alone(seeds: Path, alone: Path, tmp_
         theirs = arrays(latest_checkpoint(single))
         assert_equal_up_to_rounding({name: value[i] for name, value in together.items()}, theirs)
     assert (together["params.policy.params.Dense_0.kernel"].std(axis=0) > 0).any()
-
-
-@pytest.mark.slow
-def test_the_seeds_are_drawn_as_one_band(seeds: Path, tmp_path: Path, capsys):
-    plot_command.main([str(seeds), "--out", str(tmp_path), "--formats", "svg"])
-    drawn = [str(tmp_path / name) for name in ("curves.svg", "rewards.svg")]
-    assert capsys.readouterr().out.split() == drawn
-    (group,) = group_runs(runs_of_seeds(seeds))
-    assert len(group.runs) == SEEDS
-    assert len({tuple(run.curves["loss/value"].values) for run in group.runs}) == SEEDS
 
 
 @pytest.mark.slow

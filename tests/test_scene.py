@@ -11,7 +11,6 @@ import pytest
 
 import viewing
 from bounce_mjx import BounceBall, EnvConfig
-from bounce_mjx.env.env import Env
 from bounce_mjx.resources import resource_path
 from bounce_mjx.task import term_names
 from bounce_mjx.tasks.bounce_rewards import BounceReward
@@ -21,30 +20,18 @@ from bounce_mjx.viewers.controls import direction
 from bounce_mjx.viewers.display import (
     Display,
     _primitive,
-    body_scenes,
     camera_pose,
     marker_body,
 )
 from bounce_mjx.viewers.guard import open_server
-from bounce_mjx.viewers.page import write_page
 from bounce_mjx.viewers.scene import Scene
 from bounce_mjx.viewers.scene import _grid as scene_grid
-from bounce_mjx.viewers.simulation import (
-    Simulation,
-    make_zero_controller,
-)
-from bounce_mjx.world.config import WorldConfig
-from viewing import NAN, LeanConfig, StillConfig, at_height, evaluated, watch
+from viewing import NAN, at_height, evaluated
 
 
 @pytest.fixture(scope="module")
 def env() -> BounceBall:
     return viewing.mirrored().env
-
-
-def simulated(config: WorldConfig, number: int) -> Simulation:
-    env = Env(config)
-    return Simulation(env, make_zero_controller(env), number, seed=0)
 
 
 SHAPES = """<mujoco><worldbody>
@@ -63,14 +50,6 @@ def test_shapes_have_the_sizes_of_mujoco() -> None:
         np.testing.assert_allclose(mesh.bounds, bounds, rtol=0.01, atol=1e-9)
         # The faces look outward.
         assert np.all(np.einsum("ij,ij->i", mesh.face_normals, mesh.triangles_center) > 0.0)
-
-
-def test_every_shown_geom_is_in_the_meshes(env: BounceBall) -> None:
-    model = Display(env).model
-    shapes = {model.body(body).name: len(s.geometry) for body, s in body_scenes(model)}
-    shown = {model.body(body).name: int(model.body_geomnum[body]) for body in range(model.nbody)}
-    shown["world"] -= 1  # the floor
-    assert shapes == shown
 
 
 def marker_position(display: Display, name: str) -> np.ndarray:
@@ -123,16 +102,6 @@ def test_on_a_phone_the_panel_leaves_the_arm_and_the_ball_visible() -> None:
     points = projected(parts, home, 390 / 844, np.zeros((1, 3)))
     assert np.all(np.abs(points[:, 0]) < 1.0)
     assert np.all((points[:, 1] > 0.2) & (points[:, 1] < 1.0))
-
-
-def test_a_zoom_enlarges_the_paddle_and_brings_it_to_the_middle() -> None:
-    home, one = np.array(HOMES[0]), np.zeros((1, 3))
-    edges = home + [(0.0, 0.0, 0.0), (0.0, 0.0, 0.01)]
-    middle, above = projected(edges, home, 4 / 3, one)
-    near_middle, near_above = projected(edges, home, 4 / 3, one, zoom=3.0)
-    size = np.linalg.norm(near_above - near_middle) / np.linalg.norm(above - middle)
-    assert size == pytest.approx(3.0, rel=0.2)
-    assert abs(near_middle[0]) < abs(middle[0])
 
 
 @pytest.mark.parametrize("home", HOMES, ids=["default", "raised", "turned", "behind"])
@@ -215,25 +184,3 @@ def test_reward_bars_show_every_term() -> None:
         assert text.count(f">{name.replace('_', ' ')}<") == 1
     assert ">2.00<" in text and ">-1.25<" in text and "sum 1.25" in text
     assert "-0.00" not in reward_bars({"a": -0.001})
-
-
-def test_a_label_without_readings_is_not_shown() -> None:
-    """It would be a white stroke."""
-    still = simulated(StillConfig(physics="fused"), 1)
-    for simulation, is_shown in ((still, False), (viewing.mirrored(), True)):
-        with open_server("127.0.0.1", 0) as server:
-            scene = Scene(server, simulation.env, 1)
-            scene.update([simulation.frame])
-            assert [label.visible for label in scene._labels] == [is_shown]
-
-
-def test_a_replay_shows_the_commands_of_any_task(tmp_path: Path, monkeypatch) -> None:
-    leaning = simulated(LeanConfig(physics="fused"), 2)
-    shown = []
-    watch(monkeypatch, Scene, "update", lambda _, frames: shown.extend(frames))
-    leaning.command = {"lean_angle": 0.1, "pace": 1.5}
-    write_page(tmp_path / "a.html", leaning.env, leaning.record(0.2), fps=20)
-    assert (tmp_path / "a.html").exists() and len(shown) == 4
-    for frame in shown:
-        np.testing.assert_allclose(frame.command["lean_angle"], [0.1, 0.1])
-        np.testing.assert_array_equal(frame.command["pace"], [1.5, 1.5])

@@ -73,30 +73,3 @@ def test_the_commands_are_the_motion_of_their_acceleration(smooth: bool) -> None
     else:
         fine = fine[1000:]
     np.testing.assert_allclose(trajectory(targets, limits), fine[99::100], atol=2e-5)
-
-
-@pytest.mark.parametrize("smooth", [False, True])
-@pytest.mark.parametrize("lag", [None, 0.003, 0.05])
-def test_late_and_lagged_commands_go_on_without_a_gap(smooth: bool, lag: float | None) -> None:
-    """The command at a negative time is that of the step before, and a lag follows both."""
-    limits, rng = limits_of(smooth), np.random.default_rng(2)
-    steps = [Setpoint(*(np.zeros(2) for _ in range(3)))]
-    for target in rng.uniform(-1.0, 1.0, (6, 2)):
-        steps.append(next_setpoint(limits, steps[-1], target, T, np))
-    before, start, after = steps[-3:]
-
-    def of(piece: Setpoint, acceleration, time, lag=lag):
-        earlier = (T, steps[-3 if piece is start else -4].acceleration) if smooth else None
-        return command(piece, acceleration, time, np, limits.smoothing, lag, earlier)
-
-    if lag is None:
-        for time in np.linspace(0.0, T, 7):
-            last = of(before, start.acceleration, time)
-            np.testing.assert_allclose(of(start, after.acceleration, time - T), last, atol=1e-12)
-        return
-    # The lag solves its differential equation: lag * y' = u - y.
-    for time in np.linspace(-0.9 * T, 0.9 * T, 13):
-        h = 1e-6
-        y, ahead, behind = (of(start, after.acceleration, time + d) for d in (0.0, h, -h))
-        u = of(start, after.acceleration, time, None)
-        np.testing.assert_allclose(lag * (ahead - behind) / (2 * h), u - y, atol=1e-7)

@@ -63,15 +63,3 @@ def test_an_interrupted_search_continues(sweep, monkeypatch):
     assert states(command.storage).count("COMPLETE") == 2
     module.search(command, base)
     assert len(tried) == 2, "a finished search tries nothing more"
-
-
-@pytest.mark.slow
-def test_a_trial_trains_a_population(sweep):
-    module, command = sweep
-    base = module.read_preset(command.config)
-    study = module.search(command.model_copy(update={"trials": 1}), base)
-    (trial,) = study.trials
-    assert trial.state.name == "COMPLETE"
-    assert 0.0 <= trial.value < 1.0, "so short a training cannot meet all results"
-    assert list(trial.intermediate_values) == [64, 128]
-    assert "0 of 2" in module.table(study, command.seeds)

@@ -3,7 +3,6 @@ libraries."""
 
 import itertools
 import runpy
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -82,15 +81,6 @@ def test_actions_and_results_share_the_memory_of_jax(env, monkeypatch):
     assert seen == [action.data_ptr()]
 
 
-def test_only_the_first_step_compiles(task):
-    env = TorchVectorEnv(task, NUM_ENVS)
-    env.reset()
-    env.clock = torch.arange(NUM_ENVS)
-    for action in random_actions(2):
-        env.step(action)
-    assert env._jit_step._cache_size() == 1
-
-
 def test_tensors_of_a_step_outlive_the_following_steps(env):
     """They stay valid although the state is donated from step to step."""
     first, _ = env.reset()
@@ -133,15 +123,6 @@ def test_steps_equal_vector_steps(task, env):
     assert ended >= 2 * NUM_ENVS
 
 
-def test_rewards_are_scaled(task, env):
-    scaled = TorchVectorEnv(task, NUM_ENVS, reward_scale=0.25, critic_metrics=())
-    for each in (env, scaled):
-        each.reset(seed=5)
-    action = torch.zeros(NUM_ENVS, 6)
-    torch.testing.assert_close(scaled.step(action).reward, 0.25 * env.step(action).reward)
-    assert scaled.step(action).critic_metrics.shape == (NUM_ENVS, 0)
-
-
 BAD_ACTIONS = {
     "type": (torch.zeros(NUM_ENVS, 6, dtype=torch.float64), "torch.float64", "torch.float32"),
     "shape": (torch.zeros(6, NUM_ENVS), "(6, 4)", "(4, 6)"),
@@ -166,24 +147,6 @@ def test_wrong_environment_is_refused(task):
         TorchVectorEnv(task, NUM_ENVS).step(torch.zeros(NUM_ENVS, 6))
 
 
-def test_package_works_without_torch():
-    script = """
-import sys
-sys.modules["torch"] = None
-import jax, bounce_mjx, bounce_mjx.commands.train, bounce_mjx.eval
-print(bounce_mjx.BounceBall().reset(jax.random.PRNGKey(0)).obs.shape)
-try:
-    import bounce_mjx.adapters.torch
-except ImportError as error:
-    print(error)
-"""
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    shape, sentence = done.stdout.splitlines()
-    assert shape == "(29,)"
-    assert sentence.startswith("PyTorch cannot be imported")
-    assert sentence.endswith("install it with: pip install 'bounce_mjx[torch]'")
-
-
 # rsl_rl
 
 
@@ -202,15 +165,6 @@ def test_rsl_rl_gets_time_outs_and_terminal_observations(env):
     torch.testing.assert_close(terminal[:, 28], before[:, 28])
     assert torch.equal(terminal[1:], after["policy"][1:])
     assert terminal[0, 28] != after["policy"][0, 28]
-
-
-def test_rsl_rl_log_has_the_mean_reward_terms(env):
-    vec_env = RslRlVecEnv(env)
-    _, rewards, _, extras = vec_env.step(torch.zeros(NUM_ENVS, 6))
-    log = extras["log"]
-    terms = [value for name, value in log.items() if name.startswith("task/reward/")]
-    assert len(terms) == 15
-    torch.testing.assert_close(sum(terms), rewards.mean())
 
 
 # skrl

@@ -23,13 +23,13 @@ from bounce_mjx.runs.folders import pretrained_checkpoint
 from bounce_mjx.runs.reading import read_policy
 from bounce_mjx.training.callbacks import Event
 from bounce_mjx.training.video import EvaluationVideo
-from bounce_mjx.viewers import native, offscreen, show
+from bounce_mjx.viewers import offscreen, show
 from bounce_mjx.viewers.browser import LivePage
 from bounce_mjx.viewers.offscreen import choose_backend
 from bounce_mjx.viewers.simulation import (
     Simulation,
 )
-from bounce_mjx.viewers.video import VideoWriter, caption, find_ffmpeg
+from bounce_mjx.viewers.video import VideoWriter, find_ffmpeg
 
 
 @pytest.fixture(autouse=True)
@@ -48,19 +48,6 @@ def test_a_video_needs_ffmpeg_of_the_extra_or_of_the_system(monkeypatch, tmp_pat
         VideoWriter(tmp_path / "a.mp4", (64, 64), None)
     (tmp_path / "ffmpeg").touch(mode=0o755)
     assert Path(find_ffmpeg()) == tmp_path / "ffmpeg"
-
-
-@pytest.mark.parametrize("value", ["2", "figure of eight, 0.25 m/s"])
-def test_a_caption_stays_in_its_box(value: str) -> None:
-    """Nothing white outside the dark box on a white picture; the box ends after the text."""
-    paper = np.full((300, 400, 3), 255, np.uint8)
-    drawn = caption(paper, {"path": value, "second": "0.50 m"}, 0.5)
-    rows, columns = np.nonzero(np.any(drawn != 255, axis=2))
-    box = drawn[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
-    text = box.min(axis=2) > 200
-    assert text[10:-10, 10:-10].any()
-    # Its corners are round.
-    assert not text[:, -6:][8:-8].any() and not text[-6:, 8:-8].any()
 
 
 def run(command: list[str], cwd: Path, **variables: str) -> subprocess.CompletedProcess:
@@ -225,12 +212,6 @@ def fails(tmp_path: Path, monkeypatch, capfd):
         return err
 
     return call
-
-
-def test_a_dead_display_is_not_used(monkeypatch) -> None:
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    monkeypatch.setenv("DISPLAY", ":987")
-    assert sys.platform != "linux" or not native.has_display()
 
 
 def test_policies_given_together_are_named_and_have_one_world(monkeypatch) -> None:

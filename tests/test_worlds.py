@@ -1,6 +1,5 @@
 """A named world has sourced numbers, and training and measuring take place in it."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +7,6 @@ import pytest
 import yaml
 
 from bounce_mjx import EnvConfig
-from bounce_mjx.commands.main import main
 from bounce_mjx.commands.train import read_command
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.suite import load_suite
@@ -18,7 +16,6 @@ from bounce_mjx.runs.config import TrainConfig, in_world, read_preset
 from bounce_mjx.world.config import ActionConfig
 from bounce_mjx.world.named import read_world
 from bounce_mjx.world.randomization import TERMS
-from test_deploy import make_run
 
 TWICE = "twice the assumed"
 NAMES = ("ur5e_rtde", "panda_fci", "iiwa_fri", "fast_servo")
@@ -138,21 +135,6 @@ def test_a_world_of_a_robot_brings_its_limits_to_a_policy() -> None:
     config = trained.model_copy(update={"env": trained.env.model_copy(update=measured)})
     with pytest.raises(UserError, match="ur5e_rtde.*action.base"):
         in_world(config, Path("ur5e_rtde"))
-
-
-@pytest.mark.slow
-def test_robustness_measures_twice_the_assumed_alone(tmp_path, capsys) -> None:
-    run = make_run(tmp_path / "run", {"episode_seconds": 0.05})
-    with pytest.raises(SystemExit):
-        main(["robustness", str(run), "--assumed"])
-    assert "--assumed needs a named world" in capsys.readouterr().err
-    world = ["--world", str(written(tmp_path)), "--assumed", "--episodes", "2"]
-    with pytest.raises(SystemExit):
-        main(["robustness", str(run), *world, "--out", str(tmp_path / "out")])
-    report = json.loads((tmp_path / "out" / "robustness.json").read_text())
-    names = [outcome["perturbation"] for outcome in report["outcomes"]]
-    assert names == ["nominal", "twice randomization.frame_drop"]
-    assert report["suite"].startswith("twice what ") and report["version"] == ""
 
 
 def test_robustness_starts_from_the_world_and_doubles_what_is_assumed() -> None:
