@@ -81,7 +81,6 @@ def test_the_law_keeps_the_ball_up(env: Env) -> None:
         (eval_command.main, "pretrained --robot ur5e", "give mirror"),
         (eval_command.main, "mirror --task catch", "target_height"),
         (eval_command.main, "mirror --robot nope", "no robot is named nope"),
-        (play.main, "robust --actions mirror --html a.html", "cannot be combined"),
     ],
 )
 def test_a_mistake_is_one_sentence(main, flags: str, word: str, capsys) -> None:
@@ -96,5 +95,4 @@ def test_the_word_mirror_is_shown_beside_a_policy(tmp_path, monkeypatch, capsys)
     titles = []
     monkeypatch.setattr(show, "show", lambda shown, *_, **__: titles.extend(x.title for x in shown))
     play.main(["pretrained", "mirror"])
-    play.main(["--actions", "mirror"])
-    assert titles[0].startswith("pretrained, ") and titles[1:] == ["mirror law", "mirror law"]
+    assert titles[0].startswith("pretrained, ") and titles[1:] == ["mirror law"]

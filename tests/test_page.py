@@ -20,7 +20,6 @@ import viser
 from rich.console import Console
 
 import viewing
-from bounce_mjx import BounceBall
 from bounce_mjx.commands import train
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
@@ -33,7 +32,6 @@ from bounce_mjx.viewers import browser
 from bounce_mjx.viewers.guard import open_server
 from bounce_mjx.viewers.scene import Scene
 from bounce_mjx.viewers.simulation import (
-    EnvFrame,
     Simulation,
     make_zero_controller,
 )
@@ -240,30 +238,6 @@ def test_keys_act(page) -> None:
     np.testing.assert_allclose(did["push"][-1], (0.0, 0.0, 0.2))
     client.press("pause")
     wait_until(lambda: stands_still(did))
-    client.press("pause")
-
-
-def test_the_last_seconds_are_saved_as_they_were_seen(
-    page, mirrored: Simulation, monkeypatch
-) -> None:
-    client, did = page
-    saved = []
-
-    def replay(env: BounceBall, recording: EnvFrame, names) -> str:
-        saved.append(recording)
-        return "<html>"
-
-    monkeypatch.setattr(browser, "replay", replay)
-    wait_until(lambda: len(did["target"]) > 20)
-    client.press("pause")
-    wait_until(lambda: stands_still(did))
-    client.set(client.control("save a replay of the last 10 s"), True)
-    while not client.download:
-        client.receive()
-    assert client.download == b"<html>"
-    (recording,) = saved
-    assert len(recording.ball) == len(did["target"]) and recording.ball.shape[1:] == (1, 3)
-    np.testing.assert_array_equal(recording.ball[-1, 0], mirrored.frame.ball[0])
     client.press("pause")
 
 

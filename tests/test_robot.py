@@ -1,7 +1,6 @@
 """An unsuitable arm is refused in one sentence; another one becomes the scene, with its motion."""
 
 import re
-import shlex
 from pathlib import Path
 
 import jax
@@ -13,7 +12,6 @@ from against_c import States, assert_same_step, c_models, c_steps, fused_steps, 
 from arms import ARM, ARM_JOINTS, arm, hinge, link, mjcf, motors, ur5e
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.commands import adopt as adopt_command
-from bounce_mjx.commands import view as view_command
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.adopt import adopt, check_as_alone
@@ -360,16 +358,9 @@ def test_a_start_pose_lies_inside_the_limits(tmp_path) -> None:
         assert np.all(angles >= low + noise) and np.all(angles <= high - noise)
 
 
-def test_adopting_ends_by_itself_and_view_shows_the_arm(tmp_path, monkeypatch, capsys) -> None:
-    shown = []
-    monkeypatch.setattr(view_command, "main", shown.append)
+def test_adopting_names_the_next_commands(tmp_path, capsys) -> None:
     (tmp_path / "arm.xml").write_text(ARM)
     args = [f"{tmp_path}/arm.xml", "--site", "tool", "--out", f"{tmp_path}/arm.yaml"]
-    adopt_command.main(args)
-    assert not shown
-    (command,) = re.findall(r"see it: bounce-mjx view (.+)", capsys.readouterr().out)
-    adopt_command.main([*args, "--view"])
-    assert shown == [shlex.split(command)]
     adopt_command.main([*args, "--task", "juggle"])
     said = capsys.readouterr().out
     assert len(re.findall(r": bounce-mjx (?:view|train) --task juggle --robot ", said)) == 2

@@ -88,8 +88,6 @@ class Client:
         self.sliders: dict[str, tuple[float, float, float]] = {}
         self.lines: list[str] = []
         self.keys: list[str] = []
-        self.camera: dict[str, list[float]] = {}
-        self.download = b""
 
     def control(self, label: str) -> str:
         """The identifier of a control or of a key's command, by its label."""
@@ -121,10 +119,6 @@ class Client:
                 self.lines += [line["label"] for line in props["series"]]
             if "hotkey" in props:
                 self.keys.append(props["hotkey"])
-            if message["type"].startswith("SetCamera"):
-                self.camera |= message
-            if message["type"] == "FileTransferPart":
-                self.download += message["content"]
             updates = message.get("updates", {})
             self.texts += [part["content"] for part in (props, updates) if "content" in part]
             if "value" in updates:

@@ -41,8 +41,6 @@ class AdoptCommand(StrictModel):
     """File for the config; by default, my_arm.yaml for my_arm.xml."""
     paddle: PaddleConfig = PaddleConfig()
     """The paddle; a given position or quaternion fixes the mount, which is searched otherwise."""
-    view: bool = False
-    """Show the arm afterwards, until Ctrl-C."""
 
 
 @exit_on_user_error()
@@ -77,14 +75,9 @@ def main(args: Sequence[str]) -> None:
     console.print(f"config: {out}", markup=False)
     named = [] if command.task == DEFAULT else ["--task", command.task]
     flags = [*named, "--robot", str(out)]
-    shown = [*flags, "--actions", "zero"]
-    console.print(f"see it: bounce-mjx view {shlex.join(shown)}", markup=False)
+    shown = shlex.join([*flags, "--actions", "zero"])
+    console.print(f"see it: bounce-mjx view {shown}", markup=False)
     console.print(f"train it: bounce-mjx train {shlex.join(flags)}", markup=False)
-    if command.view:
-        # The viewers import seconds of libraries.
-        from bounce_mjx.commands import view
-
-        view.main(shown)
 
 
 def env_values(mjcf: Path, adoption: "Adoption", config_class: type[WorldConfig]) -> dict[str, Any]:

@@ -26,15 +26,13 @@ class ExciteCommand(StrictModel):
     """Largest speed of a joint's target, rad/s; give less than the robot's own limit."""
     table_height: Finite | None = None
     """Height of a table that the arm must not touch, m; the floor is at 0."""
-    simulated: Path | None = None
-    """CSV file for the log that the simulated arm gives, as a rehearsal of bounce-mjx identify."""
 
 
 @exit_on_user_error()
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 2 on a mistake."""
     command = parse(ExciteCommand, args, prog="bounce-mjx excite")
-    from bounce_mjx.identify.excitation import excite, simulate_arm, to_csv
+    from bounce_mjx.identify.excitation import excite, to_csv
     from bounce_mjx.runs.files import writable, write_output
 
     config = read_preset(Path("default"), command.robot).env
@@ -45,6 +43,3 @@ def main(args: Sequence[str]) -> None:
     for name, amplitude in zip(motion.joint_names, motion.amplitudes, strict=True):
         console.print(f"  {name}: up to {amplitude:.3f} rad from the start pose", markup=False)
     console.print(f"motion: {command.out} ({motion.times[-1]:.0f} s)", markup=False)
-    if command.simulated is not None:
-        simulate_arm(config, motion, command.simulated)
-        console.print(f"log: {command.simulated}", markup=False)

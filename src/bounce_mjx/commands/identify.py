@@ -57,7 +57,6 @@ def main(args: Sequence[str]) -> None:
     command = parse(IdentifyCommand, args, prog="bounce-mjx identify")
     if not command.logs:
         raise UserError("no log is given; name the CSV files or bags to identify from")
-    from bounce_mjx.identify.log import describe_gaps
     from bounce_mjx.identify.reading import Topics, read_log
     from bounce_mjx.identify.stages import identify, join
     from bounce_mjx.identify.world import compare, to_yaml
@@ -80,7 +79,7 @@ def main(args: Sequence[str]) -> None:
     names, topics = joint_names(model), Topics(**command.topics.model_dump())
     say = partial(Console(soft_wrap=True, highlight=False).print, markup=False)
     log = join([read_log(path, model, topics, command.joint_names) for path in command.logs])
-    for warning in (*log.notes, *describe_gaps(log, names)):
+    for warning in log.notes:
         say(f"warning: {warning}")
     set_up_jax(config)
     found = identify(config, log, command.camera_rotation, lambda line: say(f"  {line}"))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from rich.console import Console
 
-from bounce_mjx.commands.run_options import MIRROR, WorldCommand, parse_with_commands
+from bounce_mjx.commands.run_options import WorldCommand, parse_with_commands
 from bounce_mjx.config.command_line import stdout
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, exit_on_user_error
@@ -32,9 +32,6 @@ class PlayCommand(WorldCommand):
     policy that comes with the package: pretrained, robust, robust_small, or the name of a task or
     an arm. Several are shown side by side. The default is the newest run, or the task's policy in
     the package if there is no run. mirror stands for the mirror law, a model-based baseline."""
-    actions: Literal["policy", "mirror"] = "policy"
-    """policy: those of the checkpoints; mirror: those of the mirror law, like the checkpoint
-    mirror."""
     physics: Literal["config", "fused", "mjx"] = "config"
     """Physics engine; config is the engine used in training."""
     randomization: RandomizationConfig = RandomizationConfig()
@@ -52,13 +49,7 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.viewers.show import show
 
     console = stdout()
-    default = None if command.actions == "policy" else Path(MIRROR)
-    if default and command.checkpoints:
-        raise UserError(
-            "--actions mirror and checkpoints cannot be combined; to show the mirror law next to a "
-            "policy, give mirror as a checkpoint"
-        )
-    chosen = [command.choose(path, console) for path in command.checkpoints or (default,)]
+    chosen = [command.choose(path, console) for path in command.checkpoints or (None,)]
     configs = [_config(checkpoint, command) for checkpoint in chosen]
     (commands, *_) = [given_commands(config.env) for config in configs]
     set_up_jax(*(config.env for config in configs))

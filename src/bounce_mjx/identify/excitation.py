@@ -2,13 +2,11 @@
 together, without contacts."""
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
-from bounce_mjx.deploy.recorder import Recorder
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.contacts import ContactChecker
 from bounce_mjx.robot.model import find_addresses, joint_names, load_model
@@ -227,23 +225,3 @@ def to_csv(motion: Excitation) -> str:
     rows = np.column_stack([motion.times, motion.targets])
     lines = [",".join(titles), *(",".join(f"{x:.6f}" for x in row) for row in rows)]
     return "\n".join(lines) + "\n"
-
-
-def simulate_arm(config: WorldConfig, motion: Excitation, path: Path) -> None:
-    """Writes the log of a motion on the model's own arm, on MuJoCo's C engine.
-
-    Raises:
-      UserError: the log exists or cannot be made.
-    """
-    model = load_model(config.mjcf, config.physics_dt, visual=False, robot=config.robot)
-    addresses, data = find_addresses(model), mujoco.MjData(model)
-    qpos, qvel = list(addresses.arm_qpos), list(addresses.arm_qvel)
-    servos = list(addresses.actuators)
-    data.qpos[qpos] = config.default_joint_angles
-    with Recorder(path, motion.joint_names) as recorder:
-        for time, target in zip(motion.times, motion.targets, strict=True):
-            measured = {"time": time, "joint_angles": data.qpos[qpos]}
-            recorder.step(measured | {"joint_velocities": data.qvel[qvel]}, target)
-            data.ctrl[servos] = target * model.actuator_gear[servos, 0]
-            for _ in range(config.num_substeps):
-                mujoco.mj_step(model, data)

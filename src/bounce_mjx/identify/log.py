@@ -18,10 +18,6 @@ _MIN_ROWS = 100
 # from the log's middle beyond which one is wrong, s.
 _WRONG_ROWS = 0.05
 _FAR_IN_TIME = 3600.0
-# Acceleration of a joint, rad/s^2, beyond which an angle is wrong, and the smallest such error that
-# matters, rad.
-_FASTEST_ACCELERATION = 600.0
-_SMALLEST_SPIKE = 0.02
 # Two pictures closer than this are one, s.
 _SAME_PICTURE = 1e-4
 # Stretches of a log in which the youngest picture is looked for; drift (s) over the log below which
@@ -129,7 +125,6 @@ def make_log(source: str, angles: Rows, targets: Rows, balls: Rows) -> Log:
     """
     notes: list[str] = []
     angles, targets = (_in_order(rows, notes) for rows in (angles, targets))
-    angles = angles.without(_find_spikes(angles), "is a jump there and back", notes)
     order = np.argsort(balls.times, kind="stable")
     balls = Rows(*balls[:2], *(array[order] for array in balls[2:]))
     # An arm may have been recorded alone, with a tracker that saw no ball. Trackers, and logs of
@@ -161,22 +156,6 @@ def _in_order(rows: Rows, notes: list[str]) -> Rows:
     # A time that is too late makes all that follow early, and one too early all before it late.
     wrong = min(early, late[: len(early)], key=np.sum)
     return rows.without(wrong, "has a time out of order", notes, *_ONE_CLOCK)
-
-
-def _find_spikes(rows: Rows) -> np.ndarray:
-    """Which angles [R] are off a line through their neighbours as no arm can be."""
-    found, q = np.zeros(len(rows.times), bool), rows.values
-    if len(found) < 5:
-        return found
-    before, after = np.diff(rows.times)[:-1, None], np.diff(rows.times)[1:, None]
-    line = (after * q[:-2] + before * q[2:]) / (before + after)
-    off = np.max(np.abs(q[1:-1] - line), axis=1)
-    possible = 0.5 * _FASTEST_ACCELERATION * (before * after)[:, 0]
-    large = off > np.maximum(possible, max(_SMALLEST_SPIKE, 30.0 * np.median(off)))
-    # The line through a spike is off at its neighbours, by half as much.
-    beside = np.convolve(off, [0.5, 0.0, 0.5], "same")
-    found[1:-1] = large & (off > 1.5 * beside)
-    return found
 
 
 def align_clocks(log: Log) -> Log:
@@ -271,20 +250,3 @@ def check(log: Log, joint_names: Sequence[str], joint_ranges: np.ndarray) -> Non
             f"s, and the servo targets at {begins[1]:.6g} and {ends[1]:.6g} s; give stamps of one "
             "clock, simulated time or the computer's"
         )
-
-
-def describe_gaps(log: Log, joint_names: Sequence[str]) -> list[str]:
-    """What all logs of a robot together lack, a sentence each."""
-    said = []
-    if not len(log.picture_times):
-        said.append(
-            f"{log.source} has no picture of the ball; only the arm is identified, and the ball's "
-            "and the camera's terms keep their prior ranges"
-        )
-    moved = np.ptp(log.servo_targets, axis=0)
-    if np.any(moved < 0.01):
-        said.append(
-            f"in {log.source}, {joint_names[int(np.argmin(moved))]} moves by less than 0.01 rad; "
-            "record bounce-mjx excite too"
-        )
-    return said

@@ -58,8 +58,7 @@ def read_log(path: Path, model: mujoco.MjModel, topics: Topics, names: Sequence[
 
 
 def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
-    """Reads a CSV log. Cells are separated by commas, semicolons or tabs, as the header's; beside
-    the last two, a decimal comma is read.
+    """Reads a CSV log.
 
     Args:
       joint_names: the robot's joints, in the order of the result.
@@ -111,9 +110,7 @@ def _read_columns(path: Path) -> tuple[np.ndarray, dict[str, tuple[str, Sequence
     by its name."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            delimiter = max(",;\t", key=file.readline().count)
-            file.seek(0)
-            reader = csv.reader(file, delimiter=delimiter)
+            reader = csv.reader(file)
             header = next(reader, [])
             numbered = [(reader.line_num, row) for row in reader if any(row)]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
@@ -129,8 +126,6 @@ def _read_columns(path: Path) -> tuple[np.ndarray, dict[str, tuple[str, Sequence
                 f"{path} has {len(row)} cells in row {line}, and its header has {len(header)}; "
                 "give each row a cell for each column"
             )
-        if delimiter != ",":
-            row[:] = [cell.replace(",", ".") for cell in row]
     lines, rows = zip(*numbered, strict=True)
     columns: dict[str, tuple[str, Sequence[str]]] = {}
     for title, cells in zip(header, zip(*rows, strict=True), strict=True):
@@ -161,7 +156,7 @@ def read_bag(path: Path, joint_names: Sequence[str], topics: Topics) -> Log:
     Raises:
       MissingPackage: rosbags is missing.
       UserError: the bag cannot be read, a topic is missing or of another type, no message has a
-        joint, the ball is in two frames, or as `make_log`.
+        joint, or as `make_log`.
     """
     found, num_joints = _read_messages(path, topics), len(joint_names)
     angles, targets = (
@@ -184,14 +179,6 @@ def read_bag(path: Path, joint_names: Sequence[str], topics: Topics) -> Log:
             )
     name = f"pictures of the ball of {topics.ball} in {path}"
     balls = _make_rows(name, found[topics.ball], 3, _read_position)
-    seen = np.flatnonzero(np.isfinite(balls.values).all(axis=1))
-    frames = sorted({found[topics.ball][i][1].header.frame_id for i in seen})
-    if len(frames) > 1:
-        named = ", ".join(shorten(frame) or "none" for frame in frames)
-        raise UserError(
-            f"the messages of {topics.ball} in {path} are in the frames {named}; record the ball "
-            "in one, that of the robot's base"
-        )
     own = np.isfinite(angles.times)
     if np.any(own) and abs(np.median((angles.arrivals - angles.times)[own])) > _TWO_CLOCKS:
         # Such as simulated time: pictures arrived when the angles of the same moment did.

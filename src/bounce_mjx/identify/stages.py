@@ -8,10 +8,11 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.env.env import world_model
+from bounce_mjx.errors import UserError
 from bounce_mjx.identify.fit import Fit, Noise, Problem, certainty, minimise, picture_weights
 from bounce_mjx.identify.log import Log, least_age
 from bounce_mjx.identify.simulation import make_simulator
-from bounce_mjx.identify.unknowns import FRAME_DEVIATION, Layout, make_layout
+from bounce_mjx.identify.unknowns import Layout, make_layout
 from bounce_mjx.identify.windows import GRAVITY, Windows, cut
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.world.config import WorldConfig
@@ -31,7 +32,7 @@ _JITTER = 5e-4
 BEFORE_BOUNCE = 0.012
 """Time before a bounce at which a flight counts as over, s: the camera's jitter, half a contact."""
 _FEWEST_BOUNCES = 3
-# Height of the bounces over the paddle beyond which the search would not find it, m.
+# Distance of the bounces from the paddle's height beyond which the search would not find them, m.
 _BESIDE = 0.03
 
 
@@ -139,7 +140,7 @@ def identify(
       progress: called with a line about each step.
 
     Raises:
-      UserError: the log has fewer than five windows.
+      UserError: the log has fewer than five windows, or the ball bounces beside the paddle.
     """
     times = {name: _straighten(getattr(log, name)) for name in ("times", "target_times")}
     log = log._replace(**times)
@@ -147,6 +148,8 @@ def identify(
     bounces = int(np.sum(windows.has_ball))
     with_ball = bounces >= _FEWEST_BOUNCES
     progress(f"{len(windows.first)} windows, {bounces} with a bounce")
+    if with_ball:
+        _check_frame(windows, config, log.source)
     layout = make_layout(config.num_joints, with_ball, config.physics_dt, camera_rotation)
     simulate = make_simulator(config, layout, log, windows)
     problem = Problem(simulate, windows, layout, sensor_noise(log), progress)
@@ -154,14 +157,12 @@ def identify(
     fit = _search(problem, _guess_arm(problem), ["arm"], 10, 0.0, windows.arm_state)
     stages, states, pictures = ["arm"], windows.arm_state, 1.0
     if with_ball:
-        problem, fit = _align_frame(problem, fit, world_model(config, visual=False))
         fit, pictures = _fit_ball(problem, fit)
         stages, states = ["arm", "flight", "bounce"], None
     progress("all")
     fit = _search(problem, fit, stages, 3, pictures, states)
     unseen = _fit_held_out(problem, fit, pictures, states)
     fit = _search(problem, unseen, stages, 3, pictures, states, np.ones(1))
-    layout = problem.layout
     nominal = {name: TERMS[name].nominal for name in layout.terms() if name in TERMS}
     own = layout.vector({name: value for name, value in nominal.items() if value is not None})
     before = fit._replace(predicted=problem.predict(own, fit.starts))
@@ -211,37 +212,34 @@ def _fit_held_out(
     return _search(problem, fit, [], 3, pictures, states, 1.0 - _training(problem))
 
 
-def _align_frame(problem: Problem, fit: Fit, model: mujoco.MjModel) -> tuple[Problem, Fit]:
-    """The problem and the fit with the ball's frame moved so that the bounces are on the paddle, if
-    they are beside it: no search would find it, as a ball beside the paddle does not bounce."""
-    layout, windows, offsets = problem.layout, problem.windows, []
+def _check_frame(windows: Windows, config: WorldConfig, source: str) -> None:
+    """Refuses a ball that bounces beside the paddle: no search would find where it is, as it would
+    not bounce there.
+
+    Raises:
+      UserError: it does.
+    """
+    model, offsets = world_model(config, visual=False), []
     addresses, data = find_addresses(model), mujoco.MjData(model)
     paddle, radius = addresses.paddle_geom, model.geom_size[addresses.ball_geom, 0]
-    for s in np.flatnonzero(windows.has_ball):
-        bounce, counts = windows.bounces[s], windows.angle_weights[s] > 0.0
-        if np.any(counts):
-            since = np.where(counts, np.abs(windows.angle_times[s] - bounce), np.inf)
-            data.qpos[list(addresses.arm_qpos)] = windows.angles[s, np.argmin(since)]
-            mujoco.mj_kinematics(model, data)
-            above = data.geom_xmat[paddle].reshape(3, 3)[:, 2]
-            above = (model.geom_size[paddle, 2] + radius) * above
-            ball = windows.balls[s, np.argmin(np.abs(windows.picture_times[s] - bounce))]
-            offsets.append(ball - data.geom_xpos[paddle] - above)
+    for s in np.flatnonzero(windows.has_ball & np.any(windows.angle_weights > 0.0, axis=1)):
+        bounce = windows.bounces[s]
+        since = np.abs(windows.angle_times[s] - bounce)
+        near = np.argmin(np.where(windows.angle_weights[s] > 0.0, since, np.inf))
+        data.qpos[list(addresses.arm_qpos)] = windows.angles[s, near]
+        mujoco.mj_kinematics(model, data)
+        normal = data.geom_xmat[paddle].reshape(3, 3)[:, 2]
+        top = data.geom_xpos[paddle] + (model.geom_size[paddle, 2] + radius) * normal
+        ball = windows.balls[s, np.argmin(np.abs(windows.picture_times[s] - bounce))]
+        offsets.append(ball - top)
     offset = np.median(offsets, axis=0) if offsets else np.zeros(3)
-    sideways = np.hypot(*offset[:2]) > np.max(model.geom_size[paddle, :2])
-    offset *= [sideways, sideways, abs(offset[2]) > _BESIDE]
-    if not np.any(offset):
-        return problem, fit
-    problem.progress(f"the bounces are beside the paddle by {offset} m")
-    name, n = "ball_position_bias", layout.num_joints
-    unknown = layout.unknowns[name]
-    deviation = np.where(offset != 0.0, FRAME_DEVIATION, unknown.deviation)
-    wider = unknown._replace(deviation=tuple(deviation.tolist()))
-    layout = layout._replace(unknowns={**layout.unknowns, name: wider})
-    vector, starts = fit.vector.copy(), fit.starts.copy()
-    vector[layout.slices()[name]] = offset
-    starts[windows.has_ball, 2 * n : 2 * n + 3] -= offset
-    return problem._replace(layout=layout), fit._replace(vector=vector, starts=starts)
+    if np.hypot(*offset[:2]) > np.max(model.geom_size[paddle, :2]) or abs(offset[2]) > _BESIDE:
+        x, y, z = offset
+        raise UserError(
+            f"the ball in {source} bounces {x:.3f}, {y:.3f}, {z:.3f} m (x, y, z) beside the "
+            "paddle; give its position in the frame of the robot's base, in metres, z up, and the "
+            "robot with the paddle as it is mounted"
+        )
 
 
 def _fit_ball(problem: Problem, fit: Fit) -> tuple[Fit, np.ndarray]:

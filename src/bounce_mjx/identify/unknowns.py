@@ -11,7 +11,7 @@ class Unknown(NamedTuple):
 
     mean: float
     """Its value before the log is seen, at which the search starts."""
-    deviation: float | tuple[float, ...]
+    deviation: float
     """Standard deviation of that knowledge; the log outweighs it where it shows the term at all."""
     step: float
     """Difference at which derivatives are taken."""
@@ -58,9 +58,6 @@ _TERMS = {"delay": "action_latency", "delay_variance": "servo_lag"}
 CAMERA_ROTATION = "camera_rotation"
 """Rotation of the camera's frame about the axes of the base, rad: no term of the world, and 0
 unless its prior deviation is given."""
-FRAME_DEVIATION = 0.1
-"""Prior deviation of `ball_position_bias` along an axis in which the frame of the ball's position
-is seen to be off, m."""
 
 
 class Layout(NamedTuple):

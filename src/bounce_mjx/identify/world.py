@@ -8,7 +8,7 @@ import yaml
 
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.stages import Identified
-from bounce_mjx.identify.unknowns import ARM, BALL, CAMERA_ROTATION
+from bounce_mjx.identify.unknowns import BALL, CAMERA_ROTATION
 from bounce_mjx.world.named import NamedWorld
 from bounce_mjx.world.randomization import TERMS
 
@@ -148,12 +148,11 @@ def sentences(found: Identified, joint_names: Sequence[str]) -> list[str]:
 def _describe_mistakes(found: Identified, joint_names: Sequence[str]) -> list[str]:
     """Warnings of estimates that are several deviations of the prior away."""
     layout, listed, said = found.layout, estimates(found, joint_names), []
-    for (name, own), place in zip(layout.unknowns.items(), layout.slices().values(), strict=True):
-        unknown = (ARM | BALL).get(name, own)
+    for name, place in layout.slices().items():
+        unknown = layout.unknowns[name]
         off = (found.fit.vector[place] - unknown.mean) / unknown.deviation
         at_limit = np.isin(found.fit.vector[place], [end for end in unknown.limits if end])
-        beside = np.array(own.deviation) > unknown.deviation
-        for i in np.flatnonzero((np.abs(off) > _SURPRISING) | at_limit | beside):
+        for i in np.flatnonzero((np.abs(off) > _SURPRISING) | at_limit):
             entry = listed[place][i]
             said.append(
                 f"warning: {entry.label} is {entry.value:.4g} {entry.unit}".rstrip()

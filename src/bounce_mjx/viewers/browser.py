@@ -18,7 +18,6 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.viewers.controls import Controls, words
 from bounce_mjx.viewers.display import TRAIL_RGB, TRAIL_SECONDS
 from bounce_mjx.viewers.options import PageStart
-from bounce_mjx.viewers.page import replay
 from bounce_mjx.viewers.scene import Scene
 from bounce_mjx.viewers.simulation import (
     EnvFrame,
@@ -26,13 +25,11 @@ from bounce_mjx.viewers.simulation import (
     at_index,
     environment_pose,
     in_real_time,
-    stack,
 )
 
 # Plots per second.
 _PLOT_RATE = 8.0
 _PLOT_SECONDS = 4.0
-_SAVED_SECONDS = 10.0
 AXIS = {"stroke": "#444", "grid": {"stroke": "#e3e6ea"}}
 """Style of the axes of a plot."""
 _LEVEL_COLOURS = ("#2b8a3e", "#9c36b5", "#0b7285")
@@ -61,7 +58,6 @@ class LivePage:
         """
         self._server = server
         self._simulation = simulation
-        self._names = start.names
         gui = server.gui
         gui.configure_theme(
             show_logo=False, show_share_button=False, control_width="medium",
@@ -72,16 +68,14 @@ class LivePage:
         gui.main_panel.set_width(280)
         gui.add_html(_window_title(f"bounce_mjx: {start.title}"))
         self._controls = Controls(gui, simulation, start)
-        # viser calls it in a thread, as writing a page takes seconds.
-        self._controls.save.on_click(self._save)
         self._scene = Scene(server, simulation.env, start.num_shown, start.names)
         self._history: collections.deque[EnvFrame] = collections.deque(
-            maxlen=round(_SAVED_SECONDS / simulation.env.dt)
+            maxlen=round(_PLOT_SECONDS / simulation.env.dt)
         )
         side = side or gui.add_panel()
         side.dock_left()
         side.set_width(300)
-        self._add_plots(side)
+        self._add_plots(side, "robot 1" if start.names is None else start.names[0])
 
     def run(self, seconds: float | None, between: Callable[[], None] = lambda: None) -> None:
         """Steps the simulation and sends pictures and plots.
@@ -103,26 +97,10 @@ class LivePage:
                 self._update_plots()
                 controls.show_values()
                 next_plot = time.monotonic() + 1.0 / _PLOT_RATE
-            if controls.following.value:
-                scene.follow(simulation.frame)
         self._server.flush()
 
-    def _save(self, event: viser.GuiEvent) -> None:
-        """Sends a page that replays the last seconds; the button waits for it."""
-        frames = list(self._history)
-        if not frames:
-            return
-        event.target.disabled = True
-        try:
-            recording = jax.tree.map(lambda x: x[:, : self._scene.num_envs], stack(frames))
-            text = replay(self._simulation.env, recording, names=self._names)
-            event.client.send_file_download("replay.html", text.encode(), save_immediately=True)
-        finally:
-            event.target.disabled = False
-
-    def _add_plots(self, side: viser.PanelHandle) -> None:
+    def _add_plots(self, side: viser.PanelHandle, title: str) -> None:
         gui, frame = self._server.gui, self._simulation.frame
-        first = "robot 1" if self._names is None else self._names[0]
         levels = [
             {"label": name, "stroke": colour, "width": 2, "dash": [6, 4]}
             for name, colour in zip(self._levels(frame), itertools.cycle(_LEVEL_COLOURS))
@@ -135,7 +113,7 @@ class LivePage:
             *levels,
             {"label": "paddle", "stroke": "#1c7ed6", "width": 2},
         ]
-        with side.add_tab(first, viser.Icon.CHART_LINE):
+        with side.add_tab(title, viser.Icon.CHART_LINE):
             gui.add_markdown("height, m, over the last seconds")
             self._heights = gui.add_uplot(
                 (np.zeros(1),) * len(lines),
@@ -155,7 +133,7 @@ class LivePage:
 
     def _update_plots(self) -> None:
         env = self._simulation.env
-        frames = list(self._history)[-round(_PLOT_SECONDS / env.dt) :]
+        frames = list(self._history)
         heights = [(*f.balls[0, :, 2], *self._levels(f).values(), f.paddle[0, 2]) for f in frames]
         times = np.arange(1 - len(heights), 1) * env.dt
         self._heights.data = (times, *np.array(heights).T)

@@ -45,7 +45,7 @@ class _Setting:
         if isinstance(self._handle, viser.GuiDropdownHandle):
             names = self._handle.options
             return float(names.index(self._handle.value)) if self._handle.value in names else 0.0
-        return _bounded(self._handle)
+        return _clip(self._handle)
 
     def show(self, value: float) -> None:
         """Shows a sampled value that holds, in the slider's steps."""
@@ -90,10 +90,8 @@ class Controls:
         self._num_shown = gui.add_slider(
             "robots", 1, max(2, most), 1, start.num_shown, disabled=most == 1
         )
-        self.following = gui.add_checkbox("camera follows the ball", False)
         reset = gui.add_button("reset the robots", icon=viser.Icon.REFRESH)
         reset.on_click(self._reset)
-        self.save = gui.add_button("save a replay of the last 10 s", icon=viser.Icon.DOWNLOAD)
         self._commands = {
             name: self._add_command(gui, name, command)
             for name, command in simulation.env.config.commands.items()
@@ -156,11 +154,11 @@ class Controls:
     @property
     def num_shown(self) -> int:
         """Number of robots in the scene."""
-        return min(_bounded(self._num_shown), self._simulation.num_envs)
+        return min(_clip(self._num_shown), self._simulation.num_envs)
 
     def pace(self) -> float:
         """The present speed, as a factor of real time; 0 is a pause."""
-        return 0.0 if self._paused.value else _bounded(self._speed)
+        return 0.0 if self._paused.value else _clip(self._speed)
 
     def _keys(self) -> list[tuple[str, str, Callable[[viser.CommandEvent], None]]]:
         """What each key does, the key, and the function of its event."""
@@ -197,7 +195,7 @@ class Controls:
         if towards in _DIRECTIONS:
             camera = event.client.camera
             view = camera.look_at - camera.position
-            velocity = _bounded(self._push_speed) * direction(towards, view)
+            velocity = _clip(self._push_speed) * direction(towards, view)
             self._requests.put(lambda: self._simulation.push(velocity))
 
     def _make_nominal(self, _: object) -> None:
@@ -219,7 +217,7 @@ class Controls:
             self._requests.get()()
 
 
-def _bounded(slider: viser.GuiSliderHandle) -> float:
+def _clip(slider: viser.GuiSliderHandle) -> float:
     """The slider's value. A page may send any number, which viser does not check."""
     return max(slider.min, min(slider.value, slider.max))
 

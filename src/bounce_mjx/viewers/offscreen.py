@@ -22,7 +22,6 @@ from bounce_mjx.viewers.display import (
 )
 
 _TRAIL_RADIUS = 0.004
-_BACKENDS = ("egl", "osmesa")
 # Runs in a separate process: a library that fails to load would remain partly loaded in this one.
 _PROBE = """
 import mujoco
@@ -42,12 +41,7 @@ def choose_backend() -> str:
     wanted = os.environ.get("MUJOCO_GL", "").lower()
     if sys.platform != "linux":
         return wanted or ("cgl" if sys.platform == "darwin" else "glfw")
-    for backend in (wanted,) if wanted else _BACKENDS:
-        if backend not in (*_BACKENDS, "glfw"):
-            raise UserError(
-                f"the environment variable MUJOCO_GL is {wanted!r}, but rendering needs "
-                "egl, osmesa or glfw; set it to one of these or unset it"
-            )
+    for backend in (wanted,) if wanted else ("egl", "osmesa"):
         if works(backend):
             return backend
     tried = f"MUJOCO_GL={wanted} does not work" if wanted else "neither EGL nor OSMesa works"

@@ -39,23 +39,23 @@ def register() -> None:
     load, randomizer = manipulation.load, manipulation.get_domain_randomizer
     ppo_parameters = manipulation_params.brax_ppo_config
 
-    def load_any(env_name: str, config: Any = None, config_overrides: Any = None) -> Any:
+    def load_environment(env_name: str, config: Any = None, config_overrides: Any = None) -> Any:
         if env_name in ENVIRONMENTS:
             return PlaygroundBounceBall(config, config_overrides, ENVIRONMENTS[env_name])
         return load(env_name, config, config_overrides)
 
-    def randomizer_of_any(env_name: str) -> Any:
+    def get_randomizer(env_name: str) -> Any:
         if env_name in ENVIRONMENTS:
             return functools.partial(domain_randomize, task=ENVIRONMENTS[env_name])
         return randomizer(env_name)
 
-    def parameters_of_any(env_name: str, impl: str | None = None) -> config_dict.ConfigDict:
+    def get_parameters(env_name: str, impl: str | None = None) -> config_dict.ConfigDict:
         if env_name in ENVIRONMENTS:
             return brax_ppo_config(ENVIRONMENTS[env_name])
         return ppo_parameters(env_name, impl)
 
-    manipulation.load, manipulation.get_domain_randomizer = load_any, randomizer_of_any
-    manipulation_params.brax_ppo_config = parameters_of_any
+    manipulation.load, manipulation.get_domain_randomizer = load_environment, get_randomizer
+    manipulation_params.brax_ppo_config = get_parameters
 
 
 def domain_randomize(model: Any, rng: Any, task: str = DEFAULT) -> tuple[Any, Any]:
