@@ -33,7 +33,7 @@ from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import judge
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.learning.ppo import CHECKED, first_fault
-from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import (
     best_checkpoint,
     find_checkpoint,
@@ -49,7 +49,6 @@ from bounce_mjx.training import ppo_trainer
 from bounce_mjx.training.devices import make_mesh
 from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.ppo_trainer import PPOTrainer
-from bounce_mjx.training.warm_start import present_start
 from tiny_runs import STEPS, TIMEOUT, TINY, arrays, job, shared_run
 
 
@@ -311,15 +310,6 @@ def test_a_reader_reads_the_next_checkpoint_where_a_training_replaces_one(run: P
     for checkpoint, marked in read:
         if checkpoint.steps >= STEPS:
             assert all((leaf == checkpoint.steps).all() for leaf in jax.tree.leaves(marked))
-
-
-def test_a_warm_start_takes_the_next_checkpoint_where_a_training_replaces_one(run: Path) -> None:
-    latest = latest_checkpoint(run).folder
-    start = TrainConfig(warm_start=latest.with_name("64"))
-    assert present_start(start).warm_start == latest
-    for kept in (latest, run, Path("robust"), None):
-        config = start.model_copy(update={"warm_start": kept})
-        assert present_start(config) == config
 
 
 # Paths

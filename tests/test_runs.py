@@ -116,8 +116,6 @@ def test_the_newest_run_is_introduced(runs: Path, name: Path | None, capsys) -> 
     assert choose_checkpoint(name, runs, Console()).run == runs / "2026-01-02"
     assert capsys.readouterr().out.splitlines() == [
         f"using the newest run: {runs}/2026-01-02 (0 of 4 judged results met)",
-        f"an older run met all its results: {runs}/2026-01-01",
-        f"a newer run has no checkpoint yet: {runs}/2026-01-03",
     ]
 
 
@@ -325,7 +323,7 @@ def test_files_of_the_user_lie_on_each_other(presets: Path) -> None:
 def test_a_run_that_cannot_be_written_leaves_no_folder(tmp_path: Path, monkeypatch) -> None:
     full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     monkeypatch.setattr(folders, "write_atomically", unittest.mock.Mock(side_effect=full))
-    with pytest.raises(UserError, match="cannot be made in .*No space left on device"):
+    with pytest.raises(UserError, match="cannot be written .No space left on device"):
         create_run(TrainConfig(log_dir=tmp_path))
     assert not list(tmp_path.iterdir())
 
@@ -386,7 +384,6 @@ BAD_RESULTS = {
     "list": "[]",
     "results of another shape": {"results": [3]},
     "infinite value": {"seconds": {"train": math.inf}},
-    "an evaluation without its results": {"evaluations": [{"steps": 1, "passed": True}]},
 }
 
 

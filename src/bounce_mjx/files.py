@@ -1,5 +1,4 @@
-"""Files and folders that other people may have changed: reading has a limit, and nothing is written
-through a link."""
+"""Files and folders that other people may have changed: nothing is written through a link."""
 
 import contextlib
 import errno
@@ -12,26 +11,6 @@ from bounce_mjx.errors import UserError
 
 UNFINISHED = ".unfinished-"
 """Start of the name of a file that is being written."""
-
-
-def read_regular(path: Path, limit: int) -> bytes:
-    """Reads a regular file, or one that a link leads to.
-
-    Args:
-      limit: most bytes that it may have.
-
-    Raises:
-      OSError: the file cannot be read.
-      ValueError: it is a pipe, a device or a folder, or it is longer.
-    """
-    # Opening a pipe would wait for a writer, and a device may have no end.
-    if not stat.S_ISREG(path.stat().st_mode):
-        raise ValueError("it is not a regular file")
-    with path.open("rb") as file:
-        content = file.read(limit + 1)
-    if len(content) > limit:
-        raise ValueError(f"it is longer than {limit} bytes")
-    return content
 
 
 def check_name(path: Path) -> None:

@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +20,6 @@ from bounce_mjx.task.shown import Curve
 _FREE_KEYS = frozenset(("seed", "log_dir", "total_steps", "stop_when_solved", "num_devices"))
 # Maximum number of settings in a label.
 _MAX_NAMED = 3
-_MAX_LOG_BYTES = 2**28
 
 
 class LoggedCurve(NamedTuple):
@@ -63,13 +61,6 @@ def read_curves(run: Path) -> RunCurves:
     # At the top of the module, this import would delay the start of training.
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    files = list(run.glob("*tfevents*"))
-    # TensorBoard would wait for a pipe's writer.
-    if not all(map(os.path.isfile, files)) or sum(map(os.path.getsize, files)) > _MAX_LOG_BYTES:
-        raise UserError(
-            f"the TensorBoard log in {run} is longer than {_MAX_LOG_BYTES // 2**20} MB or not a "
-            "regular file; remove it, or give another run's folder"
-        )
     # 0 keeps every point; by default, at most 10,000 points are kept.
     log = EventAccumulator(str(run), size_guidance={"scalars": 0})
     try:

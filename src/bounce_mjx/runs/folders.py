@@ -23,14 +23,13 @@ Functions that search raise a `UserError` if they find nothing.
 import contextlib
 import datetime
 import itertools
+import json
 import os
 import re
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-import pydantic
 from rich.console import Console
 
 import bounce_mjx
@@ -40,7 +39,7 @@ from bounce_mjx.files import check_name
 from bounce_mjx.resources import POLICIES, PRETRAINED, TASK_POLICIES, resource_path
 from bounce_mjx.runs import old
 from bounce_mjx.runs.config import BASE, CONFIG_FILE, TrainConfig, runs_folder
-from bounce_mjx.runs.files import read_json, write_atomically
+from bounce_mjx.runs.files import writable, write_atomically
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.robot import ROBOT, copy_robot
 from bounce_mjx.runs.task import copy_code
@@ -52,13 +51,6 @@ LATEST = "latest"
 """Name of the newest run on the command line."""
 CHECKPOINTS = "checkpoints"
 _STAMP = "%Y-%m-%d_%H-%M-%S"
-
-
-class Metrics(pydantic.BaseModel):
-    """What orbax keeps of an evaluation."""
-
-    score: list[float]
-    """See `evaluation.results.Report.score`; empty for a policy that was not evaluated."""
 
 
 class Checkpoint(NamedTuple):
@@ -97,25 +89,19 @@ def create_run(config: TrainConfig) -> Path:
     refuse_brackets(config.log_dir)
     # Not the local time, which is another one on another machine, and in autumn goes back.
     stamp = datetime.datetime.now(datetime.UTC).strftime(_STAMP)
-    try:
+    with writable(config.log_dir, "choose another folder with --log-dir"):
         config.log_dir.mkdir(parents=True, exist_ok=True)
         for copy in itertools.count(1):
             folder = config.log_dir / (stamp if copy == 1 else f"{stamp}_{copy}")
-            try:
+            with contextlib.suppress(FileExistsError):
                 folder.mkdir()
-            except FileExistsError:
-                continue
-            try:
-                save_config(folder, config)
-            except (UserError, OSError):
-                shutil.rmtree(folder, ignore_errors=True)
-                raise
-            return folder
-    except OSError as error:
-        raise UserError(
-            f"the run's folder cannot be made in {config.log_dir} ({error.strerror}); choose a "
-            "folder that can be written with --log-dir"
-        ) from error
+                break
+        try:
+            save_config(folder, config)
+        except (UserError, OSError):
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+    return folder
 
 
 def save_config(run: Path, config: TrainConfig) -> None:
@@ -150,21 +136,6 @@ def runs_of_seeds(run: Path) -> list[Path]:
     """Existing folders of a run's seeds; the run itself if it has one seed."""
     seeds = (path for path in run.glob("seed_*") if re.fullmatch("seed_[0-9]+", path.name))
     return sorted(path for path in seeds if not path.is_symlink()) or [run]
-
-
-def check_links(run: Path) -> None:
-    """Checks that a run's folder holds no links, through which training would write elsewhere;
-    those of Weights & Biases do not count, as it makes them anew.
-
-    Raises:
-      UserError: there is one, as there may be in a run from someone else.
-    """
-    for path in run.rglob("*"):
-        if path.is_symlink() and "wandb" not in path.relative_to(run).parts[:-1]:
-            raise UserError(
-                f"{path} is a link, and training writes only into the folder of its run; remove "
-                "it, or replace it with its target"
-            )
 
 
 def find_run(path: Path) -> Path:
@@ -263,26 +234,10 @@ def choose_checkpoint(path: Path | None, log_dir: Path, console: Console) -> Che
             f"runs/bounce_ball/<time stamp>, or {', '.join(POLICIES)}"
         )
     if run != path:
-        for line in _introduction(run, log_dir):
-            console.out(line, highlight=False)
+        results = load_results(_best_seed(run))
+        known = results.best.summary if results else "not evaluated"
+        console.out(f"using the newest run: {run} ({known})", highlight=False)
     return find_checkpoint(run)
-
-
-def _introduction(run: Path, log_dir: Path) -> Iterator[str]:
-    """Lines that say which run is used, how good it is, and which run may be meant instead."""
-    results = load_results(_best_seed(run))
-    yield f"using the newest run: {run} ({results.best.summary if results else 'not evaluated'})"
-    if results is None or not results.best.passed:
-        for other in sorted(_runs(log_dir), key=_started, reverse=True):
-            # A damaged file of another run is no reason to stop.
-            with contextlib.suppress(UserError):
-                found = load_results(_best_seed(other)) if stored_checkpoints(other) else None
-                if found is not None and found.best.passed:
-                    yield f"an older run met all its results: {other}"
-                    break
-    newest = max(_runs(log_dir), key=_started)
-    if newest != run:
-        yield f"a newer run has no checkpoint yet: {newest}"
 
 
 def stored_checkpoints(run: Path) -> list[Checkpoint]:
@@ -317,18 +272,9 @@ def _score(folder: Path) -> tuple[float, ...]:
     """Quality of a checkpoint, greater than () if it was evaluated."""
     if folder.parent.name == "best":
         return (0.0,)
-    with contextlib.suppress(OSError, ValueError):
-        return tuple(read_json(folder / "metrics/metrics", Metrics).score)
+    with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
+        return tuple(json.loads((folder / "metrics/metrics").read_bytes())["score"])
     return ()
-
-
-def replacement(folder: Path) -> Checkpoint | None:
-    """The best checkpoint of the run, if a training has removed this one meanwhile."""
-    if folder.exists() or folder.parent.name != CHECKPOINTS:
-        return None
-    with contextlib.suppress(UserError):
-        return best_checkpoint(folder.parent.parent)
-    return None
 
 
 def _best_seed(run: Path) -> Path:

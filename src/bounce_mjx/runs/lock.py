@@ -21,15 +21,12 @@ def lock_run(run: Path) -> Iterator[None]:
     On a file system without locks on folders, such as NFS, and on Windows, every process gets it.
 
     Raises:
-      UserError: another process holds the lock, or the folder cannot be opened.
+      UserError: another process holds the lock.
     """
     if fcntl is None:
         yield
         return
-    try:
-        descriptor = os.open(run, os.O_RDONLY)
-    except OSError as error:
-        raise UserError(f"{run} cannot be opened ({error.strerror}); make it readable") from error
+    descriptor = os.open(run, os.O_RDONLY)
     try:
         # Any other OSError means that the file system has no locks.
         with contextlib.suppress(OSError):

@@ -6,9 +6,8 @@ from typing import Annotated, Any
 import pydantic
 from pydantic import Field
 
-from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Figure, Report
-from bounce_mjx.runs.files import first_mistake, read_stored
+from bounce_mjx.runs.files import read_stored
 
 RESULTS_FILE = "results.json"
 
@@ -69,13 +68,6 @@ class Results(_Evaluations):
     def _nest(cls, plain: Any) -> Any:
         return plain | {"best": plain} if isinstance(plain, dict) else plain
 
-    @pydantic.model_validator(mode="after")
-    def _check_names(self) -> "Results":
-        names = {result.name for result in self.best.results}
-        if any(names - evaluation.model_extra.keys() for evaluation in self.evaluations):
-            raise ValueError("an evaluation lacks a result")
-        return self
-
 
 def load_results(run: Path) -> Results | None:
     """Results of a run; None if there are none yet.
@@ -92,21 +84,6 @@ class Progress(_Evaluations):
     best: Report | None = None
     fault: str | None = None
     """First quantity that was not finite, and its step; None unless the training diverged."""
-
-    @classmethod
-    def from_dict(cls, plain: dict[str, Any], checkpoint: Path) -> "Progress":
-        """Reads the `model_dump` stored in a checkpoint.
-
-        Raises:
-          UserError: the data is damaged.
-        """
-        try:
-            return cls.model_validate(plain)
-        except pydantic.ValidationError as error:
-            raise UserError(
-                f"the evaluations in the checkpoint {checkpoint} are damaged "
-                f"({first_mistake(error)}); give another checkpoint"
-            ) from error
 
     def results(self, report: Report, **run: Any) -> dict[str, Any]:
         """Content of results.json: an evaluation, and the other fields of `Results`."""

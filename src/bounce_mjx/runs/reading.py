@@ -7,8 +7,7 @@ from the run's.
 
 import sys
 from collections.abc import Callable
-from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import numpy as np
@@ -30,10 +29,8 @@ from bounce_mjx.learning.statistics import RunningStatistics, init_statistics
 from bounce_mjx.runs import old
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
 from bounce_mjx.runs.files import MANIFEST_FILE, check_integrity, first_mistake, read_json
-from bounce_mjx.runs.folders import MIRROR_LAW, Checkpoint, replacement
+from bounce_mjx.runs.folders import MIRROR_LAW, Checkpoint, best_checkpoint
 from bounce_mjx.tasks.registry import is_file
-
-Result = TypeVar("Result")
 
 POLICY, TRAINING, NETWORKS, RECORD = "policy", "training", "networks", "record"
 """Items of a checkpoint: what acts; what a training continues from; both networks, with which
@@ -71,30 +68,20 @@ def read_policy(checkpoint: Checkpoint, config: TrainConfig) -> Policy:
     return jax.tree.map(jax.numpy.asarray, policy)
 
 
-def read_newest(
-    checkpoint: Checkpoint, read: Callable[[Checkpoint], Result]
-) -> tuple[Checkpoint, Result]:
-    """Reads a checkpoint, or the next one if a training replaces it meanwhile; also returns which
-    one."""
-    while True:
-        try:
-            return checkpoint, read(checkpoint)
-        except UserError:
-            newer = replacement(checkpoint.folder)
-            if newer is None:
-                raise
-            checkpoint = newer
-
-
 def read_actor(
     checkpoint: Checkpoint, config: TrainConfig
 ) -> tuple[Checkpoint, Policy | None, Callable[[Env], Actor]]:
     """The policy of a checkpoint and what acts with it, or the mirror law, which has no policy; and
-    the checkpoint that was read (`read_newest`)."""
+    the checkpoint that was read: the next one, if a training replaces it meanwhile."""
     if checkpoint is MIRROR_LAW:
         return checkpoint, None, MirrorLaw
-    checkpoint, policy = read_newest(checkpoint, partial(read_policy, config=config))
-    return checkpoint, policy, networks_of(config.ppo)
+    while True:
+        try:
+            return checkpoint, read_policy(checkpoint, config), networks_of(config.ppo)
+        except UserError:
+            if checkpoint.folder.exists():
+                raise
+            checkpoint = best_checkpoint(checkpoint.run)
 
 
 def policy_shapes(config: TrainConfig) -> Policy:

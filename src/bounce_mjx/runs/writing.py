@@ -16,11 +16,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from bounce_mjx.errors import UserError
 from bounce_mjx.learning.policy import Policy
-from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig
+from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.files import seal, to_json, to_plain, writable, write_atomically
-from bounce_mjx.runs.folders import CHECKPOINTS, create_run, save_config
+from bounce_mjx.runs.folders import CHECKPOINTS, create_run
 from bounce_mjx.runs.progress import RESULTS_FILE
 from bounce_mjx.runs.reading import POLICY, RECORD
 
@@ -87,12 +86,6 @@ class CheckpointWriter:
         text = None if results is None else to_json(results)
 
         def write() -> None:
-            # The user may have moved or removed the folder.
-            if not (self._run / CONFIG_FILE).exists():
-                self._run.mkdir(parents=True, exist_ok=True)
-                # The only copy of the robot may have been in the folder.
-                with contextlib.suppress(UserError):
-                    save_config(self._run, self._config)
             save()
             if text is not None:
                 write_atomically(self._run / RESULTS_FILE, text)

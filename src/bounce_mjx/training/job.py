@@ -53,7 +53,7 @@ from bounce_mjx.training.trainer import (
     in_whole_blocks,
     iterations_per_block,
 )
-from bounce_mjx.training.warm_start import present_start, read_start
+from bounce_mjx.training.warm_start import read_start
 
 # Imported by name during the compilation, because these imports take half a second each.
 CHECKPOINT_MODULE, REPORT_MODULE = "orbax.checkpoint", "bounce_mjx.reports.page"
@@ -112,9 +112,6 @@ def train(
       TrainingStopped: SIGINT, SIGTERM or SIGHUP came; the state is saved.
       Interrupted: the signal came before the first block, and there is no run.
     """
-    if resume is None and (present := present_start(config)) != config:
-        was, config = config.warm_start, present
-        say(console, f"{was} was replaced meanwhile: starting from {config.warm_start}")
     hosts.agree(config, resume)
     with contextlib.ExitStack() as stack:
         job = Job(in_whole_blocks(config), console, resume, callbacks, stack)
@@ -267,7 +264,6 @@ class Job:
                     folders.save_config(folder, config)
 
     def _read_resumed(self) -> None:
-        folders.check_links(self.run)
         folders.refuse_brackets(self.run)
         if hosts.is_leader():
             # What a process that was killed was writing.
@@ -279,7 +275,7 @@ class Job:
         for member, plain in zip(
             self.members, record.progress.get("seeds", [record.progress]), strict=True
         ):
-            member.progress = _resumed_progress(member.run, plain, latest)
+            member.progress = _resumed_progress(member.run, plain)
             member.saved = (member.progress.best, member.progress.best_steps, None)
         self._say_how_far()
 
@@ -613,15 +609,15 @@ class Job:
         )
 
 
-def _resumed_progress(run: Path, plain: dict[str, Any], latest: folders.Checkpoint) -> Progress:
+def _resumed_progress(run: Path, plain: dict[str, Any]) -> Progress:
     """The evaluations of a seed before it is resumed. The best checkpoint's own record says which
     one is the best: with several seeds, the process may have been killed between its save and that
     of the latest one."""
-    progress = Progress.from_dict(plain, latest.folder)
+    progress = Progress.model_validate(plain)
     progress.best, progress.best_steps = None, 0
     with contextlib.suppress(UserError):
         best = folders.best_checkpoint(run)
-        stored = Progress.from_dict(read_record(best).progress, best.folder)
+        stored = Progress.model_validate(read_record(best).progress)
         progress.best, progress.best_steps = stored.best, stored.best_steps
     return progress
 

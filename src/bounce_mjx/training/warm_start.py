@@ -1,7 +1,6 @@
 """A training that starts with the networks of an earlier one."""
 
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 import jax
@@ -20,8 +19,8 @@ from bounce_mjx.runs.config import (
     read_preset,
     runs_folder,
 )
-from bounce_mjx.runs.folders import Checkpoint, choose_checkpoint, replacement
-from bounce_mjx.runs.reading import policy_shapes, read_networks, read_newest
+from bounce_mjx.runs.folders import Checkpoint, choose_checkpoint
+from bounce_mjx.runs.reading import policy_shapes, read_networks
 from bounce_mjx.task.task import Task
 from bounce_mjx.tasks.registry import DEFAULT, find_task
 
@@ -58,13 +57,6 @@ def warm_config(
     return config if world is None else in_world(config, world)[0]
 
 
-def present_start(config: TrainConfig) -> TrainConfig:
-    """The config with the checkpoint that another training has put in the place of `warm_start`
-    since the command line was read."""
-    newer = config.warm_start and replacement(config.warm_start)
-    return config.model_copy(update={"warm_start": newer.folder}) if newer else config
-
-
 def read_start(config: TrainConfig, env: Env) -> tuple[Params, RunningStatistics]:
     """The networks with which a training starts, and the statistics of their inputs.
 
@@ -84,7 +76,7 @@ def read_start(config: TrainConfig, env: Env) -> tuple[Params, RunningStatistics
             f"the policy {config.warm_start} has another observation, other actions or other "
             "hidden layers than this training; leave out the flags that change them"
         )
-    _, (params, statistics, names) = read_newest(checkpoint, partial(read_networks, config=own))
+    params, statistics, names = read_networks(checkpoint, own)
     wanted = names_of_critic_metrics(config.ppo, env)
 
     def moved(array: jax.Array, default: float) -> np.ndarray:
