@@ -14,7 +14,6 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.errors import UserError, install_command, needed, reason_of, shorten
-from bounce_mjx.files import check_name
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.config import PaddleConfig, RobotConfig
 
@@ -46,16 +45,6 @@ class ServoSettings(NamedTuple):
     """N m, or N; None for no limit."""
 
 
-class Own(NamedTuple):
-    """The user's file compiled alone."""
-
-    model: mujoco.MjModel
-    joints: list[int]
-    """The acting joints in it."""
-    bodies: list[int]
-    """The bodies in it that the scene has too."""
-
-
 class Arm(NamedTuple):
     """An arm in the task's scene."""
 
@@ -68,7 +57,6 @@ class Arm(NamedTuple):
     """Largest force of the MJCF's actuator of each acting joint, N m or N; None for no limit."""
     changes: tuple[str, ...]
     """Changes to the user's model, one sentence each."""
-    own: Own
 
 
 def locate(mjcf: Path) -> Path:
@@ -90,7 +78,6 @@ def locate(mjcf: Path) -> Path:
     if not path.is_file():
         wrong = "is not a file" if path.exists() else "does not exist"
         raise UserError(f"the MJCF file {path} {wrong}; give the path of an MJCF file")
-    check_name(path)
     return path
 
 
@@ -206,26 +193,22 @@ class _Builder:
         chain = _chain(model, end)
         joints = self._acting_joints(chain)
         actuators = self._actuators(joints)
-        servos = tuple(_servo(model, actuators[j]) for j in joints)
-        limits = tuple(_force_limit(model, actuators[j], j) for j in joints)
+        servos = tuple(_servo(model, j, actuators[j]) for j in joints)
+        limits = tuple(_force_limit(model, j, actuators[j]) for j in joints)
         names = tuple(joint_name(model, j) for j in joints)
         holder = self._arm.bodies[end]
         holder.name = holder.name or "end_effector"
-        gripper = self._gripper(chain, joints, actuators)
-        objects = self._objects(chain)
-        self._check_loops(joints, end, gripper, objects)
+        loose = self._loose_bodies(chain, joints, actuators)
         self._freeze(joints, actuators)
-        self._strip(joints, gripper, objects, actuators)
+        self._strip(joints, loose)
         self._disable_contacts_and_limits(joints)
         scene = self._attach(holder.name, position, quaternion)
         self._replace_servos(scene, names)
-        kept = [b for b in range(1, model.nbody) if not is_below(model, b, gripper + objects)]
-        own = Own(model, joints, kept)
-        return Arm(scene, names, servos, limits, tuple(self._changes), own)
+        return Arm(scene, names, servos, limits, tuple(self._changes))
 
     def _acting_joints(self, chain: list[int]) -> list[int]:
         model, given = self._model, self._config.joints
-        on_chain = [j for body in chain for j in _joints_of(model, body)]
+        on_chain = [j for j in range(model.njnt) if model.jnt_bodyid[j] in chain]
         balls = [j for j in on_chain if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_BALL]
         if balls:
             raise UserError(
@@ -244,7 +227,7 @@ class _Builder:
                 )
         acting = [j for name, j in names.items() if given is None or name in given]
         if len(acting) < MIN_JOINTS:
-            have = _list(joint_name(model, j) for j in acting) if acting else "none"
+            have = _list(joint_name(model, j) for j in acting)
             remedy = _other_sites(model) if given is None else "name more with --joints"
             raise UserError(
                 f"too few joints to hold the paddle level and lift it: {len(acting)} ({have}) on "
@@ -252,16 +235,20 @@ class _Builder:
             )
         return acting
 
-    def _actuators(self, joints: list[int]) -> dict[int, list[int]]:
-        """Actuators of each joint that has some, and so of each acting joint."""
+    def _actuators(self, joints: list[int]) -> dict[int, int]:
+        """The actuator of each joint that has one, and so of each acting joint."""
         model, actuators = self._model, {}
         if model.nactuator == 0:
             raise UserError(
                 "no actuators; add a <position> or <motor> with a force limit for each joint"
             )
         for a in range(model.nactuator):
-            if int(model.actuator_trntype[a]) in _JOINT_TRANSMISSIONS:
-                actuators.setdefault(int(model.actuator_trnid[a, 0]), []).append(a)
+            joint = int(model.actuator_trnid[a, 0])
+            if int(model.actuator_trntype[a]) not in _JOINT_TRANSMISSIONS:
+                continue
+            if joint in joints and joint in actuators:
+                raise UserError(f"several actuators on {joint_name(model, joint)}; give it one")
+            actuators[joint] = a
         idle = [joint_name(model, joint) for joint in joints if joint not in actuators]
         if idle:
             raise UserError(
@@ -269,26 +256,30 @@ class _Builder:
             )
         return actuators
 
-    def _gripper(
-        self, chain: list[int], joints: list[int], actuators: dict[int, list[int]]
+    def _loose_bodies(
+        self, chain: list[int], joints: list[int], actuators: dict[int, int]
     ) -> list[int]:
-        """Bodies on the links beyond the last acting joint that joints move.
+        """The bodies to remove, each with all below it: a gripper's, which move on the links beyond
+        the last acting joint, and objects that move in the world.
 
         Raises:
           UserError: the model has driven joints in addition to the arm.
         """
         model = self._model
-        beyond = chain[chain.index(model.jnt_bodyid[joints[-1]]) :]
-        branches = [
-            body
-            for body in range(1, model.nbody)
-            if body not in chain and model.body_parentid[body] in beyond
+        holders = [0, *chain[chain.index(model.jnt_bodyid[joints[-1]]) :]]
+        moving = {*model.jnt_bodyid.tolist(), *np.flatnonzero(model.body_mocapid >= 0).tolist()}
+        loose = [
+            b
+            for b in range(1, model.nbody)
+            if b not in chain
+            and model.body_parentid[b] in holders
+            and any(is_below(model, body, [b]) for body in moving)
         ]
-        bodies = model.jnt_bodyid.tolist()
+        gripper, owners = [b for b in loose if model.body_parentid[b]], model.jnt_bodyid.tolist()
         beside = [
             joint_name(model, j)
             for j in sorted(actuators)
-            if bodies[j] not in chain and not is_below(model, bodies[j], branches)
+            if owners[j] not in chain and not is_below(model, owners[j], gripper)
         ]
         if beside:
             raise UserError(
@@ -296,37 +287,9 @@ class _Builder:
                 f"{_list(joint_name(model, j) for j in joints)}; give an MJCF with nothing but "
                 "one arm on a fixed base"
             )
-        return [b for b in branches if any(is_below(model, body, [b]) for body in bodies)]
+        return loose
 
-    def _objects(self, chain: list[int]) -> list[int]:
-        """Bodies with a free joint or moved from outside (mocap), but for the arm's base; they are
-        children of the world."""
-        model = self._model
-        is_free = model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
-        moved = {*model.jnt_bodyid[is_free].tolist(), *np.flatnonzero(model.body_mocapid >= 0)}
-        return sorted(int(body) for body in moved if body != chain[0])
-
-    def _check_loops(
-        self, joints: list[int], end: int, gripper: list[int], objects: list[int]
-    ) -> None:
-        """Refuses constraints and tendons that act on the arm, which then is no serial chain."""
-        model = self._model
-        first = int(model.jnt_bodyid[joints[0]])
-        markers = [body for body in objects if model.body_mocapid[body] >= 0]
-        for words, driven, bodies in _couplings(model):
-            # A gripper belongs to the last link. A marker that leads the arm is removed.
-            bodies = [end if is_below(model, body, gripper) else body for body in bodies]
-            moves, is_led = (
-                any(is_below(model, body, above) for body in bodies) for above in ([first], markers)
-            )
-            links = {int(model.body_weldid[body]) for body in bodies}
-            if {*driven} & {*joints} or (moves and len(links) > 1 and not is_led):
-                raise UserError(
-                    f"{words} on the arm, so it is not a serial chain; remove it, or give a serial "
-                    "arm"
-                )
-
-    def _freeze(self, joints: list[int], actuators: dict[int, list[int]]) -> None:
+    def _freeze(self, joints: list[int], actuators: dict[int, int]) -> None:
         """Gives the spec the numbers of the compiled model.
 
         MuJoCo's compiler computes them from the whole file, with its units and settings. Compiled
@@ -350,14 +313,9 @@ class _Builder:
         arm.compiler.boundmass = arm.compiler.boundinertia = 0.0
         narrowed: list[str] = []
         for i in joints:
-            joint, dof = parts[i], model.jnt_dofadr[i]
-            if np.any(joint.range) and not model.jnt_limited[i]:
-                self._changes.append(
-                    f"ignored the range of {joint_name(model, i)}, which is not limited"
-                )
-            joint.limited = mujoco.mjtLimited.mjLIMITED_FALSE
+            a, joint, dof = actuators[i], parts[i], model.jnt_dofadr[i]
             own = model.jnt_range[i] if model.jnt_limited[i] else (-np.inf, np.inf)
-            least, greatest = _servo_range(model, actuators[i])
+            least, greatest = _servo_range(model, a)
             low, high = max(own[0], least), min(own[1], greatest)
             if not low < high:
                 raise UserError(
@@ -366,84 +324,68 @@ class _Builder:
                 )
             if low - own[0] > _NARROWER or own[1] - high > _NARROWER:
                 narrowed.append(joint_name(model, i))
+            joint.limited = mujoco.mjtLimited.mjLIMITED_FALSE
             joint.range = (low, high) if high < np.inf else np.zeros(2)
             joint.springdamper = np.zeros(2)
-            joint.stiffness[0], joint.damping[0] = model.jnt_stiffness[i], model.dof_damping[dof]
-            joint.armature = model.dof_armature[dof]
-            for a in actuators[i]:
-                # The rotor moves with the joint, also where another servo replaces the actuator.
-                gear, drive = model.actuator_gear[a, 0], drives[a]
-                joint.armature += gear**2 * model.actuator_armature[a]
-                joint.damping[0] += gear**2 * model.actuator_damping[a]
-                drive.armature, drive.damping[0] = 0.0, 0.0
-                drive.gainprm, drive.biasprm = model.actuator_gainprm[a], model.actuator_biasprm[a]
-                control = model.actuator_ctrladr[a]
-                drive.inheritrange, drive.ctrlrange = 0.0, model.actuator_ctrlrange[control]
+            # The rotor moves with the joint, also where another servo replaces the actuator.
+            gear, drive = model.actuator_gear[a, 0], drives[a]
+            joint.stiffness[0] = model.jnt_stiffness[i]
+            joint.damping[0] = model.dof_damping[dof] + gear**2 * model.actuator_damping[a]
+            joint.armature = model.dof_armature[dof] + gear**2 * model.actuator_armature[a]
+            drive.armature, drive.damping[0] = 0.0, 0.0
+            drive.gainprm, drive.biasprm = model.actuator_gainprm[a], model.actuator_biasprm[a]
+            drive.inheritrange = 0.0
+            drive.ctrlrange = model.actuator_ctrlrange[model.actuator_ctrladr[a]]
         if narrowed:
             self._changes.append(f"narrowed the ranges to what the servos reach: {_list(narrowed)}")
 
-    def _strip(
-        self,
-        joints: list[int],
-        gripper: list[int],
-        objects: list[int],
-        actuators: dict[int, list[int]],
-    ) -> None:
-        """Removes all but the arm, and fixes its base."""
-        arm, model = self._arm, self._model
-        own = {a for joint in joints for a in actuators[joint]}
-        others = [a for i, a in enumerate(arm.actuators) if i not in own]
-        floors = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
-        self._remove("keyframes", arm.keys)
-        self._remove("sensors", arm.sensors)
-        self._remove("actuators that do not drive the arm", others)
-        self._remove("tendons", arm.tendons)
-        self._remove("equality constraints", arm.equalities)
-        self._remove("contact pairs and exclusions", [*arm.pairs, *arm.excludes])
-        self._remove("lights and cameras", [*arm.lights, *arm.cameras])
-        self._remove("floors", [g for g in arm.geoms if g.type in floors])
-        bodies, parts = list(arm.bodies), list(arm.joints)
-        base = bodies[model.body_rootid[model.jnt_bodyid[joints[0]]]]
-        if base.mocap:
-            base.mocap = False
-            self._changes.append(f"fixed the base {base.name}, a body that is moved (mocap)")
-        for words, removed in (
-            ("removed the gripper beyond the last joint: ", gripper),
-            ("removed the loose objects ", objects),
-        ):
-            if removed:
-                names = _list(model.body(b).name or f"body {b}" for b in removed)
-                self._changes.append(words + names)
-        fixed = [
-            j
-            for j, body in enumerate(model.jnt_bodyid)
-            if j not in joints and not is_below(model, int(body), gripper + objects)
-        ]
-        if fixed:
-            names = _list(joint_name(model, j) for j in fixed)
-            self._changes.append(f"fixed the joints that do not act: {names}")
-        for element in [parts[j] for j in fixed] + [bodies[b] for b in gripper + objects]:
-            arm.delete(element)
+    def _strip(self, joints: list[int], loose: list[int]) -> None:
+        """Removes all but the arm, and fixes its base.
 
-    def _remove(self, nouns: str, elements: Iterable) -> None:
+        Raises:
+          UserError: an equality constraint or a tendon acts on the arm.
+        """
+        arm, model = self._arm, self._model
+        bodies, parts = list(arm.bodies), list(arm.joints)
+        names = [parts[j].name for j in joints]
+        still = (j for j in range(model.njnt) if not is_below(model, model.jnt_bodyid[j], loose))
+        fixed = [parts[j] for j in still if j not in joints]
+        # With what acts on them, such as a gripper's tendons.
+        self._remove("removed the grippers and loose objects", [bodies[b] for b in loose])
+        self._remove("fixed the joints that do not act", fixed)
+        for noun, found in (("equality constraint", arm.equalities), ("tendon", arm.tendons)):
+            for element in found:
+                raise UserError(
+                    f"the {noun} {element.name} on the arm, so it is not a serial chain; remove "
+                    "it, or give a serial arm"
+                )
+        others = [a for a in arm.actuators if a.target not in names]
+        floors = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
+        self._remove("removed the keyframes", arm.keys)
+        self._remove("removed the sensors", arm.sensors)
+        self._remove("removed the actuators that do not drive the arm", others)
+        self._remove("removed the contact pairs and exclusions", [*arm.pairs, *arm.excludes])
+        self._remove("removed the lights and cameras", [*arm.lights, *arm.cameras])
+        self._remove("removed the floors", [g for g in arm.geoms if g.type in floors])
+
+    def _remove(self, words: str, elements: Iterable) -> None:
         elements = list(elements)
         names = [element.name for element in elements]
         for element in elements:
             self._arm.delete(element)
         if elements:
             named = f": {_list(names)}" if any(names) else ""
-            self._changes.append(f"removed the {nouns} ({len(elements)}{named})")
+            self._changes.append(f"{words} ({len(elements)}{named})")
 
     def _disable_contacts_and_limits(self, joints: list[int]) -> None:
         model = self._model
-        touching = np.any((model.geom_contype != 0) & (model.geom_conaffinity != 0))
-        if touching:
+        if np.any((model.geom_contype != 0) & (model.geom_conaffinity != 0)):
             self._changes.append("turned off the arm's own contacts: only ball and paddle touch")
-        for i, body in enumerate(self._arm.bodies):
+        for body in self._arm.bodies[1:]:
             touching = [bool(geom.contype or geom.conaffinity) for geom in body.geoms]
             for geom, touches in zip(body.geoms, touching, strict=True):
                 # Where a link has both kinds of shapes, the others are its picture.
-                if touches and i > 0 and not all(touching):
+                if touches and not all(touching):
                     geom.group = HIDDEN_GROUP
                 geom.contype = geom.conaffinity = 0
         if np.any(model.jnt_limited[joints]):
@@ -453,7 +395,12 @@ class _Builder:
         """The scene with the arm, and the paddle on the body `holder`."""
         config, arm = self._config, self._arm
         scene = read_spec(resource_path("mjcf/scene.xml"))
-        differing = _option_differences(self._model.opt, scene.option)
+        differing = [
+            name
+            for name in dir(scene.option)
+            if not name.startswith("_")
+            and not np.array_equal(getattr(self._model.opt, name), getattr(scene.option, name))
+        ]
         if differing:
             names = ", ".join(differing)
             self._changes.append(f"replaced the physics options with the task's ({names})")
@@ -549,18 +496,16 @@ def limit_words(limit: float | None) -> str:
     return "no force limit" if limit is None else f"force limit {limit:.4g}"
 
 
-def _servo(model: mujoco.MjModel, actuators: list[int]) -> ServoSettings | None:
-    """The position servo that drives a joint alone; None for other actuators."""
-    actuator = actuators[0]
-    gear = float(model.actuator_gear[actuator, 0])
-    plain = len(actuators) == 1 and model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_NONE
+def _servo(model: mujoco.MjModel, joint: int, actuator: int) -> ServoSettings | None:
+    """The position servo that drives a joint; None for another actuator."""
+    plain = model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_NONE
     if not (plain and is_position_servo(model, actuator)):
         return None
-    joint = int(model.actuator_trnid[actuator, 0])
+    gear = float(model.actuator_gear[actuator, 0])
     return ServoSettings(
         float(model.actuator_gainprm[actuator, 0] * gear**2),
         float(-model.actuator_biasprm[actuator, 2] * gear**2) + 0.0,
-        _force_limit(model, actuators, joint),
+        _force_limit(model, joint, actuator),
     )
 
 
@@ -580,40 +525,34 @@ def is_position_servo(model: mujoco.MjModel, actuator: int) -> bool:
     )
 
 
-def _servo_range(model: mujoco.MjModel, actuators: list[int]) -> tuple[float, float]:
-    """Joint positions that the targets of a joint's position servos reach."""
-    least, greatest = -np.inf, np.inf
-    for actuator in filter(lambda a: is_position_servo(model, a), actuators):
-        control = model.actuator_ctrladr[actuator]
-        limited, span = model.actuator_ctrllimited[control], model.actuator_ctrlrange[control]
-        if model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_INTEGRATOR:
-            # Its control is a velocity.
-            limited, span = model.actuator_actlimited[actuator], model.actuator_actrange[actuator]
-        if limited:
-            low, high = sorted(span / model.actuator_gear[actuator, 0])
-            least, greatest = max(least, low), min(greatest, high)
-    return float(least), float(greatest)
+def _servo_range(model: mujoco.MjModel, actuator: int) -> tuple[float, float]:
+    """Joint positions that the targets of a position servo reach."""
+    control = model.actuator_ctrladr[actuator]
+    # The control of an integrator is a velocity.
+    direct = model.actuator_dyntype[actuator] != mujoco.mjtDyn.mjDYN_INTEGRATOR
+    if not (direct and is_position_servo(model, actuator) and model.actuator_ctrllimited[control]):
+        return -np.inf, np.inf
+    low, high = sorted(model.actuator_ctrlrange[control] / model.actuator_gear[actuator, 0])
+    return float(low), float(high)
 
 
-def _force_limit(model: mujoco.MjModel, actuators: list[int], joint: int) -> float | None:
-    """Largest force of a joint's actuators, None for no limit: by the force range, by the control
+def _force_limit(model: mujoco.MjModel, joint: int, actuator: int) -> float | None:
+    """Largest force of a joint's actuator, None for no limit: by the force range, by the control
     range of a plain motor, or by the joint's own limit."""
-    total = 0.0
-    for actuator in actuators:
-        limit, gear = np.inf, abs(float(model.actuator_gear[actuator, 0]))
-        if model.actuator_forcelimited[actuator]:
-            limit = _both_ways(model.actuator_forcerange[actuator], "forcerange", model, joint)
-        is_motor = model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_NONE
-        # A <pid> has several controls; the other arrays have one row for each actuator.
-        control = model.actuator_ctrladr[actuator]
-        if is_motor and model.actuator_ctrllimited[control]:
-            largest = _both_ways(model.actuator_ctrlrange[control], "ctrlrange", model, joint)
-            limit = min(limit, largest * abs(float(model.actuator_gainprm[actuator, 0])))
-        total = max(total, limit * gear)
+    limit, gear = np.inf, abs(float(model.actuator_gear[actuator, 0]))
+    if model.actuator_forcelimited[actuator]:
+        limit = _both_ways(model.actuator_forcerange[actuator], "forcerange", model, joint)
+    is_motor = model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_NONE
+    # A <pid> has several controls; the other arrays have one row for each actuator.
+    control = model.actuator_ctrladr[actuator]
+    if is_motor and model.actuator_ctrllimited[control]:
+        largest = _both_ways(model.actuator_ctrlrange[control], "ctrlrange", model, joint)
+        limit = min(limit, largest * abs(float(model.actuator_gainprm[actuator, 0])))
+    limit *= gear
     if model.jnt_actfrclimited[joint]:
         span = model.jnt_actfrcrange[joint]
-        total = min(total, _both_ways(span, "actuatorfrcrange", model, joint))
-    return total if np.isfinite(total) else None
+        limit = min(limit, _both_ways(span, "actuatorfrcrange", model, joint))
+    return limit if np.isfinite(limit) else None
 
 
 def _both_ways(span: np.ndarray, name: str, model: mujoco.MjModel, joint: int) -> float:
@@ -628,37 +567,12 @@ def _both_ways(span: np.ndarray, name: str, model: mujoco.MjModel, joint: int) -
     return min(-low, high)
 
 
-def _couplings(model: mujoco.MjModel) -> Iterator[tuple[str, Iterable[int], Iterable[int]]]:
-    """Of each equality constraint and tendon: words, and the joints and bodies that it couples."""
-    for i in range(model.neq):
-        words = f"the equality constraint {model.equality(i).name or f'number {i}'}"
-        ends = [int(model.eq_obj1id[i]), int(model.eq_obj2id[i])]
-        if model.eq_type[i] == mujoco.mjtEq.mjEQ_JOINT:
-            yield words, ends, []
-        elif int(model.eq_type[i]) in (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD):
-            between_sites = model.eq_objtype[i] == mujoco.mjtObj.mjOBJ_SITE
-            yield words, [], model.site_bodyid[ends].tolist() if between_sites else ends
-    for i in range(model.ntendon):
-        path = slice(model.tendon_adr[i], model.tendon_adr[i] + model.tendon_num[i])
-        kinds, ids = model.wrap_type[path], model.wrap_objid[path]
-        sites = ids[kinds == mujoco.mjtWrap.mjWRAP_SITE]
-        geoms = ids[np.isin(kinds, (mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER))]
-        bodies = [*model.site_bodyid[sites].tolist(), *model.geom_bodyid[geoms].tolist()]
-        driven = ids[kinds == mujoco.mjtWrap.mjWRAP_JOINT].tolist()
-        yield f"the tendon {model.tendon(i).name or f'number {i}'}", driven, bodies
-
-
 def _chain(model: mujoco.MjModel, end: int) -> list[int]:
     """Bodies from the base to `end`."""
     chain = [end]
     while parent := model.body_parentid[chain[-1]]:
         chain.append(int(parent))
     return chain[::-1]
-
-
-def _joints_of(model: mujoco.MjModel, body: int) -> range:
-    first = int(model.body_jntadr[body])
-    return range(first, first + int(model.body_jntnum[body]))
 
 
 def is_below(model: mujoco.MjModel, body: int, ancestors: list[int]) -> bool:
@@ -676,12 +590,6 @@ def raise_solver_limits(option: mujoco.MjOption) -> None:
     default = mujoco.MjOption()
     option.iterations = max(option.iterations, default.iterations)
     option.ls_iterations = max(option.ls_iterations, default.ls_iterations)
-
-
-def _option_differences(given: mujoco.MjOption, task: mujoco.MjOption) -> list[str]:
-    """Names of the options of a file that differ from the task's."""
-    names = [name for name in dir(task) if not name.startswith("_")]
-    return [n for n in names if not np.array_equal(getattr(given, n), getattr(task, n))]
 
 
 def joint_name(model: mujoco.MjModel, joint: int) -> str:

@@ -35,7 +35,6 @@ from rich.console import Console
 import bounce_mjx
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.errors import UserError
-from bounce_mjx.files import check_name
 from bounce_mjx.resources import POLICIES, PRETRAINED, TASK_POLICIES, resource_path
 from bounce_mjx.runs import old
 from bounce_mjx.runs.config import BASE, CONFIG_FILE, TrainConfig, runs_folder
@@ -85,7 +84,6 @@ def create_run(config: TrainConfig) -> Path:
     Raises:
       UserError: the folder cannot be written, or the robot cannot be copied into it.
     """
-    check_name(config.log_dir.absolute())
     refuse_brackets(config.log_dir)
     # Not the local time, which is another one on another machine, and in autumn goes back.
     stamp = datetime.datetime.now(datetime.UTC).strftime(_STAMP)
@@ -148,7 +146,6 @@ def find_run(path: Path) -> Path:
         )
     for folder in (path, *Path(os.path.abspath(path)).parents):
         if (folder / CONFIG_FILE).is_file():
-            check_name(folder.absolute())
             return folder
     raise UserError(
         f"{path} is not in a run's folder, as there is no {CONFIG_FILE}; give a folder that "
