@@ -1,5 +1,7 @@
 """Several balls move in the fused engine, in MJX and in the environment as on C."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -104,7 +106,7 @@ def num_pressed(model: mujoco.MjModel, states: States) -> np.ndarray:
 @pytest.mark.parametrize(
     ("num_balls", "friction"),
     # Newton's method is slow for the last one.
-    [(2, None), (3, None), (2, 0.3), (2, 1.5), (2, (0.02, 0.2))],
+    [(2, None), (3, None), (2, 0.3), (2, (0.02, 0.2))],
 )
 @pytest.mark.usefixtures("float64")
 def test_one_step_of_several_balls_is_mujocos(num_balls, friction, record_property):
@@ -123,8 +125,7 @@ def test_one_step_of_several_balls_is_mujocos(num_balls, friction, record_proper
 @pytest.mark.slow
 @pytest.mark.usefixtures("float64")
 def test_given_parameters_act_on_all_balls(record_property):
-    """All parameters at once, against C on `edited_model`; without and with both kinds of
-    friction."""
+    """All parameters at once, against C on `edited_model`; without and with friction."""
     model, count = balls_model(2), 120
     states = hostile_states(model, count, seed=1)
     plain = random_parameters(model, count, seed=2)
@@ -133,7 +134,7 @@ def test_given_parameters_act_on_all_balls(record_property):
         frictionloss=10.0 ** rng.uniform(-1.0, 1.5, (count, 6)),
         contact_friction=rng.uniform(0.0, 1.0, count),
     )
-    for parameters in (plain, plain._replace(frictionloss=dry.frictionloss), dry):
+    for parameters in (plain, dry):
         models = c_models(model, parameters, count)
         if parameters.frictionloss is not None:
             states, sticking, _ = sticking_and_sliding(models, states)
@@ -217,8 +218,10 @@ def test_the_gradient_of_touching_balls_is_that_of_finite_differences():
         after = step(MODEL, PhysicsState(qpos, qvel), Control(ctrl), 2)
         return weights @ after.qvel
 
-    value = jax.jit(jax.vmap(outcome))
-    given = jax.jit(jax.vmap(jax.grad(outcome, argnums=(0, 1))))
+    # Without fusion XLA compiles much faster, and the programs run only a few times.
+    compiled = partial(jax.jit, compiler_options={"xla_disable_hlo_passes": "fusion"})
+    value = compiled(jax.vmap(outcome))
+    given = compiled(jax.vmap(jax.grad(outcome, argnums=(0, 1))))
     qpos, qvel, ctrl = (jnp.asarray(x[touching]) for x in states)
     by_position, by_velocity = given(qpos, qvel, ctrl)
     rng = np.random.default_rng(1)

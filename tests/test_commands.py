@@ -73,18 +73,8 @@ def assert_says(sentence: str, words: tuple[str, ...]) -> None:
 
 
 BAD_FLAGS = {
-    "unknown flag": ("--zzz 3", "--zzz", "--help"),
-    "near miss": ("--num-envz 3", "--num-envz", "did you mean --num-envs?"),
     "near miss of a switch": ("--no-stop-if-solved", "did you mean --no-stop-when-solved?"),
-    "no environments": ("--num-envs 0", "--num-envs is 0", "greater than or equal to 1"),
     "not a number": ("--num-envs abc", "--num-envs is abc", "integer"),
-    "minibatches": (
-        "--num-envs 8 --rollout-length 8 --num-minibatches 7",
-        "num_minibatches 7",
-        "64 samples",
-        "choose a divisor of 64",
-    ),
-    "targets reversed": ("--target-height-range 0.6 0.4", "(0.6, 0.4)", "lower end first"),
     "control step": ("--control-dt 0.0105", "control_dt 0.0105", "multiple of physics_dt"),
     "rollout longer than an episode": (
         "--num-envs 8 --rollout-length 8 --episode-seconds 0.05",
@@ -93,13 +83,10 @@ BAD_FLAGS = {
         "shorter rollout",
     ),
     "scale nan": ("--action-scale nan", "--action-scale is nan", "0 rad"),
-    "discount": ("--discount 1.5", "--discount is 1.5", "less than or equal to 1"),
-    "unknown engine": ("--physics warp", "--physics is warp", "'fused'"),
     "preset and resume": ("--config a.yaml --resume b", "--config", "--resume", "combined"),
     "preset missing": ("--config a.yaml", "a.yaml", "No such file", "configs/default.yaml"),
     "no such preset": ("--config nope", "no preset is named nope", "cpu, default, finetune"),
     "no such robot": ("--robot nope", "no robot is named nope", "iiwa, panda, peitian, ur5e"),
-    "run missing": ("--resume nowhere", "nowhere", "give a run's folder"),
     "MJCF missing": ("--mjcf a.xml", "a.xml", "does not exist", "give the path"),
 }
 
@@ -111,7 +98,6 @@ def test_bad_flag(fails: Fails, case: tuple[str, ...]) -> None:
 
 
 BAD_YAML = {
-    "list": (b"- 1\n", "a list", "mapping", "configs/default.yaml"),
     "no YAML": (b"ppo: [1\nseed: {", "cannot be read", "line 2", "configs/default.yaml"),
     "key twice": (
         b"ppo: {num_envs: 8}\nenv: {}\nppo: {discount: 0.9}",
@@ -123,8 +109,6 @@ BAD_YAML = {
         "env.reward.height.wieght",
         "did you mean env.reward.height.weight?",
     ),
-    "wrong level": (b"num_envs: 3", "unknown key num_envs", "did you mean ppo.num_envs?"),
-    "word": (b"env: {default_joint_angles: [a, 0, 0, 0, 0, 0]}", "'a'", "valid number"),
 }
 
 
@@ -144,17 +128,11 @@ def test_flag_is_validated_on_top_of_the_config_file(fails: Fails, tmp_path: Pat
 MJCF = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
 BAD_MJCF = {
     "text": ("hello", "does not compile", "correct it"),
-    "paddle": (MJCF.replace('"blocker"', '"bat"'), "no geom named blocker", "needs the names"),
     "ball": (MJCF.replace('"ball_link"', '"ball"'), "no body named ball_link", "needs the names"),
     "actuator": (
         re.sub(r'<position [^>]*joint="Joint2"[^>]*/>', "", MJCF),
         "default_joint_angles has 6 numbers",
         "5 joints with an actuator (Joint1, Joint3",
-    ),
-    "motor": (
-        re.sub(r'<position [^>]*joint="Joint2"[^>]*/>', '<motor joint="Joint2"/>', MJCF),
-        "an actuator on Joint2 that is not a position servo",
-        '<position joint="Joint2"/>',
     ),
 }
 
@@ -175,11 +153,8 @@ def test_log_dir_that_cannot_be_made(fails: Fails, tmp_path: Path, log_dir: str)
 
 
 BAD_EVAL_FLAGS = {
-    "no episodes": ("--episodes 0", "--episodes is 0", "equal to 1"),
     "target below the floor": ("--target-height -1", "--target-height is -1.0", ">= 0.001"),
     "json in no folder": ("--json nowhere/a.json", "nowhere/a.json", "make it"),
-    "checkpoint missing": ("nowhere", "nowhere", "give a run's folder", "pretrained, robust, "),
-    "no runs": ("--log-dir mine", "no run", "in mine", "bounce-mjx train"),
 }
 
 

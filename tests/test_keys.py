@@ -1,20 +1,14 @@
-"""Every key of the config reference has an effect: it changes a program before it is compiled, or a
-value that the training resolves; or it is refused, as without another key it has none."""
+"""Every key of the environment and of PPO has an effect: it changes a program before it is
+compiled, or it is refused, as without another key it has none."""
 
-import contextlib
 import functools
 import re
-import types
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any, get_args
 
 import jax
 import numpy as np
 import pytest
-from rich.console import Console
 
-from arms import ARM
 from bounce_mjx.config.settings import StrictModel, merged
 from bounce_mjx.config.validation import validate
 from bounce_mjx.env.env import Env, State
@@ -24,10 +18,7 @@ from bounce_mjx.physics import Control
 from bounce_mjx.robot.model import fingerprint
 from bounce_mjx.runs.config import TrainConfig, train_config
 from bounce_mjx.tasks.registry import find_task
-from bounce_mjx.training.evaluators import Evaluators
-from bounce_mjx.training.job import Job
-from bounce_mjx.training.ppo_trainer import PPOTrainer, episode_steps
-from bounce_mjx.training.trainer import in_whole_blocks
+from bounce_mjx.training.ppo_trainer import episode_steps
 from bounce_mjx.world.randomization import Term
 from test_ppo import TwoStates
 
@@ -45,57 +36,34 @@ def keys(group: type[StrictModel], prefix: str = "") -> dict[str, Any]:
     return found
 
 
-KEYS = keys(CONFIG)
+# Tests of the robot and of several balls have the other keys.
+ELSEWHERE = "env.robot.", "env.mjcf", "env.num_balls"
+KEYS = {k: v for k, v in keys(CONFIG).items() if re.match("env|ppo", k)}
+KEYS = {k: v for k, v in KEYS.items() if not k.startswith(ELSEWHERE)}
 
 # Other values, where neither half of the default nor one more of it is one.
 VALUES = {
-    "task": "catch", "seed": 1, "num_devices": 1000, "screening_episodes": 16,
-    "warm_start": "nowhere", "log_dir": "elsewhere",
-    "env.mjcf": "nowhere.xml", "env.friction": 0.2, "env.num_balls": 2,
-    "env.default_joint_angles": [0.1, 0.7, 1.9, 0.0, -1.0, 0.0], "env.ball_init_pos": [0.5, 0, 0.4],
-    "env.target_height_range": [0.4, 0.5], "env.control_dt": 0.02,
-    "env.robot.site": "nowhere", "env.robot.joints": ["Joint1"],
-    "env.robot.paddle.quaternion": [1, 0, 0, 0], "env.robot.ball.mass": 0.003,
-    "env.robot.ball.radius": 0.02, "env.robot.servo_stiffness": [100.0] * 6,
-    "env.robot.servo_damping": [10.0] * 6, "env.robot.servo_force_limit": [10.0] * 6,
-    "env.robot.limits.velocity": [2.0] * 6, "env.robot.limits.acceleration": [30.0] * 6,
-    "env.robot.limits.jerk": [9000.0] * 6, "env.robot.limits.torque": [20.0] * 6,
-    "env.randomization.shares": {"restitution": 0.5}, "env.randomization.warmup_steps": 1000,
+    "env.friction": 0.2, "env.default_joint_angles": [0.1, 0.7, 1.9, 0.0, -1.0, 0.0],
+    "env.ball_init_pos": [0.5, 0, 0.4], "env.target_height_range": [0.4, 0.5],
+    "env.control_dt": 0.02, "env.randomization.shares": {"restitution": 0.5},
+    "env.randomization.warmup_steps": 1000, "env.randomization.camera_rate": [60, 90],
+    "env.randomization.command_interval": [1, 2], "env.physics": "mjx",
     "env.reward.target_y": 0.1, "ppo.training_episode_seconds": 3.0, "ppo.entropy_cost": 0.01,
     "ppo.critic_metrics": ["ball_xy_error"], "ppo.hidden_layers": [8], "ppo.critic_layers": [8],
-    "algorithm": "own.py:Own",
-    "ppo.min_learning_rate": 2e-5, "env.randomization.camera_rate": [60, 90],
-    "env.randomization.command_interval": [1, 2], "env.physics": "mjx", "ppo.decay_steps": 1000,
+    "ppo.min_learning_rate": 2e-5, "ppo.decay_steps": 1000,
 }  # fmt: skip
 
-# Keys that are refused alone, and the settings with which each has an effect; None where the
-# refusal is all that this test can see, as its value names what there is not.
-LIMITS = {"velocity": [1.0] * 6, "acceleration": [20.0] * 6, "jerk": [8000.0] * 6}
-WITH_LIMITS = {"robot": {"limits": LIMITS}, "action": {"base": "target"}}
-SERVOS = {
-    "servo_stiffness": [500.0] * 6, "servo_damping": [5.0] * 6, "servo_force_limit": [50.0] * 6,
-}  # fmt: skip
-ADOPTED = {
-    "mjcf": "arm.xml", "default_joint_angles": [0.0] * 6, "robot": {"site": "tool"} | SERVOS,
-    "ball_init_pos": [0.0, 0.0, 5.0], "target_height_range": [5.0, 6.0],
-}  # fmt: skip
-OF_SITE = [k for k in KEYS if k.startswith("env.robot.") and "limits" not in k]
+# Keys that are refused alone, and the settings with which each has an effect.
+RESTITUTION = {"randomization": {"restitution": [0.8, 0.9]}}
 NEEDED = {
     "env.action.max_lead": {"action": {"base": "target"}},
     "env.observation.servo_lead": {"action": {"base": "target"}},
     "env.randomization.first_command_range": {"randomization": {"warmup_steps": 1000}},
     "env.randomization.push_interval": {"randomization": {"push_speed": [0.1, 0.1]}},
-    "env.randomization.restitution_slope": {"randomization": {"restitution": [0.8, 0.9]}},
-    **{f"env.robot.limits.{name}": WITH_LIMITS for name in LIMITS},
-    **dict.fromkeys(OF_SITE, ADOPTED),
-    **dict.fromkeys(("num_devices", "warm_start", "env.mjcf", "env.num_balls", "algorithm"), None),
-    **dict.fromkeys(("env.robot.site", "env.robot.joints"), None),
+    "env.randomization.restitution_slope": RESTITUTION,
 }
 # Keys that describe others, and have an effect with them alone.
-WITH = {
-    "env.randomization.share": {"randomization": {"restitution": [0.8, 0.9]}},
-    "env.randomization.shares": {"randomization": {"restitution": [0.8, 0.9]}},
-}
+WITH = {"env.randomization.share": RESTITUTION, "env.randomization.shares": RESTITUTION}
 
 
 def other(key: str) -> Any:
@@ -117,33 +85,19 @@ def other(key: str) -> Any:
     return 0.5 * value or 0.01
 
 
-def settings(key: str, value: Any) -> dict[str, Any]:
-    for name in reversed(key.split(".")):
-        value = {name: value}
-    return value
-
-
 def text(program: jax.stages.Traced) -> tuple:
     """A traced program with its constants."""
     constants = [np.asarray(x).tobytes() for x in program.jaxpr.consts]
     return re.sub(r" at 0x[0-9a-f]+", "", str(program.jaxpr)), constants
 
 
-def of_model(config: TrainConfig) -> tuple:
-    """The engine and its model."""
-    return _of_model(Env(config.env))
-
-
-def _of_model(env: Env) -> tuple:
-    return env.engine.name, env.mj_model.opt.timestep, fingerprint(env.mj_model)
-
-
 def of_environment(config: TrainConfig) -> tuple:
-    """The programs of a reset and of a step but for the engine's, and the engine's model."""
+    """The programs of a reset and of a step but for the engine's, and the engine's settings."""
     env = Env(config.env)
     reset = _reset(env)
     numbers = env.config.num_substeps, env.config.episode_steps, env.warmup_steps
-    return text(reset), _step(env, reset.out_info), numbers, _of_model(env)
+    engine = env.engine.name, env.mj_model.opt.timestep, fingerprint(env.mj_model)
+    return text(reset), _step(env, reset.out_info), numbers, engine
 
 
 def of_step(config: TrainConfig) -> tuple:
@@ -181,69 +135,25 @@ def of_learning(config: TrainConfig) -> tuple:
     return text(program), episode_steps(config)
 
 
-def of_run(config: TrainConfig) -> tuple:
-    """What a run resolves: its blocks, evaluations, seeds and folder."""
-    blocks, measured = [], []
-    with contextlib.ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
-        config = in_whole_blocks(config)
-        job = Job(config, Console(quiet=True), None, (), stack)
-        job.prepare(PPOTrainer)
-        job.open()
-
-        def run_block() -> None:
-            blocks.append(job.steps)
-            job.steps += job.block_steps
-
-        answers = {"_stopping": lambda: False, "_is_due": lambda: False, "_is_solved": lambda: True}
-        for name, answer in (answers | {"_run_block": run_block}).items():
-            patch.setattr(job, name, answer)
-        job.train()
-        nothing = types.SimpleNamespace(compile=lambda: None)
-        patch.setattr(Evaluators, "_lower", lambda _: nothing)
-        patch.setattr(Evaluators, "_measure", lambda *given, **_: measured.append(given[2]))
-        evaluators = Evaluators(config, job.env, job.trainer.mesh, job.pool)
-        evaluators.final(None)
-        seeds, task = str(job.trainer._seeds), type(job.env.task).__name__
-    return blocks, job.eval_steps, evaluators._chunk, measured, seeds, job.run.parent, task
-
-
-PARTS = {"env.physics": of_model, "env.robot.": of_model, "env.robot.limits": of_environment}
-PARTS |= {"env.reward.": of_step, "env.": of_environment, "ppo.": of_learning, "": of_run}
+PARTS = {"env.reward.": of_step, "env.": of_environment, "ppo.": of_learning}
 
 
 @functools.cache
 def resolved(part: str, values: str) -> tuple:
-    """The programs and values of a config that a key changes.
-
-    Args:
-      part: the start of the key.
-      values: the settings as Python's text.
-    """
-    given = eval(values)
-    kind = train_config(find_task(given.get("task", "bounce")))
-    return PARTS[part](validate(kind, given, "my.yaml"))
-
-
-@pytest.fixture(autouse=True, scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory):
-    with contextlib.chdir(tmp_path_factory.mktemp("keys")):
-        Path("arm.xml").write_text(ARM)
-        yield
-
-
-@pytest.mark.parametrize("kind", [of_environment, of_step, of_learning, of_run])
-def test_equal_settings_have_equal_programs(kind: Callable) -> None:
-    assert kind(CONFIG()) == kind(CONFIG())
+    """The programs that a key changes, where `part` is its start, and `values` are the settings as
+    Python's text."""
+    return PARTS[part](validate(CONFIG, eval(values), "my.yaml"))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("key", KEYS)
 def test_a_key_has_an_effect_or_is_refused(key: str) -> None:
-    part, changed = max(filter(key.startswith, PARTS), key=len), settings(key, other(key))
+    part, changed = max(filter(key.startswith, PARTS), key=len), other(key)
+    for name in reversed(key.split(".")):
+        changed = {name: changed}
     if key in NEEDED:
         with pytest.raises(UserError):
             resolved(part, repr(changed))
     context = {"env": NEEDED.get(key) or WITH.get(key, {})}
-    if NEEDED.get(key, {}) is not None:
-        before, after = (resolved(part, repr(x)) for x in (context, merged(context, changed)))
-        assert before != after
+    before, after = (resolved(part, repr(x)) for x in (context, merged(context, changed)))
+    assert before != after

@@ -70,7 +70,6 @@ def test_an_installed_release_trains_evaluates_exports_and_acts(
     # An untrained policy misses results, which is status 1.
     said = call(command, "eval", run, "--episodes", 4, folder=other, status=1)
     assert "FAIL" in said
-    call(command, "report", run, folder=other)
     assert "<iframe" in (run / "report.html").read_text(encoding="utf-8")
     call(command, "play", run, "--video", "a.gif", "--seconds", 1, folder=other)
     assert (other / "a.gif").read_bytes().startswith(b"GIF")
@@ -83,4 +82,3 @@ def test_an_installed_release_trains_evaluates_exports_and_acts(
     )
     package, shape = call(python, "-c", acts, folder=other).split(maxsplit=1)
     assert Path(package).is_relative_to(tmp_path / "env") and shape == "(6,)\n"
-    assert f"in {Path(package).parent}" in call(command, "doctor", folder=other)

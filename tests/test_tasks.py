@@ -6,7 +6,6 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import jax
@@ -15,7 +14,8 @@ import numpy as np
 import pytest
 
 import rest_task
-from bounce_mjx import task
+from bounce_mjx import load_policy, task
+from bounce_mjx.commands.main import main
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
@@ -35,19 +35,23 @@ DRIBBLE = f"{CHECKOUT / 'examples' / 'dribble_task.py'}:Dribble"
 RESULT = r"rests +episodes"
 
 
-def run(folder: Path, *args: str, code: int = 0) -> str:
-    """The output of a command, which must exit with `code`."""
-    done = subprocess.run(
-        [sys.executable, "-m", "bounce_mjx", *args], cwd=folder, capture_output=True, text=True
-    )
-    assert done.returncode == code, done.stdout + done.stderr
-    return done.stdout + done.stderr
-
-
 @pytest.mark.slow
-def test_a_task_without_events_goes_through_every_command(tmp_path: Path) -> None:
+def test_a_task_without_events_goes_through_every_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """It has no command, event, curve, marker or plot."""
-    command = partial(run, tmp_path)
+    monkeypatch.chdir(tmp_path)
+
+    def command(*args: str, code: int = 0) -> str:
+        """The output of a command, which must exit with `code`."""
+        status = 0
+        try:
+            main([*args])
+        except SystemExit as end:
+            status = end.code or 0
+        said = "".join(capsys.readouterr())
+        assert status == code, said
+        return said
 
     task = ("--task", REST)
     said = command("train", *task, *TINY, "--total-steps", "128")
@@ -62,23 +66,10 @@ def test_a_task_without_events_goes_through_every_command(tmp_path: Path) -> Non
     assert "target_height" in command("view", *task, *flags, code=2)
     command("plot", *task, "--formats", "svg")
     command("export", *task, "--onnx", "rest.onnx")
-    script = """
-import numpy as np
-from bounce_mjx import load_policy
-from pathlib import Path
-(run,) = Path("runs/rest").iterdir()
-policy, again = load_policy("rest.onnx"), load_policy(run, task=TASK)
-assert again.metadata == policy.metadata
-sizes = {"joint_angles": 6, "joint_velocities": 6, "ball_position": 3, "ball_velocity": 3}
-print(policy.step({name: np.zeros(sizes[name]) for name in policy.needs}).shape)
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", script.replace("TASK", repr(REST))],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-    )
-    assert done.stdout == "(6,)\n", done.stderr
+    policy, again = load_policy("rest.onnx"), load_policy(folder, task=REST)
+    assert again.metadata == policy.metadata
+    sizes = {"joint_angles": 6, "joint_velocities": 6, "ball_position": 3, "ball_velocity": 3}
+    assert policy.step({name: np.zeros(sizes[name]) for name in policy.needs}).shape == (6,)
 
 
 def adapters() -> dict[str, Callable[[], tuple[int, ...]]]:

@@ -176,18 +176,12 @@ def test_native_viewer_shows_the_arm(tmp_path: Path) -> None:
 
 MISTAKES = {
     "suffix of a video": ("play --video a.avi", "--video a.avi", ".mp4 or .webp or .gif", "rename"),
-    "suffix of a page": ("view --html a.txt", "--html a.txt", ".html", "rename"),
     "no folder": ("play --video no/a.mp4", "no/a.mp4", "does not exist", "make it"),
-    "a folder": ("view --html folder.html", "folder.html is a folder", "give a file"),
     "odd size": ("play --video a.mp4 --size 321 240", "--size 321 240", "even"),
-    "small size": ("view --video a.mp4 --size 2 2", "--size is 2", "64"),
     "rate of a gif": ("play --video a.gif --fps 60", "--fps 60", "GIF", "25 or 50"),
-    "too many robots": ("view --num-envs 17", "--num-envs is 17", "16"),
     "two ways": ("play --viewer browser --video a.mp4", "--viewer browser", "give only one"),
     "no screen": ("view --viewer native", "--viewer native", "display", "--viewer browser"),
-    "unknown viewer": ("play --viewer vr", "--viewer", "vr", "native"),
     "foreign address": ("view --viewer browser --host 192.0.2.1", "--host 192.0.2.1", "127.0.0.1"),
-    "speed": ("play --speed 0", "--speed is 0", "0.1"),
     "no host": ("view --allow-host http://a", "'http://a' is not the name of a host", "without"),
     "two policies": ("play pretrained pretrained --video a.mp4", "shows one policy", "browser"),
 }
