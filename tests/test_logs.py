@@ -263,15 +263,6 @@ def test_pictures_of_a_clock_of_its_own_come_into_that_of_the_robot(drift, offse
     assert len(said) == bool(drift)
 
 
-def test_no_clock_drifts_by_parts_in_a_thousand() -> None:
-    log, _ = camera_log(seconds=20.0, drift=-1e-3)
-    found = align_clocks(log)
-    np.testing.assert_array_equal(found.picture_times, log.picture_times)
-    assert any("grow older by 20" in note for note in found.notes)
-    with pytest.raises(UserError, match=r"advance by 999 s each second, .+ write ball_time \[ms\]"):
-        align_clocks(log._replace(picture_times=1e3 * log.picture_times))
-
-
 @pytest.mark.parametrize("lost", [0.0, 0.1])
 def test_a_picture_that_a_later_one_replaced_is_not_lost(lost: float) -> None:
     """Control steps of 100 Hz see five of six pictures of a camera of 120 Hz."""
@@ -380,20 +371,6 @@ def test_messages_without_a_measurement_are_left_out_and_counted(tmp_path: Path)
     assert "3 of the 64 joint angles of /joint_states" in said and "message 1 lacks" in said
     assert "1 of the 61 joint angles of /joint_states" in said and "repeats the one before" in said
     assert "59 of the 118 pictures of the ball" in said
-
-
-def test_a_bag_in_simulated_time_is_align_clocks(tmp_path: Path) -> None:
-    bag = Bag().fill(120, 1.7e9, 1.7e9 - 7.0)
-    log = read_bag(bag.write(tmp_path / "bag"), JOINTS, TOPICS)
-    np.testing.assert_allclose(log.times[0], 7.0)
-    np.testing.assert_allclose((log.arrivals - log.picture_times)[:-1], 0.018, atol=1e-5)
-    # Targets without a stamp have the computer's time.
-    bag.rows = [(t, a, bag.array([0.3, 0.4]) if t == "/targets" else m) for t, a, m in bag.rows]
-    log = read_bag(bag.write(tmp_path / "other"), JOINTS, TOPICS)
-    with pytest.raises(
-        UserError, match=r"begin at 7 s .+ the servo targets at 1.7e\+09 .+ stamps of one clock"
-    ):
-        check(log, JOINTS, 100.0 * np.array([[-1.0, 1.0]] * 2))
 
 
 def test_a_bag_that_cannot_be_read_is_refused_with_a_hint(tmp_path: Path) -> None:

@@ -1,7 +1,6 @@
 """XLA joins loops on a CPU in every command whose engine allows it, unless the user decides."""
 
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -14,31 +13,6 @@ from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import default_preset, read_preset
 from bounce_mjx.tasks.bounce import BounceConfig as EnvConfig
 from bounce_mjx.training.setup import JOINED_LOOPS, join_loops
-
-# Two results of one value: with the option, one loop computes both.
-PROGRAM = """
-from bounce_mjx.tasks.bounce import BounceConfig as EnvConfig
-from bounce_mjx.training.setup import join_loops
-join_loops(EnvConfig(physics="{physics}"))
-import jax
-import jax.numpy as jnp
-two = jax.jit(lambda x: (jnp.sin(x) * 2.0, jnp.sin(x) + x))
-print(two.lower(jnp.ones(1000)).compile().as_text())
-"""
-
-
-@pytest.mark.parametrize("physics", ["auto", "mjx"])
-@pytest.mark.slow
-def test_two_results_of_one_value_share_a_loop_unless_mjx_runs(physics: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM.format(physics=physics)],
-        env=without_flags() | {"JAX_PLATFORMS": "cpu"},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    joined = re.search(r"= \(.*\) fusion\(", done.stdout) is not None
-    assert joined == (physics == "auto")
 
 
 def without_flags() -> dict[str, str]:

@@ -310,29 +310,6 @@ def test_an_arm_that_was_moved_starts_from_where_it_is() -> None:
     np.testing.assert_allclose(moves.angles, HOME, atol=2e-3)
 
 
-def test_an_arm_is_home_when_its_angles_are() -> None:
-    """Homing needs no ball, but angles in each step; an arm that does not move stops."""
-    for angles, fault in ((HOME + 0.5, "joint_stuck"), (None, "measurement")):
-        arm = limited().supervise(1000)
-        arm.commands({"joint_angles": HOME + 0.5})
-        states = set()
-        for _ in range(300):
-            arm.commands({} if angles is None else {"joint_angles": angles})
-            states.add(arm.state)
-        assert arm.fault == fault and "ready" not in states
-    arm = limited().supervise(1000)
-    angles = HOME + 0.1
-    while arm.state != "ready":
-        angles = arm.commands({"joint_angles": angles})[-1]
-    # Somebody pushes it away.
-    arm.commands({"joint_angles": HOME + 0.03})
-    assert arm.state == "homing"
-    # Under a load, it rests beside its command.
-    for _ in range(60):
-        arm.commands({"joint_angles": HOME + 0.008})
-    assert arm.state == "ready"
-
-
 def test_joints_may_have_the_names_of_the_driver() -> None:
     names = [f"fr3_joint{i}" for i in range(1, 8)]
     assert load_policy("panda", joint_names=names).metadata.joint_names == tuple(names)
@@ -356,20 +333,3 @@ def test_a_step_refuses_what_no_world_can_hold(wrong: dict, words: str) -> None:
     assert policy.step_number == -1
     # A lost ball is no error.
     policy.step(measured(ball_position=[1.4, -1.4, 0.02]))
-
-
-def test_an_episode_starts_again_after_a_loss() -> None:
-    arm = running()
-    with pytest.raises(UserError, match="restart it when it has stopped"):
-        arm.supervisor.restart()
-    arm.supervisor.stop("the operator pressed a button")
-    arm.until("stopped", 100)
-    assert arm.supervisor.reason == "the operator pressed a button"
-    with pytest.raises(UserError, match="starts when it is ready"):
-        arm.supervisor.start()
-    arm.supervisor.restart()
-    arm.until("ready")
-    assert arm.supervisor.reason is None
-    arm.supervisor.start()
-    assert arm.step() == "running"
-    arm.check()

@@ -94,16 +94,6 @@ def test_runs_that_differ_in_the_seed_are_one_group(runs: list[Path]) -> None:
     assert [group.label for group in group_runs(runs[:3])] == ["3 seeds"]
 
 
-def test_a_label_tells_settings_of_one_name_apart(tmp_path: Path) -> None:
-    logs, runs = {"episode/return": {1: 1.0}}, []
-    for height, position in ((1.0, 2.0), (3.0, 4.0)):
-        weights = {"height": {"weight": height}, "position": {"weight": position}}
-        config = TrainConfig(env={"reward": weights})
-        runs.append(write_run(tmp_path / str(height), config, logs))
-    labels = [group.label for group in group_runs(runs)]
-    assert labels[1] == "position.weight 4.0, height.weight 3.0 (one seed)"
-
-
 def test_a_curve_has_the_values_logged_last(tmp_path: Path) -> None:
     """A run that was resumed from step 2 logs step 3 again."""
     run = write_run(
