@@ -119,6 +119,29 @@ def test_bad_config_file(fails: Fails, tmp_path: Path, case: tuple) -> None:
     assert_says(fails(train_command.main, ["--config", "my.yaml"]), ["my.yaml", *words])
 
 
+ODD_YAML = (
+    b"\xff\xfe\x00",
+    b"? [1]\n: 2",
+    b"seed: !!int ''",
+    b"seed: !!python/object/apply:os.system [touch ran]",
+    b"env: &e {env: *e}",
+    b"seed: " + b"[" * 5000,
+    b"env: {mjcf: ~nobody/a.xml, physics: mjx}",
+    b'log_dir: "a\\0b"',
+    b'"a\\nb\\e[31m": 1',
+    b"env: {control_dt: 1.0e+308, physics_dt: 1.0e-308}",
+)
+
+
+@pytest.mark.parametrize("data", ODD_YAML, ids=range(len(ODD_YAML)))
+def test_config_file_of_any_bytes_is_refused_in_one_sentence(
+    fails: Fails, tmp_path: Path, data: bytes
+) -> None:
+    (tmp_path / "my.yaml").write_bytes(data)
+    sentence = fails(train_command.main, ["--config", "my.yaml"])
+    assert len(sentence) < 5000 and sentence[:-1].isprintable()
+
+
 def test_flag_is_validated_on_top_of_the_config_file(fails: Fails, tmp_path: Path) -> None:
     (tmp_path / "my.yaml").write_text("ppo: {num_envs: 8, rollout_length: 8, num_minibatches: 4}")
     sentence = fails(train_command.main, "--config my.yaml --num-envs 9 --rollout-length 5".split())

@@ -67,21 +67,6 @@ def windows_of(log: Log) -> Windows:
     return cut(log, 0.001)
 
 
-def test_windows_hold_each_bounce_once_and_each_measurement_at_most_once() -> None:
-    log = flight_log()
-    w = windows_of(log)
-    zero = w.origin + 0.001 * w.first
-    found = np.sort((zero + w.bounces)[w.has_ball])
-    # Those at the ends and at the begin of the gap have no flight on one side.
-    expected = [t for t in np.arange(0.6, 5.9, 0.6) if not 2.9 < t < 3.1]
-    np.testing.assert_allclose(found, expected, atol=0.012)
-    times = (zero[:, None] + w.angle_times)[w.angle_weights > 0.0]
-    assert len(np.unique(np.round(times, 6))) == len(times) > 0.9 * len(log.times)
-    pictures = (zero[:, None] + w.picture_times)[w.picture_weights > 0.0]
-    assert not np.any((pictures > 3.0) & (pictures < 3.5))
-    assert np.max(w.picture_times) < w.steps * 0.001
-
-
 @pytest.mark.parametrize("latency, lag", [(0.0237, 0.0), (0.0082, 0.015)])
 def test_targets_are_late_and_lagged(latency: float, lag: float) -> None:
     """Against a simulation with steps a hundred times as short."""
@@ -236,13 +221,6 @@ def unseen() -> Identified:
     known = Fit(layout.mean, np.zeros(0), predicted), np.linalg.inv(spread), spread
     errors = {"joint_angles": 1.234567, "ball_position": 1.0}
     return Identified(layout, windows, None, *known, errors, errors, errors, 0)
-
-
-def test_no_interval_leaves_what_is_possible() -> None:
-    """A friction is not below zero, however little the log shows of it."""
-    friction = [entry for entry in estimates(unseen(), NAMES) if "friction" in entry.label]
-    assert friction and all(entry.low >= 0.0 for entry in friction)
-    assert min(e.value - e.low for e in friction) < min(e.high - e.value for e in friction)
 
 
 def test_the_page_begins_with_the_answer() -> None:

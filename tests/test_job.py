@@ -17,7 +17,6 @@ import jax
 import numpy as np
 import pytest
 from rich.console import Console
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report, Result
@@ -35,8 +34,7 @@ from bounce_mjx.runs.folders import (
 from bounce_mjx.runs.lock import lock_run
 from bounce_mjx.runs.progress import Progress
 from bounce_mjx.runs.reading import policy_shapes, read_policy, read_record
-from bounce_mjx.runs.writing import CheckpointWriter
-from bounce_mjx.training import console, job
+from bounce_mjx.training import job
 from bounce_mjx.training.callbacks import Event
 from bounce_mjx.training.trainer import Snapshot
 from tiny_runs import contents
@@ -284,25 +282,6 @@ def test_a_training_does_not_wait_long_for_a_margin(evaluations, solved: bool) -
     assert progress.solved is solved
 
 
-@pytest.mark.parametrize(
-    ("steps", "solved", "expected"),
-    [(100, False, ", 0 s left"), (70, False, ", 180 s left"), (70, True, ", at most 180 s left")],
-)
-def test_the_time_left_is_told(monkeypatch, steps: int, solved: bool, expected: str) -> None:
-    """A training that is resumed after 50 steps needs 120 s for the next 20, evaluations
-    included."""
-    now = 0.0
-    monkeypatch.setattr(console.time, "monotonic", lambda: now)
-    shown = io.StringIO()
-    config = TrainConfig(total_steps=100, stop_when_solved=solved)
-    names = ("episode/return", "episode/bounces", "task/non_finite", "speed/steps_per_second")
-    metrics = {name: np.ones(1) for name in names} | {"task/non_finite": np.zeros(1)}
-    reporter = console.Reporter(Console(file=shown, width=200), config, 50)
-    now = 120.0
-    reporter.block(steps, 1.0, metrics)
-    assert expected in shown.getvalue()
-
-
 def test_settings_that_cannot_be_trained_are_refused_before_a_save(tmp_path: Path) -> None:
     class Falling(CountingTrainer):
         def run(self, iterations, stopping):
@@ -445,26 +424,6 @@ def test_a_training_holds_the_lock_of_its_run(tmp_path: Path) -> None:
     with lock_run(run), pytest.raises(UserError, match=f"{run} is in use by another training"):
         train(tmp_path, RETURNS, run)
     assert contents(run) == saved
-
-
-def test_the_log_holds_every_point_of_a_checkpoint(tmp_path: Path, monkeypatch) -> None:
-    """This holds even if the process dies right after the save, because a second SIGTERM does not
-    wait."""
-    logged = []
-    save = CheckpointWriter.save
-
-    def save_and_look(writer, steps, *rest):
-        (run,) = tmp_path.iterdir()
-        log = EventAccumulator(str(run)).Reload()
-        scalars = [log.Scalars(tag) for tag in ("episode/return", "results/mean_return")]
-        # The last that an evaluation adds.
-        points = [*scalars, log.Tensors("results/text_summary")]
-        logged.append((steps, *(tag[-1].step for tag in points)))
-        save(writer, steps, *rest)
-
-    monkeypatch.setattr(CheckpointWriter, "save", save_and_look)
-    train(tmp_path, {1: 1.0, 2: 2.0})
-    assert logged == [(steps,) * 4 for steps in (64, 128)]
 
 
 # Full disks

@@ -1,7 +1,6 @@
 """benchmarks/rank.py: its limits, hits, intervals, and rows."""
 
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -40,10 +39,3 @@ def test_the_interval_is_that_of_the_mean(rank) -> None:
     assert mean == pytest.approx(values.mean(), abs=1e-3)
     np.testing.assert_allclose([low, high], [mean - half, mean + half], atol=0.15 * half)
     assert rank.interval([None], ".1f") == "-" and rank.interval([2.0, 2.0], ".1f") == "2.0"
-
-
-def test_no_policy_is_a_mistake(rank, capsys, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "argv", ["rank.py"])
-    with pytest.raises(SystemExit) as exit_info:
-        rank.main()
-    assert exit_info.value.code == 2 and "pretrained" in capsys.readouterr().err

@@ -84,16 +84,6 @@ def test_runs_started_at_once_have_folders_of_their_own(tmp_path: Path) -> None:
     assert all(load_run_config(run).log_dir == tmp_path for run in runs)
 
 
-@pytest.mark.parametrize("name", ["[/x]", ":smile:"])
-def test_a_path_is_printed_as_it_is(tmp_path: Path, name: str, capsys) -> None:
-    run = tmp_path / name / "2026-01-01"
-    (run / "checkpoints/64").mkdir(parents=True)
-    save_config(run, TrainConfig())
-    chosen = choose_checkpoint(None, tmp_path / name, Console())
-    assert chosen.run == run
-    assert capsys.readouterr().out == f"using the newest run: {run} (not evaluated)\n"
-
-
 @pytest.fixture
 def runs(tmp_path: Path, progress: Progress) -> Path:
     """A folder of runs: the first solved, the second not, the third without a checkpoint."""

@@ -4,7 +4,6 @@ import itertools
 import re
 from pathlib import Path
 
-import jax
 import mujoco
 import numpy as np
 import pytest
@@ -23,8 +22,6 @@ from bounce_mjx.viewers.display import (
     camera_pose,
     marker_body,
 )
-from bounce_mjx.viewers.guard import open_server
-from bounce_mjx.viewers.scene import Scene
 from bounce_mjx.viewers.scene import _grid as scene_grid
 from viewing import NAN, at_height, evaluated
 
@@ -105,35 +102,6 @@ def test_the_camera_sees_every_robot(home) -> None:
         offsets = scene_grid(number)
         points = (offsets[:, None] + parts).reshape(-1, 3)
         assert np.all(np.abs(projected(points, np.array(home), aspect, offsets)) < 1.0)
-
-
-@pytest.mark.parametrize(
-    ("number", "names", "text"),
-    [
-        (1, None, "bounces 0   target 0.80 m"),
-        (2, ["A", "B"], "B:  bounces 0   target 0.80 m"),
-        (16, None, "16:  0"),
-    ],
-)
-def test_labels_are_above_the_highest_target_and_in_the_picture(env, number, names, text) -> None:
-    mirrored = viewing.mirrored()
-    mirrored.reset()
-    frame = jax.tree.map(
-        lambda values: np.resize(values, (number, *values.shape[1:])), mirrored.frame
-    )
-    with open_server("127.0.0.1", 0) as server:
-        scene = Scene(server, env, number, names)
-        scene.update([frame._replace(command=at_height(np.full(number, 0.8)))])
-        labels = np.array([label.position for label in scene._labels])
-        body = scene._display.model.body(marker_body("target_height")).id
-        targets = scene._bodies[body].batched_positions
-        assert scene._labels[-1].text == text
-    np.testing.assert_allclose(labels - targets, [(0.0, 0.0, 0.14)] * number, atol=1e-6)
-    for aspect in ASPECTS:
-        offsets = scene_grid(number)
-        across, up = projected(labels, np.array(env.task.focus()), aspect, offsets).T
-        # Room for the text of a label.
-        assert np.all(np.abs(across) < 0.9) and np.all((-1.0 < up) & (up < 0.93))
 
 
 VIEWS = {

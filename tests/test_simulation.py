@@ -7,11 +7,10 @@ import pytest
 from rich.console import Console
 
 import viewing
-from bounce_mjx import BounceBall, EnvConfig
+from bounce_mjx import BounceBall
 from bounce_mjx.baselines.mirror import MirrorLaw
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.policy import make_networks
-from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import pretrained_checkpoint
 from bounce_mjx.runs.reading import read_policy
@@ -20,7 +19,6 @@ from bounce_mjx.viewers.display import Display
 from bounce_mjx.viewers.options import ViewerOptions
 from bounce_mjx.viewers.simulation import (
     EnvFrame,
-    SideBySide,
     Simulation,
     at_index,
     frame_at,
@@ -28,7 +26,7 @@ from bounce_mjx.viewers.simulation import (
     make_policy_controller,
     resample,
 )
-from bounce_mjx.viewers.world import SLIDERS, reset_ranges, sliders_for, with_sliders
+from bounce_mjx.viewers.world import SLIDERS, reset_ranges, with_sliders
 from bounce_mjx.world.randomization import RandomizationConfig
 from viewing import (
     GRAVITY,
@@ -102,28 +100,6 @@ def test_the_target_height_can_be_set_and_stays(mirrored: Simulation) -> None:
     assert np.all((target >= low) & (target <= high))
 
 
-def test_only_an_episode_that_was_not_timed_out_is_lost(
-    env: BounceBall, mirrored: Simulation, recording: EnvFrame
-) -> None:
-    assert recording.over.any() and not recording.lost.any()
-    mirrored.reset()
-    mirrored.push((2.0, 0.0, 0.0))
-    frames = mirrored.record(1.0)
-    assert frames.lost.any(axis=0).all() and frames.over.any(axis=0).all()
-    mirrored.reset()
-
-
-def test_policies_side_by_side_are_shown_as_one(mirrored: Simulation) -> None:
-    both = SideBySide([mirrored, mirrored])
-    both.command = at_height(0.7)
-    both.reset()
-    frame = both.step()
-    assert both.num_envs == len(frame.ball) == len(both.frame.metrics["n_bounces"]) == 4
-    np.testing.assert_allclose(target_of(both.frame), 0.7)
-    assert both.record(0.05).qpos.shape[:2] == (6, 4)
-    both.command = {}
-
-
 def test_an_exchanged_policy_acts(env: BounceBall) -> None:
     exchangeable = viewing.exchangeable()
     before = exchangeable.frame.qpos[0, :6]
@@ -156,18 +132,6 @@ def ramp(over: tuple[int, ...] = ()) -> EnvFrame:
     ended[list(over)] = True
     command, metrics = {"height": value}, {"count": value}
     return EnvFrame(value * 0.01, wide, wide[:, :, None], wide, command, metrics, ended, ended)
-
-
-def test_resampling_interpolates_positions() -> None:
-    frames = resample(ramp(), dt=0.01, fps=60)
-    assert len(frames.time) == 6
-    times = np.arange(6) / 60
-    np.testing.assert_allclose(frames.time[:, 0], times)
-    for positions in (frames.qpos, frames.balls[:, 0], frames.paddle):
-        np.testing.assert_allclose(positions[:, 0, 0], 100 * times)
-    # Commands and metrics come from the last step.
-    for values in (frames.command["height"], frames.metrics["count"]):
-        np.testing.assert_array_equal(values[:, 0], np.floor(100 * times + 1e-9))
 
 
 def test_resampling_does_not_blend_two_episodes() -> None:
@@ -254,25 +218,6 @@ def test_only_the_worlds_own_terms_are_drawn(played: Simulation) -> None:
     played.world = {}
     played.step()
     np.testing.assert_array_equal(played._states.pipeline_state.world["ball_mass"], 1.0)
-
-
-def test_sliders_extend_the_ranges_of_a_task() -> None:
-    """Of all axes; another robot's own restitution is unknown."""
-    tilt = (-0.08, 0.01), (-0.07, 0.2)
-    drawn = {"action_latency": (0.01, 0.2), "restitution": (0.7, 0.8), "paddle_tilt": tilt}
-    config = EnvConfig(randomization=RandomizationConfig(**drawn))
-    widened = with_sliders(config).randomization
-    assert (widened.action_latency, widened.restitution) == ((0.0, 0.2), (0.6, 0.98))
-    assert widened.paddle_tilt == (-0.08, 0.2)
-    assert sliders_for(widened) == SLIDERS and not sliders_for(config.randomization)
-    ranges = reset_ranges(config)
-    assert set(ranges) == set(widened.terms)
-    np.testing.assert_allclose(ranges["restitution"], (0.7, 0.8))
-    np.testing.assert_allclose(ranges["paddle_tilt"], tilt)
-    np.testing.assert_array_equal(ranges["ball_latency"], np.zeros(2))
-    other = EnvConfig(mjcf=resource_path("mjcf/bounce_ball.xml"))
-    labels = [slider.term for slider in sliders_for(with_sliders(other).randomization)]
-    assert labels == [slider.term for slider in SLIDERS if slider.term != "restitution"]
 
 
 def test_a_moved_slider_changes_the_world_at_once(played: Simulation, monkeypatch) -> None:

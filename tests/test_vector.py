@@ -133,16 +133,6 @@ def test_observation_is_the_next_state_and_differs_from_the_final_one_only_at_en
     np.testing.assert_array_equal(same, ~ended)
 
 
-def test_every_episode_has_a_draw_of_its_own(limited):
-    results, states = limited
-    first, second = results.observation[np.flatnonzero(results.truncated.any(axis=1))]
-    starts = np.concatenate([vector.observe(states[0]), first, second])
-    drawn = starts[:, np.r_[0:9, 13:19, 28]]
-    for entry in drawn.T:
-        # A coordinate of order 1 keeps 24 bits of a draw; two of 12 hardly ever coincide.
-        assert len(np.unique(entry)) == len(starts)
-
-
 def test_termination_at_the_limit_is_not_a_time_out(unlimited, reset, step, actions):
     ended_at, i = np.argwhere(unlimited[0].terminated)[0]
     episode_steps = ended_at + 1
