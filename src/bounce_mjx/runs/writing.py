@@ -9,7 +9,6 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,55 +17,42 @@ import numpy as np
 
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.files import seal, to_json, to_plain, writable, write_atomically
+from bounce_mjx.runs.files import seal, to_plain, writable
 from bounce_mjx.runs.folders import CHECKPOINTS, create_run
-from bounce_mjx.runs.progress import RESULTS_FILE
 from bounce_mjx.runs.reading import POLICY, RECORD
 
 # Where orbax moves the checkpoints that are not kept any more.
 _REPLACED = "replaced"
 
 
-class CheckpointWriter:
-    """Saves a run's checkpoints and results in the background. What could not be saved is lost: the
+Write = Callable[[], None]
+
+
+class Saving:
+    """Writes a run in a background thread while it is entered. What could not be saved is lost: the
     next save has newer data."""
 
-    def __init__(self, run: Path, config: TrainConfig, pool: concurrent.futures.Executor):
-        """
-        Args:
-          pool: the thread that writes.
-        """
-        self._run, self._config, self._pool = run, config, pool
-        self._writing: concurrent.futures.Future | None = None
+    def __init__(self, run: Path):
+        self._run = run
+        # One thread, so that the saves keep their order.
+        self._pool = concurrent.futures.ThreadPoolExecutor(1)
+        self._writing = self._pool.submit(lambda: None)
         self._problem: str | None = None
 
-    def save(
-        self,
-        steps: int,
-        items: dict[str, Any],
-        progress: dict[str, Any],
-        score: Sequence[float] = (),
-        results: dict[str, Any] | None = None,
-    ) -> None:
-        """Starts a save after waiting for the previous save.
+    def __enter__(self) -> "Saving":
+        return self
 
-        Args:
-          steps: environment steps trained.
-          items: pytrees of arrays by their names.
-          progress: the evaluations so far, plain data.
-          score: quality of the policy; empty if it was not evaluated.
-          results: the run's results, plain data.
-        """
-        # A copy, because the training reuses its buffers while the writer is still busy.
-        items = jax.tree.map(np.array, items)
-        self.problem()
-        arguments = self._run, self._config, steps, items, progress, score
-        self._start(partial(save_checkpoint, *arguments), results)
+    def __exit__(self, *_) -> None:
+        self._pool.shutdown()
 
-    def save_results(self, results: dict[str, Any] | None) -> None:
-        """Starts to write the run's results alone."""
-        self.problem()
-        self._start(lambda: None, results)
+    def start(self, writes: Sequence[Write]) -> None:
+        """Starts a save; those after the first that fails are left out."""
+
+        def write_all() -> None:
+            for write in writes:
+                write()
+
+        self._writing = self._pool.submit(write_all)
 
     def problem(self, wait: bool = True) -> str | None:
         """Reason for the last save's failure, as part of a sentence; None if it succeeded.
@@ -74,23 +60,13 @@ class CheckpointWriter:
         Args:
           wait: whether to wait for a save in progress; otherwise the result is of the save before.
         """
-        if self._writing is not None and (wait or self._writing.done()):
+        if wait or self._writing.done():
             self._problem = None
             try:
                 self._writing.result()
             except OSError as error:
                 self._problem = f"{self._run} cannot be written ({error.strerror})"
         return self._problem
-
-    def _start(self, save: Callable[[], None], results: dict[str, Any] | None) -> None:
-        text = None if results is None else to_json(results)
-
-        def write() -> None:
-            save()
-            if text is not None:
-                write_atomically(self._run / RESULTS_FILE, text)
-
-        self._writing = self._pool.submit(write)
 
 
 def write_run(config: TrainConfig, steps: int, policy: Policy) -> Path:

@@ -11,6 +11,7 @@ import shlex
 import shutil
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +26,11 @@ from bounce_mjx.evaluation.results import Report
 from bounce_mjx.files import UNFINISHED
 from bounce_mjx.interrupt import Interrupted, StopRequest
 from bounce_mjx.learning.policy import Policy
-from bounce_mjx.runs import folders
+from bounce_mjx.runs import folders, writing
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.files import writable
+from bounce_mjx.runs.files import to_json, writable, write_atomically
 from bounce_mjx.runs.lock import lock_run
-from bounce_mjx.runs.progress import Progress
+from bounce_mjx.runs.progress import RESULTS_FILE, Progress
 from bounce_mjx.runs.reading import (
     NETWORKS,
     POLICY,
@@ -38,7 +39,7 @@ from bounce_mjx.runs.reading import (
     read_record,
     read_training,
 )
-from bounce_mjx.runs.writing import CheckpointWriter
+from bounce_mjx.runs.writing import Saving, Write
 from bounce_mjx.tasks.registry import is_file
 from bounce_mjx.training import hosts
 from bounce_mjx.training.callbacks import Callback, Event, block_means, call_all, points_of
@@ -114,10 +115,8 @@ def train(
     """
     hosts.agree(config, resume)
     with contextlib.ExitStack() as stack:
-        job = Job(in_whole_blocks(config), console, resume, callbacks, stack)
-        job.prepare(make_trainer)
+        job = Job(in_whole_blocks(config), console, resume, callbacks, stack, make_trainer)
         job.open()
-        job.announce()
         try:
             job.compile(make_evaluators)
             job.train()
@@ -147,7 +146,9 @@ class Job:
         resume: Path | None,
         callbacks: Sequence[Callback],
         stack: contextlib.ExitStack,
+        make_trainer: Callable[[TrainConfig, Env], Trainer],
     ):
+        """Builds what may refuse the config, before a folder is made."""
         self.config, self.console, self.resume, self.stack = config, console, resume, stack
         self.callbacks = callbacks if hosts.is_leader() else ()
         self.pool = concurrent.futures.ThreadPoolExecutor()
@@ -155,38 +156,46 @@ class Job:
         self.clock = Clock()
         self.block_steps = iterations_per_block(config) * config.ppo.batch_steps
         self.eval_steps = self.block_steps * max(1, round(config.eval_every / self.block_steps))
+        self.env = Env(config.env)
+        self.trainer = make_trainer(config, self.env)
+        warm = config.warm_start is not None and resume is None
+        self.first = read_start(config, self.env) if warm else None
         self.state: Any = None
         self.steps = 0
         self.ended = False
-        self.logs: concurrent.futures.Future[list[TensorBoardLog]] | None = None
-        self.writers: list[CheckpointWriter] = []
-        self.seed_writers: list[CheckpointWriter] = []
-
-    def prepare(self, make_trainer: Callable[[TrainConfig, Env], Trainer]) -> None:
-        """Builds what may refuse the config, before a folder is made."""
-        self.env = Env(self.config.env)
-        self.trainer = make_trainer(self.config, self.env)
-        warm = self.config.warm_start is not None and self.resume is None
-        self.first = read_start(self.config, self.env) if warm else None
+        self.logs: concurrent.futures.Future[dict[Path, TensorBoardLog]] | None = None
 
     def open(self) -> None:
-        """Makes the folder of a new run, or reads the resumed one."""
+        """Makes the folder of a new run, or reads the resumed one, and says what is trained."""
         # Before, a signal ends the process by its default action.
         self.stop = self.stack.enter_context(StopRequest())
-        self.keeps_folder = self.resume is not None
-        self.run = self.resume or self._create()
+        config, self.keeps_folder = self.config, self.resume is not None
+        if self.resume is None:
+            made = str(folders.create_run(config)) if hosts.is_leader() else None
+            self.run = Path(hosts.text_from_leader(made))
+        else:
+            self.run = self.resume
         self.stack.push(self._remove_unstarted)
         if hosts.is_leader():
             self.stack.enter_context(lock_run(self.run))
-        self.members = self._seed_runs()
+        seconds = self.clock.seconds
+        self.members = [SeedRun(self.run, config, seconds)]
+        if config.num_seeds > 1:
+            seeds = range(config.seed, config.seed + config.num_seeds)
+            alone = [config.model_copy(update={"seed": seed, "num_seeds": 1}) for seed in seeds]
+            runs = [folders.seed_folder(self.run, seed) for seed in seeds]
+            self.members = [SeedRun(*each, seconds) for each in zip(runs, alone, strict=True)]
         if self.resume is not None:
             self._read_resumed()
-        if hosts.is_leader():
-            self._write_configs()
-
-    def announce(self) -> None:
-        """Says what is trained, where and for how long."""
-        config, mesh = self.config, self.trainer.mesh
+        configs = {self.run: config} | {member.run: member.config for member in self.members}
+        for folder, own in configs.items() if hosts.is_leader() else ():
+            # A new run has its own config.
+            if self.resume is not None or folder != self.run:
+                with writable(folder, "make room there or make it writable"):
+                    folder.mkdir(exist_ok=True)
+                    folders.save_config(folder, own)
+        self.saving = self.stack.enter_context(Saving(self.run))
+        mesh = self.trainer.mesh
         self.device = mesh.devices.flat[0].device_kind
         if mesh.size > 1:
             self.device = f"{mesh.size} x {self.device}"
@@ -208,7 +217,7 @@ class Job:
 
     def failure(self, error: jax.errors.JaxRuntimeError) -> str:
         """What a device's failure means to the user, once the last state is saved."""
-        self._problem()
+        self.saving.problem()
         reason = shorten(reason_of(error), 200)
         if reason.startswith("RESOURCE_EXHAUSTED"):
             envs = f"{self.config.ppo.num_envs:,} environments"
@@ -223,17 +232,12 @@ class Job:
         latest = self._latest()
         if latest is None:
             return "start again, as no checkpoint had been saved yet"
-        everywhere = " on every host" if jax.process_count() > 1 else ""
-        return f"{self._go_on}{everywhere} (the last checkpoint is {latest.folder})"
+        return f"{self._go_on} (the last checkpoint is {latest.folder})"
 
     def _latest(self) -> folders.Checkpoint | None:
         with contextlib.suppress(UserError):
             return folders.latest_checkpoint(self.run)
         return None
-
-    def _create(self) -> Path:
-        run = str(folders.create_run(self.config)) if hosts.is_leader() else None
-        return Path(hosts.text_from_leader(run))
 
     def _remove_unstarted(self, error: type[BaseException] | None, *_) -> None:
         """Removes the folder of a new run without a checkpoint or a block that can be trained."""
@@ -242,26 +246,6 @@ class Job:
                 # A log that is opened later would make the folder again.
                 concurrent.futures.wait([self.logs])
             shutil.rmtree(self.run, ignore_errors=True)
-
-    def _seed_runs(self) -> list[SeedRun]:
-        config, seconds = self.config, self.clock.seconds
-        if config.num_seeds == 1:
-            return [SeedRun(self.run, config, seconds)]
-        seeds = range(config.seed, config.seed + config.num_seeds)
-        alone = [config.model_copy(update={"seed": seed, "num_seeds": 1}) for seed in seeds]
-        return [SeedRun(folders.seed_folder(self.run, own.seed), own, seconds) for own in alone]
-
-    def _configs(self) -> dict[Path, TrainConfig]:
-        """The config of each folder: the run's, and with several seeds, those of the seeds."""
-        return {self.run: self.config} | {member.run: member.config for member in self.members}
-
-    def _write_configs(self) -> None:
-        for folder, config in self._configs().items():
-            # A new run has its own config.
-            if self.resume is not None or folder != self.run:
-                with writable(folder, "make room there or make it writable"):
-                    folder.mkdir(exist_ok=True)
-                    folders.save_config(folder, config)
 
     def _read_resumed(self) -> None:
         folders.refuse_brackets(self.run)
@@ -272,23 +256,15 @@ class Job:
         latest = folders.latest_checkpoint(self.run)
         self.state, record = read_training(latest, self.trainer.state_template())
         self.steps = record.steps
-        for member, plain in zip(
-            self.members, record.progress.get("seeds", [record.progress]), strict=True
-        ):
+        evaluated = record.progress.get("seeds", [record.progress])
+        for member, plain in zip(self.members, evaluated, strict=True):
             member.progress = _resumed_progress(member.run, plain)
             member.saved = (member.progress.best, member.progress.best_steps, None)
-        self._say_how_far()
-
-    def _say_how_far(self) -> None:
-        """Says if the resumed training has nothing to do, or was solved before."""
-        steps, total = f"{self.steps:,} steps", f"{self.config.total_steps:,} steps"
-        how = "add --total-steps N to train on"
-        if self.steps >= self.config.total_steps:
-            say(self.console, f"{self.run} has been trained to its end, {steps}; {how}")
-        elif self._is_solved():
-            met = f"{self.run} has met all results after {steps}"
-            continues = f"it continues to {total}"
-            say(self.console, f"{met}; {how if self.config.stop_when_solved else continues}")
+        solved = self.config.stop_when_solved and self._is_solved()
+        if self._is_done() or solved:
+            met = "has met all results" if solved else "has been trained to its end"
+            end = f"{self.run} {met}, {self.steps:,} steps"
+            say(self.console, f"{end}; add --total-steps N to train on")
 
     def compile(self, make_evaluators: Callable[..., Evaluators]) -> None:
         """Compiles the programs that training needs to start. Evaluations are compiled, logs are
@@ -301,14 +277,17 @@ class Job:
             compiling = self.trainer.compile(self.pool)
             mesh = self.trainer.mesh
             self.evaluators = make_evaluators(self.config, self.env, mesh, self.pool)
-            first_step = None if self.resume is None else self.steps
-            self.logs = self.pool.submit(self._open_logs, first_step)
+            self.logs = self.pool.submit(self._open_logs)
             for module in (CHECKPOINT_MODULE, REPORT_MODULE):
                 self.logs.add_done_callback(lambda _, m=module: importlib.import_module(m))
             compiling.result()
 
+        def start_callbacks() -> None:
+            for member in self.members:
+                call_all(self.callbacks, "start", member.run, member.config)
+
         with self.console.status("compiling"):
-            starting = self.pool.submit(self._start_callbacks)
+            starting = self.pool.submit(start_callbacks)
             compiling = self.pool.submit(compile)
             if not self.stop.wait_for(compiling):
                 raise Interrupted
@@ -323,39 +302,28 @@ class Job:
         self.state = None
         if self.first is not None:
             self.trainer.warm_start(*self.first)
-        if hosts.is_leader():
-            # One thread, so that the saves keep their order.
-            saving = self.stack.enter_context(concurrent.futures.ThreadPoolExecutor(1))
-            configs = self._configs().items()
-            self.writers = [CheckpointWriter(run, config, saving) for run, config in configs]
-            self.seed_writers = self.writers[-len(self.members) :]
         reporter = Reporter(self.console, self.config, self.steps)
         self.reporter = self.stack.enter_context(reporter)
         self.stack.callback(self._flush)
         self.clock.lap("compile")
 
-    def _start_callbacks(self) -> None:
-        for member in self.members:
-            call_all(self.callbacks, "start", member.run, member.config)
-
-    def _open_logs(self, first_step: int | None) -> list[TensorBoardLog]:
+    def _open_logs(self) -> dict[Path, TensorBoardLog]:
         """A log for each seed, none in a process that writes nothing."""
-        members = self.members if hosts.is_leader() else []
-        logs = [TensorBoardLog(member.run) for member in members]
-        for log, member in zip(logs, members, strict=True):
+        first_step = None if self.resume is None else self.steps
+        logs = {m.run: TensorBoardLog(m.run) for m in self.members if hosts.is_leader()}
+        for log, member in zip(logs.values(), self.members, strict=False):
             log.start(member.config, first_step)
         return logs
 
     def _flush(self) -> None:
         """Writes everything logged so far to the logs' files."""
-        for log in self.logs.result():
+        for log in self.logs.result().values():
             log.flush()
 
     def _tell(self, events: Sequence[Event]) -> None:
         """Logs an event of each seed, and tells the callbacks."""
-        logs = {log.run: log for log in self.logs.result()}
         for event in events if hosts.is_leader() else ():
-            logs[event.run](event)
+            self.logs.result()[event.run](event)
             answers = [callback(event) for callback in self.callbacks]
             self.ended |= any(answer is False for answer in answers)
 
@@ -364,8 +332,7 @@ class Job:
         while not self._stopping():
             if self._is_due() and not self._evaluate():
                 break
-            solved = self.config.stop_when_solved and self._is_solved()
-            if solved or self._is_done():
+            if self._is_done() or (self.config.stop_when_solved and self._is_solved()):
                 break
             self._run_block()
             self.ended = hosts.any_of(self.ended)
@@ -381,7 +348,7 @@ class Job:
             jax.distributed.shutdown()
             raise Interrupted
         if stopping and not self._evaluated():
-            self._save(self.trainer.snapshot())
+            self._save(self.trainer.snapshot(), {})
         self._wait_until_saved()
         evaluated = not stopping and self._evaluate_best()
         jax.distributed.shutdown()
@@ -418,36 +385,34 @@ class Job:
         reports = self._wait_for_reports(self.evaluators.select, snapshot.policies)
         if reports is None:
             return False
-        healthy = [member.progress.fault is None for member in self.members]
-        sound = [report for report, is_sound in zip(reports, healthy, strict=True) if is_sound]
-        self.reporter.evaluation(self.steps, sound)
+        evaluated = [
+            (i, member, reports[i])
+            for i, member in enumerate(self.members)
+            if member.progress.fault is None
+        ]
+        self.reporter.evaluation(self.steps, [report for *_, report in evaluated])
+        policies = snapshot.policies
         self._tell(
             [
-                Event(m.run, m.config, self.steps, points_of(report), report, policy)
-                for m, report, policy in zip(self.members, reports, snapshot.policies, strict=True)
-                if m.progress.fault is None
+                Event(member.run, member.config, self.steps, points_of(report), report, policies[i])
+                for i, member, report in evaluated
             ]
         )
-        self._settle()
+        # A policy that could not be saved is not the best one.
+        lost = hosts.any_of(self.saving.problem() is not None)
+        for member in self.members:
+            kept = member.progress.best, member.progress.best_steps, member.best_policy
+            member.saved = member.saved if lost else kept
+            member.progress.best, member.progress.best_steps, member.best_policy = member.saved
         seconds, scores = sum(self.clock.seconds.values()), {}
-        for i, member in enumerate(self.members):
-            if healthy[i] and member.progress.improves(reports[i], self.steps, seconds):
-                member.best_policy = snapshot.policies[i]
-                scores[i] = reports[i].score
-            elif len(self.members) == 1:
-                scores[i] = reports[i].score
+        for i, member, report in evaluated:
+            is_best = member.progress.improves(report, self.steps, seconds)
+            if is_best:
+                member.best_policy = policies[i]
+            if is_best or len(self.members) == 1:
+                scores[i] = report.score
         self._save(snapshot, scores)
         return True
-
-    def _settle(self) -> None:
-        """Waits for the last save: a policy that could not be saved is not the best one."""
-        lost = hosts.any_of(self._problem() is not None)
-        for member in self.members:
-            progress = member.progress
-            if lost:
-                progress.best, progress.best_steps, member.best_policy = member.saved
-            else:
-                member.saved = progress.best, progress.best_steps, member.best_policy
 
     def _evaluate_best(self) -> bool:
         """Evaluates the best policies on fresh resets, and writes the results; returns False if a
@@ -464,8 +429,8 @@ class Job:
             return False
         for member, report in zip(self.members, reports, strict=True):
             member.final = None if member.progress.best is None else report
-        for writer, member in zip(self.seed_writers, self.members, strict=False):
-            writer.save_results(self._results(member))
+        if hosts.is_leader():
+            self.saving.start([w for member in self.members for w in self._results(member)])
         self._wait_until_saved()
         return True
 
@@ -474,7 +439,7 @@ class Job:
         Raises:
           UserError: the end of the training could not be saved.
         """
-        if problem := self._problem():
+        if problem := self.saving.problem():
             raise UserError(
                 f"{problem}, so the end of the training is lost; make room, and {self._advice()}"
             )
@@ -519,17 +484,15 @@ class Job:
         metrics["speed/steps_per_second"] = np.full((self.config.num_seeds, 1), rate)
         means = block_means(metrics)
         self.reporter.block(self.steps, seconds, means)
-        points = [{name: float(x[i]) for name, x in means.items()} for i in range(len(faults))]
-        points = [{name: x for name, x in seed.items() if np.isfinite(x)} for seed in points]
+        points = [
+            {name: float(x[i]) for name, x in means.items() if np.isfinite(x[i])}
+            for i in range(len(faults))
+        ]
         members = zip(self.members, points, strict=True)
         self._tell([Event(member.run, member.config, self.steps, x) for member, x in members])
-        self.reporter.saving_problem(self._problem(wait=False))
+        self.reporter.saving_problem(self.saving.problem(wait=False))
         self._check_faults(faults)
         self.clock.lap("train")
-
-    def _problem(self, wait: bool = True) -> str | None:
-        """Why the last save failed; see `CheckpointWriter.problem`."""
-        return next(filter(None, [writer.problem(wait) for writer in self.writers]), None)
 
     def _check_faults(self, faults: np.ndarray) -> None:
         """Ends a run that diverged, because its state is useless; with several seeds, the
@@ -543,15 +506,14 @@ class Job:
             if member.progress.fault is not None or not block_faults.any():
                 continue
             first = int(np.argmax(block_faults != 0))
-            member.progress.fault = (
-                f"{self.trainer.checked[int(block_faults[first]) - 1]} became infinite or NaN at "
-                f"iteration {before + first + 1}"
-            )
+            quantity = self.trainer.checked[int(block_faults[first]) - 1]
+            where = f"iteration {before + first + 1}"
+            member.progress.fault = f"{quantity} became infinite or NaN at {where}"
             if self.config.num_seeds > 1:
                 self.reporter.say(f"seed {member.config.seed} diverged: {member.progress.fault}")
         if self._healthy():
             return
-        self._problem()
+        self.saving.problem()
         latest = self._latest()
         kept = "no checkpoint had been saved yet"
         if latest is not None:
@@ -561,7 +523,7 @@ class Job:
             "start a new run with a lower learning rate or other rewards"
         )
 
-    def _save(self, snapshot: Snapshot, scores: dict[int, tuple[float, ...]] | None = None) -> None:
+    def _save(self, snapshot: Snapshot, scores: dict[int, tuple[float, ...]]) -> None:
         """Starts to save the state, and with several seeds the policies of some of them.
 
         Args:
@@ -572,34 +534,42 @@ class Job:
         # of the checkpoint.
         self._flush()
         # Each save waits for the one before.
-        self.reporter.saving_problem(self._problem())
+        self.reporter.saving_problem(self.saving.problem())
         self.keeps_folder = True
-        scores = scores or {}
-        plain = [member.progress.model_dump() for member in self.members]
-        several = len(self.members) > 1
-        for i, writer in enumerate(self.seed_writers):
-            results = self._results(self.members[i])
-            if several and i not in scores:
-                writer.save_results(results)
-                continue
-            items = {POLICY: snapshot.policies[i]}
-            if snapshot.networks is not None:
-                items[NETWORKS] = snapshot.networks[i]
-            if not several:
-                items[TRAINING] = snapshot.state
-            writer.save(self.steps, items, plain[i], scores.get(i, ()), results)
-        if several and self.writers:
-            # Last, as it refers to the best policies of the seeds.
-            policies = jax.tree.map(lambda *leaves: np.stack(leaves), *snapshot.policies)
-            items = {POLICY: policies, TRAINING: snapshot.state}
-            self.writers[0].save(self.steps, items, {"seeds": plain})
+        if hosts.is_leader():
+            self.saving.start(self._writes(snapshot, scores))
         self.clock.lap("save")
 
-    def _results(self, member: SeedRun) -> dict[str, Any] | None:
-        """The content of the seed's results.json; None before its first evaluation."""
+    def _writes(self, snapshot: Snapshot, scores: dict[int, tuple[float, ...]]) -> list[Write]:
+        """What writes a state."""
+        # A copy, because the training reuses its buffers meanwhile.
+        policies, state, networks = jax.tree.map(np.array, snapshot)
+        plain = [member.progress.model_dump() for member in self.members]
+        several, writes = len(self.members) > 1, []
+
+        def add(run: Path, config: TrainConfig, *rest: Any) -> None:
+            writes.append(partial(writing.save_checkpoint, run, config, self.steps, *rest))
+
+        for i, member in enumerate(self.members):
+            items = {POLICY: policies[i]}
+            if networks is not None:
+                items[NETWORKS] = networks[i]
+            if not several:
+                items[TRAINING] = state
+            if i in scores or not several:
+                add(member.run, member.config, items, plain[i], scores.get(i, ()))
+            writes += self._results(member)
+        if several:
+            # Last, as it refers to the best policies of the seeds.
+            stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *policies)
+            add(self.run, self.config, {POLICY: stacked, TRAINING: state}, {"seeds": plain})
+        return writes
+
+    def _results(self, member: SeedRun) -> list[Write]:
+        """What writes the seed's results.json; nothing before its first evaluation."""
         if member.report is None:
-            return None
-        return member.progress.results(
+            return []
+        results = member.progress.results(
             member.report,
             fresh_resets=member.final is not None,
             trained_steps=self.steps,
@@ -607,6 +577,7 @@ class Job:
             device=self.device,
             version=bounce_mjx.__version__,
         )
+        return [partial(write_atomically, member.run / RESULTS_FILE, to_json(results))]
 
 
 def _resumed_progress(run: Path, plain: dict[str, Any]) -> Progress:
