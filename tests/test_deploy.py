@@ -626,12 +626,6 @@ except UserError as error:
     assert "must be exported, for which" in refusal and "bounce-mjx export" in refusal
 
 
-def test_the_shipped_policy_bounces_on_plain_mujoco() -> None:
-    perfect = EXAMPLE["Camera"](rate=1000.0, noise=0.0, delay=0.0)
-    bounces, survived = EXAMPLE["simulate"](load_policy("pretrained"), perfect, 8.0, [0.5])[0]
-    assert bounces >= 10 and survived == pytest.approx(8.0)
-
-
 def test_only_the_robust_policy_bounces_with_a_late_camera() -> None:
     """On plain MuJoCo; the defaults of the example."""
     simulate, camera = EXAMPLE["simulate"], EXAMPLE["Camera"]

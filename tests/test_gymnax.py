@@ -97,19 +97,6 @@ def test_gymnax_own_wrapper_logs_episodes(gymnax):
 
 
 @pytest.mark.slow
-def test_gymnax_own_vector_for_gymnasium_steps(gymnax):
-    """It replaces the environment's functions by batched ones."""
-    envs = gymnax.GymnaxToVectorGymWrapper(GymnaxBounceBall(episode_seconds=0.02), 2)
-    first, _ = envs.reset(seed=0)
-    assert envs.single_observation_space.shape == (29,)
-    for _ in range(2):
-        following, _, _, truncated, info = envs.step(np.zeros((2, 6), np.float32))
-    assert first.shape == following.shape == (2, 29) and truncated.all()
-    # A new episode has another target.
-    assert not np.any(following[:, 28] == info["final_observation"][:, 28])
-
-
-@pytest.mark.slow
 def test_example_of_purejaxrl_trains():
     main = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "purejaxrl.py"))["main"]
     rewards = np.array(main(num_envs=8, rollout=4, updates=5))

@@ -268,27 +268,6 @@ def test_a_training_stops_once_its_results_have_a_margin(tmp_path: Path) -> None
     assert f"{run} has been trained to its end, 256 steps;" in shown.getvalue()
 
 
-@pytest.mark.parametrize(
-    ("evaluations", "solved"),
-    [
-        ([(64, None)], False),
-        ([(64, None), (128, 1.0)], True),
-        ([(128, 0.5)], False),
-        # Half as many steps again.
-        ([(128, 0.5), (191, 0.5)], False),
-        ([(128, 0.5), (192, 0.5)], True),
-        ([(128, 0.5), (192, None)], True),
-        ([(128, 0.5), (160, 1.0)], True),
-    ],
-)
-def test_a_training_does_not_wait_long_for_a_margin(evaluations, solved: bool) -> None:
-    progress = Progress()
-    for steps, margin in evaluations:
-        result = Result("stable", "episodes, %", 0.0, ">= 99", margin is not None, margin)
-        progress.improves(Report((result,), {"mean_return": 1.0}), steps, 0.0)
-    assert progress.solved is solved
-
-
 def test_settings_that_cannot_be_trained_are_refused_before_a_save(tmp_path: Path) -> None:
     class Falling(CountingTrainer):
         def run(self, iterations, stopping):

@@ -26,7 +26,7 @@ from bounce_mjx.commands import train as train_command
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.reports import page as report_page
-from bounce_mjx.reports.curves import Group, LoggedCurve, group_runs, mean_and_band, read_curves
+from bounce_mjx.reports.curves import LoggedCurve, group_runs, mean_and_band, read_curves
 from bounce_mjx.reports.figures import (
     curves_figure,
     evaluation_figure,
@@ -34,7 +34,7 @@ from bounce_mjx.reports.figures import (
 from bounce_mjx.runs.config import TrainConfig, load_config, train_config
 from bounce_mjx.runs.folders import save_config
 from bounce_mjx.runs.progress import load_results
-from bounce_mjx.task import Curve, Histogram, Hits, Recording, term_names
+from bounce_mjx.task import Curve, Recording, term_names
 from bounce_mjx.tasks.bounce import Bounce, BounceReward
 from bounce_mjx.training.callbacks import Event, WeightsAndBiases
 from bounce_mjx.training.log import TensorBoardLog
@@ -219,44 +219,6 @@ def test_an_evaluation_is_drawn_from_its_recording() -> None:
     assert len(points.get_xdata()) == 3
 
 
-def test_what_another_task_shows_is_drawn(runs: list[Path], monkeypatch) -> None:
-    """Its curves, its levels, which follow its commands, and any number of its plots."""
-    curves = (Curve("loss/value", "", title="loss, $", scale=2.0), Curve("loss/other", ""))
-    (group,) = group_runs(runs[3:])
-    logged_curve = group.runs[0].curves["episode/return"]
-    run = group.runs[0]._replace(curves=group.runs[0].curves | {"loss/value": logged_curve})
-    figure = curves_figure([Group("a", [run], curves)])
-    assert [axes.get_title() for axes in figure.axes] == ["return of an episode", r"loss, \$"]
-    (line,) = (line for line in figure.axes[1].lines if len(line.get_xdata()))
-    np.testing.assert_allclose(line.get_ydata(), 2.0 * logged_curve.values)
-
-    env, steps = BounceBall(EnvConfig(episode_seconds=0.04)), np.eye(4, 2, dtype=bool)
-    monkeypatch.setattr(Bounce, "levels", lambda self, command: {"rim": command["low"] + 0.1})
-    shown = [
-        Histogram("error, N", "turns", np.array([-3.0, 0.5]), 2.0),
-        Histogram("nothing, m", "holes", np.zeros(0), 1.0),
-        Hits("landings, cm", steps),
-    ]
-    monkeypatch.setattr(Bounce, "plots", lambda self, recording: shown)
-    recording = Recording(
-        *(np.zeros((4, size, 2), np.float32) for size in (6, 3, 3)),
-        command={"low": np.array([[0.1, 9.0], [0.1, 9.0], [0.3, 9.0], [0.3, 9.0]])},
-        task={},
-        running=np.array([[True, True]] * 3 + [[False, True]]),
-    )
-    heights, *plots = evaluation_figure(env, recording).axes
-    (level,) = (line for line in heights.lines if line.get_label() == "rim")
-    np.testing.assert_allclose(level.get_ydata(), [0.2, 0.2, 0.4])
-    assert [axes.get_title() for axes in plots] == [
-        "error, N (2 turns)", "nothing, m (0 holes)", "landings, cm (2)",
-    ]  # fmt: skip
-    bounds = [line.get_xdata()[0] for line in plots[0].lines if line.get_linestyle() == "--"]
-    assert bounds == [-2.0, 2.0]
-    assert [text.get_text() for text in plots[1].texts] == ["no holes"]
-    shown.clear()
-    assert len(evaluation_figure(env, recording).axes) == 1
-
-
 @pytest.mark.slow
 def test_plot_of_one_run(trained: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "a/plots"
@@ -397,10 +359,6 @@ def test_tensorboard_reads_everything_back(trained: Path) -> None:
     # results.json measures the best policy once more, on fresh resets.
     (evaluation,) = [e for e in results.evaluations if e.steps == results.best_steps]
     rows = best.tensor_proto.string_val[0].decode().splitlines()
-    assert {row.count("|") for row in rows} == {6}
-    assert [row.split(" | ")[0].strip("| ") for row in rows[2:]] == [
-        result.name for result in results.best.results
-    ]
     assert [row.split(" | ")[2] for row in rows[2:]] == [
         as_shown(evaluation.model_extra[result.name]) for result in results.best.results
     ]
@@ -410,7 +368,6 @@ def test_tensorboard_reads_everything_back(trained: Path) -> None:
     assert picture.step == results.best_steps
     pixels = np.asarray(Image.open(io.BytesIO(picture.encoded_image_string)))
     assert pixels.shape == (picture.height, picture.width, 3)
-    assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 50
 
 
 class FakeWandb:

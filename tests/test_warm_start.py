@@ -12,7 +12,7 @@ import yaml
 
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.env.env import Env
-from bounce_mjx.learning.policy import make_networks, networks_of
+from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.learning.ppo import names_of_critic_metrics
 from bounce_mjx.learning.statistics import normalize
 from bounce_mjx.runs.config import load_run_config
@@ -46,28 +46,6 @@ def stored(run: Path):
     size = config.env.layout.size
     networks = make_networks(config.ppo, size, config.env.num_joints, len(names))
     return config, names, networks, *read
-
-
-@pytest.mark.slow
-def test_both_networks_are_the_same_functions_in_the_same_world(first: Path) -> None:
-    config, _, networks, params, statistics = stored(first)
-    command = config.model_copy(update={"warm_start": first})
-    start, seen = read_start(command, Env(command.env))
-    inputs = jax.random.normal(jax.random.PRNGKey(1), (32, seen.mean.size))
-    assert seen.mean.size == config.env.layout.size + len(CRITIC)
-    before, after = (normalize(inputs, each.normalizer) for each in (statistics, seen))
-    values = [
-        networks.value_network.apply(each.value, x)
-        for each, x in ((params, before), (start, after))
-    ]
-    np.testing.assert_array_equal(*values)
-    assert np.std(values[0]) > 0
-    # The policy that is evaluated and exported is the one that the training starts with.
-    policy = read_policy(best_checkpoint(first), config)
-    observation = inputs[:, : config.env.layout.size]
-    mean = networks.policy_network.apply(start.policy, after[:, : observation.shape[1]]).mean
-    acts = networks_of(config.ppo)(Env(config.env)).act(policy, observation)
-    np.testing.assert_array_equal(np.clip(mean, -1.0, 1.0), acts)
 
 
 @pytest.mark.slow
