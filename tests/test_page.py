@@ -25,8 +25,9 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import latest_checkpoint
 from bounce_mjx.runs.reading import read_policy
+from bounce_mjx.training import watch as watched
 from bounce_mjx.training.callbacks import Event
-from bounce_mjx.training.watch import TrainingPage, _Panel
+from bounce_mjx.training.watch import TrainingPage
 from bounce_mjx.viewers import browser
 from bounce_mjx.viewers.guard import open_server
 from bounce_mjx.viewers.scene import Scene
@@ -35,7 +36,7 @@ from bounce_mjx.viewers.simulation import (
     make_zero_controller,
 )
 from tiny_runs import TINY
-from viewing import NAN, Client, LeanConfig, evaluated, served, wait_until, watch
+from viewing import Client, LeanConfig, evaluated, served, wait_until, watch
 
 
 @pytest.fixture(scope="module")
@@ -209,19 +210,19 @@ def test_the_page_of_a_training_shows_its_newest_policy(
     compiled."""
     printed, stop = io.StringIO(), threading.Event()
 
-    def simulate(page: TrainingPage) -> Simulation:
+    def simulate(config: TrainConfig) -> Simulation:
         assert "watch: " in printed.getvalue()
         return exchangeable
 
-    monkeypatch.setattr(TrainingPage, "_simulate", simulate)
+    monkeypatch.setattr(watched, "_simulate", simulate)
 
     def step(simulation) -> None:
         if stop.is_set():
             raise RuntimeError("the\nend")
 
     watch(monkeypatch, Simulation, "step", step)
-    points: list[tuple[float, ...]] = []
-    watch(monkeypatch, _Panel, "draw", lambda panel: points.extend(panel._points))
+    panels: list[watched._Panel] = []
+    watch(monkeypatch, watched._Panel, "show", lambda panel, _: panels.append(panel))
     training = TrainingPage(TrainConfig(), "127.0.0.1", 8500, Console(file=printed, width=200))
     wait_until(lambda: "watch: " in printed.getvalue())
     client = Client(re.search(r"http://\S+", printed.getvalue())[0])
@@ -234,7 +235,7 @@ def test_the_page_of_a_training_shows_its_newest_policy(
     for told in ("500,000 of 50,000,000 steps", "1 of 2 results met"):
         while not any(told in text for text in client.texts):
             client.receive()
-    np.testing.assert_allclose(points[0], (0.5, 1.0, NAN, 2.0))
+    assert [list(points) for points in panels[0]._points] == [[(0.5, 1.0)], [], [(0.5, 2.0)]]
     titles = ("return of an episode", "bounces in a row at its end", "|apex − target height|, cm")
     assert [line for line in client.lines if line in titles] == list(titles)
     # A page that fails leaves the training alone.

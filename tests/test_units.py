@@ -203,15 +203,15 @@ LATE, NAN = np.array([0.0, 0.0, 3.0, 3.0]), np.array([1.0, 1.0, 1.0, np.nan])
 @pytest.mark.parametrize(
     "block, reason",
     [
-        (first_block(), r"lasts 0\.01 s .* an end of the task bounce .*min_ball_height 0\.05,"),
-        (first_block(too_fast=60.0), r"lasts 0\.01 s .* max_joint_velocity \(6\.28319 rad/s\)"),
+        (first_block(), r"lasts 0\.01 s .* an end of the task bounce;"),
+        (first_block(too_fast=60.0), r"lasts 0\.01 s .* max_joint_velocity;"),
         (first_block(non_finite=64.0), "the physics, which is not finite"),
         (first_block(ended=7.0), r"lasts 0\.091 s"),
         (
             first_block(ended=0.0, height=-1.1e5),
-            "height is -1.1e.05 on average, beyond 10000 after",
+            "height is -1.1e.05 on average, not within 10000 after",
         ),
-        (first_block(ended=0.0, height=NAN), "height is not finite"),
+        (first_block(ended=0.0, height=NAN), "height is nan on average"),
     ],
 )
 def test_a_first_block_without_a_chance_is_refused(block: dict, reason: str) -> None:

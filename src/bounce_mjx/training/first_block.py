@@ -21,54 +21,30 @@ def fault_of(metrics: Metrics, config: TrainConfig) -> str | None:
       metrics: each [S, I], as from `Trainer.run`.
     """
     # What follows an iteration that diverged is not due to the settings.
-    diverged = np.cumsum(metrics["fault"] != 0, axis=1) > (metrics["fault"] != 0)
-    return _fault_of_rewards(metrics, config, ~diverged) or _fault_of_lengths(metrics, config)
-
-
-def _fault_of_rewards(metrics: Metrics, config: TrainConfig, counts: np.ndarray) -> str | None:
-    terms = {name: x for name, x in metrics.items() if name.startswith("reward/")}
-    for name, values in terms.items():
-        scaled = config.ppo.reward_scale * values
-        wrong = counts & ~(np.abs(scaled) <= MAX_REWARD)
-        if wrong.any(axis=1).all():
-            mean = values[wrong][0]
-            size = f"{mean:.3g} on average, beyond {MAX_REWARD:g} after ppo.reward_scale"
+    faults = metrics["fault"] != 0
+    counts = np.cumsum(faults, axis=1) <= faults
+    for name, values in metrics.items():
+        wrong = counts & ~(np.abs(config.ppo.reward_scale * values) <= MAX_REWARD)
+        if name.startswith("reward/") and wrong.any(axis=1).all():
             return (
-                f"the reward term {name.removeprefix('reward/')} is "
-                f"{size if np.isfinite(mean) else 'not finite'}; check the unit of its settings "
-                "and of those of the robot"
+                f"the reward term {name.removeprefix('reward/')} is {values[wrong][0]:.3g} on "
+                f"average, not within {MAX_REWARD:g} after ppo.reward_scale; check the unit of its "
+                "settings and of those of the robot"
             )
-    return None
-
-
-def _fault_of_lengths(metrics: Metrics, config: TrainConfig) -> str | None:
-    env, ended = config.env, metrics["episode/ended"].sum(axis=1)
-    limits = (env.episode_seconds, config.ppo.training_episode_seconds or env.episode_seconds)
+    ended = metrics["episode/ended"].sum(axis=1)
+    limit = config.ppo.training_episode_seconds or config.env.episode_seconds
     steps = config.ppo.batch_steps * metrics["episode/ended"].shape[1]
-    with np.errstate(divide="ignore"):
-        seconds = env.control_dt * steps / ended
-    if min(limits) <= MIN_SECONDS or not (seconds < MIN_SECONDS).all():
+    seconds = config.env.control_dt * steps / np.maximum(ended, 1e-9)
+    if min(limit, config.env.episode_seconds) <= MIN_SECONDS or (seconds >= MIN_SECONDS).any():
         return None
-    causes = {
-        "the physics, which is not finite": "task/non_finite",
-        f"max_joint_velocity ({env.max_joint_velocity:g} rad/s)": "task/too_fast",
-    }
-    most = [
-        cause
-        for cause, name in causes.items()
-        if name in metrics and metrics[name].sum() > 0.5 * ended.sum()
-    ]
-    cause = most[0] if most else f"an end of the task {config.task}{_ends(config)}"
+    cause = f"an end of the task {config.task}"
+    for name, other in (
+        ("task/too_fast", "max_joint_velocity"),
+        ("task/non_finite", "the physics, which is not finite"),
+    ):
+        if metrics.get(name, np.zeros(1)).sum() > 0.5 * ended.sum():
+            cause = other
     return (
         f"an episode lasts {seconds.max():.2g} s on average, less than {MIN_SECONDS:g} s, and what "
         f"ends it is {cause}; check the unit of the settings"
     )
-
-
-def _ends(config: TrainConfig) -> str:
-    """The settings of the task that end an episode, with their values."""
-    fields = type(config.env).model_fields.items()
-    names = (n for n, field in fields if (field.description or "").startswith("The episode ends"))
-    ends = (f"{n} {getattr(config.env, n):g}" for n in names if n != "max_joint_velocity")
-    text = ", ".join(ends)
-    return f" ({text})" if text else ""
