@@ -3,6 +3,9 @@
     pip install -e '.[simulators]'
     python benchmarks/simulators.py robust pretrained --jobs 2
     python benchmarks/simulators.py track juggle ur5e --worlds nominal
+    python benchmarks/simulators.py robust --simulators bullet --worlds "20 + 10 ms" --logs logs
+
+The last line records the logs from which `bounce-mjx identify` finds that simulator's world.
 
 The arm is rebuilt, link by link, from the environment's compiled model, as a URDF file. Two numbers
 of a simulator are set before any policy acts, and printed: the coefficient of restitution, such
@@ -10,13 +13,14 @@ that a ball that drops onto the paddle of the arm at rest rebounds with the worl
 the time constant of the motors, such that a step of 0.05 rad takes as long to 63% as MuJoCo's
 servos take. (`physx` has servos of the same stiffness and damping, and needs none.) The policy acts
 through `load_policy`, as on a robot: it sees the joints and the newest picture of the ball. The
-environment's own functions measure the results.
+environment's own functions measure the results. `mujoco` is the C engine, as a comparison.
 """
 
 import argparse
 import concurrent.futures
 import functools
 import itertools
+import math
 import multiprocessing
 import tempfile
 import xml.etree.ElementTree as ET
@@ -30,10 +34,12 @@ import numpy as np
 
 from bounce_mjx import load_policy
 from bounce_mjx.deploy.policy import DeployedPolicy
+from bounce_mjx.deploy.recorder import Recorder
 from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.episodes import reset_episodes
 from bounce_mjx.evaluation.results import Report, judge
 from bounce_mjx.evaluation.statistics import accumulate, empty_statistics
+from bounce_mjx.identify.excitation import excite
 from bounce_mjx.resources import POLICIES, resource_path
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.runs.config import load_run_config
@@ -43,6 +49,8 @@ DROP = 0.3
 """Height of a drop, m."""
 STEP = 0.05
 """Step of a servo's target, rad."""
+BALL_SECONDS = 40.0
+"""Length of a log with the ball, s."""
 RATE = 1000.0
 """Rate of the policy's commands, Hz."""
 
@@ -447,6 +455,23 @@ def own_engine(model: mujoco.MjModel) -> Simulator:
 SIMULATORS = {"bullet": bullet, "physx": physx, "dart": dart}
 
 
+def maker(
+    name: str, model: mujoco.MjModel, world: World, angles: np.ndarray
+) -> Callable[[], Simulator]:
+    """Makes tuned simulators of a model.
+
+    Args:
+      angles: of the joints [J], where the paddle is level.
+    """
+    if name != "mujoco":
+        tuning = tune(name, model, world, angles)
+        return functools.partial(SIMULATORS[name], make_parts(model), world, tuning)
+    delays = {"action_latency": world.action_latency, "ball_latency": world.ball_latency}
+    if world != World(**delays):
+        raise ValueError("mujoco simulates delays alone; bounce-mjx robustness has other worlds")
+    return functools.partial(own_engine, model)
+
+
 def drop(simulator: Simulator, parts: Parts, angles: np.ndarray, above: np.ndarray) -> float:
     """Restitution of a ball that drops 0.3 m onto the paddle of the arm at rest.
 
@@ -548,21 +573,30 @@ class Episode:
         self._steps, self._targets = 0, [angles]
         self._balls = [self.simulator.ball_state()]
 
-    def control_step(self, command: dict[str, np.ndarray]) -> None:
-        """The policy acts on what it knows, and the physics runs until its next step."""
+    def measure(self) -> dict[str, np.ndarray | float]:
+        """What the robot measures: its joints, and the newest picture of the ball."""
         dt, number = self.policy.metadata.control_dt, len(self._balls) - 1
         angles, velocities = self.simulator.joint_state()
         age = min(round(self.world.ball_latency / dt), number)
         position, velocity, spin = np.split(self._balls[number - age], 3, axis=1)
         seen = {"position": position, "velocity": velocity, "angular_velocity": spin}
         measured = {"joint_angles": angles, "joint_velocities": velocities, "ball_age": age * dt}
-        self.policy.step(measured | command | {f"ball_{name}": x for name, x in seen.items()})
-        self._targets.extend(self.policy.commands(RATE))
+        return measured | {f"ball_{name}": x for name, x in seen.items()}
+
+    def control_step(self, command: dict[str, np.ndarray]) -> None:
+        """The policy acts on what it knows, and the physics runs until its next step."""
+        self.policy.step(self.measure() | command)
+        self.run(self.policy.commands(RATE))
+
+    def run(self, targets: np.ndarray) -> None:
+        """The physics runs until the next control step, with targets [n, J] at `RATE`."""
+        dt, number = self.policy.metadata.control_dt, len(self._balls) - 1
+        self._targets.extend(targets)
         # A time step may be longer or shorter than the interval of the commands.
         timestep = self.world.timestep
         while (self._steps + 0.5) * timestep < (number + 1) * dt:
             time = self._steps * timestep - self.world.action_latency
-            self.simulator.servo_targets(self._targets[max(0, int(time * RATE + 1e-6) + 1)])
+            self.simulator.servo_targets(self._targets[max(0, math.floor(time * RATE + 1e-6) + 1)])
             self.simulator.step()
             self._steps += 1
         self._balls.append(self.simulator.ball_state())
@@ -575,16 +609,13 @@ def evaluate(
     positions [T, nq] of the first episode."""
     config = load_run_config(resource_path(POLICIES[policy])).env
     env = Env(config.model_copy(update={"randomization": RandomizationConfig()}))
-    addresses, parts = env.addresses, make_parts(env.mj_model)
+    addresses = env.addresses
     arm_qpos, arm_qvel = list(addresses.arm_qpos), list(addresses.arm_qvel)
     ball_qpos = np.array([ball.qpos[:3] for ball in addresses.balls])
     ball_qvel = np.array([ball.qvel[:3] for ball in addresses.balls])
     home = np.array(load_policy(policy).metadata.default_joint_angles)
-    tuning = tune(name, env.mj_model, world, home)
-    running = [
-        Episode(load_policy(policy), SIMULATORS[name](parts, world, tuning), world)
-        for _ in range(episodes)
-    ]
+    make = maker(name, env.mj_model, world, home)
+    running = [Episode(load_policy(policy), make(), world) for _ in range(episodes)]
     states = jax.jit(reset_episodes, static_argnums=(0, 2))(env, jax.random.key(seed), episodes)
     qpos, qvel = (np.array(x, float) for x in states.pipeline_state.physics[:2])
 
@@ -618,8 +649,38 @@ def evaluate(
     return judge(env, statistics), np.array(path)
 
 
+def record_logs(policy: str, name: str, world: World, folder: Path) -> None:
+    """Writes the logs for `bounce-mjx identify`: the arm in the motion of `bounce-mjx excite`
+    (arm.csv), and the policy, with a new target height every 3 s (ball.csv)."""
+    config = load_run_config(resource_path(POLICIES[policy])).env
+    env, acting = Env(config), load_policy(policy)
+    joints, home = acting.metadata.joint_names, np.array(acting.metadata.default_joint_angles)
+    dt = acting.metadata.control_dt
+    simulator = maker(name, env.mj_model, world, home)()
+    episode = Episode(acting, simulator, world)
+    folder.mkdir(parents=True, exist_ok=True)
+    motion = excite(config, seconds=20.0, max_velocity=1.0)
+    episode.reset(home, np.array([[0.0, 10.0, 10.0]]), np.zeros((1, 3)))
+    with Recorder(folder / "arm.csv", joints) as log:
+        for time, target in zip(motion.times, motion.targets, strict=True):
+            measured = {k: x for k, x in episode.measure().items() if k.startswith("joint")}
+            log.step(measured | {"time": time}, target)
+            episode.run(np.tile(target, (round(dt * RATE), 1)))
+    episode.reset(home, np.array([config.ball_init_pos]), np.zeros((1, 3)))
+    with Recorder(folder / "ball.csv", joints, {"target_height": "m"}) as log:
+        for step in range(round(BALL_SECONDS / dt)):
+            heights = {"target_height": (0.4, 0.5, 0.6)[int(step * dt / 3.0) % 3]}
+            measured = episode.measure() | heights | {"time": step * dt}
+            episode.control_step(heights)
+            log.step(measured, acting.commands(RATE)[-1])
+    simulator.close()
+
+
 def measure(policy: str, name: str, world: str, given: argparse.Namespace) -> str:
     """One row of the table; stores the first episode if asked to."""
+    if given.logs:
+        record_logs(policy, name, WORLDS[world], given.logs)
+        return f"written: {given.logs}/arm.csv, {given.logs}/ball.csv"
     report, path = evaluate(policy, name, WORLDS[world], given.episodes, given.seed)
     if given.out:
         given.out.mkdir(parents=True, exist_ok=True)
@@ -639,12 +700,15 @@ def measure(policy: str, name: str, world: str, given: argparse.Namespace) -> st
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("policies", nargs="*", default=["robust", "pretrained"])
-    parser.add_argument("--simulators", nargs="+", default=list(SIMULATORS), choices=SIMULATORS)
+    parser.add_argument(
+        "--simulators", nargs="+", default=list(SIMULATORS), choices=[*SIMULATORS, "mujoco"]
+    )
     parser.add_argument("--worlds", nargs="+", default=list(WORLDS), choices=WORLDS)
     parser.add_argument("--episodes", type=int, default=64)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=1, help="processes at once")
     parser.add_argument("--out", type=Path, help="folder for the positions of first episodes")
+    parser.add_argument("--logs", type=Path, help="folder for logs, instead of results")
     given = parser.parse_args()
     cases = list(itertools.product(given.policies, given.simulators, given.worlds))
     # A simulator keeps settings for its process.
