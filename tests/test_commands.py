@@ -82,7 +82,7 @@ BAD_FLAGS = {
         "5 control steps",
         "shorter rollout",
     ),
-    "scale nan": ("--action-scale nan", "--action-scale is nan", "0 rad"),
+    "scale nan": ("--action-scale nan", "--action-scale is nan", "a finite number"),
     "preset and resume": ("--config a.yaml --resume b", "--config", "--resume", "combined"),
     "preset missing": ("--config a.yaml", "a.yaml", "No such file", "configs/default.yaml"),
     "no such preset": ("--config nope", "no preset is named nope", "cpu, default, finetune"),

@@ -182,7 +182,6 @@ MISTAKES = {
     "two ways": ("play --viewer browser --video a.mp4", "--viewer browser", "give only one"),
     "no screen": ("view --viewer native", "--viewer native", "display", "--viewer browser"),
     "foreign address": ("view --viewer browser --host 192.0.2.1", "--host 192.0.2.1", "127.0.0.1"),
-    "no host": ("view --allow-host http://a", "'http://a' is not the name of a host", "without"),
     "two policies": ("play pretrained pretrained --video a.mp4", "shows one policy", "browser"),
 }
 

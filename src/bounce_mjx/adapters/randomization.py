@@ -22,22 +22,6 @@ from bounce_mjx.physics.scalars import scalars_of
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.world.randomization import RandomizationConfig, physics_parameters, sample_world
 
-# Fields that MuJoCo's compiler can compute from others.
-_DERIVED_FIELDS = frozenset(
-    (
-        "actuator_acc0",
-        "actuator_length0",
-        "body_inertia",
-        "body_invweight0",
-        "body_subtreemass",
-        "dof_M0",
-        "dof_invweight0",
-        "dof_length",
-        "geom_aabb",
-        "geom_rbound",
-    )
-)
-
 Fields = dict[str, Any]
 """Arrays of a model by their names, such as `body_mass` and `opt.gravity`."""
 
@@ -75,8 +59,7 @@ def domain_randomize(
         world = sample_world(config.ranges(), key, jnp.result_type(float), num_joints)
         given = scalars_of(physics_parameters(world, mj_model), jnp.result_type(float))
         m = edited(mj_model, given)
-        fields = {name: m.array(name) for name in m.fields}
-        return {name: x for name, x in fields.items() if jnp.issubdtype(x.dtype, jnp.floating)}
+        return {name: m.array(name) for name in m.fields if m.rows(name)}
 
     fields = jax.jit(jax.vmap(sample))(rng)
     axes = jax.tree.map(lambda _: None, model)
@@ -86,7 +69,7 @@ def domain_randomize(
 def parameters_of(mj_model: mujoco.MjModel, base: Any, model: Any) -> PhysicsParameters:
     """The entries of one environment's randomised model that differ from the environment's own.
 
-    Fields that MuJoCo's compiler derives from others are left out where they follow the others.
+    What MuJoCo's compiler derives from them, such as an inertia from a mass, follows by itself.
 
     Args:
       mj_model: the environment's model.
@@ -102,33 +85,14 @@ def parameters_of(mj_model: mujoco.MjModel, base: Any, model: Any) -> PhysicsPar
         for name, value in _fields_of(model)
         if value is not before[name] and not _equal(value, before[name])
     }
-    batches = _batches(changed)
-    varied = {
-        name: np.any(batch != np.asarray(before[name]), axis=0) for name, batch in batches.items()
-    }
-    varied = {name: mask for name, mask in varied.items() if mask.any()}
-    if "pair_solref" in varied:
-        # One of the two numbers tells the meaning of the other.
-        varied["pair_solref"] |= varied["pair_solref"].any(axis=1, keepdims=True)
-    places = {
-        f"{name}[{', '.join(map(str, index))}]": (name, tuple(index))
-        for name, mask in varied.items()
-        for index in np.argwhere(mask).tolist()
-    }
-    own = {key: place for key, place in places.items() if place[0] not in _DERIVED_FIELDS}
-    following = varied.keys() & _DERIVED_FIELDS
-    for i in range(max(map(len, batches.values()), default=0)):
-        one = {name: batch[min(i, len(batch) - 1)] for name, batch in batches.items()}
-        entries = {key: float(one[name][index]) for key, (name, index) in own.items()}
-        derived = edited(mj_model, PhysicsParameters(entries=entries))
-        following = {
-            name
-            for name in following
-            if name in derived.fields and np.allclose(one[name], derived.array(name), rtol=1e-4)
-        }
-    entries = {
-        key: changed[name][index] for key, (name, index) in places.items() if name not in following
-    }
+    entries = {}
+    for name, batch in _batches(changed).items():
+        varied = np.any(batch != np.asarray(before[name]), axis=0)
+        if name == "pair_solref":
+            # One of the two numbers tells the meaning of the other.
+            varied |= varied.any(axis=1, keepdims=True)
+        for index in np.argwhere(varied).tolist():
+            entries[f"{name}[{', '.join(map(str, index))}]"] = changed[name][tuple(index)]
     return PhysicsParameters(entries=entries or None)
 
 

@@ -72,7 +72,7 @@ def main(args: Sequence[str]) -> None:
         command.episodes, command.seed, command.physics, command.nominal, commands
     )
     length = f"{command.episodes:,} episodes of {config.env.episode_seconds:g} s"
-    with progress(console, "evaluating", "evaluated") as shown:
+    with progress(console, "evaluating") as shown:
         report, engine = evaluate_policy(
             policy,
             config.env,

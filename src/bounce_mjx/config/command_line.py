@@ -4,7 +4,6 @@ import contextlib
 import functools
 import re
 import textwrap
-import time
 import types
 import typing
 from collections.abc import Callable, Iterator, Sequence
@@ -30,9 +29,6 @@ from bounce_mjx.config.validation import describe
 from bounce_mjx.errors import UserError, suggest
 
 CommandT = TypeVar("CommandT", bound=pydantic.BaseModel)
-
-# Lines about the progress are left out where less time than this is left.
-_SILENT_SECONDS = 10.0
 
 # Column at which the texts of a help page start.
 _HELP_COLUMN = 26
@@ -63,31 +59,16 @@ def stdout(**options: Any) -> Console:
 
 
 @contextlib.contextmanager
-def progress(console: Console, doing: str, done: str) -> Iterator[Callable[[float], None]]:
-    """A function that shows the share of a task that is done, from 0 to 1: as a bar on a terminal;
-    elsewhere, as a line after each tenth of a task whose rest is slow.
+def progress(console: Console, doing: str) -> Iterator[Callable[[float], None]]:
+    """A function that shows on a terminal, as a bar, which share of a task is done, from 0 to 1.
 
     Args:
       doing: what the task does, such as "evaluating".
-      done: what is done with the share, such as "evaluated".
     """
-    # The first call follows the compilation.
-    said, first, started = 0.0, 0.0, None
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+        # The first call follows the compilation.
         task = bar.add_task("compiling", total=1.0)
-
-        def show(share: float) -> None:
-            nonlocal said, first, started
-            bar.update(task, completed=share, description=doing)
-            if started is None:
-                first, started = share, time.monotonic()
-            spent, left = time.monotonic() - started, 1.0 - share
-            slow = spent * left >= _SILENT_SECONDS * (share - first)
-            if not console.is_terminal and slow and left and share - max(said, first) > 0.0999:
-                said = share
-                console.print(f"{share:.0%} {done}", highlight=False)
-
-        yield show
+        yield lambda share: bar.update(task, completed=share, description=doing)
 
 
 def parse(

@@ -7,7 +7,6 @@ are wide, and refuse the same quantity in another unit: millimetres, degrees or 
 
 import re
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Annotated, Any
 
 import pydantic
@@ -15,23 +14,13 @@ from pydantic import Field
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticKnownError
 
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
-def _check_number(value: Any) -> Any:
-    """Any value but a switch, which Python counts as 0 or 1."""
-    if isinstance(value, bool):
-        raise PydanticKnownError("float_type")
-    return value
+NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 
+Finite = Annotated[float, Field(allow_inf_nan=False)]
 
-_Number = pydantic.BeforeValidator(_check_number)
-
-Positive = Annotated[float, _Number, Field(gt=0.0, allow_inf_nan=False)]
-
-NonNegative = Annotated[float, _Number, Field(ge=0.0, allow_inf_nan=False)]
-
-Finite = Annotated[float, _Number, Field(allow_inf_nan=False)]
-
-UnitInterval = Annotated[float, _Number, Field(ge=0.0, le=1.0)]
+UnitInterval = Annotated[float, Field(ge=0.0, le=1.0)]
 
 Length = Annotated[Positive, Field(le=10.0)]
 """m"""
@@ -63,24 +52,6 @@ def _check_order(ends: tuple[float, float]) -> tuple[float, float]:
 
 Ascending = pydantic.AfterValidator(_check_order)
 """Mark of a range: its lower end comes first."""
-
-
-def _check_path(path: Path) -> Path:
-    if "\0" in str(path):
-        raise ValueError("a path cannot hold the null character; remove it")
-    return path
-
-
-PlainPath = Annotated[Path, pydantic.AfterValidator(_check_path)]
-
-
-def _check_host(name: str) -> str:
-    if not re.fullmatch(r"[\w.-]+", name):
-        raise ValueError(f"{name!r} is not the name of a host; give it without http:// and port")
-    return name
-
-
-HostName = Annotated[str, pydantic.AfterValidator(_check_host)]
 
 
 def whole_number(value: Any) -> Any:

@@ -15,7 +15,6 @@ from bounce_mjx.config.files import read_mapping
 from bounce_mjx.config.settings import (
     Count,
     NonNegativeInt,
-    PlainPath,
     Steps,
     StrictModel,
     merged,
@@ -88,10 +87,10 @@ class TrainConfig(StrictModel):
     stop_when_solved: bool = False
     """End once an evaluation meets all results with a margin. Then 64 other episodes should meet
     them too. It ends at the latest after 1.5 times the steps of the first one that meets all."""
-    warm_start: PlainPath | None = None
+    warm_start: Path | None = None
     """The run, or the policy of the package, with whose networks, environment and hidden layers the
     training starts."""
-    log_dir: PlainPath
+    log_dir: Path
     """Folder in which the run creates its own, named by the time (UTC)."""
 
     def __eq__(self, other: object) -> bool:
@@ -138,7 +137,7 @@ def train_config(
       base: `TrainConfig`, or the command line that trains.
       ppo: settings of the algorithm.
     """
-    kinds = {"task": str, "log_dir": PlainPath}
+    kinds = {"task": str, "log_dir": Path}
     kinds["env"] = Annotated[task.Config, *base.model_fields["env"].metadata]
     if "ppo" in base.model_fields:
         kinds["ppo"] = Annotated[ppo, *base.model_fields["ppo"].metadata]

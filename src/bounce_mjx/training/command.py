@@ -10,7 +10,7 @@ import tyro
 from pydantic import Field
 
 from bounce_mjx.config.command_line import help_page, parse, parse_first
-from bounce_mjx.config.settings import Count, HostName, NonNegativeInt
+from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.runs.config import TrainConfig, train_config
 from bounce_mjx.training.start import Start
@@ -48,7 +48,7 @@ class TrainCommand(TrainConfig, Start):
     """Serve a page during the training, with the newest policy, the curves and the results."""
     watch_host: str = "127.0.0.1"
     """Address of that page's server; 0.0.0.0 also admits other machines."""
-    watch_allow_host: tuple[HostName, ...] = ()
+    watch_allow_host: tuple[str, ...] = ()
     """Other names under which a browser may open that page, such as a proxy's."""
     watch_port: Annotated[int, Field(ge=1, lt=2**16)] = 8080
     """Port of that page's server, or the next free port."""

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field
 
-from bounce_mjx.config.settings import HostName, Positive, StrictModel
+from bounce_mjx.config.settings import Positive, StrictModel
 
 MAX_ENVS = 16
 """Largest number of robots side by side."""
@@ -44,7 +44,7 @@ class ViewerOptions(StrictModel):
     """Seed of the resets."""
     host: str = "127.0.0.1"
     """Address of the page's server; 0.0.0.0 also admits other machines."""
-    allow_host: tuple[HostName, ...] = ()
+    allow_host: tuple[str, ...] = ()
     """Other names under which a browser may open the page, such as a proxy's."""
     port: Annotated[int, Field(ge=1, lt=2**16)] = 8080
     """Port of the page's server, or the next free port."""

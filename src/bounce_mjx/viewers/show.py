@@ -100,7 +100,7 @@ def _recording(options: ViewerOptions, console: Console) -> Present:
             if options.html is not None:
                 write_page(options.html, simulation.env, recording, options.fps, start.names)
         if film is not None:
-            with progress(console, "drawing", "drawn") as shown:
+            with progress(console, "drawing") as shown:
                 film.write(simulation, recording, shown)
         for path in (options.video, options.html):
             if path is not None:

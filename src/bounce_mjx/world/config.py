@@ -13,7 +13,6 @@ from bounce_mjx.config.settings import (
     Finite,
     Friction,
     NonNegative,
-    PlainPath,
     Positive,
     Speed,
     StrictModel,
@@ -117,14 +116,14 @@ class WorldConfig(StrictModel):
     physics: Literal["auto", "fused", "mjx"] = "auto"
     """Physics engine: fused (fast, for one kind of model), mjx (any MJCF), auto (fused if it
     supports the model)."""
-    mjcf: PlainPath | None = None
+    mjcf: Path | None = None
     """MJCF file to simulate; null for the project's own robot. package:NAME/FILE is a file of an
     installed Python package, and menagerie:NAME a model of MuJoCo Menagerie."""
     robot: RobotConfig = RobotConfig()
     """Adoption of an arm."""
-    physics_dt: Annotated[Positive, Field(le=0.1)] = 0.001
+    physics_dt: Annotated[Positive, Field(ge=1e-5, le=0.1)] = 0.001
     """Physics time step, s; at most an eighth of a period of the contact, 2.5 ms by default."""
-    control_dt: Annotated[Positive, Field(le=0.1)] = 0.01
+    control_dt: Annotated[Positive, Field(ge=1e-5, le=0.1)] = 0.01
     """Time between two actions, s; a whole number of physics steps."""
     episode_seconds: Duration = 20.0
     """Length of an episode before it is truncated, s."""
@@ -167,11 +166,6 @@ class WorldConfig(StrictModel):
     @pydantic.model_validator(mode="after")
     def _check_times(self):
         substeps = self.control_dt / self.physics_dt
-        if not max(substeps, self.episode_seconds / self.control_dt) < 2**31:
-            raise ValueError(
-                f"control_dt {self.control_dt} is too long for physics_dt {self.physics_dt} or too "
-                f"short for episode_seconds {self.episode_seconds}; choose times less far apart"
-            )
         if round(substeps) < 1 or not math.isclose(substeps, round(substeps), rel_tol=1e-6):
             raise ValueError(
                 f"control_dt {self.control_dt} is not a whole number of physics steps of "
