@@ -161,10 +161,9 @@ def test_the_curves_are_in_the_displayed_units(runs: list[Path]) -> None:
 
 
 def test_evaluations_are_points_on_the_curves(runs: list[Path]) -> None:
-    """Of a screening too; in the units of the curve."""
+    """In the units of the curve."""
     (group,) = group_runs(runs[3:])
     points = {
-        "screening/mean_apex_error_m": LoggedCurve(np.array([1000]), np.array([0.2])),
         "results/mean_apex_error_m": LoggedCurve(np.array([3000, 5000]), np.array([0.03, 0.02])),
     }
     run = group.runs[0]._replace(curves=group.runs[0].curves | points)
@@ -175,7 +174,7 @@ def test_evaluations_are_points_on_the_curves(runs: list[Path]) -> None:
         if line.get_marker() == "o"
         for x, y in zip(line.get_xdata(), line.get_ydata(), strict=True)
     ]
-    assert shown == [(1000, 20.0), (3000, 3.0), (5000, 2.0)]
+    assert shown == [(3000, 3.0), (5000, 2.0)]
     words = [text.get_text() for text in figure.legends[0].get_texts()]
     assert "evaluation, without noise" in words
     (without,) = curves_figure([group]).legends

@@ -5,7 +5,7 @@ They do not use pyplot, so they need no display and can be drawn in several thre
 
 import functools
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import jax
 import matplotlib
@@ -48,13 +48,10 @@ style = functools.partial(matplotlib.rc_context, _STYLE)
 
 
 @style()
-def curves_figure(
-    groups: Sequence[Group], reference: Mapping[str, float] = {}, columns: int = 3
-) -> Figure:
+def curves_figure(groups: Sequence[Group], columns: int = 3) -> Figure:
     """The return and the curves of the task over the training, with points for evaluations.
 
     Args:
-      reference: values of the policy that comes with the package, by the curve's tag.
       columns: most panels side by side.
     """
     shown = [Curve(RETURN, "", title="return of an episode")]
@@ -65,15 +62,10 @@ def curves_figure(
     for axes, curve in zip(panels, shown, strict=True):
         _draw_curve(axes, groups, curve)
         has_evaluations |= _draw_evaluations(axes, groups, curve)
-        if curve.tag in reference:
-            axes.axhline(reference[curve.tag], color=_GREY, linestyle="--", linewidth=1.0)
         axes.set_ylim(bottom=0.0)
         axes.set_xlabel("environment steps")
-    others = [Line2D([], [], color=_GREY, linestyle="--", label="policy of the package")]
-    others = others[: len(reference)]
-    if has_evaluations:
-        others += [Line2D([], [], color=_GREY, label="evaluation, without noise", **_POINTS)]
-    _add_legend(figure, groups, others)
+    points = [Line2D([], [], color=_GREY, label="evaluation, without noise", **_POINTS)]
+    _add_legend(figure, groups, points if has_evaluations else [])
     return figure
 
 
@@ -183,10 +175,9 @@ def _draw_evaluations(axes: Axes, groups: Sequence[Group], shown: Curve) -> bool
     found = False
     for group, colour in _with_colours(groups):
         for run in group.runs:
-            for curve in (run.curves.get(f"{kind}/{name}") for kind in ("screening", "results")):
-                if curve is not None:
-                    axes.plot(curve.steps, shown.scale * curve.values, color=colour, **_POINTS)
-                    found = True
+            if (curve := run.curves.get(f"results/{name}")) is not None:
+                axes.plot(curve.steps, shown.scale * curve.values, color=colour, **_POINTS)
+                found = True
     return found
 
 

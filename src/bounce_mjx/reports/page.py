@@ -4,7 +4,6 @@ Training writes it after its results; `bounce-mjx report [RUN]` writes it again.
 """
 
 import html
-import json
 from pathlib import Path
 
 import jax
@@ -18,7 +17,6 @@ from bounce_mjx.evaluation.policy_evaluation import recorded_episodes
 from bounce_mjx.reports.curves import group_runs
 from bounce_mjx.reports.figures import (
     PANEL_WIDTH,
-    RETURN,
     curves_figure,
     evaluation_figure,
     rewards_figure,
@@ -26,11 +24,10 @@ from bounce_mjx.reports.figures import (
 from bounce_mjx.reports.html_page import data_url, figures_html, page, table
 from bounce_mjx.reports.robustness import load_robustness, robustness_figure
 from bounce_mjx.reports.tables import details_line, figure_text, result_cells, robot_name
-from bounce_mjx.resources import POLICIES, resource_path
 from bounce_mjx.runs.config import TrainConfig, load_run_config
-from bounce_mjx.runs.files import write_atomically
-from bounce_mjx.runs.folders import POLICY_OF_TASK, Checkpoint
-from bounce_mjx.runs.progress import Evaluation, Results, load_results
+from bounce_mjx.runs.files import writable, write_atomically
+from bounce_mjx.runs.folders import Checkpoint
+from bounce_mjx.runs.progress import Results, load_results
 from bounce_mjx.runs.reading import read_actor
 from bounce_mjx.task.shown import Recording
 from bounce_mjx.viewers.page import replay_first_episode
@@ -76,39 +73,17 @@ def write_report(run: Path, recording: Recording) -> tuple[Path, Figure]:
     evaluation = evaluation_figure(env, recording, _WIDTH)
     robustness = load_robustness(run)
     figures = {
-        "Learning curves": curves_figure(groups, _reference(config), _COLUMNS),
+        "Learning curves": curves_figure(groups, _COLUMNS),
         "The best checkpoint": evaluation,
         "Reward terms": rewards_figure(groups, _COLUMNS),
     }
     if robustness is not None:
-        figures["Perturbed worlds"] = robustness_figure(robustness, columns=1)
+        figures["Perturbed worlds"] = robustness_figure(robustness)
     replay = replay_first_episode(env, recording)
     path = run / REPORT_FILE
-    try:
+    with writable(path, "make the folder writable"):
         write_atomically(path, _html(run, config, env.engine.name, results, figures, replay))
-    except OSError as error:
-        raise UserError(
-            f"{path} cannot be written ({error.strerror}); make the folder writable"
-        ) from error
     return path, evaluation
-
-
-def _reference(config: TrainConfig) -> dict[str, float]:
-    """Figures of the policy that comes with the package for a training's task on the project's own
-    arm, by the tag of the curve of the same quantity."""
-    name = POLICY_OF_TASK.get(config.task)
-    if name is None or config.env.mjcf is not None:
-        return {}
-    path = resource_path(f"{POLICIES[name]}/results.json")
-    details = json.loads(path.read_text(encoding="utf-8"))["details"]
-    # The evaluation's episodes are whole ones.
-    whole = config.ppo.training_episode_seconds is None
-    found = {RETURN: details["mean_return"]} if whole else {}
-    for curve in config.env.task.curves:
-        value = details.get(f"mean_{curve.metric}_m")
-        if value is not None:
-            found[curve.tag] = curve.scale * value
-    return found
 
 
 def _html(
@@ -124,7 +99,11 @@ def _html(
     phases = [[name, f"{value:.1f}"] for name, value in seconds.items()]
     names = [result.name for result in report.results]
     evaluations = [
-        [f"{e.steps:,}", *[figure_text(e.model_extra[name]) for name in names], _standing(e)]
+        [
+            f"{e.steps:,}",
+            *(figure_text(e.model_extra.get(name)) for name in names),
+            "pass" if e.passed else "screening" if e.screening else "-",
+        ]
         for e in results.evaluations
     ]
     resets = "fresh resets" if results.fresh_resets else "the resets of the selection"
@@ -145,9 +124,3 @@ the robot {html.escape(robot_name(config.env))}. The best of {len(evaluations)} 
 {table(["environment steps", *names, "all met"], evaluations)}
 <details><summary>Config</summary><pre>{html.escape(dump_config(config))}</pre></details>"""
     return page(run.name, body)
-
-
-def _standing(evaluation: Evaluation) -> str:
-    if evaluation.passed:
-        return "pass"
-    return "screening" if evaluation.screening else "-"

@@ -110,31 +110,27 @@ def result_letters(report: RobustnessReport) -> dict[str, str]:
 
 
 @style()
-def robustness_figure(report: RobustnessReport, columns: int = 2) -> Figure:
-    """Chart of perturbations by strength, in one or two columns. The colour of a cell shows the
-    lowest of the results that are shares. A cell has a tick or the letters of the missed results; a
-    frame marks conditions within the training ranges."""
-    letters = result_letters(report)
-    parts = _columns(report.outcomes, columns)
-    lines = max(map(len, parts))
-    size = 2.0 * PANEL_WIDTH * columns, _LINE * lines + 1.8
-    figure = Figure(figsize=size, layout="constrained")
+def robustness_figure(report: RobustnessReport) -> Figure:
+    """Chart of perturbations by strength. The colour of a cell shows the lowest of the results that
+    are shares. A cell has a tick or the letters of the missed results; a frame marks conditions
+    within the training ranges."""
+    letters, rows = result_letters(report), _rows(report.outcomes)
+    figure = Figure(figsize=(2.0 * PANEL_WIDTH, _LINE * len(rows) + 1.8), layout="constrained")
     title = f"{summary(report)}\n{literal(_engines_text(report))}"
     figure.suptitle(title, fontsize=10, wrap=True)
-    panels = figure.subplots(1, len(parts), squeeze=False)[0]
-    cells = max(8, *(len(outcomes) for part in parts for _, outcomes in part))
-    for axes, part in zip(panels, parts, strict=True):
-        axes.set(xlim=(0.0, cells), ylim=(lines, 0.0), xticks=[], frame_on=False)
-        axes.set_yticks(np.arange(len(part)) + 0.5, [literal(label) for label, _ in part])
-        axes.tick_params(length=0, labelsize=8)
-        axes.grid(False)
-        for y, (label, (_, outcomes)) in enumerate(zip(axes.get_yticklabels(), part, strict=True)):
-            label.set_fontweight("normal" if outcomes else "bold")
-            for x, outcome in enumerate(outcomes):
-                _draw_cell(axes, x, y, outcome, letters, report.worst_share(outcome))
+    axes = figure.subplots()
+    cells = max(8, *(len(outcomes) for _, outcomes in rows))
+    axes.set(xlim=(0.0, cells), ylim=(len(rows), 0.0), xticks=[], frame_on=False)
+    axes.set_yticks(np.arange(len(rows)) + 0.5, [literal(label) for label, _ in rows])
+    axes.tick_params(length=0, labelsize=8)
+    axes.grid(False)
+    for y, (label, (_, outcomes)) in enumerate(zip(axes.get_yticklabels(), rows, strict=True)):
+        label.set_fontweight("normal" if outcomes else "bold")
+        for x, outcome in enumerate(outcomes):
+            _draw_cell(axes, x, y, outcome, letters, report.worst_share(outcome))
     scale = ScalarMappable(_SCALE, _COLOURS)
     bar = figure.colorbar(
-        scale, ax=panels, location="bottom", ticks=(0, 50, 75, 90, 100), shrink=0.5, aspect=50
+        scale, ax=axes, location="bottom", ticks=(0, 50, 75, 90, 100), shrink=0.5, aspect=50
     )
     bar.set_label("lowest result of those in %", fontsize=8)
     missed = "   ".join(f"{letter} {name}" for name, letter in letters.items())
@@ -160,25 +156,16 @@ def _perturbations(outcomes: Sequence[ConditionOutcome]) -> list[list[ConditionO
     return [list(rows) for _, rows in groupby(outcomes, lambda outcome: outcome.perturbation)]
 
 
-_Row = tuple[str, list[ConditionOutcome]]
-"""A perturbation and its outcomes, or the heading of a group, without outcomes."""
-
-
-def _columns(outcomes: Sequence[ConditionOutcome], columns: int) -> list[list[_Row]]:
-    """The rows in one column, or in two of about equal length, which no group spans."""
-    rows: list[_Row] = []
+def _rows(outcomes: Sequence[ConditionOutcome]) -> list[tuple[str, list[ConditionOutcome]]]:
+    """Each perturbation and its outcomes, below the heading of its group, without outcomes."""
+    rows = []
     for group, members in groupby(_perturbations(outcomes), lambda row: row[0].group):
         if group != NOMINAL:
             rows.append((group, []))
         for row in members:
-            first = row[0]
-            unit = f", {first.unit}" if first.unit else ""
-            rows.append((first.perturbation + unit, row))
-    if columns == 1:
-        return [rows]
-    headings = [i for i, (_, members) in enumerate(rows) if not members]
-    split = min(headings, key=lambda i: abs(2 * i - len(rows)), default=len(rows))
-    return [rows[:split], rows[split:]]
+            unit = f", {row[0].unit}" if row[0].unit else ""
+            rows.append((row[0].perturbation + unit, row))
+    return rows
 
 
 def _draw_cell(

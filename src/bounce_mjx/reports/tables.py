@@ -1,7 +1,6 @@
 """The results of an evaluation as tables and lines of text."""
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from rich.markup import escape
@@ -20,16 +19,6 @@ _UNITS = {
     "_kg": ("kg", 1.0),
     "_N": ("N", 1.0),
 }
-
-
-class _Detail(NamedTuple):
-    """A figure of the task in addition to the results."""
-
-    title: str
-    unit: str
-    value: float | None
-    """In the unit."""
-    is_mean: bool
 
 
 def robot_name(env: WorldConfig) -> str:
@@ -80,40 +69,30 @@ def results_table(report: Report, title: str) -> Table:
 
 
 def seeds_table(reports: dict[int, Report | None]) -> Table:
-    """The best checkpoint of each seed, with the mean and the standard deviation over the seeds:
-    the results, and the task's other figures.
+    """The results of the best checkpoint of each seed, with their mean and standard deviation over
+    the seeds.
 
     Args:
       reports: reports by seed; None for a seed that diverged before its first evaluation.
     """
     known = [report for report in reports.values() if report is not None]
     table = _plain_table("best checkpoint of each seed")
-    own = [f"{d.title}, {d.unit}" if d.unit else d.title for d in _details(known[0])]
-    for header in ("seed", *(result.name for result in known[0].results), *own, "all met"):
+    for header in ("seed", *(result.name for result in known[0].results), "all met"):
         table.add_column(header.replace(" ", "\n"), justify="right")
-
     for seed, report in reports.items():
         if report is None:
             table.add_row(str(seed), "diverged")
             continue
         met = "[green]pass" if report.passed else "[red]FAIL"
-        table.add_row(str(seed), *map(figure_text, _seed_figures(report)), met)
+        table.add_row(str(seed), *(figure_text(result.value) for result in report.results), met)
     table.add_section()
-    figures = list(zip(*map(_seed_figures, known), strict=True))
-    passed = sum(report.passed for report in known)
+    columns = zip(*([result.value for result in report.results] for report in known), strict=True)
     # If a seed lacks a figure, the mean of the other seeds would be too favourable.
-    for name, statistic, met in (
-        ("mean", np.mean, f"{passed}/{len(reports)}"),
-        ("std", np.std, ""),
-    ):
-        cells = [figure_text(None if None in each else statistic(each)) for each in figures]
-        table.add_row(name, *cells, met)
+    complete = [None if None in column else column for column in columns]
+    passed = f"{sum(report.passed for report in known)}/{len(reports)}"
+    for name, statistic, met in (("mean", np.mean, passed), ("std", np.std, "")):
+        table.add_row(name, *(figure_text(x and statistic(x)) for x in complete), met)
     return table
-
-
-def _seed_figures(report: Report) -> list[float | None]:
-    """A seed's row in the table."""
-    return [item.value for item in (*report.results, *_details(report))]
 
 
 def result_cells(result: Result) -> list[str]:
@@ -147,25 +126,12 @@ def unsolved_line(report: Report) -> str:
 
 def details_line(report: Report) -> str:
     """The other figures of an evaluation, in one line."""
-    details = report.details
-    means, others = [], []
-    for title, unit, value, is_mean in _details(report):
-        text = f"{title} {short_text(value)} {'' if value is None else unit}".rstrip()
-        (means if is_mean else others).append(text)
-    means += [f"return {details['mean_return']:.0f}", f"length {details['mean_length_s']:.2f} s"]
-    line = ", ".join([f"{', '.join(means)} (means)", *others])
-    return f"{details['episodes']:.0f} episodes: {line}"
-
-
-def _details(report: Report) -> list[_Detail]:
-    """The task's own figures."""
-    found = []
+    parts = []
     for name, value in report.details.items():
-        if name in ("episodes", "mean_return", "mean_length_s"):
-            continue
         end = next((end for end in _UNITS if name.endswith(end)), "")
         unit, factor = _UNITS.get(end, ("", 1.0))
-        title = name.removesuffix(end).removeprefix("mean_").replace("_", " ")
-        value = None if value is None else factor * value
-        found.append(_Detail(title, unit, value, name.startswith("mean_")))
-    return found
+        title = name.removesuffix(end).replace("_", " ")
+        text = "-" if value is None else f"{short_text(factor * value)} {unit}".rstrip()
+        if name != "episodes":
+            parts.append(f"{title} {text}")
+    return f"{report.details['episodes']:.0f} episodes: {', '.join(parts)}"

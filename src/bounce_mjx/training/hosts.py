@@ -10,7 +10,6 @@ import contextlib
 import itertools
 import json
 import os
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -53,22 +52,9 @@ def join(
       timeout: seconds to wait for the other processes.
 
     Raises:
-      UserError: only some of the arguments are given, no launcher supplies the others, or the
-        processes did not find each other in time.
+      UserError: an argument is missing and no launcher supplies it, or the processes did not find
+        each other in time.
     """
-    given = {
-        "--coordinator-address": coordinator_address,
-        "--num-processes": num_processes,
-        "--process-id": process_id,
-    }
-    missing = [flag for flag, value in given.items() if value is None]
-    if missing and len(missing) < len(given):
-        raise UserError(
-            f"{', '.join(f for f in given if f not in missing)} needs {', '.join(missing)} as well;"
-            " give all three, or only --distributed under Slurm, Open MPI or Kubernetes"
-        )
-    if sys.platform == "win32":
-        raise UserError("several hosts cannot train together on Windows; use Linux, such as WSL 2")
 
     def connect() -> None:
         # JAX's own time limit ends the process with a stack trace.
