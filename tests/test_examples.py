@@ -20,9 +20,14 @@ SMALL = ["--num-envs", "3", "--steps"]
     [
         # A ball that the arm misses reaches the floor after 0.3 s.
         ("gymnasium_policy.py", ["--steps", "150"], ["onnxruntime"], r"[2-9] bounces in 1\.50 s"),
-        ("gymnasium_policy.py", ["robust", "--steps", "150"], ["onnxruntime"], r"[2-9] bounces in"),
         ("sb3_ppo.py", [*SMALL, "96", "--judged-steps", "5"], ["stable_baselines3"], "5. stable"),
-        ("sbx_ppo.py", [*SMALL, "96"], ["sbx"], lambda names: names["model"].num_timesteps == 96),
+        pytest.param(
+            "sbx_ppo.py",
+            [*SMALL, "96"],
+            ["sbx"],
+            lambda names: names["model"].num_timesteps == 96,
+            marks=pytest.mark.slow,
+        ),
         ("torchrl_ppo.py", [*SMALL, "96"], ["torchrl"], r"batch=0, reward=-?\d"),
         ("cleanrl_ppo.py", [*SMALL, "192"], ["torch"], r"iteration=\d, episodic_return=-?\d"),
     ],

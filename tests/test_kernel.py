@@ -121,6 +121,7 @@ def test_the_kernel_has_the_derivative_of_the_function():
         np.testing.assert_allclose(given[1], 3.0 * x * y**2, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_one_environment_and_float64_are_compiled_by_xla(env, in_kernel):
     physics, ctrl = moving(env, 2)
     one = jax.tree.map(lambda x: x[:, 0], physics)

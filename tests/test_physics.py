@@ -62,6 +62,7 @@ def test_one_step_from_random_states_is_mujocos(mj_model, record_property):
     record_property("largest_difference", error)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("float64")
 def test_2000_random_action_steps_are_mujocos(mj_model, fused_step, record_property):
     """Both engines run freely; neither sees the other's state."""

@@ -29,6 +29,7 @@ from bounce_mjx.tasks.registry import find_task
 ENV_NAME = "BounceBall"
 
 
+@pytest.mark.slow
 def test_playground_loads_the_environment_without_a_network(monkeypatch):
     # Playground fetches its own robots before it loads one of its environments.
     monkeypatch.setattr(mjx_env, "ensure_menagerie_exists", lambda: pytest.fail("fetched"))
@@ -91,6 +92,7 @@ def test_playground_has_the_other_tasks(task):
     assert jax.eval_shape(worlds.reset, keys).obs.shape == (2, env.observation_size)
 
 
+@pytest.mark.slow
 def test_randomization_by_playground_acts_on_the_physics():
     """Worlds of Playground's own randomiser: the ball falls with the gravity of its world."""
     env = registry.load(ENV_NAME)

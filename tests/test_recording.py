@@ -57,6 +57,7 @@ def stepped(env: BounceBall, networks, policy: Policy):
     return jax.tree.map(lambda *x: np.moveaxis(np.stack(x), 1, -1), *history)
 
 
+@pytest.mark.slow
 def test_a_recording_holds_the_first_episodes(evaluated, stepped) -> None:
     statistics, recording = evaluated
     ended = np.cumsum(stepped.done, axis=0) > 0

@@ -273,6 +273,7 @@ class _Thrown(rest_task.Rest):
         return {"height": command["height"] + 0.01}
 
 
+@pytest.mark.slow
 def test_a_task_throws_the_ball_and_moves_its_commands(monkeypatch: pytest.MonkeyPatch) -> None:
     commands = {"height": task.Command(0.4, 0.4)}
     monkeypatch.setattr(_Thrown.Config, "commands", commands, raising=False)
