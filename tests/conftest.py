@@ -9,6 +9,7 @@ import collections
 import importlib
 import importlib.util
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -16,11 +17,13 @@ import sys
 import tempfile
 import types
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import jax
 import mujoco
 import pytest
 
+from bounce_mjx.commands.main import main
 from bounce_mjx.errors import UserError
 from bounce_mjx.robot.model import load_model
 from bounce_mjx.tasks.bounce import BounceConfig as EnvConfig
@@ -107,6 +110,34 @@ def float64() -> Iterator[None]:
 def mj_model() -> mujoco.MjModel:
     """The shipped model at the default time step."""
     return load_model(None, EnvConfig().physics_dt)
+
+
+@pytest.fixture
+def refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> Callable[..., str]:
+    """A function (command line, words) -> the sentence with which `bounce-mjx` refuses the command
+    line, in which the words are. It leaves the working directory `tmp_path` as it is."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"):
+        monkeypatch.delenv(name, raising=False)
+
+    def contents() -> dict[Path, bytes | None]:
+        return {p: p.read_bytes() if p.is_file() else None for p in tmp_path.rglob("*")}
+
+    def refuse(line: str | list, *words: str) -> str:
+        before = contents()
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            main(line.split() if isinstance(line, str) else [str(word) for word in line])
+        said, sentence = capfd.readouterr()
+        assert ended.value.code == 2 and "Traceback" not in said
+        assert re.fullmatch(r"error: .+\n", sentence), sentence
+        assert not [word for word in words if word not in sentence], sentence
+        assert contents() == before
+        return sentence
+
+    return refuse
 
 
 @pytest.fixture(scope="session")

@@ -54,21 +54,6 @@ def test_an_output_that_cannot_be_written_is_dropped(args: list[str], status: in
     assert not done.stderr and not done.stdout
 
 
-@pytest.mark.parametrize(
-    ("args", "words"),
-    [
-        (["evl"], ("unknown command evl", "did you mean eval?", "bounce-mjx --help")),
-        (["--num-envs", "3"], ("unknown command --num-envs", "choose train, eval")),
-    ],
-)
-def test_unknown_command(args: list[str], words: tuple[str, ...], capsys) -> None:
-    with pytest.raises(SystemExit) as exit_info:
-        console_script.main(args)
-    assert exit_info.value.code == 2
-    error = capsys.readouterr().err
-    assert re.fullmatch(r"error: .+\n", error) and all(word in error for word in words), error
-
-
 def test_version(capsys) -> None:
     console_script.main(["--version"])
     assert capsys.readouterr().out == f"bounce_mjx {bounce_mjx.__version__}\n"

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bounce_mjx.commands.main import main
 from bounce_mjx.errors import UserError
 from bounce_mjx.identify.fit import Fit, Noise, Problem, _eliminate, certainty, minimise
 from bounce_mjx.identify.log import Log
@@ -259,19 +258,3 @@ def test_a_hidden_robot_is_identified(tmp_path: Path) -> None:
     assert found.before["ball_position"] > 2.0
     assert all(0.8 < error < 1.2 for error in found.after.values())
     assert all(error < 1.3 for error in found.held_out.values())
-
-
-@pytest.mark.parametrize(
-    "args, sentence",
-    [
-        ([], "no log is given"),
-        (["nowhere.csv"], "the log nowhere.csv cannot be read"),
-        (["x.csv", "--check", "nowhere.yaml"], "nowhere.yaml"),
-    ],
-)
-def test_identify_command_refuses(args, sentence, tmp_path, monkeypatch, capsys) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as end:
-        main(["identify", *args])
-    assert end.value.code == 2 and sentence in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())

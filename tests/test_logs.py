@@ -450,18 +450,3 @@ def test_excitation_keeps_to_the_limits_of_the_robot() -> None:
         largest = np.max(np.abs(np.diff(motion.targets, order, axis=0)), axis=0)
         assert np.all(largest / config.control_dt**order <= limit)
     assert np.all(np.ptp(motion.targets, axis=0) > 0.01)
-
-
-@pytest.mark.parametrize(
-    "flags, sentence",
-    [
-        (["--table-height", "0.5"], "the start pose has a contact of the table and"),
-        (["--seconds", "3"], "3 s are too short to move 6 joints; give at least"),
-        (["--robot", "nowhere"], "nowhere"),
-    ],
-)
-def test_an_impossible_excitation_is_refused(flags, sentence, tmp_path: Path, capsys) -> None:
-    with pytest.raises(SystemExit) as end:
-        main(["excite", "--out", str(tmp_path / "motion.csv"), *flags])
-    assert end.value.code == 2 and sentence in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from bounce_mjx.baselines.mirror import MirrorLaw, observing
-from bounce_mjx.commands import eval as eval_command
 from bounce_mjx.commands import play
 from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.episodes import make_evaluator
@@ -73,21 +72,6 @@ def test_the_law_keeps_the_ball_up(env: Env) -> None:
     assert values["stable"] == values["consecutive bounces"] == 100.0
     assert values["height"] > 90.0 and values["horizontal position"] > 95.0
     assert report.details["mean_consecutive_bounces"] > 8.0
-
-
-@pytest.mark.parametrize(
-    ("main", "flags", "word"),
-    [
-        (eval_command.main, "pretrained --robot ur5e", "give mirror"),
-        (eval_command.main, "mirror --task catch", "target_height"),
-        (eval_command.main, "mirror --robot nope", "no robot is named nope"),
-    ],
-)
-def test_a_mistake_is_one_sentence(main, flags: str, word: str, capsys) -> None:
-    with pytest.raises(SystemExit) as exit_info:
-        main(flags.split())
-    error = capsys.readouterr().err
-    assert exit_info.value.code == 2 and word in error and error.count("\n") == 1, error
 
 
 def test_the_word_mirror_is_shown_beside_a_policy(tmp_path, monkeypatch, capsys) -> None:

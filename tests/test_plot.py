@@ -238,25 +238,6 @@ def test_plot_of_several_runs(trained: Path, tmp_path: Path) -> None:
     assert (tmp_path / "mine").read_text() == "mine"
 
 
-BAD_PLOTS = {
-    "unknown format": ("{run} --formats gif", "--formats is gif", "'png' or 'svg'"),
-    "out is a file": ("{run} --out {run}/config.yaml", "cannot be written", "--out"),
-}
-
-
-@pytest.mark.parametrize("case", BAD_PLOTS.values(), ids=BAD_PLOTS)
-def test_bad_plot(trained: Path, tmp_path: Path, monkeypatch, capfd, case) -> None:
-    args, *words = case
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as exit_info:
-        plot_command.main(args.format(run=trained).split())
-    out, error = capfd.readouterr()
-    assert exit_info.value.code == 2
-    assert re.fullmatch(r"error: .+\n", error) and not out
-    assert [word for word in words if word not in error] == []
-    assert not list(tmp_path.iterdir())
-
-
 def check_report(run: Path) -> str:
     """The text of a report, after checking that the page is complete and needs no other file."""
     page = (run / "report.html").read_text(encoding="utf-8")

@@ -170,15 +170,10 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("name", MISTAKES)
-def test_a_mistake_in_a_suite_is_one_sentence(name: str, tmp_path: Path, capsys) -> None:
+def test_a_mistake_in_a_suite_is_one_sentence(name: str, refused) -> None:
     perturbations, words = MISTAKES[name]
-    path = tmp_path / "suite.yaml"
-    path.write_text(yaml.safe_dump({"perturbations": perturbations}), encoding="utf-8")
-    with pytest.raises(SystemExit) as exit_info:
-        robustness_command.main(["--suite", str(path), "--out", str(tmp_path)])
-    assert exit_info.value.code == 2
-    error = capsys.readouterr().err
-    assert "suite.yaml" in error and error.count("\n") == 1 and words in error, error
+    Path("suite.yaml").write_text(yaml.safe_dump({"perturbations": perturbations}))
+    refused("robustness --suite suite.yaml --out out", "suite.yaml", words)
 
 
 # The episodes

@@ -1,7 +1,6 @@
 """A training that starts with the networks of an earlier one."""
 
 import json
-import re
 import shutil
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import best_checkpoint, pretrained_checkpoint
 from bounce_mjx.runs.reading import read_networks, read_policy
 from bounce_mjx.training.warm_start import read_start
-from tiny_runs import STEPS, TINY, shared_run
+from tiny_runs import STEPS, TINY
 
 CRITIC = {"n_bounces", "world/restitution", "world/air_drag"}
 WORLD = {
@@ -120,27 +119,3 @@ def test_the_latest_run_is_that_of_the_task_wherever_the_new_one_lies(
     command = train_command.read_command("--warm-start latest --log-dir new".split())
     assert command.warm_start == best_checkpoint(run).folder
     assert command.log_dir == Path("new")
-
-
-MISTAKES = {
-    "no value network": ("--warm-start robust", "without its value network; give robust_small"),
-    "layers": ("--warm-start robust_small --hidden-layers 8", "other hidden layers"),
-    "observation": ("--warm-start robust_small --observation.action 1", "another observation"),
-    "robot": ("--warm-start robust_small --robot ur5e", "--warm-start and --robot"),
-    "nowhere": ("--warm-start nowhere", "there is no run nowhere, and no policy of this name"),
-    "resume": ("--resume {run} --warm-start robust_small", "--resume cannot change warm_start"),
-}
-
-
-@pytest.mark.parametrize("flags, words", MISTAKES.values(), ids=MISTAKES)
-def test_mistakes_give_one_sentence(
-    flags: str, words: str, tmp_path: Path, monkeypatch, capfd
-) -> None:
-    run = shared_run() if "{run}" in flags else None
-    capfd.readouterr()
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit):
-        train_command.main(flags.format(run=run).split())
-    error = capfd.readouterr().err
-    assert re.fullmatch(r"error: .+\n", error) and words in error, error
-    assert not list(tmp_path.iterdir())
