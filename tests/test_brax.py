@@ -59,13 +59,6 @@ def test_unknown_settings_are_refused():
         brax.envs.get_environment("bounce_ball", debug=True)
 
 
-def test_an_engine_of_brax_is_not_used():
-    """PureJaxRL's `BraxGymnaxWrapper` names one."""
-    with pytest.warns(UserWarning, match="'positional', but .* its own engine 'fused'"):
-        env = brax.envs.get_environment("bounce_ball", backend="positional")
-    assert env.backend == "fused"
-
-
 @pytest.mark.slow
 def test_randomization_by_brax_acts_on_the_physics():
     """After a step of free fall, the ball's speed is that of the world's gravity; a time-out keeps

@@ -200,8 +200,7 @@ FUNCTIONS = {
     "parts": lambda x: sum(jnp.split(x, 3)) + jnp.append(x, 1.0)[3:],
     "windows": lambda x: jax.lax.dynamic_slice(x, (1,), (2,)),
     "an update": lambda x: jax.lax.dynamic_update_slice(x, jnp.ones(2), (1,)),
-    "products": lambda a, x: a @ x + jnp.einsum("ij,ij->i", a, a) + x @ jnp.ones((3, 2)),
-    "outer products": lambda a, x: jnp.outer(x, x)[:2] + a @ a.T @ a + jnp.ones((2, 2)) @ a,
+    "products": lambda x: jnp.outer(x, x) + x @ jnp.arange(6.0).reshape(3, 2)[:, :1],
     "cross": lambda x: jnp.cross(x, x[::-1]) + jnp.hypot(x[0], x[1]),
 }
 
@@ -244,6 +243,7 @@ REFUSED = {
     "atan2": lambda x: jnp.arctan2(x, x),
     "scan": lambda x: jax.lax.fori_loop(0, 3, lambda _, y: 2.0 * y, x),
     "dynamic_slice": lambda x, i: x[i[0]],
+    "dot_general": lambda a, x: a @ x,
     "div of int32": lambda i: jax.lax.div(i, i),
     "mul of float16": lambda x: x.astype(jnp.float16) * 2,
 }

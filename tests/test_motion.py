@@ -24,7 +24,7 @@ def limited(limits: dict[str, Any] = LIMITS) -> DeployedPolicy:
     """The shipped policy as if its training had had limits."""
     policy = load_policy("pretrained")
     policy.metadata = policy.metadata._replace(limits=CommandLimits(**limits), max_lead=0.15)
-    policy._motion = type(policy._motion)(policy.metadata)
+    policy.motion = type(policy.motion)(policy.metadata)
     policy.reset()
     return policy
 
@@ -177,7 +177,6 @@ SETTINGS = {
     "box": [((0, 0, 0), (1, math.nan, 1)), ((1, 1, 1), (0, 0, 0)), ((0, 0), (1, 1))],
     "max_picture_age": [0.0, -0.1, 1.5, math.nan, math.inf],
     "max_steps_late": [0, -1, math.nan, math.inf],
-    "home_speed": [0.0, -1.0, 2.5, 1e9, math.nan],
     "rate": [125, 0, math.nan],
 }
 

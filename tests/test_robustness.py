@@ -82,7 +82,10 @@ def test_strengths_have_a_unit_and_values_a_shape(tmp_path: Path) -> None:
             name="start",
             unit="cm",
             strengths=[5],
-            terms={"ball_start": {"from": ["-strength", 0, 0], "to": "strength"}, "air_drag": 0.1},
+            terms={
+                "ball_start": {"from": ["-strength", 0, 0], "to": ["strength"] * 3},
+                "air_drag": 0.1,
+            },
         ),
         dict(name="real", terms={"servo_gain": 0.9, "target_height": {"from": 0.3, "to": 0.8}}),
     )
@@ -155,8 +158,11 @@ MISTAKES = {
         [LATE | {"terms": {"target_height": {"from": 0, "to": "strength"}}}],
         "'late' at 0.01: target_height is 0, but must be a finite number >= 0.001",
     ),
-    "unused strengths": ([LATE | {"terms": {"action_latency": 0.01}}], "strengths are alike"),
-    "nothing": ([dict(name="late")], "it changes nothing"),
+    "unused strengths": (
+        [LATE | {"terms": {"action_latency": 0.01}}],
+        "with the word strength",
+    ),
+    "nothing": ([dict(name="late")], "give terms or settings"),
     "same name": ([LATE, LATE], "'late': the name is taken"),
     "length": (
         [LATE | {"terms": {"paddle_tilt": ["strength", 0, 0]}}],

@@ -92,6 +92,15 @@ ASPECTS = (0.46, 0.85, 2.0)
 HOMES = ((0.58856, 0.0, 0.05), (0.67, 0.0, 0.4), (0.0, 0.55, 0.25), (-0.6, 0.0, 0.3))
 
 
+def test_on_a_phone_the_panel_leaves_the_arm_and_the_ball_visible() -> None:
+    """It covers the lower three fifths."""
+    home = np.array(HOMES[0])
+    parts = np.array([(-0.1, 0.0, 0.0), home + (0.05, 0.0, 0.0), home + (0.0, 0.0, 0.8)])
+    points = projected(parts, home, 390 / 844, np.zeros((1, 3)))
+    assert np.all(np.abs(points[:, 0]) < 1.0)
+    assert np.all((points[:, 1] > 0.2) & (points[:, 1] < 1.0))
+
+
 @pytest.mark.parametrize("home", HOMES, ids=["default", "raised", "turned", "behind"])
 def test_the_camera_sees_every_robot(home) -> None:
     """Base, paddle, and the ball at the highest target."""

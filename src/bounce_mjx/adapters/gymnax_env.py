@@ -5,7 +5,7 @@ The functions are pure and take one environment: apply `jax.vmap` to batch them.
 """
 
 import functools
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,9 +16,6 @@ from bounce_mjx.env.env import Env, State
 from bounce_mjx.errors import needed
 from bounce_mjx.task.task import Task
 from bounce_mjx.tasks.registry import DEFAULT, task_config
-
-if TYPE_CHECKING:
-    from gymnax.environments.spaces import Box
 
 
 @struct.dataclass
@@ -60,11 +57,11 @@ class GymnaxBounceBall:
         self.num_actions = self.task.action_size
         """Length of the action vector."""
 
-    def action_space(self, params: EnvParams | None = None) -> "Box":
+    def action_space(self, params: EnvParams | None = None) -> Any:
         """The space of the actions."""
         return _box(1.0, self.task.action_size)
 
-    def observation_space(self, params: EnvParams | None = None) -> "Box":
+    def observation_space(self, params: EnvParams | None = None) -> Any:
         """The space of the observations, which has no limits."""
         return _box(jnp.inf, self.task.observation_size)
 
@@ -137,7 +134,7 @@ class PureJaxRLBounceBall(GymnaxBounceBall):
         return observation, state, reward, terminated | truncated, info
 
 
-def _box(limit: float, size: int) -> "Box":
+def _box(limit: float, size: int) -> Any:
     with needed("gymnax", "gymnax"):
         from gymnax.environments.spaces import Box
     return Box(-limit, limit, (size,))

@@ -39,8 +39,6 @@ def describe() -> Iterator[tuple[str, str]]:
     yield "bounce_mjx", f"{bounce_mjx.__version__} in {Path(bounce_mjx.__file__).parent}"
     yield "python", f"{platform.python_version()} ({sys.executable}) on {platform.platform()}"
     yield "packages", ", ".join(f"{name} {version_of(name) or 'missing'}" for name in _PACKAGES)
-    plugins = importlib.metadata.entry_points(group="jax_plugins")
-    yield "plugins of jax", ", ".join(sorted({plugin.name for plugin in plugins})) or "none"
     chosen = {name: value for name, value in os.environ.items() if name.startswith(_VARIABLES)}
     yield "variables", ", ".join(f"{n}={v}" for n, v in sorted(chosen.items())) or "none"
     yield "processors", f"{os.cpu_count()}"

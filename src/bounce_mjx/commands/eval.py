@@ -9,7 +9,7 @@ import tyro
 from rich.console import Console
 
 from bounce_mjx.commands.run_options import OneActorCommand, WorldCommand, parse_with_commands
-from bounce_mjx.config.command_line import progress, stdout
+from bounce_mjx.config.command_line import stdout
 from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.config import (
@@ -72,14 +72,13 @@ def main(args: Sequence[str]) -> None:
         command.episodes, command.seed, command.physics, command.nominal, commands
     )
     length = f"{command.episodes:,} episodes of {config.env.episode_seconds:g} s"
-    with progress(console, "evaluating") as shown:
+    with console.status("evaluating"):
         report, engine = evaluate_policy(
             policy,
             config.env,
             actor,
             options,
             started=lambda engine: console.out(f"physics: {engine}  {length}", highlight=False),
-            progress=shown,
         )
     console.print(results_table(report, "the results"))
     console.print(details_line(report), highlight=False, soft_wrap=True)

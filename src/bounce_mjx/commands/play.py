@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.console import Console
@@ -32,8 +32,6 @@ class PlayCommand(WorldCommand):
     policy that comes with the package: pretrained, robust, robust_small, or the name of a task or
     an arm. Several are shown side by side. The default is the newest run, or the task's policy in
     the package if there is no run. mirror stands for the mirror law, a model-based baseline."""
-    physics: Literal["config", "fused", "mjx"] = "config"
-    """Physics engine; config is the engine used in training."""
     randomization: RandomizationConfig = RandomizationConfig()
     """World of the episodes, if a term is given, in place of the world of the training."""
     viewing: Annotated[ViewerOptions, tyro.conf.arg(name="")] = ViewerOptions()
@@ -62,13 +60,12 @@ def main(args: Sequence[str]) -> None:
 
 
 def _config(checkpoint: "Checkpoint", command: PlayCommand) -> TrainConfig:
-    """The config of a checkpoint's training, with the engine and the world that are to be shown."""
+    """The config of a checkpoint's training, with the world that is to be shown."""
     config = command.config_of(checkpoint)
-    changes = {} if command.physics == "config" else {"physics": command.physics}
-    if command.randomization.terms:
-        changes["randomization"] = command.randomization
-    env = validate(type(config.env), dict(config.env) | changes, "play")
-    return config.model_copy(update={"env": env})
+    if not command.randomization.terms:
+        return config
+    given = dict(config.env) | {"randomization": command.randomization}
+    return config.model_copy(update={"env": validate(type(config.env), given, "play")})
 
 
 def load_shown(checkpoint: "Checkpoint", config: TrainConfig, console: Console) -> "Shown":

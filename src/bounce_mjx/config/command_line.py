@@ -1,12 +1,11 @@
 """Command lines made from the types of settings: tyro reads words, and pydantic their values."""
 
-import contextlib
 import functools
 import re
 import textwrap
 import types
 import typing
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -14,7 +13,6 @@ import pydantic
 import tyro
 from pydantic.fields import FieldInfo
 from rich.console import Console
-from rich.progress import Progress
 from tyro.constructors import (
     MISSING_NONPROP,
     ConstructorRegistry,
@@ -56,19 +54,6 @@ def stdout(**options: Any) -> Console:
     if not console.is_terminal:
         console.width = _NO_WRAP
     return console
-
-
-@contextlib.contextmanager
-def progress(console: Console, doing: str) -> Iterator[Callable[[float], None]]:
-    """A function that shows on a terminal, as a bar, which share of a task is done, from 0 to 1.
-
-    Args:
-      doing: what the task does, such as "evaluating".
-    """
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        # The first call follows the compilation.
-        task = bar.add_task("compiling", total=1.0)
-        yield lambda share: bar.update(task, completed=share, description=doing)
 
 
 def parse(

@@ -187,7 +187,7 @@ class _Graph:
         raise UserError(
             f"{self._owner} uses the operation {equation.primitive.name} of "
             f"{equation.invars[-1].aval.dtype}, which an exported policy cannot compute; use "
-            "arithmetic, comparisons, jnp.where and fixed indices"
+            "arithmetic, sums, comparisons, jnp.where and fixed indices"
         )
 
     def _align(self, value: Value, atom: Var | Literal, equation: JaxprEqn) -> Value:
@@ -268,21 +268,9 @@ class _Graph:
         return self.node("Or", first, self.node("And", condition, cases[1]))
 
     def product(self, equation: JaxprEqn, x: Value, y: Value) -> str:
-        """Sum of products (`jax.lax.dot_general`)."""
-        (sum_x, sum_y), (each_x, each_y) = equation.params["dimension_numbers"]
+        """A vector times a constant matrix (`jax.lax.dot_general`)."""
+        is_layer = equation.params["dimension_numbers"] == (((0,), (0,)), ((), ()))
         ndims = [atom.aval.ndim for atom in equation.invars]
-        if isinstance(y, np.ndarray) and ndims == [1, 2] and sum_y == (0,):
-            # The layer of a network, which onnxruntime computes faster than other sums.
-            return self.node("MatMul", x, y)
-        names_x, names_y = (
-            list(letters[:ndim])
-            for letters, ndim in zip(("abcdefgh", "ijklmnop"), ndims, strict=True)
-        )
-        for i, j in zip((*sum_x, *each_x), (*sum_y, *each_y), strict=True):
-            names_y[j] = names_x[i]
-        result = [names_x[i] for i in each_x]
-        result += [name for i, name in enumerate(names_x) if i not in (*sum_x, *each_x)]
-        result += [name for j, name in enumerate(names_y) if j not in (*sum_y, *each_y)]
-        rows_x, rows_y = ("Z" * isinstance(value, str) for value in (x, y))
-        terms = f"{rows_x}{''.join(names_x)},{rows_y}{''.join(names_y)}->Z{''.join(result)}"
-        return self.node("Einsum", x, y, equation=terms)
+        if not is_layer or ndims != [1, 2] or isinstance(y, str):
+            self._refuse(equation)
+        return self.node("MatMul", x, y)

@@ -40,6 +40,21 @@ class Motion:
         """Takes back the commands of the control step."""
         self._end = self._start
 
+    def hold(self) -> None:
+        """A control step in which the commands brake, within the limits, or rest."""
+        self.begin()
+        self.aim(self.position)
+
+    def move(self, target: np.ndarray, speed: float) -> None:
+        """A control step in which the commands move toward joint angles [J] (rad), at most at a
+        speed (rad/s) from which half of the acceleration stops there."""
+        self.begin()
+        left = target - self.position
+        if self._limits is not None:
+            speed = np.minimum(speed, np.sqrt(self._limits.acceleration * np.abs(left)))
+        step = speed * self._duration
+        self.aim(self.position + np.clip(left, -step, step))
+
     @property
     def is_known(self) -> bool:
         """Whether there is a command."""
@@ -77,15 +92,6 @@ class Motion:
             return np.tile(self._end.position, (len(times), 1))
         acceleration, smoothing = self._end.acceleration, self._limits.smoothing
         return command(self._start, acceleration, np.asarray(times)[:, None], np, smoothing)
-
-    def toward(self, target: np.ndarray, speed: float) -> np.ndarray:
-        """An aim [J] on the way to a target [J], rad, at most at a speed (rad/s) from which half
-        of the acceleration stops at the target."""
-        left = target - self._start.position
-        if self._limits is not None:
-            speed = np.minimum(speed, np.sqrt(self._limits.acceleration * np.abs(left)))
-        step = speed * self._duration
-        return self._start.position + np.clip(left, -step, step)
 
     def clip(self, angles: np.ndarray) -> np.ndarray:
         """Angles [J] within the joints' ranges."""

@@ -42,7 +42,8 @@ class DeployedPolicy:
             commands = self.metadata.commands.items()
             self.units = UNITS | {name: c.unit or "no unit" for name, c in commands}
             """Measurements that a step accepts, and their units."""
-            self._motion = Motion(self.metadata)
+            self.motion = Motion(self.metadata)
+            """Commands of the joints; a `Supervisor` also moves them without the policy."""
             self._sizes = measurement_sizes(self.metadata)
             self.needs = self._needs()
             """Measurements required in every step."""
@@ -84,7 +85,7 @@ class DeployedPolicy:
         self.step_number = -1
         """Number of the last step, from 0; -1 before the first one."""
         self._action = np.zeros(count)
-        self._motion.rest(targets)
+        self.motion.rest(targets)
 
     def step(self, measurements: Mapping[str, Any]) -> np.ndarray:
         """Action of a control step.
@@ -117,7 +118,7 @@ class DeployedPolicy:
         self._refuse_impossible(measured)
         angles = measured.get("joint_angles")
         if angles is not None and self.metadata.max_lead is not None:
-            last = self._motion.end if self._motion.is_known else angles
+            last = self.motion.end if self.motion.is_known else angles
             measured["servo_lead"] = last - angles
         time = float(measured.pop("time")[0]) if "time" in measured else None
         steps = self._steps_since(time)
@@ -141,7 +142,7 @@ class DeployedPolicy:
         if self._first is None and time is not None:
             self._first = time - self.step_number * self.metadata.control_dt
         if angles is not None:
-            self._motion.begin(angles)
+            self.motion.begin(angles)
             self._act(action)
         return self._action.copy()
 
@@ -175,7 +176,7 @@ class DeployedPolicy:
         """
         if self.targets is None:
             raise UserError("there are no commands before the first step; call step first")
-        return self._motion.at(np.arange(1, self.commands_per_step(rate) + 1) / rate)
+        return self.motion.at(np.arange(1, self.commands_per_step(rate) + 1) / rate)
 
     def commands_per_step(self, rate: float) -> int:
         """Number of `commands` of a control step at a rate (Hz); UserError as there."""
@@ -191,30 +192,9 @@ class DeployedPolicy:
     @property
     def targets(self) -> np.ndarray | None:
         """Servo targets [J] at the end of the control step, rad; None before the first step."""
-        if not self._motion.is_known:
+        if not self.motion.is_known:
             return None
-        return self._motion.at(np.array([self.metadata.control_dt]))[0]
-
-    @property
-    def is_still(self) -> bool:
-        """Whether the commands come to rest in this control step."""
-        return self._motion.is_known and self._motion.is_still
-
-    def hold(self) -> None:
-        """A control step without the policy, in which the commands brake, within the limits, or
-        rest. Before the first step, call `reset` with the arm's joint angles."""
-        self._motion.begin()
-        self._motion.aim(self._motion.position)
-
-    def withdraw(self) -> None:
-        """Takes back the commands of the last step, which were not sent."""
-        self._motion.withdraw()
-
-    def move(self, target: np.ndarray, speed: float) -> None:
-        """A control step without the policy, in which the commands move toward joint angles [J]
-        (rad) at a speed (rad/s). Before the first step, as for `hold`."""
-        self._motion.begin()
-        self._motion.aim(self._motion.toward(target, speed))
+        return self.motion.at(np.array([self.metadata.control_dt]))[0]
 
     def supervise(self, rate: float, **settings: Any) -> Supervisor:
         """A supervisor that gives the commands of this policy at the robot's rate (Hz).
@@ -223,7 +203,7 @@ class DeployedPolicy:
           settings: `box`, the lowest and the highest x, y and z of the paddle's centre, m;
             `max_picture_age`, s (at most 1; by default the file's largest latency and five of its
             longest camera intervals, at least 0.1); `max_steps_late`, control steps between two
-            steps, and calls in a row without a new step (2); `home_speed`, rad/s (0.3).
+            steps, and calls in a row without a new step (2).
 
         Raises:
           UserError: the rate is not a multiple of the policy's, or a setting is wrong.
@@ -234,8 +214,8 @@ class DeployedPolicy:
         """Aims the commands of the control step at the targets of an action [J]."""
         base, lead = self._measured["joint_angles"], self.metadata.max_lead
         if lead is not None:
-            base = np.clip(self._motion.position, base - lead, base + lead)
-        self._motion.aim(base + self.metadata.action_scale * action)
+            base = np.clip(self.motion.position, base - lead, base + lead)
+        self.motion.aim(base + self.metadata.action_scale * action)
 
     @property
     def observation(self) -> np.ndarray:
@@ -322,7 +302,7 @@ class DeployedPolicy:
                     f"({self.units[name]}); give one near this range"
                 )
         angles = measured.get("joint_angles", np.array(self.metadata.default_joint_angles))
-        outside = np.abs(angles - self._motion.clip(angles))
+        outside = np.abs(angles - self.motion.clip(angles))
         worst = np.argmax(outside)
         if outside[worst] > _OUTSIDE:
             raise UserError(

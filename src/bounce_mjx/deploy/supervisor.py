@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from bounce_mjx.deploy.chain import Chain
-from bounce_mjx.deploy.faults import EARLIER, FASTEST, FLYING, first_fault, make_bounds, picture_age
+from bounce_mjx.deploy.faults import EARLIER, FLYING, first_fault, make_bounds, picture_age
 from bounce_mjx.deploy.histories import Measurements
 from bounce_mjx.errors import UserError
 
@@ -18,6 +18,8 @@ State = Literal["homing", "ready", "running", "braking", "stopped"]
 Box = tuple[Sequence[float], Sequence[float]]
 
 _HOME_TOLERANCE = 2e-3
+# On the way home, rad/s.
+_HOME_SPEED = 0.3
 
 
 class Supervisor:
@@ -40,18 +42,15 @@ class Supervisor:
         box: Box = ((-math.inf,) * 3, (math.inf,) * 3),
         max_picture_age: float | None = None,
         max_steps_late: float = 2.0,
-        home_speed: float = 0.3,
     ):
         """See `DeployedPolicy.supervise`."""
         policy.commands_per_step(rate)
         self._policy, self._rate = policy, rate
-        metadata, limits = policy.metadata, policy.metadata.limits
+        metadata = policy.metadata
         age = picture_age(metadata) if max_picture_age is None else max_picture_age
-        fastest = FASTEST if limits is None else min(limits.velocity)
         for name, value, most in (
             ("max_picture_age", age, 1.0),
             ("max_steps_late", max_steps_late, 1.0 / metadata.control_dt),
-            ("home_speed", home_speed, fastest),
         ):
             if not 0.0 < value <= most:
                 raise UserError(f"{name} is {value}; give a number above 0 and at most {most:g}")
@@ -59,7 +58,7 @@ class Supervisor:
         if corners.shape != (2, 3) or not np.all(corners[0] < corners[1]):
             raise UserError(f"the box is {box}; give its lowest and its highest x, y and z, m")
         self._allowed = make_bounds(metadata, age, max_steps_late, corners)
-        self._home_speed, self._chain = home_speed, Chain(metadata)
+        self._chain = Chain(metadata)
         self.state: State = "homing"
         self.fault: str | None = None
         """Code of the rule that was broken, such as `ball_lost`; `measurement` for a measurement
@@ -124,8 +123,8 @@ class Supervisor:
         if self.state in ("braking", "stopped"):
             if policy.targets is None:
                 policy.reset(self._angles(measurements))
-            policy.hold()
-            if self.state == "braking" and policy.is_still:
+            policy.motion.hold()
+            if self.state == "braking" and policy.motion.is_still:
                 self.state = "stopped"
         return policy.commands(self._rate)
 
@@ -154,10 +153,10 @@ class Supervisor:
         if not self._is_fine(self._window(angles)):
             return
         if np.abs(policy.targets - home).max() > _HOME_TOLERANCE:
-            policy.move(home, self._home_speed)
+            policy.motion.move(home, _HOME_SPEED)
             return
-        policy.hold()
-        is_home = policy.is_still and self._are_near(angles, home)
+        policy.motion.hold()
+        is_home = policy.motion.is_still and self._are_near(angles, home)
         self.state = "ready" if is_home else "homing"
 
     def _are_near(self, one: np.ndarray, other: np.ndarray) -> bool:
@@ -173,10 +172,10 @@ class Supervisor:
         policy.step(measurements)
         self._idle = self._idle + 1 if policy.step_number == last else 0
         if self._idle:
-            policy.hold()
+            policy.motion.hold()
         target = self._chain.paddle(policy.targets)[0]
         if not self._is_fine({"idle": self._idle, "target": target}):
-            policy.withdraw()
+            policy.motion.withdraw()
 
     def _window(self, angles: np.ndarray) -> dict[str, np.ndarray]:
         """The last angles and commands, with those of this control step."""

@@ -32,29 +32,17 @@ _CTRL_AND_FORCE = _CTRL | mujoco.mjtState.mjSTATE_XFRC_APPLIED
 _NUM_THREADS = os.cpu_count() or 1
 
 
-def make_mujoco_evaluator(
-    env: Env,
-    actor: Actor,
-    episodes: int,
-    progress: Callable[[float], None] | None = None,
-) -> Callable[..., Statistics]:
+def make_mujoco_evaluator(env: Env, actor: Actor, episodes: int) -> Callable[..., Statistics]:
     """Like `evaluation.make_evaluator`, with `mj_step` (float64) in place of the env's engine.
 
     Each episode is simulated in the world that its reset drew.
-
-    Args:
-      progress: called every 100 control steps with the share of the time limit that is simulated.
     """
-    measure = make_recording_mujoco_evaluator(env, actor, episodes, 0, progress)
+    measure = make_recording_mujoco_evaluator(env, actor, episodes, recorded=0)
     return lambda policy, key, ranges=None: measure(policy, key, ranges)[0]
 
 
 def make_recording_mujoco_evaluator(
-    env: Env,
-    actor: Actor,
-    episodes: int,
-    recorded: int,
-    progress: Callable[[float], None] | None = None,
+    env: Env, actor: Actor, episodes: int, recorded: int
 ) -> Callable[..., tuple[Statistics, Recording]]:
     """Like `make_mujoco_evaluator`, but also returns a recording of the first `recorded`
     episodes."""
@@ -87,12 +75,8 @@ def make_recording_mujoco_evaluator(
                 actions, actuation, control, targets = decide(policy, now.states)
                 after = physics.step(control, targets, now.states.pipeline_state)
                 now = finish(now, actions, actuation, after)
-                if step % 100 < 99:
-                    continue
-                if not np.any(now.statistics.running):
+                if step % 100 == 99 and not np.any(now.statistics.running):
                     break
-                if progress is not None:
-                    progress((step + 1) / env.config.episode_steps)
         return now.statistics, now.recording
 
     return evaluate

@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from bounce_mjx.env.env import Env, State
 from bounce_mjx.evaluation.recording import empty_recording, record
@@ -25,43 +24,12 @@ class Batch(NamedTuple):
     """Control steps so far [], int32."""
 
 
-def make_evaluator(
-    env: Env,
-    actor: Actor,
-    episodes: int,
-    progress: Callable[[float], None] | None = None,
-) -> Callable[..., Statistics]:
-    """A function (policy, key, ranges) -> statistics of `episodes` deterministic episodes, each
-    from its own reset (`reset_episodes`). It stops when all episodes have ended or their time limit
-    is reached. The ranges are optional.
-
-    Args:
-      progress: called every second of simulated time with the share of the time limit that is
-        simulated; without it, the function is one jitted program.
-    """
-    if progress is None:
-        measure = make_recording_evaluator(env, actor, episodes, recorded=0)
-        return jax.jit(lambda policy, key, ranges=None: measure(policy, key, ranges)[0])
-
-    @jax.jit
-    def start(key: jax.Array, ranges: Ranges | None) -> Batch:
-        return begin(env, reset_episodes(env, key, episodes, ranges), recorded=0)
-
-    @jax.jit
-    def run(policy: Policy, now: Batch, last_step: jax.Array) -> Batch:
-        return run_until(env, actor, policy, now, last_step)
-
-    def evaluate(policy: Policy, key: jax.Array, ranges: Ranges | None = None) -> Statistics:
-        now, limit = start(key, ranges), env.config.episode_steps
-        second = max(1, round(1.0 / env.dt))
-        for done in range(0, limit, second):
-            now = run(policy, now, np.int32(min(done + second, limit)))
-            if not np.any(now.statistics.running):
-                break
-            progress(min(1.0, (done + second) / limit))
-        return now.statistics
-
-    return evaluate
+def make_evaluator(env: Env, actor: Actor, episodes: int) -> Callable[..., Statistics]:
+    """A jitted function (policy, key, ranges) -> statistics of `episodes` deterministic episodes,
+    each from its own reset (`reset_episodes`). It stops when all episodes have ended or their time
+    limit is reached. The ranges are optional."""
+    measure = make_recording_evaluator(env, actor, episodes, recorded=0)
+    return jax.jit(lambda policy, key, ranges=None: measure(policy, key, ranges)[0])
 
 
 def make_recording_evaluator(
@@ -86,8 +54,16 @@ def run_episodes(
 
     Returns: The statistics of all episodes, and a recording of the first `recorded`.
     """
-    first = begin(env, states, recorded)
-    last = run_until(env, actor, policy, first, env.config.episode_steps)
+
+    def unfinished(now: Batch) -> jax.Array:
+        return jnp.any(now.statistics.running) & (now.step < env.config.episode_steps)
+
+    def advance(now: Batch) -> Batch:
+        actions = actor.act(policy, now.states.obs.T)
+        states = jax.vmap(env.step, in_axes=-1, out_axes=-1)(now.states, actions.T)
+        return add_step(env, now, states)
+
+    last = jax.lax.while_loop(unfinished, advance, begin(env, states, recorded))
     return last.statistics, last.recording
 
 
@@ -99,26 +75,6 @@ def begin(env: Env, states: State, recorded: int) -> Batch:
         recording=empty_recording(env, states, min(recorded, states.done.shape[-1])),
         step=jnp.int32(0),
     )
-
-
-def run_until(
-    env: Env,
-    actor: Actor,
-    policy: Policy | None,
-    now: Batch,
-    last_step: int | jax.Array,
-) -> Batch:
-    """Continues until all episodes have ended or `last_step` is reached."""
-
-    def unfinished(now: Batch) -> jax.Array:
-        return jnp.any(now.statistics.running) & (now.step < last_step)
-
-    def advance(now: Batch) -> Batch:
-        actions = actor.act(policy, now.states.obs.T)
-        states = jax.vmap(env.step, in_axes=-1, out_axes=-1)(now.states, actions.T)
-        return add_step(env, now, states)
-
-    return jax.lax.while_loop(unfinished, advance, now)
 
 
 def add_step(env: Env, before: Batch, states: State) -> Batch:

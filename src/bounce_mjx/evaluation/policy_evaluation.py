@@ -36,7 +36,6 @@ def evaluate_policy(
     actor: Callable[[Env], Actor],
     options: EvaluationOptions = DEFAULT_OPTIONS,
     started: Callable[[str], None] = lambda engine: None,
-    progress: Callable[[float], None] | None = None,
 ) -> PolicyEvaluation:
     """Measures the results of a policy without action noise.
 
@@ -44,7 +43,6 @@ def evaluate_policy(
       env_config: the world and the task of the policy's training.
       actor: what acts with the policy, such as the networks of its training (`networks_of`).
       started: called with the engine's name before anything is compiled.
-      progress: called now and then with the share of the work that is done, from 0 to 1.
 
     Raises:
       UserError: the engine does not support the model.
@@ -54,7 +52,7 @@ def evaluate_policy(
     engine = "mujoco" if on_c else env.engine.name
     started(engine)
     make = make_mujoco_evaluator if on_c else make_evaluator
-    evaluate = make(env, actor(env), options.episodes, progress)
+    evaluate = make(env, actor(env), options.episodes)
     statistics = evaluate(policy, jax.random.PRNGKey(options.seed), ranges)
     return PolicyEvaluation(judge(env, statistics, commands), engine)
 

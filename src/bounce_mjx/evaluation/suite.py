@@ -14,7 +14,7 @@ from bounce_mjx.config.files import differing_keys, read_mapping
 from bounce_mjx.config.settings import Finite, StrictModel, merged
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, shorten
-from bounce_mjx.tasks.registry import find_task, is_file
+from bounce_mjx.tasks.registry import find_task, registered_tasks
 from bounce_mjx.world.actuation import DEFAULT_PUSH_INTERVAL
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import TERMS, RandomizationConfig
@@ -131,13 +131,12 @@ def load_suite(
         conditions.append(_condition(twice, None, trained, doubled, twice.name))
     for perturbation in suite.perturbations:
         source = f"{shorten(path.name, 30)}, perturbation {shorten(perturbation.name, 30)!r}"
-        if not perturbation.name.strip() or perturbation.name in names:
-            reason = "is taken" if perturbation.name in names else "is empty"
-            raise UserError(f"{source}: the name {reason}; give each perturbation its own name")
+        if perturbation.name in names:
+            raise UserError(f"{source}: the name is taken; give each perturbation its own name")
         names.add(perturbation.name)
-        if not _is_for(perturbation, trained, source):
+        _check(perturbation, source)
+        if perturbation.task and not issubclass(trained.task, find_task(perturbation.task)):
             continue
-        _check_changes(perturbation, source)
         if perturbation.trained_ranges and not trained.randomization.terms:
             continue
         for strength in perturbation.strengths or (None,):
@@ -171,32 +170,20 @@ def neutral_commands(env: WorldConfig) -> dict[str, tuple[float, float]]:
     return {name: (command.low, command.high) for name, command in ranges.items()}
 
 
-def _is_for(perturbation: Perturbation, trained: WorldConfig, source: str) -> bool:
-    """Whether a perturbation is for the policy's task."""
-    if perturbation.task is None:
-        return True
-    try:
-        # A suite is data, and a task in a file would be code.
-        if is_file(perturbation.task):
-            raise UserError(f"the task {shorten(perturbation.task)} is a file; name a task")
-        return issubclass(trained.task, find_task(perturbation.task))
-    except UserError as error:
-        raise UserError(f"{source}: {error}") from error
-
-
-def _check_changes(p: Perturbation, source: str) -> None:
-    """Checks that a perturbation changes the world, and each strength in another way."""
-    changes = bool(p.terms or p.settings)
-    if changes == p.trained_ranges:
-        reason = "has both terms and trained_ranges" if changes else "changes nothing"
-        raise UserError(f"{source}: it {reason}; give terms, settings or trained_ranges: true")
-    uses = any(_fill_in(values, 0.0) != values for values in (p.terms, p.settings))
-    if uses and not p.strengths:
-        raise UserError(f"{source}: it has no strengths; give a list such as strengths: [1, 2]")
-    if p.strengths and not uses:
+def _check(p: Perturbation, source: str) -> None:
+    """Checks that a perturbation is for a task, changes the world, and each strength in another
+    way."""
+    # A suite is data, and a task in a file would be code.
+    if p.task not in (None, *registered_tasks()):
         raise UserError(
-            f"{source}: no value is the word strength, so all its strengths are alike; write "
-            "strength for a value, or leave strengths out"
+            f"{source}: there is no task {shorten(p.task)}; name one of "
+            f"{', '.join(registered_tasks())}"
+        )
+    uses = any(_fill_in(values, 0.0) != values for values in (p.terms, p.settings))
+    if bool(p.terms or p.settings) == p.trained_ranges or uses != bool(p.strengths):
+        raise UserError(
+            f"{source}: give terms or settings, with the word strength in a value if and only if "
+            "it has strengths, or trained_ranges: true"
         )
 
 
@@ -271,22 +258,14 @@ def _ends(entry: Any, source: str) -> tuple[Any, Any]:
     ends = entry if isinstance(entry, dict) else {"from": entry, "to": entry}
     if ends.keys() != {"from", "to"}:
         raise UserError(f"{source}: a range has other keys than from and to; give both")
-    low, high = ends["from"], ends["to"]
-    if isinstance(low, list) != isinstance(high, list):
-        size = len(low if isinstance(low, list) else high)
-        low, high = (end if isinstance(end, list) else [end] * size for end in (low, high))
-    return low, high
+    return ends["from"], ends["to"]
 
 
 def _broadcast(term: str, num_joints: int, low: Any, high: Any) -> Bounds:
     """Ends of a range in the term's shape."""
-    shape = _shape(term, num_joints)
+    # A command is a number.
+    shape = TERMS[term].shape(num_joints) if term in TERMS else ()
     return tuple(np.broadcast_to(np.asarray(end, np.float64), shape) for end in (low, high))
-
-
-def _shape(term: str, num_joints: int) -> tuple[int, ...]:
-    """Shape of a term; a command is a number."""
-    return TERMS[term].shape(num_joints) if term in TERMS else ()
 
 
 def _contains(trained: WorldConfig, term: str, bounds: Bounds) -> bool:

@@ -110,9 +110,8 @@ def _read_columns(path: Path) -> tuple[np.ndarray, dict[str, tuple[str, Sequence
     by its name."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file)
-            header = next(reader, [])
-            numbered = [(reader.line_num, row) for row in reader if any(row)]
+            reader = csv.DictReader(file)
+            numbered = [(reader.line_num, row) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise UserError(
             f"the log {path} cannot be read ({shorten(reason_of(error))}); give a CSV file in "
@@ -120,19 +119,17 @@ def _read_columns(path: Path) -> tuple[np.ndarray, dict[str, tuple[str, Sequence
         ) from error
     if not numbered:
         raise UserError(f"the log {path} is empty; record with bounce_mjx's Recorder")
-    for line, row in numbered:
-        if len(row) != len(header):
-            raise UserError(
-                f"{path} has {len(row)} cells in row {line}, and its header has {len(header)}; "
-                "give each row a cell for each column"
-            )
     lines, rows = zip(*numbered, strict=True)
+    for line, row in numbered:
+        if None in row or None in row.values():
+            raise UserError(
+                f"{path} has another number of cells in row {line} than in its header; give each "
+                "row a cell for each column"
+            )
     columns: dict[str, tuple[str, Sequence[str]]] = {}
-    for title, cells in zip(header, zip(*rows, strict=True), strict=True):
+    for title in reader.fieldnames:
         name, unit = re.fullmatch(r"\s*(.*?)\s*(?:\[([^\[\]]*)\])?\s*", title).groups()
-        if name in columns:
-            raise UserError(f"{path} has two columns {shorten(name)}; leave one")
-        columns[name] = (unit or "").strip(), cells
+        columns[name] = (unit or "").strip(), [row[title] for row in rows]
     return np.array(lines), columns
 
 

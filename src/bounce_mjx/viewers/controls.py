@@ -2,16 +2,18 @@
 
 import html
 import queue
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import viser
 
-from bounce_mjx.viewers.options import SPEED_RANGE, PageStart
+from bounce_mjx.viewers.options import PageStart
 from bounce_mjx.viewers.simulation import Simulation
 from bounce_mjx.viewers.world import WorldSlider, sliders_for
 from bounce_mjx.world.config import Command
 
+# Slowest and fastest speed, as factors of real time.
+_SPEED_RANGE = (0.1, 4.0)
 _PUSH_RANGE = (0.05, 1.0)
 _DIRECTIONS = ("up", "away", "back", "left", "right")
 _SPEED_STEP = 0.1
@@ -29,8 +31,9 @@ class _Setting:
         self,
         handle: viser.GuiSliderHandle | viser.GuiDropdownHandle,
         sampled: viser.GuiCheckboxHandle,
+        names: Sequence[str] = (),
     ):
-        self._handle, self.sampled = handle, sampled
+        self._handle, self.sampled, self._names = handle, sampled, list(names)
         self._shown: float | None = None
         handle.on_update(self._take)
 
@@ -42,38 +45,34 @@ class _Setting:
     @property
     def value(self) -> float:
         """The value; a choice's number."""
-        if isinstance(self._handle, viser.GuiDropdownHandle):
-            names = self._handle.options
-            return float(names.index(self._handle.value)) if self._handle.value in names else 0.0
-        return _clip(self._handle)
+        if not self._names:
+            return _clip(self._handle)
+        name = self._handle.value
+        return float(self._names.index(name)) if name in self._names else 0.0
 
     def show(self, value: float) -> None:
         """Shows a sampled value that holds, in the slider's steps."""
-        if isinstance(self._handle, viser.GuiDropdownHandle):
-            shown = min(int(value), len(self._handle.options) - 1)
+        if self._names:
+            shown = min(int(value), len(self._names) - 1)
         else:
             shown = round(round(value / self._handle.step) * self._handle.step, _DECIMALS)
         # A user may be moving it.
         if shown != self._shown:
             self._shown = shown
-            self._set(shown)
+            self._handle.value = self._names[shown] if self._names else shown
 
     def set(self, value: float) -> None:
         """Sets a value."""
         self.sampled.value = False
-        self._set(value)
+        self._handle.value = self._names[int(value)] if self._names else value
 
     def move(self, change: float) -> None:
         """Adds to the value, within the limits."""
-        if isinstance(self._handle, viser.GuiDropdownHandle):
-            self.set((self.value + np.sign(change)) % len(self._handle.options))
+        if self._names:
+            self.set((self.value + np.sign(change)) % len(self._names))
         else:
             ends = self._handle.min, self._handle.max
             self.set(round(float(np.clip(self.value + change, *ends)), _DECIMALS))
-
-    def _set(self, value: float) -> None:
-        is_choice = isinstance(self._handle, viser.GuiDropdownHandle)
-        self._handle.value = self._handle.options[int(value)] if is_choice else value
 
 
 class Controls:
@@ -85,7 +84,7 @@ class Controls:
         self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         gui.add_html(f'<div style="padding:0 12px"><b>{html.escape(start.title)}</b></div>')
         self._paused = gui.add_checkbox("pause", False)
-        self._speed = gui.add_slider("speed", *SPEED_RANGE, _SPEED_STEP, start.speed)
+        self._speed = gui.add_slider("speed", *_SPEED_RANGE, _SPEED_STEP, 1.0)
         most = simulation.num_envs
         self._num_shown = gui.add_slider(
             "robots", 1, max(2, most), 1, start.num_shown, disabled=most == 1
@@ -124,7 +123,7 @@ class Controls:
             else:
                 low, high = min(start, *ends), max(start, *ends)
                 handle = gui.add_slider(short, low, high, command.step / _STEPS_PER_KEY, start)
-        setting = _Setting(handle, sampled)
+        setting = _Setting(handle, sampled, command.names)
         if command.names:
             setting.show(start)
         return setting
@@ -188,7 +187,7 @@ class Controls:
         setting.move(steps * self._simulation.env.config.commands[name].step)
 
     def _accelerate(self, change: float) -> None:
-        self._speed.value = float(np.clip(round(self._speed.value + change, 1), *SPEED_RANGE))
+        self._speed.value = float(np.clip(round(self._speed.value + change, 1), *_SPEED_RANGE))
 
     def _push(self, towards: str, event: viser.GuiEvent | viser.CommandEvent) -> None:
         """Requests a push of the ball in a direction as the event's page sees it."""

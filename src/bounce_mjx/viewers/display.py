@@ -30,8 +30,11 @@ _VIEW = np.array([1.06, -1.17, 0.42])
 _HIGHEST = 0.85
 FIELD_OF_VIEW = 40.0
 """Vertical angle of the camera's view, degrees."""
-# A picture that is narrower than this needs a more distant camera.
+# A canvas that is narrower than this, such as a phone's, needs a more distant camera.
 _FULL_ASPECT = 0.9
+# On a page that is narrower than this, the panel covers the lower three fifths: the camera moves
+# away by this factor, and down by this share of what it sees.
+_PHONE_ASPECT, _PHONE_DISTANCE, _PHONE_SHIFT = 0.6, 1.25, 0.275
 
 TRAIL_SECONDS = 0.6
 """Age of the end of the line, s."""
@@ -74,20 +77,15 @@ def marker_body(name: str) -> str:
 
 
 def _with_markers(config: WorldConfig, markers: Sequence[Marker]) -> mujoco.MjModel:
-    """The config's model with a body for each marker, which has the size and the colour of the
-    model's site of its name, if there is one."""
+    """The config's model with a body for each marker, in place of its sites of their names."""
     spec, path = scene_spec(config.mjcf, config.robot)
     add_balls(spec, config.num_balls)
-    looks = {marker.name: (marker.size, marker.rgba) for marker in markers}
+    names = {marker.name for marker in markers}
     for site in spec.sites:
-        if site.name in looks:
-            material = spec.material(site.material)
-            looks[site.name] = site.size, (site if material is None else material).rgba
         # The project's own file has markers of one task.
-        if site.name in looks or config.mjcf is None:
+        if site.name in names or config.mjcf is None:
             site.group = _SHOWN_GROUPS
-    for name, position, _, _, shape in markers:
-        size, rgba = looks[name]
+    for name, position, size, rgba, shape in markers:
         body = spec.worldbody.add_body(name=marker_body(name), pos=position, mocap=True)
         boxes = [((0.0, 0.0, 0.0), size)]
         if shape == "frame":
@@ -218,4 +216,9 @@ def camera_pose(
     view = extent * max(1.0, _FULL_ASPECT / aspect) * _VIEW
     # What is above the focus stays above it; what is beside it leaves the picture.
     look_at = focus + (look_at - focus) / (zoom**2, zoom**2, zoom)
+    if aspect < _PHONE_ASPECT:
+        view = _PHONE_DISTANCE * view
+        seen = 2.0 * np.linalg.norm(view) * np.tan(np.radians(0.5 * FIELD_OF_VIEW))
+        up = np.cross(view, np.cross((0.0, 0.0, 1.0), view))
+        look_at = look_at - _PHONE_SHIFT * seen * up / np.linalg.norm(up)
     return look_at + view / zoom, look_at

@@ -7,7 +7,6 @@ or by a name that it lets point to this machine (DNS rebinding).
 
 import asyncio
 import contextlib
-import functools
 import http
 import ipaddress
 import logging
@@ -23,6 +22,7 @@ import rich
 import viser
 import websockets.asyncio.server
 from websockets.asyncio.server import ServerConnection
+from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from bounce_mjx.errors import UserError
@@ -40,6 +40,7 @@ _REFUSAL = (
     "--watch-allow-host)\n"
 )
 _STARTING = threading.Lock()
+_NO_LOGGER = logging.Logger(__name__, logging.CRITICAL + 1)
 
 
 @contextlib.contextmanager
@@ -55,17 +56,31 @@ def open_server(host: str, port: int, allowed: Collection[str] = ()) -> Iterator
     Raises:
       UserError: this version of viser cannot be guarded.
     """
-    guard = _Guard(host, allowed)
+    serve, is_own = websockets.asyncio.server.serve, _make_rule(host, allowed)
+    guarded = False
+
+    def guarded_serve(*args: Any, process_request: Callable[..., Any], **options: Any) -> Any:
+        nonlocal guarded
+        guarded = True
+        asyncio.get_running_loop().set_exception_handler(lambda loop, context: None)
+
+        def answer(connection: ServerConnection, request: Request) -> Response | None:
+            if is_own(request.headers):
+                return process_request(connection, request)
+            return connection.respond(http.HTTPStatus.FORBIDDEN, _REFUSAL)
+
+        options |= {"create_connection": _Connection, "max_size": _MAX_BYTES, "logger": _NO_LOGGER}
+        return serve(*args, process_request=answer, **options)
+
     # viser starts its websocket server in its constructor, and has no parameter for a guard.
     with _STARTING, _quiet_console():
-        serve = websockets.asyncio.server.serve
-        websockets.asyncio.server.serve = functools.partial(guard.serve, serve)
+        websockets.asyncio.server.serve = guarded_serve
         try:
             server = viser.ViserServer(host=host, port=port, verbose=False)
         finally:
             websockets.asyncio.server.serve = serve
     try:
-        if not guard.is_serving:
+        if not guarded:
             raise UserError(
                 f"viser {viser.__version__} would admit every website to the page; install viser "
                 "1.1"
@@ -93,55 +108,32 @@ def _stop(server: viser.ViserServer) -> None:
         server.stop()
 
 
-class _Guard:
-    def __init__(self, host: str, allowed: Collection[str]):
-        self.is_serving = False
-        self._allowed = {name.lower() for name in allowed}
-        self._names = self._allowed | {*_LOCAL_NAMES, host.lower()}
-        self._is_everywhere = host in _ALL_ADDRESSES
-        if self._is_everywhere:
-            self._names.add(socket.gethostname().lower())
+def _make_rule(host: str, allowed: Collection[str]) -> Callable[[Headers], bool]:
+    """A function of a request's headers: whether it is from the page itself, or of no browser."""
+    proxies = {name.lower() for name in allowed}
+    names = proxies | {*_LOCAL_NAMES, host.lower()}
+    is_everywhere = host in _ALL_ADDRESSES
+    if is_everywhere:
+        names.add(socket.gethostname().lower())
 
-    def serve(self, serve: Callable[..., Any], *args: Any, **options: Any) -> Any:
-        """`websockets.asyncio.server.serve` with the guard."""
-        self.is_serving = True
-        asyncio.get_running_loop().set_exception_handler(lambda loop, context: None)
-        return serve(
-            *args,
-            **options
-            | {
-                "process_request": functools.partial(self._refusal, options["process_request"]),
-                "create_connection": _Connection,
-                "max_size": _MAX_BYTES,
-                "logger": logging.Logger(__name__, logging.CRITICAL + 1),
-            },
-        )
-
-    def _refusal(
-        self, process_request: Callable[..., Any], connection: ServerConnection, request: Request
-    ) -> Response | None:
-        """The answer to a request from elsewhere; viser's own answer to any other one."""
-        hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
-        if (
-            len(hosts) == 1
-            and self._is_name(_host_name(f"//{hosts[0]}"))
-            and all(self._is_own(origin, hosts[0]) for origin in origins)
-        ):
-            return process_request(connection, request)
-        return connection.respond(http.HTTPStatus.FORBIDDEN, _REFUSAL)
-
-    def _is_name(self, name: str) -> bool:
+    def is_name(name: str) -> bool:
         """Whether the page may be opened at a name. No website can let an address point here."""
-        if self._is_everywhere and name not in self._names:
+        if is_everywhere and name not in names:
             with contextlib.suppress(ValueError):
                 return bool(ipaddress.ip_address(name))
-        return name in self._names
+        return name in names
 
-    def _is_own(self, origin: str, host: str) -> bool:
-        """Whether a page of an origin may connect to a host: the page from there, and one through a
-        proxy that replaces the name."""
-        own = origin.lower().partition("://")[2] == host.lower()
-        return own or _host_name(origin) in self._allowed
+    def is_own(headers: Headers) -> bool:
+        hosts = headers.get_all("Host")
+        if len(hosts) != 1 or not is_name(_host_name(f"//{hosts[0]}")):
+            return False
+        # A proxy may replace the name of the host.
+        return all(
+            origin.lower().partition("://")[2] == hosts[0].lower() or _host_name(origin) in proxies
+            for origin in headers.get_all("Origin")
+        )
+
+    return is_own
 
 
 class _Connection(ServerConnection):

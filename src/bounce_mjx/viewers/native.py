@@ -36,13 +36,10 @@ def check_display() -> None:
         )
 
 
-def show_window(
-    simulation: Simulation, speed: float, seconds: float | None, between: Callable[[], None]
-) -> None:
-    """Shows the first environment of a simulation until the window is closed.
+def show_window(simulation: Simulation, seconds: float | None, between: Callable[[], None]) -> None:
+    """Shows the first environment of a simulation in real time until the window is closed.
 
     Args:
-      speed: a factor of real time.
       seconds: simulated time; None for no end.
       between: called between two pictures.
     """
@@ -54,7 +51,7 @@ def show_window(
     ) as viewer:
         with viewer.lock():
             mujoco.mjv_defaultFreeCamera(display.model, viewer.cam)
-        for frames in in_real_time(simulation, seconds, lambda: speed):
+        for frames in in_real_time(simulation, seconds):
             if not viewer.is_running():
                 return
             between()

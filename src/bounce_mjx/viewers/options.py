@@ -10,8 +10,6 @@ from bounce_mjx.config.settings import Positive, StrictModel
 
 MAX_ENVS = 16
 """Largest number of robots side by side."""
-SPEED_RANGE = (0.1, 4.0)
-"""Slowest and fastest speed of a viewer, as factors of real time."""
 
 
 class ViewerOptions(StrictModel):
@@ -28,8 +26,6 @@ class ViewerOptions(StrictModel):
     """Simulated time, s. The default is 10 for a recording; a viewer runs until it is closed."""
     num_envs: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 1
     """Robots side by side, on the live page and in the replay."""
-    speed: Annotated[float, Field(ge=SPEED_RANGE[0], le=SPEED_RANGE[1])] = 1.0
-    """Speed of a viewer, as a factor of real time."""
     fps: Annotated[int, Field(ge=1, le=240)] | None = None
     """Frames per second of a recording. The default is 60 for an MP4, 25 for a WebP or a GIF,
     and 30 for a page."""
@@ -58,8 +54,6 @@ class PageStart(NamedTuple):
     """A name of each environment for its label; by default their numbers."""
     num_shown: int = 1
     """Number of environments in the scene; the page's slider goes up to all of the simulation."""
-    speed: float = 1.0
-    """Speed as a factor of real time."""
 
 
 class Address(NamedTuple):

@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+import time
 from collections.abc import Sequence
 
 import numpy as np
@@ -26,6 +27,8 @@ _ANNOUNCED_SECONDS = 1.5
 _BACKGROUND = np.array([222.0, 228.0, 235.0])
 # Where there are more robots than this, their labels are short.
 _MAX_LONG_LABELS = 4
+# A page lays out its panels within this time, s.
+_LAYOUT_SECONDS = 5.0
 
 
 class Scene:
@@ -47,6 +50,8 @@ class Scene:
         self._names = names
         self._display = Display(env)
         self.show(num_envs)
+        # After the scene is built: a page that is there already is welcomed at once.
+        server.on_client_connect(self._welcome)
 
     def show(self, num_envs: int) -> None:
         """Builds the scene for the first `num_envs` environments of the next frames."""
@@ -85,7 +90,7 @@ class Scene:
             np.repeat(colors, num_lines, axis=1).reshape(-1, 2, 3).astype(np.uint8),
             thickness=0.006,
         )
-        focus = np.array(self._env.task.focus())
+        self._focus = focus = np.array(self._env.task.focus())
         self._label_places = self._offsets + focus * (1.0, 1.0, 0.0)
         self._labels = [
             scene.add_label(
@@ -99,12 +104,9 @@ class Scene:
             for i, place in enumerate(self._label_places)
         ]
         self._lost = np.zeros(num_envs, bool)
-        position, gaze = camera_pose(self._offsets, focus)
         for client in self._server.get_clients().values():
-            # A page whose own camera is invalid keeps it.
-            with contextlib.suppress(ValueError, TypeError, AssertionError):
-                client.camera.position, client.camera.look_at = position, gaze
-        initial = self._server.initial_camera
+            self._frame(client)
+        initial, (position, gaze) = self._server.initial_camera, camera_pose(self._offsets, focus)
         initial.position, initial.look_at = tuple(position), tuple(gaze)
         initial.up, initial.fov = (0.0, 0.0, 1.0), math.radians(FIELD_OF_VIEW)
 
@@ -149,6 +151,26 @@ class Scene:
             return name + next(iter(readings.values()), "")
         text = name + "   ".join(f"{word} {value}" for word, value in readings.items())
         return text.strip(": ")
+
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        """Turns the camera of a new page, and once more when its panels have taken their room."""
+        self._frame(client)
+        aspect, until = client.camera.aspect, time.monotonic() + _LAYOUT_SECONDS
+
+        @client.camera.on_update
+        def _(camera: viser.CameraHandle) -> None:
+            nonlocal aspect
+            if time.monotonic() < until and camera.aspect != aspect:
+                aspect = camera.aspect
+                self._frame(client)
+
+    def _frame(self, client: viser.ClientHandle) -> None:
+        """Turns the camera of a page towards the environments."""
+        # A page whose own camera is invalid keeps it.
+        with contextlib.suppress(ValueError, TypeError, AssertionError, ZeroDivisionError):
+            position, gaze = camera_pose(self._offsets, self._focus, client.camera.aspect)
+            if np.all(np.isfinite(position)):
+                client.camera.position, client.camera.look_at = position, gaze
 
 
 def _grid(number: int) -> np.ndarray:

@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 from rich.console import Console
 
-from bounce_mjx.config.command_line import progress
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.interrupt import Interrupted, StopRequest
@@ -99,9 +98,8 @@ def _recording(options: ViewerOptions, console: Console) -> Present:
             recording = simulation.record(options.seconds or _RECORDED_SECONDS)
             if options.html is not None:
                 write_page(options.html, simulation.env, recording, options.fps, start.names)
-        if film is not None:
-            with progress(console, "drawing") as shown:
-                film.write(simulation, recording, shown)
+            if film is not None:
+                film.write(simulation.env, recording)
         for path in (options.video, options.html):
             if path is not None:
                 console.out(f"written: {path}", highlight=False)
@@ -115,7 +113,7 @@ def _window(options: ViewerOptions, console: Console) -> Present:
 
     def present(simulation: Simulation, start: PageStart) -> None:
         with contextlib.suppress(Interrupted), StopRequest() as stop:
-            show_window(simulation, start.speed, options.seconds, stop.check)
+            show_window(simulation, options.seconds, stop.check)
 
     return present
 
@@ -181,8 +179,8 @@ def _page_start(shown: Sequence[Shown], options: ViewerOptions) -> PageStart:
     """The titles, and how many robots are shown."""
     each = _robots_each(shown, options)
     if len(shown) == 1:
-        return PageStart(shown[0].title, None, each, options.speed)
+        return PageStart(shown[0].title, None, each)
     letters = string.ascii_uppercase[: len(shown)]
     titles = [f"{letter}: {one.title}" for letter, one in zip(letters, shown, strict=True)]
     names = [letter for letter in letters for _ in range(each)]
-    return PageStart(", ".join(titles), names, len(names), options.speed)
+    return PageStart(", ".join(titles), names, len(names))

@@ -266,7 +266,7 @@ class SideBySide(Simulation):
 
 
 def in_real_time(
-    simulation: Simulation, seconds: float | None, speed: Callable[[], float]
+    simulation: Simulation, seconds: float | None, speed: Callable[[], float] = lambda: 1.0
 ) -> Iterator[list[EnvFrame]]:
     """Steps a simulation with the clock, and yields for each picture the frames since the last one.
 

@@ -3,7 +3,7 @@
 import contextlib
 import shutil
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,6 @@ from bounce_mjx.viewers.display import Trail
 from bounce_mjx.viewers.offscreen import Renderer, choose_opengl
 from bounce_mjx.viewers.simulation import (
     EnvFrame,
-    Simulation,
     environment_pose,
     frame_at,
     frame_readings,
@@ -91,20 +90,15 @@ class VideoWriter:
         self._ffmpeg = find_ffmpeg()
         choose_opengl()
 
-    def write(
-        self, simulation: Simulation, recording: EnvFrame, progress: Callable[[float], None]
-    ) -> None:
-        """Writes a recording of the simulation's first environment.
-
-        Args:
-          progress: called with the share that is written.
+    def write(self, env: Env, recording: EnvFrame) -> None:
+        """Writes the first environment of a recording.
 
         Raises:
           UserError: the file cannot be written.
           Interrupted: Ctrl-C came; no file is left.
         """
-        frames = resample(recording, simulation.env.dt, self.fps)
-        shown = captioned(simulation.env, frames, self._size, self.fps, self._zoom)
+        frames = resample(recording, env.dt, self.fps)
+        shown = captioned(env, frames, self._size, self.fps, self._zoom)
         advice = "give another file with --video"
         with writable(self._path, advice), new_file(self._path) as new:
             encoder = subprocess.Popen(
@@ -113,10 +107,9 @@ class VideoWriter:
             try:
                 # A broken pipe means that the encoder failed; it prints the reason.
                 with contextlib.suppress(BrokenPipeError), StopRequest() as stop:
-                    for i, picture in enumerate(shown):
+                    for picture in shown:
                         stop.check()
                         encoder.stdin.write(picture.tobytes())
-                        progress((i + 1) / len(frames.time))
                 _, errors = encoder.communicate()
                 if encoder.returncode:
                     reason = " ".join(errors.decode(errors="replace").split())

@@ -1,7 +1,6 @@
 """The environment for brax, with this project's physics."""
 
 import copy
-import dataclasses
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -26,8 +25,6 @@ from bounce_mjx.world.config import WorldConfig
 ENV_NAME = "bounce_ball"
 
 
-# A dataclass without fields, because TorchRL turns the fields of a state into tensors.
-@dataclasses.dataclass(init=False, eq=False)
 class _Model:
     """A model as a static field of a state; equal only to itself."""
 
@@ -78,7 +75,6 @@ class BraxBounceBall(brax.envs.Env):
         self,
         config: WorldConfig | None = None,
         task: str | type[Task] = DEFAULT,
-        backend: str | None = None,
         **settings: Any,
     ):
         """Makes the environment.
@@ -86,7 +82,6 @@ class BraxBounceBall(brax.envs.Env):
         Args:
           config: all settings; None for the defaults of the task.
           task: its class, its name, or FILE.py:CLASS, if there is no config.
-          backend: one of brax's engines, as brax's environments take it; it has no effect.
           settings: fields of the task's config, such as episode_seconds=30, which replace fields of
             `config`.
 
@@ -98,12 +93,6 @@ class BraxBounceBall(brax.envs.Env):
         self.task = Env(validate(kind, given | settings, ENV_NAME))
         self.dt, self.mj_model = self.task.dt, self.task.mj_model
         """Time of one control step, s, and MuJoCo's model."""
-        if backend not in (None, self.backend):
-            warnings.warn(
-                f"backend is {backend!r}, but {ENV_NAME} computes with its own engine "
-                f"{self.backend!r}, which the setting physics chooses",
-                stacklevel=2,
-            )
         self._model = _Model(self.mj_model)
         self._base: brax.base.System | None = None
         self._sys: brax.base.System | None = None
@@ -133,10 +122,7 @@ class BraxBounceBall(brax.envs.Env):
 
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one control step under the action [action_size]."""
-        now = state.pipeline_state.task
-        # TorchRL drops the parts of a state that hold no arrays.
-        empty = {n: x for n, x in EnvState._field_defaults.items() if getattr(now, n) is None}
-        plain = state.replace(pipeline_state=now._replace(**empty))
+        plain = state.replace(pipeline_state=state.pipeline_state.task)
         return self._to_brax(self.task.step(plain, action))
 
     def _to_brax(self, state: State) -> State:

@@ -100,8 +100,6 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         }
         if render_mode not in (None, "rgb_array"):
             raise UserError(f'render_mode is {render_mode!r}; choose "rgb_array" or omit it')
-        if not (0 < width <= 4096 and 0 < height <= 4096):
-            raise UserError(f"the size is {width} x {height} pixels; choose 1 to 4096 of each")
         self.render_mode, self._picture = render_mode, (width, height, camera)
         self._renderer: Renderer | None = None
         if render_mode is not None:
