@@ -16,7 +16,6 @@ import onnxruntime
 import pytest
 
 from bounce_mjx import BounceBall, EnvConfig, load_policy
-from bounce_mjx.commands import export as export_command
 from bounce_mjx.deploy.chain import Chain
 from bounce_mjx.deploy.export import export_onnx, policy_metadata
 from bounce_mjx.deploy.graph import onnx_graph
@@ -332,16 +331,6 @@ def test_paddle_position_is_that_of_mujoco(tmp_path: Path) -> None:
         np.testing.assert_allclose(chain.paddle(angles)[0], data.geom("blocker").xpos, atol=1e-12)
 
 
-def test_an_arm_with_another_joint_is_refused(tmp_path: Path) -> None:
-    text = MJCF.replace(
-        '<body name="Link1" pos="0 0 0.1">',
-        '<body name="Link1" pos="0 0 0.1"><joint name="track" type="slide" axis="1 0 0"/>',
-    )
-    (tmp_path / "arm.xml").write_text(text, encoding="utf-8")
-    with pytest.raises(UserError, match="hangs on the joint 'track'.*remove the joint"):
-        policy_metadata(TrainConfig(env={"mjcf": tmp_path / "arm.xml"}), 0)
-
-
 def measured_by(sensing: Sensing, command: dict) -> dict[str, np.ndarray]:
     """Newest measurements in an environment's sensor memory."""
     names = ("joint_angles", "joint_velocities", "ball_quaternion", "ball_angular_velocity")
@@ -443,18 +432,6 @@ def falling(time: float) -> dict:
         "ball_position": measured["ball_position"] - 1.5 * time,
         "time": time,
     }
-
-
-def test_a_repeated_call_changes_nothing(policies) -> None:
-    policy = policies["all histories"]
-    policy.reset()
-    actions = [policy.step(falling(time)) for time in (1.0, 1.01)]
-    seen = policy.observation
-    for time in (1.01, 1.0149, 1.0, 0.5):
-        np.testing.assert_array_equal(policy.step(falling(1.0) | {"time": time}), actions[1])
-        np.testing.assert_array_equal(policy.observation, seen)
-    policy.step(falling(1.02))
-    assert not np.array_equal(policy.observation, seen)
 
 
 def test_histories_stay_in_control_steps(policies) -> None:
@@ -636,11 +613,3 @@ def test_only_the_robust_policy_bounces_with_a_late_camera() -> None:
     # The arm starts with the first picture.
     assert bounces >= 10 and survived == pytest.approx(7.98)
     assert lost_bounces < 5 and lost_at < 4.0
-
-
-def test_command_writes_the_file(tmp_path: Path, monkeypatch, capsys) -> None:
-    monkeypatch.chdir(tmp_path)
-    export_command.main("pretrained --onnx policy.onnx".split())
-    fresh = export_onnx(pretrained_checkpoint())
-    assert (tmp_path / "policy.onnx").read_bytes() == fresh
-    assert "written: policy.onnx" in capsys.readouterr().out

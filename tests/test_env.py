@@ -17,8 +17,6 @@ from bounce_mjx.tasks.bounce import Bounce, BounceState
 from bounce_mjx.world.config import PADDLE_HOME
 from reward_reference import REFERENCE_WEIGHTS, reference_terms
 
-OBSERVATION = EnvConfig().layout
-
 JOINTS = tuple(f"Joint{i}" for i in range(1, 7))
 TARGET_XY = np.array([0.58856, 0.0])
 BALL = np.array([0.58856, 0.0, 0.45])
@@ -134,19 +132,6 @@ def test_the_observation_is_mujocos_state(walked, model):
         np.testing.assert_allclose(walked.obs[entries], values, rtol=0, atol=1e-6)
     assert walked.obs.shape == (29,) and walked.obs.dtype == jnp.float32
     assert walked.obs[28] == walked.pipeline_state.command["target_height"]
-
-
-def test_layout_names_the_parts_of_the_observation(walked, model):
-    """The slices are the entries of the test above; the true state has the same values under the
-    same names."""
-    assert OBSERVATION.size == 29
-    kinematics = BounceBall().kinematics(walked.pipeline_state)._asdict()
-    assert [*kinematics, "target_height"] == [part.name for part in OBSERVATION.parts]
-    for name, value in kinematics.items():
-        np.testing.assert_array_equal(walked.obs[OBSERVATION[name]], value, err_msg=name)
-    np.testing.assert_array_equal(
-        walked.obs[OBSERVATION["target_height"]], walked.pipeline_state.command["target_height"]
-    )
 
 
 # Reset

@@ -335,17 +335,6 @@ def random_policy(networks):
     return policy.Policy(init_normalizer(29), params)
 
 
-def test_an_evaluation_is_a_function_of_its_key(networks, random_policy):
-    evaluate = make_evaluator(BounceBall(EnvConfig(min_ball_height=0.4)), networks, 4)
-    statistics, again, other = (evaluate(random_policy, jax.random.key(i)) for i in (0, 0, 1))
-    # Free fall through 0.04 to 0.06 m.
-    assert not np.any(statistics.running)
-    assert np.all((statistics.steps >= 8) & (statistics.steps <= 12))
-    np.testing.assert_array_equal(again.episode_return, statistics.episode_return)
-    drawn = np.concatenate([again.episode_return, other.episode_return])
-    assert len(np.unique(drawn)) == 8
-
-
 def heavy_and_light(key: jax.Array) -> PhysicsParameters:
     """Environment with balls of 1 to 100 times the mass."""
     return PhysicsParameters(ball_mass=0.0027 * 100.0 ** jax.random.uniform(key))

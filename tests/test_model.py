@@ -95,17 +95,6 @@ def targets(env: BounceBall, angle: float, action: float) -> np.ndarray:
     return np.asarray(env.servo_targets(physics, jnp.full(6, action)))
 
 
-def test_a_joint_without_a_range_is_not_clipped(tmp_path):
-    env = env_of(
-        tmp_path,
-        ('name="Joint4" axis="0 0 1" range="-3.49066 3.49066"', 'name="Joint4" axis="0 0 1"'),
-    )
-    found = targets(env, 5.0, 1.0)
-    assert found[3] == pytest.approx(5.02)
-    assert found[2] == pytest.approx(2.6529)
-    assert targets(env, 0.3, 1.0)[3] == pytest.approx(0.32)
-
-
 def test_with_a_gear_the_target_is_the_actuators_length(tmp_path):
     """A servo whose length is a multiple of the angle holds its joint like a servo without gear."""
     geared = env_of(

@@ -288,18 +288,6 @@ def test_training_is_a_function_of_its_key(init, run, after_two):
         assert np.any(np.asarray(a) != np.asarray(b)) and np.any(np.asarray(a) != before)
 
 
-def test_policy_sees_only_the_observation(tiny, after_two):
-    state, _ = after_two
-    assert state.statistics.mean.shape == (29 + len(Bounce.critic_metrics),)
-    acting = ppo.policy_of(state, OBSERVATION.size)
-    np.testing.assert_array_equal(acting.normalizer.mean, state.statistics.mean[:29])
-    networks = policy.make_networks(tiny, 29, 6)
-    observation = state.statistics.mean[:29] + jnp.linspace(-20, 20, 3)[:, None]
-    actions = networks.act(acting, observation)
-    assert actions.shape == (3, 6)
-    assert np.all(np.abs(actions) <= 1) and len(np.unique(actions)) == 18
-
-
 def some_samples(trainer, params) -> ppo.Samples:
     """Samples of another policy than that of the parameters."""
     rng = np.random.default_rng(0)

@@ -3,7 +3,6 @@ alone."""
 
 import contextlib
 import json
-import os
 import re
 import shutil
 import socket
@@ -24,7 +23,7 @@ from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import (
     latest_checkpoint,
 )
-from bounce_mjx.training import devices, hosts, setup
+from bounce_mjx.training import devices, hosts
 from bounce_mjx.training.command import read_command
 from tiny_runs import STEPS, TINY, arrays, job
 
@@ -64,29 +63,6 @@ def assert_equal_up_to_rounding(ours: dict[str, np.ndarray], theirs: dict[str, n
             np.testing.assert_array_equal(ours[name], theirs[name], err_msg=name)
         elif name.endswith("qpos"):
             np.testing.assert_allclose(ours[name], theirs[name], rtol=0, atol=1e-3, err_msg=name)
-
-
-@pytest.mark.parametrize(
-    ("kernel", "preallocate", "expected"),
-    [(None, None, (True, "false")), ("false", "true", (False, "true"))],
-)
-def test_a_command_leaves_the_users_settings_of_jax(kernel, preallocate, expected, monkeypatch):
-    before = jax.config.jax_threefry_gpu_kernel_lowering
-    for name, value in (
-        ("JAX_THREEFRY_GPU_KERNEL_LOWERING", kernel),
-        ("XLA_PYTHON_CLIENT_PREALLOCATE", preallocate),
-    ):
-        # Set first, so that the settings of the command itself are undone as well.
-        monkeypatch.setenv(name, value or "")
-        if value is None:
-            monkeypatch.delenv(name)
-    try:
-        jax.config.update("jax_threefry_gpu_kernel_lowering", False)
-        setup.set_up_gpu()
-        numbers = jax.config.jax_threefry_gpu_kernel_lowering
-        assert (numbers, os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"]) == expected
-    finally:
-        jax.config.update("jax_threefry_gpu_kernel_lowering", before)
 
 
 # Shuffling in groups

@@ -187,21 +187,6 @@ def played() -> Simulation:
     return Simulation(env, controller, 2, 0, reset_ranges(config), policy)
 
 
-def test_only_the_worlds_own_terms_are_drawn(played: Simulation) -> None:
-    """The sliders' terms are nominal where they are not drawn, and all terms where nothing is."""
-    played.world = None
-    played.reset()
-    played.step()
-    world = played._states.pipeline_state.world
-    mass = np.asarray(world["ball_mass"])
-    assert np.all((mass >= 0.8) & (mass <= 0.95)) and mass[0] != mass[1]
-    np.testing.assert_allclose(world["restitution"], 0.85)
-    np.testing.assert_array_equal(world["action_latency"], 0.0)
-    played.world = {}
-    played.step()
-    np.testing.assert_array_equal(played._states.pipeline_state.world["ball_mass"], 1.0)
-
-
 def test_a_moved_slider_changes_the_world_at_once(played: Simulation, monkeypatch) -> None:
     frames, worlds = [], []
     watch(monkeypatch, Simulation, "step", lambda simulation: frames.append(simulation.frame))
