@@ -147,7 +147,7 @@ def test_a_signal_saves_and_says_how_to_resume(tmp_path: Path, straight: Path) -
 @pytest.mark.slow
 def test_a_slow_block_is_stopped_between_two_iterations(tmp_path: Path, monkeypatch) -> None:
     """On MJX a block may take minutes. The resumed training first completes the block."""
-    monkeypatch.setattr(ppo_trainer, "_iterations_at_once", lambda *_: 1)
+    monkeypatch.setattr(ppo_trainer, "iterations_per_block", lambda *_: 1)
     flags = [*TINY, "--block-steps", "128", "--total-steps", "256", "--no-report"]
 
     class Stopped(PPOTrainer):

@@ -1,7 +1,9 @@
 """Ctrl-C, SIGTERM and SIGHUP as requests: a handler that raised an exception would lose it wherever
 Python drops exceptions, such as in JAX's callback of the garbage collection."""
 
+import atexit
 import concurrent.futures
+import functools
 import os
 import signal
 import sys
@@ -9,7 +11,7 @@ import threading
 import time
 import types
 from collections.abc import Callable
-from typing import NoReturn, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 Result = TypeVar("Result")
 
@@ -106,6 +108,26 @@ def in_daemon_thread(function: Callable[[], Result]) -> concurrent.futures.Futur
 
     threading.Thread(target=run, daemon=True).start()
     return future
+
+
+class DaemonThreads(concurrent.futures.Executor):
+    """A thread for each call, for which the end of the process does not wait: for compilations,
+    which cannot be stopped."""
+
+    def __init__(self):
+        self._futures: list[concurrent.futures.Future] = []
+        atexit.register(self._leave)
+
+    def submit(self, function: Callable[..., Result], /, *args: Any, **kwargs: Any):
+        """Calls a function in a thread of its own."""
+        future = in_daemon_thread(functools.partial(function, *args, **kwargs))
+        self._futures.append(future)
+        return future
+
+    def _leave(self) -> None:
+        if not all(future.done() for future in self._futures):
+            # After an exception that nobody caught, the interpreter has its value.
+            leave(INTERRUPTED if hasattr(sys, "last_value") else 0)
 
 
 def leave(status: int = INTERRUPTED) -> NoReturn:

@@ -119,14 +119,12 @@ def _write_report(report: "RobustnessReport", out: Path, console: Console) -> No
     from bounce_mjx.reports.figures import image
     from bounce_mjx.reports.robustness import (
         ROBUSTNESS_FILE,
-        misses,
         robustness_figure,
         robustness_table,
     )
     from bounce_mjx.runs.files import to_json, writable, write_output
 
     console.print(robustness_table(report))
-    console.print(f"missed: {misses(report)}", markup=False, highlight=False)
     figure = robustness_figure(report)
     files = {ROBUSTNESS_FILE: to_json(report.model_dump())}
     files |= {f"robustness.{suffix}": image(figure, suffix) for suffix in ("png", "svg")}

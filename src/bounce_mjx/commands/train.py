@@ -1,11 +1,10 @@
 """Trains a policy in JAX and writes a run's folder (`bounce-mjx train`)."""
 
-import importlib.util
 import shlex
 from collections.abc import Sequence
 
 from bounce_mjx.config.command_line import stdout
-from bounce_mjx.errors import UserError, exit_on_user_error, install_command
+from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.interrupt import leave
 from bounce_mjx.runs.config import (
     default_preset,
@@ -22,11 +21,6 @@ def main(args: Sequence[str]) -> None:
     with exit_on_user_error():
         machine = default_preset(has_plugin())
         command = read_command(args, machine)
-        if command.wandb is not None and importlib.util.find_spec("wandb") is None:
-            raise UserError(
-                "--wandb needs the package wandb; install it with: "
-                f"{install_command('bounce_mjx[wandb]')}"
-            )
         from bounce_mjx.training.setup import find_devices, set_up_jax
 
         set_up_jax(command.env)

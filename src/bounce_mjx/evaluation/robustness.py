@@ -82,14 +82,6 @@ class RobustnessReport(pydantic.BaseModel):
         return all(outcome.passed for outcome in self.outcomes)
 
     @property
-    def engines(self) -> dict[str, set[str]]:
-        """Perturbations simulated by each engine."""
-        return {
-            engine: {o.perturbation for o in self.outcomes if o.physics == engine}
-            for engine in {outcome.physics for outcome in self.outcomes}
-        }
-
-    @property
     def met(self) -> int:
         """Number of conditions that meet all judged results: the score."""
         return sum(outcome.passed for outcome in self.outcomes)

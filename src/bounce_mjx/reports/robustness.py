@@ -52,17 +52,6 @@ def summary(report: RobustnessReport) -> str:
     )
 
 
-def misses(report: RobustnessReport) -> str:
-    """The conditions that miss a result, by name."""
-    names = []
-    for rows in _perturbations(report.outcomes):
-        missed = [outcome for outcome in rows if not outcome.passed]
-        strengths = ", ".join(f"{o.strength:g}" for o in missed if o.strength is not None)
-        if missed:
-            names.append(" ".join(filter(None, (missed[0].perturbation, strengths, rows[0].unit))))
-    return "; ".join(names) or "none"
-
-
 def robustness_table(report: RobustnessReport) -> Table:
     """Table of the results in each condition; an asterisk marks a missed bound."""
     letters = result_letters(report)
@@ -116,8 +105,7 @@ def robustness_figure(report: RobustnessReport) -> Figure:
     within the training ranges."""
     letters, rows = result_letters(report), _rows(report.outcomes)
     figure = Figure(figsize=(2.0 * PANEL_WIDTH, _LINE * len(rows) + 1.8), layout="constrained")
-    title = f"{summary(report)}\n{literal(_engines_text(report))}"
-    figure.suptitle(title, fontsize=10, wrap=True)
+    figure.suptitle(summary(report), fontsize=10, wrap=True)
     axes = figure.subplots()
     cells = max(8, *(len(outcomes) for _, outcomes in rows))
     axes.set(xlim=(0.0, cells), ylim=(len(rows), 0.0), xticks=[], frame_on=False)
@@ -137,18 +125,6 @@ def robustness_figure(report: RobustnessReport) -> Figure:
     below = f"{_TICK} all judged results met; missed: {missed}; framed: within the trained ranges"
     figure.supxlabel(literal(below), fontsize=8, wrap=True)
     return figure
-
-
-def _engines_text(report: RobustnessReport) -> str:
-    """Engine of most perturbations, and the perturbations that other engines simulated."""
-    names = {"fused": "the fused engine", "mjx": "MJX", "mujoco": "MuJoCo's C engine"}
-    engines = report.engines
-    most = max(engines, key=lambda engine: len(engines[engine]))
-    others = (
-        f"; {', '.join(sorted(engines[other]))} on {names[other]}"
-        for other in sorted(engines.keys() - {most})
-    )
-    return f"on {names[most]}{''.join(others)}"
 
 
 def _perturbations(outcomes: Sequence[ConditionOutcome]) -> list[list[ConditionOutcome]]:

@@ -424,12 +424,10 @@ def _read(path: Path, kind: str = "config file", example: str = _EXAMPLE) -> dic
     """The values of a config file (`read_mapping`), with absolute paths of the MJCF file and of the
     files of the task and the algorithm."""
     values = read_mapping(path, kind, example)
-    for key in ("task", "algorithm"):
-        name = values.get(key, "")
-        if not isinstance(name, str):
-            raise UserError(f"{path}: {key} is {shorten(repr(name))}; give a name")
-        if is_file(name) and not name.startswith("~"):
-            values = values | {key: str((path.parent / name).absolute())}
+    for key in {"task", "algorithm"} & values.keys():
+        name = str(values[key])
+        own = is_file(name) and not name.startswith("~")
+        values = values | {key: str((path.parent / name).absolute()) if own else name}
     env = values.get("env")
     mjcf = env.get("mjcf") if isinstance(env, dict) else None
     if isinstance(mjcf, str) and not mjcf.startswith("~") and not is_packaged(Path(mjcf)):

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from bounce_mjx.errors import UserError, reason_of
+from bounce_mjx.errors import UserError, needed, reason_of
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.runs.config import TrainConfig
@@ -68,11 +68,12 @@ class WeightsAndBiases:
     def start(self, run: Path, config: TrainConfig) -> None:
         """
         Raises:
-          UserError: Weights & Biases refuses the run, for example without an account.
+          UserError: the package is missing, or Weights & Biases refuses the run, for example
+            without an account.
         """
-        # Imported only when it is asked for; it is optional and takes seconds.
-        import wandb
-
+        # Imported only when it is asked for; it takes seconds.
+        with needed("wandb", "bounce_mjx[wandb]"):
+            import wandb
         try:
             self._runs[run] = wandb.init(
                 project=self._project,

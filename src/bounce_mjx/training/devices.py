@@ -37,18 +37,14 @@ def make_mesh(num_devices: int | None, config: PPOConfig, num_seeds: int = 1) ->
         raise UserError(
             f"num_devices is {num_devices}, but the hosts have {len(devices)} and use all; omit it"
         )
-    groups = num_groups(config)
-    if num_seeds > 1 and num_seeds % num_devices:
-        raise UserError(
-            f"num_seeds {num_seeds} cannot be divided among {num_devices} devices; choose a "
-            f"multiple of {num_devices} seeds"
-        )
-    if num_seeds == 1 and groups % num_devices:
-        raise UserError(
-            f"num_envs {config.num_envs} cannot be divided among {num_devices} devices; choose a "
-            f"power of two as num_devices, and a multiple of {num_devices} * num_minibatches as "
-            "num_envs"
-        )
+    if num_seeds > 1:
+        shared, name, advice = num_seeds, f"num_seeds {num_seeds}", f"a multiple of {num_devices}"
+    else:
+        shared, name = num_groups(config), f"num_envs {config.num_envs}"
+        multiple = f"a multiple of {num_devices} * num_minibatches as num_envs"
+        advice = f"a power of two as num_devices, and {multiple}"
+    if shared % num_devices:
+        raise UserError(f"{name} cannot be divided among {num_devices} devices; choose {advice}")
     return Mesh(devices[:num_devices], (_AXIS,))
 
 

@@ -137,14 +137,13 @@ class Evaluators:
             # Otherwise one thread would start all of them at once.
             return jax.block_until_ready(chunk)
 
-        starts = range(0, episodes, self._chunk)
         with concurrent.futures.ThreadPoolExecutor(self._threads) as pool:
-            chunks = list(pool.map(evaluate, starts))
-        statistics = _joined([statistics for statistics, _ in chunks], episodes)
+            chunks = pool.map(evaluate, range(0, episodes, self._chunk))
+            parts, recordings = zip(*chunks, strict=True)
+        statistics = _joined(parts, episodes)
         if config.num_seeds == 1:
             recorded = min(RECORDED_EPISODES, episodes)
-            needed = chunks[: -(-recorded // self._chunk)]
-            recording = _joined([recording for _, recording in needed], recorded)
+            recording = _joined(recordings[: -(-recorded // self._chunk)], recorded)
             return [dataclasses.replace(judge(self._env, statistics), recording=recording)]
         return [
             judge(self._env, jax.tree.map(lambda x, i=i: x[i], statistics))

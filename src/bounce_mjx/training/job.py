@@ -24,7 +24,7 @@ from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.files import UNFINISHED
-from bounce_mjx.interrupt import Interrupted, StopRequest
+from bounce_mjx.interrupt import DaemonThreads, Interrupted, StopRequest
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.runs import folders, writing
 from bounce_mjx.runs.config import TrainConfig
@@ -163,7 +163,8 @@ class Job:
         self.state: Any = None
         self.steps = 0
         self.ended = False
-        self.logs: concurrent.futures.Future[dict[Path, TensorBoardLog]] | None = None
+        self.logs: dict[Path, TensorBoardLog] = {}
+        self.starting: concurrent.futures.Future[None] | None = None
 
     def open(self) -> None:
         """Makes the folder of a new run, or reads the resumed one, and says what is trained."""
@@ -242,9 +243,9 @@ class Job:
     def _remove_unstarted(self, error: type[BaseException] | None, *_) -> None:
         """Removes the folder of a new run without a checkpoint or a block that can be trained."""
         if error is not None and not self.keeps_folder and hosts.is_leader():
-            if self.logs is not None:
+            if self.starting is not None:
                 # A log that is opened later would make the folder again.
-                concurrent.futures.wait([self.logs])
+                concurrent.futures.wait([self.starting])
             shutil.rmtree(self.run, ignore_errors=True)
 
     def _read_resumed(self) -> None:
@@ -274,26 +275,22 @@ class Job:
         def compile() -> None:
             # The longest program is traced first: Python traces one program at a time while XLA
             # compiles others.
-            compiling = self.trainer.compile(self.pool)
+            compiling = self.trainer.compile(threads)
             mesh = self.trainer.mesh
-            self.evaluators = make_evaluators(self.config, self.env, mesh, self.pool)
-            self.logs = self.pool.submit(self._open_logs)
+            self.evaluators = make_evaluators(self.config, self.env, mesh, threads)
+            self.starting = self.pool.submit(self._start_logs)
             for module in (CHECKPOINT_MODULE, REPORT_MODULE):
-                self.logs.add_done_callback(lambda _, m=module: importlib.import_module(m))
+                self.starting.add_done_callback(lambda _, m=module: importlib.import_module(m))
             compiling.result()
 
-        def start_callbacks() -> None:
-            for member in self.members:
-                call_all(self.callbacks, "start", member.run, member.config)
-
+        threads = DaemonThreads()
         with self.console.status("compiling"):
-            starting = self.pool.submit(start_callbacks)
-            compiling = self.pool.submit(compile)
+            compiling = threads.submit(compile)
             if not self.stop.wait_for(compiling):
                 raise Interrupted
         compiling.result()
-        # One of them may refuse the run.
-        starting.result()
+        # A callback may refuse the run.
+        self.starting.result()
         self.stack.callback(call_all, self.callbacks, "close")
         # A process that finds its programs in the cache waits here for a process that compiles
         # them; otherwise the exchange between devices would time out after 30 s.
@@ -307,23 +304,22 @@ class Job:
         self.stack.callback(self._flush)
         self.clock.lap("compile")
 
-    def _open_logs(self) -> dict[Path, TensorBoardLog]:
-        """A log for each seed, none in a process that writes nothing."""
-        first_step = None if self.resume is None else self.steps
-        logs = {m.run: TensorBoardLog(m.run) for m in self.members if hosts.is_leader()}
-        for log, member in zip(logs.values(), self.members, strict=False):
-            log.start(member.config, first_step)
-        return logs
+    def _start_logs(self) -> None:
+        """Opens a log for each seed, and tells the callbacks; not where nothing is written."""
+        for member in self.members if hosts.is_leader() else ():
+            log = self.logs[member.run] = TensorBoardLog(member.run)
+            log.start(member.config, None if self.resume is None else self.steps)
+            call_all(self.callbacks, "start", member.run, member.config)
 
     def _flush(self) -> None:
         """Writes everything logged so far to the logs' files."""
-        for log in self.logs.result().values():
+        for log in self.logs.values():
             log.flush()
 
     def _tell(self, events: Sequence[Event]) -> None:
         """Logs an event of each seed, and tells the callbacks."""
         for event in events if hosts.is_leader() else ():
-            self.logs.result()[event.run](event)
+            self.logs[event.run](event)
             answers = [callback(event) for callback in self.callbacks]
             self.ended |= any(answer is False for answer in answers)
 

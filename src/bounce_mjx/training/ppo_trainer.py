@@ -36,7 +36,9 @@ class PPOTrainer:
           UserError: the config does not fit the devices or the environment.
         """
         self._config, self._observation_size = config, env.observation_size
-        self._compiled_iterations = _iterations_at_once(config, env)
+        # On MJX, a block may take minutes, and could not be stopped before its end.
+        on_mjx = env.engine.name == "mjx"
+        self._compiled_iterations = 1 if on_mjx else iterations_per_block(config)
         self.mesh = make_mesh(config.num_devices, config.ppo, config.num_seeds)
         trainer = find_algorithm(config.algorithm)(config.ppo, env, episode_steps(config))
         self._trainer = trainer if config.num_seeds == 1 else population(trainer)
@@ -68,28 +70,21 @@ class PPOTrainer:
         return self._shapes
 
     def compile(self, pool: concurrent.futures.Executor) -> concurrent.futures.Future:
-        self._run = pool.submit(self._lower_run().compile)
-        self._init = pool.submit(self._lower_init().compile)
-        return self._run
-
-    def _lower_run(self) -> jax.stages.Lowered:
-        sharding = self._sharding
         run = jax.jit(
             self._train_block,
-            in_shardings=(sharding,),
-            out_shardings=(sharding, replicated(self.mesh)),
+            in_shardings=(self._sharding,),
+            out_shardings=(self._sharding, replicated(self.mesh)),
             donate_argnums=0,
             compiler_options=compiler_options(tunes_products=True),
         )
-        return run.lower(self._shapes)
-
-    def _lower_init(self) -> jax.stages.Lowered:
+        self._run = pool.submit(run.lower(self._shapes).compile)
         init = jax.jit(
             self._initial_state,
             out_shardings=self._sharding,
             compiler_options=compiler_options(runs_once=True),
         )
-        return init.lower(self._seeds)
+        self._init = pool.submit(init.lower(self._seeds).compile)
+        return self._run
 
     def start(self, state: TrainingState | None = None) -> None:
         if state is None:
@@ -121,12 +116,6 @@ class PPOTrainer:
             state,
             [{"params": seed.params, "statistics": seed.statistics} for seed in seeds],
         )
-
-
-def _iterations_at_once(config: TrainConfig, env: Env) -> int:
-    """Iterations in one program: a whole block, but one on MJX, which may take minutes for a block
-    and could not be stopped before its end."""
-    return 1 if env.engine.name == "mjx" else iterations_per_block(config)
 
 
 def episode_steps(config: TrainConfig) -> int:

@@ -21,12 +21,6 @@ def set_up_jax(*configs: WorldConfig) -> None:
     Args:
       configs: the environments that the command simulates, for `join_loops`.
     """
-    if jax.config.jax_disable_jit:
-        print(
-            "warning: JAX_DISABLE_JIT is set, so that nothing is compiled, and this takes hours; "
-            "unset it",
-            file=sys.stderr,
-        )
     if configs:
         join_loops(*configs)
     set_up_gpu()
