@@ -54,16 +54,8 @@ def run_episodes(
 
     Returns: The statistics of all episodes, and a recording of the first `recorded`.
     """
-
-    def unfinished(now: Batch) -> jax.Array:
-        return jnp.any(now.statistics.running) & (now.step < env.config.episode_steps)
-
-    def advance(now: Batch) -> Batch:
-        actions = actor.act(policy, now.states.obs.T)
-        states = jax.vmap(env.step, in_axes=-1, out_axes=-1)(now.states, actions.T)
-        return add_step(env, now, states)
-
-    last = jax.lax.while_loop(unfinished, advance, begin(env, states, recorded))
+    first = begin(env, states, recorded)
+    last = run_until(env, actor, policy, first, env.config.episode_steps)
     return last.statistics, last.recording
 
 
@@ -75,6 +67,22 @@ def begin(env: Env, states: State, recorded: int) -> Batch:
         recording=empty_recording(env, states, min(recorded, states.done.shape[-1])),
         step=jnp.int32(0),
     )
+
+
+def run_until(
+    env: Env, actor: Actor, policy: Policy | None, now: Batch, last_step: int | jax.Array
+) -> Batch:
+    """Continues until all episodes have ended or `last_step` is reached."""
+
+    def unfinished(now: Batch) -> jax.Array:
+        return jnp.any(now.statistics.running) & (now.step < last_step)
+
+    def advance(now: Batch) -> Batch:
+        actions = actor.act(policy, now.states.obs.T)
+        states = jax.vmap(env.step, in_axes=-1, out_axes=-1)(now.states, actions.T)
+        return add_step(env, now, states)
+
+    return jax.lax.while_loop(unfinished, advance, now)
 
 
 def add_step(env: Env, before: Batch, states: State) -> Batch:
