@@ -12,19 +12,15 @@ import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 import viser
 from rich.console import Console
 
 import viewing
-from bounce_mjx.commands import train
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
-from bounce_mjx.runs.config import TrainConfig, load_run_config
-from bounce_mjx.runs.folders import latest_checkpoint
-from bounce_mjx.runs.reading import read_policy
+from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training import watch as watched
 from bounce_mjx.training.callbacks import Event
 from bounce_mjx.training.watch import TrainingPage
@@ -35,7 +31,6 @@ from bounce_mjx.viewers.simulation import (
     Simulation,
     make_zero_controller,
 )
-from tiny_runs import TINY
 from viewing import Client, LeanConfig, evaluated, served, wait_until, watch
 
 
@@ -242,40 +237,3 @@ def test_the_page_of_a_training_shows_its_newest_policy(
     stop.set()
     wait_until(lambda: "the page is not served (the end); training continues" in printed.getvalue())
     training.wait()
-
-
-@pytest.mark.slow
-def test_a_watched_training_tells_the_page(tmp_path: Path, monkeypatch, capsys) -> None:
-    """The last line of a training names the command that shows its policy."""
-    told, shown = [], []
-
-    class Page:
-        def __init__(self, config: TrainConfig, host: str, port: int, console: Console, allowed):
-            told.append(("served", host, port, allowed))
-
-        def __call__(self, event: Event) -> None:
-            if event.report is None:
-                told.append(("block", event.steps, event.metrics["speed/steps_per_second"] > 0.0))
-            else:
-                told.append(("evaluation", event.steps, len(event.report.results)))
-                shown.append(event.policy)
-
-        def wait(self) -> None:
-            told.append(("ended",))
-
-    monkeypatch.setattr("bounce_mjx.training.watch.TrainingPage", Page)
-    # The process would end there.
-    monkeypatch.setattr(train, "leave", lambda status: None)
-    flags = ["--total-steps", "128", "--log-dir", str(tmp_path), "--no-report"]
-    train.main([*TINY, *flags, "--watch", "--watch-port", "8123", "--watch-allow-host", "gpu.lab"])
-    assert told == [
-        ("served", "127.0.0.1", 8123, ("gpu.lab",)),
-        ("block", 64, True),
-        ("block", 128, True),
-        ("evaluation", 128, 5),
-        ("ended",),
-    ]
-    (folder,) = tmp_path.iterdir()
-    saved = read_policy(latest_checkpoint(folder), load_run_config(folder))
-    jax.tree.map(np.testing.assert_array_equal, *shown, saved)
-    assert capsys.readouterr().out.endswith(f"\nwatch it: bounce-mjx play {folder}\n")

@@ -1,19 +1,17 @@
 """Recordings of an evaluation's episodes: their content, and the figures from them."""
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
 from bounce_mjx import BounceBall, EnvConfig
-from bounce_mjx.env.env import EnvState
 from bounce_mjx.evaluation.episodes import make_recording_evaluator
 from bounce_mjx.evaluation.recording import paddle_points
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.learning.statistics import init_normalizer
-from bounce_mjx.task import Histogram, Hits, Kinematics, Recording
+from bounce_mjx.task import Histogram, Hits, Recording
 from bounce_mjx.tasks.bounce import Bounce
 
 EPISODES, RECORDED = 6, 4
@@ -148,33 +146,3 @@ def test_hit_points_are_in_the_paddles_frame(env: BounceBall) -> None:
     bounces = rng.random((5, 3)) < 0.5
     assert 0 < bounces.sum() < bounces.size
     np.testing.assert_allclose(paddle_points(env, recording, bounces), points[bounces], atol=1e-6)
-
-
-class NoisyBall(BounceBall):
-    """An environment whose sensors return only noise."""
-
-    def observe(self, state: EnvState, truth: Kinematics | None = None) -> jax.Array:
-        return jnp.sin(1e4 * super().observe(state, truth))
-
-
-@pytest.mark.slow
-def test_noise_of_the_observation_changes_no_result(env: BounceBall, networks, policy) -> None:
-    """The results and the recording use the true state, even if the policy cannot see it."""
-    layers = policy.params["params"] | {
-        "Dense_0": {"kernel": jnp.zeros((8, 6)), "bias": jnp.array([0, 0.3, -0.4, 0, 0.1, 0.2])}
-    }
-    blind = policy._replace(params={"params": layers})
-    (statistics, recording), (noisy, noisy_recording) = (
-        make_recording_evaluator(ball, networks, EPISODES, RECORDED)(blind, jax.random.PRNGKey(2))
-        for ball in (env, NoisyBall(env.config))
-    )
-    assert statistics.tally.sums["rising_steps"].sum() > 0 and recording.task["bounced"].any()
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3), noisy, statistics)
-    running = recording.running
-    np.testing.assert_array_equal(noisy_recording.running, running)
-    for name in ("ball", "paddle", "joint_angles"):
-        kept, seen = (
-            np.moveaxis(np.asarray(getattr(r, name)), 1, 2)[running]
-            for r in (recording, noisy_recording)
-        )
-        np.testing.assert_allclose(seen, kept, atol=1e-3, err_msg=name)

@@ -80,14 +80,12 @@ class Client:
             address.replace("http", "ws"), subprotocols=[protocol], compression=None, max_size=None,
             ping_interval=None,
         )  # fmt: skip
-        self.look(position=[1.0, 0.0, 0.0])
+        self.send(CAMERA)
         self._controls: dict[str, str] = {}
         self._labels: list[str] = []
         self.texts: list[str] = []
-        self.values: dict[str, object] = {}
         self.sliders: dict[str, tuple[float, float, float]] = {}
         self.lines: list[str] = []
-        self.keys: list[str] = []
 
     def control(self, label: str) -> str:
         """The identifier of a control or of a key's command, by its label."""
@@ -117,28 +115,17 @@ class Client:
                 self.sliders[props["label"]] = props["min"], props["max"], props["step"]
             if message["type"] == "GuiUplotMessage":
                 self.lines += [line["label"] for line in props["series"]]
-            if "hotkey" in props:
-                self.keys.append(props["hotkey"])
             updates = message.get("updates", {})
             self.texts += [part["content"] for part in (props, updates) if "content" in part]
-            if "value" in updates:
-                self.values[message["uuid"]] = updates["value"]
             if "text" in updates:
                 self._labels.append(updates["text"])
 
-    def set(self, label: str, value: object, name: str = "value") -> None:
+    def set(self, label: str, value: object) -> None:
         """Sets a control, and gives the page time to read it."""
-        self.send({"type": "GuiUpdateMessage", "uuid": label, "updates": {name: value}})
-
-    def look(self, position: list[float]) -> None:
-        """Reports the client's camera."""
-        self.send(CAMERA | {"position": position})
+        self.send({"type": "GuiUpdateMessage", "uuid": label, "updates": {"value": value}})
 
     def send(self, message: object) -> None:
-        self.send_bytes(msgspec.msgpack.encode(message))
-
-    def send_bytes(self, data: bytes | str) -> None:
-        self._socket.send(data)
+        self._socket.send(msgspec.msgpack.encode(message))
         time.sleep(0.1)
 
     def close(self) -> None:
