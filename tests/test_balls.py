@@ -302,24 +302,6 @@ def test_a_world_of_two_balls_sees_each_late():
 
 
 @pytest.mark.slow
-def test_noise_and_pushes_differ_between_the_balls():
-    noisy = {"ball_position_noise": (0.01, 0.01), "ball_position_bias": (0.1, 0.1)}
-    pushed = {"push_speed": (1.0, 1.0), "push_interval": (0.05,) * 2, "ball_latency": None}
-    env = Env(Two.Config(randomization=noisy | pushed))
-    truths, observations, _ = after_resting(env, 40)
-    at = np.array([truth.ball_position for truth in truths])
-    error = observations[:, env.layout["ball_position"]].reshape(at.shape) - at - 0.1
-    assert 0.005 < np.std(error) < 0.02
-    assert abs(np.corrcoef(error[:, 0].ravel(), error[:, 1].ravel())[0, 1]) < 0.4
-    velocity = np.array([truth.ball_velocity for truth in truths])
-    pushes = np.diff(velocity[..., :2], axis=0)
-    pushed = np.linalg.norm(pushes, axis=2) > 0.5
-    assert np.sum(pushed[:, 0]) >= 5 and np.all(pushed[:, 0] == pushed[:, 1])
-    np.testing.assert_allclose(np.linalg.norm(pushes[pushed], axis=1), 1.0, atol=1e-3)
-    assert np.ptp(pushes[pushed[:, 0]][:, 0] - pushes[pushed[:, 0]][:, 1]) > 0.5
-
-
-@pytest.mark.slow
 def test_c_moves_several_balls_as_the_engine_does():
     """With a push, and with the forces of the air in each physics step."""
     drawn = {"push_speed": (1.0, 1.0), "air_drag": (0.5, 0.5), "air_lift": (0.02, 0.02)}

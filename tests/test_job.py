@@ -32,7 +32,6 @@ from bounce_mjx.runs.folders import (
     newest_run,
 )
 from bounce_mjx.runs.lock import lock_run
-from bounce_mjx.runs.progress import Progress
 from bounce_mjx.runs.reading import policy_shapes, read_policy, read_record
 from bounce_mjx.training import job
 from bounce_mjx.training.callbacks import Event
@@ -208,19 +207,6 @@ def test_what_a_killed_process_was_writing_is_removed(tmp_path: Path) -> None:
     assert [path.name for path in folder.iterdir()] == ["128"]
 
 
-def test_a_screening_is_never_better_than_a_full_evaluation(tmp_path: Path) -> None:
-    def report(passed: bool, mean_return: float, screening: bool) -> Report:
-        result = Result("stable", "episodes, %", 0.0, ">= 99", passed)
-        details = {"mean_return": mean_return, "episodes": 2.0}
-        return Report((result,), details, screening=screening)
-
-    progress = Progress()
-    assert progress.improves(report(False, 5.0, True), 1, 0.0)
-    assert progress.improves(report(False, 1.0, False), 2, 0.0)
-    assert not progress.improves(report(False, 9.0, True), 3, 0.0)
-    assert progress.best_steps == 2
-
-
 def test_a_failed_screening_is_no_evaluation(tmp_path: Path) -> None:
     run = train(tmp_path, {1: 1.0, 2: 2.0}, screening=True, said=(said := io.StringIO()))
     assert said.getvalue().count("screening (1 episodes) at") == 2
@@ -347,28 +333,6 @@ def test_a_signal_during_the_compilation_leaves_nothing(tmp_path: Path) -> None:
     finally:
         ended.set_result(None)
     assert not list(tmp_path.iterdir())
-
-
-def test_a_block_that_was_stopped_is_completed_first(tmp_path: Path) -> None:
-    """On MJX a block may take minutes."""
-    asked = []
-
-    class Slow(CountingTrainer):
-        def run(self, iterations, stopping):
-            asked.append(iterations)
-            if len(asked) == 1:
-                os.kill(os.getpid(), signal.SIGTERM)
-                while not stopping():
-                    time.sleep(0.01)
-                iterations = 1
-            return super().run(iterations, stopping)
-
-    settings = {"trainer": Slow, "block_steps": 2 * BLOCK, "eval_every": 2 * BLOCK}
-    with pytest.raises(job.TrainingStopped, match="stopped after 64 steps"):
-        train(tmp_path, RETURNS, **settings)
-    (run,) = tmp_path.iterdir()
-    train(tmp_path, RETURNS, run, **settings)
-    assert asked == [2, 1, 2] and evaluated_steps(run) == [128, 256]
 
 
 def test_an_evaluation_that_was_stopped_is_repeated(tmp_path: Path) -> None:

@@ -353,16 +353,3 @@ def test_random_numbers_have_their_distribution(counters, kind: str) -> None:
             assert abs(np.corrcoef(column[:-lag], column[lag:])[0, 1]) < 5 / np.sqrt(COUNT)
     correlation = np.corrcoef(columns) - np.eye(len(columns))
     assert np.abs(correlation).max() < 5 / np.sqrt(COUNT)
-
-
-def test_neighbouring_counters_give_unrelated_numbers(counters) -> None:
-    """Environments with neighbouring first counters, and pairs of numbers from one counter."""
-    numbers = jax.vmap(lambda c: noise.uniform(c, 0, (4,), jnp.dtype("float32")))(
-        jnp.arange(COUNT, dtype=jnp.int32)
-    )
-    numbers = np.asarray(numbers, float)
-    assert len(np.unique(np.asarray(counters))) == COUNT
-    assert abs(np.corrcoef(numbers[:-1, 0], numbers[1:, 0])[0, 1]) < 5 / np.sqrt(COUNT)
-    # On a grid of 8 x 8, each cell has its share.
-    cells, *_ = np.histogram2d(numbers[:, 0], numbers[:, 1], bins=8, range=((0, 1), (0, 1)))
-    assert stats.chisquare(cells.ravel()).pvalue > 1e-4
