@@ -15,12 +15,11 @@ from typing import Annotated
 
 import jax
 import jax.numpy as jnp
-import tyro
 from pydantic import Field
 from tables import device_name, markdown_table, write
 
 from bounce_mjx import BounceBall
-from bounce_mjx.config.command_line import parse
+from bounce_mjx.config.command_line import Flag, parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.evaluation.config import DEFAULT_SEED
@@ -39,7 +38,7 @@ MIN_SHARE = 0.99
 class Command(StrictModel):
     """The command line."""
 
-    checkpoint: Annotated[Path | None, tyro.conf.Positional] = None
+    checkpoint: Annotated[Path | None, Flag(is_positional=True)] = None
     """A run's folder or a checkpoint in it. The default is the newest run."""
     num_envs: Annotated[int, Field(ge=1)] = 1024
     """Number of environments."""

@@ -31,12 +31,11 @@ from pathlib import Path
 from typing import Annotated, Any, TextIO
 
 import jax
-import tyro
 from pydantic import Field
 from tables import device_name, markdown_table
 from trainers import TRAINERS, Method
 
-from bounce_mjx.config.command_line import parse, parse_first
+from bounce_mjx.config.command_line import Flag, parse, parse_first
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.episodes import make_evaluator
@@ -69,8 +68,8 @@ Record = dict[str, Any]
 class Command(TrainConfig):
     """The command line: the config's keys as flags, and what to train."""
 
-    env: Annotated[EnvConfig, tyro.conf.arg(name="")] = EnvConfig()
-    ppo: Annotated[PPOConfig, tyro.conf.arg(name="")] = PPOConfig()
+    env: Annotated[EnvConfig, Flag(name="")] = EnvConfig()
+    ppo: Annotated[PPOConfig, Flag(name="")] = PPOConfig()
     total_steps: Annotated[int, Field(ge=1)] = 20_000_000
     """Environment steps of each run."""
     eval_every: Annotated[int, Field(ge=1)] = 1_000_000

@@ -14,11 +14,10 @@ from typing import Annotated
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 from tables import device_name, markdown_table, write
 
 from bounce_mjx.commands.run_options import ActorCommand
-from bounce_mjx.config.command_line import parse, stdout
+from bounce_mjx.config.command_line import Flag, parse, stdout
 from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, exit_on_user_error
@@ -61,7 +60,7 @@ Figures = dict[str, float | None]
 class RankCommand(ActorCommand):
     """The command line."""
 
-    policies: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="POLICY ...")]
+    policies: Annotated[tuple[Path, ...], Flag(metavar="POLICY ...", is_positional=True)]
     """Rows: a run, a checkpoint, a policy that comes with the package, mirror for the mirror law,
     or a folder whose runs are the seeds of one training run."""
     episodes: Count = DEFAULT_CONDITION_EPISODES

@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import jax
-import tyro
 from rich.console import Console
 
-from bounce_mjx.config.command_line import parse
+from bounce_mjx.config.command_line import Flag, parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.deploy.export import export_onnx
 from bounce_mjx.errors import UserError, exit_on_user_error
@@ -45,7 +44,7 @@ from bounce_mjx.training.setup import set_up_jax
 class ShipCommand(StrictModel):
     """The command line."""
 
-    run: Annotated[Path, tyro.conf.Positional]
+    run: Annotated[Path, Flag(is_positional=True)]
     """A run's folder (its best checkpoint), or a checkpoint in it."""
     name: Literal[tuple(POLICIES)] = PRETRAINED
     """Name of the policy in the package; an arm's is of a run with that arm as --robot."""

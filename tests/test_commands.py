@@ -132,7 +132,6 @@ ODD_YAML = (
     b"env: &e {env: *e}",
     b"seed: " + b"[" * 5000,
     b"env: {mjcf: ~nobody/a.xml, physics: mjx}",
-    b'log_dir: "a\\0b"',
     b'"a\\nb\\e[31m": 1',
     b"env: {control_dt: 1.0e+308, physics_dt: 1.0e-308}",
 )
@@ -259,7 +258,7 @@ def test_help_shows_plain_forms_and_no_empty_default(command: str, monkeypatch, 
         console_script([command, "--help"])
     shown = " ".join(capsys.readouterr().out.replace("│", "").split())
     assert f"usage: bounce-mjx {command} " in shown
-    for oddity in ("None}", "{None", "[[", "...]]", "(default: )", "(default: None)", "{True"):
+    for oddity in ("None}", "{None", "[[", "(default: )", "(default: None)", "{True"):
         assert oddity not in shown
 
 
@@ -273,10 +272,9 @@ def test_the_help_of_a_training_is_one_screen_and_the_whole_help_has_every_flag(
     assert len(lines) <= 45 and max(map(len, pages[1].splitlines())) <= 100
     assert "--num-envs INT          Environments that run in parallel (default: 512)" in pages[0]
     shown = {*re.findall(r"^  (--[\w.-]+)", pages[1], re.MULTILINE)}
+    shown |= {*re.findall(r"^  --.+, (--no-[\w.-]+)", pages[1], re.MULTILINE)}
     known = {*flags_of(train_config(find_task("bounce"), TrainCommand))}
-    assert shown <= known
-    plain = {flag.replace("--no-", "--").replace(".no-", ".") for flag in known}
-    assert {flag.replace("--no-", "--").replace(".no-", ".") for flag in shown} == plain
+    assert shown == known
     assert pages[1].index("\nppo:\n") < pages[1].index("--learning-rate FLOAT")
 
 

@@ -566,7 +566,7 @@ def test_a_missing_package_is_named(package: str, monkeypatch) -> None:
 
 # All dependencies of the project except NumPy and onnxruntime.
 BLOCKED = (
-    "jax jaxlib mujoco flax optax orbax pydantic pydantic_core tensorstore yaml rich tyro onnx "
+    "jax jaxlib mujoco flax optax orbax pydantic pydantic_core tensorstore yaml rich onnx "
     "matplotlib scipy brax gymnasium torch"
 )
 

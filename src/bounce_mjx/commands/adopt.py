@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import tyro
 import yaml
 from rich.console import Console
 
-from bounce_mjx.config.command_line import parse
+from bounce_mjx.config.command_line import Flag, parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import exit_on_user_error, on_one_line
@@ -28,7 +27,7 @@ DEFAULT_SITE = "attachment_site"
 class AdoptCommand(StrictModel):
     """Finds the start pose and the servos of an arm, and writes its config."""
 
-    mjcf: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MJCF")]
+    mjcf: Annotated[Path, Flag(metavar="MJCF", is_positional=True)]
     """MJCF file of the arm; package:NAME/FILE for a file of an installed Python package, or
     menagerie:NAME for a model of MuJoCo Menagerie."""
     site: str = DEFAULT_SITE

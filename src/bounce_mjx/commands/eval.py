@@ -5,11 +5,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-import tyro
 from rich.console import Console
 
 from bounce_mjx.commands.run_options import OneActorCommand, WorldCommand, parse_with_commands
-from bounce_mjx.config.command_line import stdout
+from bounce_mjx.config.command_line import Flag, stdout
 from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.config import (
@@ -38,7 +37,7 @@ class EvalCommand(WorldCommand, OneActorCommand):
     1 kHz use, in 32 episodes."""
     physics: Physics = "config"
     """Physics engine: mujoco is MuJoCo's C engine; config is the engine used in training."""
-    json_file: Annotated[Path | None, tyro.conf.arg(name="json")] = None
+    json_file: Annotated[Path | None, Flag(name="json")] = None
     """File to write the results to."""
 
 

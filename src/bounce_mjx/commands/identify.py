@@ -6,10 +6,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import tyro
 from rich.console import Console
 
-from bounce_mjx.config.command_line import parse
+from bounce_mjx.config.command_line import Flag, parse
 from bounce_mjx.config.settings import NonNegative, StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, exit_on_user_error
@@ -33,7 +32,7 @@ class TopicsConfig(StrictModel):
 class IdentifyCommand(StrictModel):
     """Estimates the world of a robot from logs of its runs, and writes it for --world."""
 
-    logs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    logs: Annotated[tuple[Path, ...], Flag(is_positional=True)] = ()
     """CSV files of Recorder, or ROS bags (folders, .mcap, .db3 or .bag files)."""
     robot: Path | None = None
     """Config of a robot: the file that bounce-mjx adopt wrote, or the name of one in

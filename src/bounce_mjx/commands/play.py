@@ -4,11 +4,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import tyro
 from rich.console import Console
 
 from bounce_mjx.commands.run_options import WorldCommand, parse_with_commands
-from bounce_mjx.config.command_line import stdout
+from bounce_mjx.config.command_line import Flag, stdout
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.runs.config import TrainConfig
@@ -25,8 +24,7 @@ class PlayCommand(WorldCommand):
 
     checkpoints: Annotated[
         tuple[Path, ...],
-        tyro.conf.Positional,
-        tyro.conf.arg(metavar="[CHECKPOINT ...]"),
+        Flag(metavar="[CHECKPOINT ...]", is_positional=True),
     ] = ()
     """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, or a
     policy that comes with the package: pretrained, robust, robust_small, or the name of a task or
@@ -34,7 +32,7 @@ class PlayCommand(WorldCommand):
     the package if there is no run. mirror stands for the mirror law, a model-based baseline."""
     randomization: RandomizationConfig = RandomizationConfig()
     """World of the episodes, if a term is given, in place of the world of the training."""
-    viewing: Annotated[ViewerOptions, tyro.conf.arg(name="")] = ViewerOptions()
+    viewing: Annotated[ViewerOptions, Flag(name="")] = ViewerOptions()
 
 
 @exit_on_user_error()

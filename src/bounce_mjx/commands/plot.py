@@ -4,11 +4,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
 from pydantic import Field
 
 from bounce_mjx.commands.run_options import RunCommand
-from bounce_mjx.config.command_line import parse
+from bounce_mjx.config.command_line import Flag, parse
 from bounce_mjx.errors import exit_on_user_error
 
 
@@ -17,8 +16,7 @@ class PlotCommand(RunCommand):
 
     runs: Annotated[
         tuple[Path, ...],
-        tyro.conf.Positional,
-        tyro.conf.arg(metavar="[RUN ...]"),
+        Flag(metavar="[RUN ...]", is_positional=True),
     ] = ()
     """Folders of runs; latest, the default, is the newest run. Runs that differ only in the seed
     become one curve with a band, as do the seeds of one run. For a run of one seed, or one

@@ -4,17 +4,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
 from bounce_mjx.commands.run_options import RunCommand
-from bounce_mjx.config.command_line import parse
+from bounce_mjx.config.command_line import Flag, parse
 from bounce_mjx.errors import exit_on_user_error
 
 
 class ReportCommand(RunCommand):
     """Writes the report of a run, report.html in its folder."""
 
-    run: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[RUN]")] = None
+    run: Annotated[Path | None, Flag(metavar="[RUN]", is_positional=True)] = None
     """A run's folder; latest, the default, is the newest run."""
 
 

@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import pydantic
-import tyro
 from pydantic import Field
 from rich.console import Console
 
-from bounce_mjx.config.command_line import flag_of, flags_of, parse, parse_first
+from bounce_mjx.config.command_line import Flag, flag_of, flags_of, parse, parse_first
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError
 from bounce_mjx.runs.config import (
@@ -95,9 +94,7 @@ class ActorCommand(RunCommand):
 class OneActorCommand(ActorCommand):
     """A command line about one policy or the mirror law."""
 
-    checkpoint: Annotated[
-        Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[CHECKPOINT]")
-    ] = None
+    checkpoint: Annotated[Path | None, Flag(metavar="[CHECKPOINT]", is_positional=True)] = None
     """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, a policy
     that comes with the package (pretrained, robust, robust_small, or the name of a task or an arm),
     or mirror for the mirror law, a model-based baseline. The default is the newest run, or the
@@ -124,9 +121,7 @@ class WorldCommand(ActorCommand):
 class PolicyCommand(RunCommand):
     """A command line about a trained policy."""
 
-    checkpoint: Annotated[
-        Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[CHECKPOINT]")
-    ] = None
+    checkpoint: Annotated[Path | None, Flag(metavar="[CHECKPOINT]", is_positional=True)] = None
     """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, or a
     policy that comes with the package: pretrained, robust, robust_small, or the name of a task or
     an arm. The default is the newest run, or the task's policy in the package if there is no
@@ -160,7 +155,7 @@ def parse_with_commands(
     commands = {
         name: Annotated[
             (str if command.names else float) | None,
-            tyro.conf.arg(metavar="|".join(command.names) or command.unit.upper() or None),
+            Flag(metavar="|".join(command.names) or command.unit.upper() or None),
         ]
         for task in names
         for name, command in find_task(task).Config().commands.items()

@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import pydantic
-import tyro
 
-from bounce_mjx.config.command_line import parse, parse_first, stdout
+from bounce_mjx.config.command_line import Flag, parse, parse_first, stdout
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.runs.config import read_preset, train_config
@@ -34,8 +33,8 @@ class ViewCommand(StrictModel):
     robot: Path | None = None
     """Config of a robot: the file that bounce-mjx adopt wrote, or the name of one in
     configs/robots/ (ur5e, panda or iiwa)."""
-    viewing: Annotated[ViewerOptions, tyro.conf.arg(name="")] = ViewerOptions()
-    env: Annotated[pydantic.SerializeAsAny[WorldConfig], tyro.conf.arg(name="")]
+    viewing: Annotated[ViewerOptions, Flag(name="")] = ViewerOptions()
+    env: Annotated[pydantic.SerializeAsAny[WorldConfig], Flag(name="")]
 
 
 @exit_on_user_error()

@@ -1,15 +1,13 @@
 """The flags of the command that trains."""
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import pydantic
-import tyro
 from pydantic import Field
 
-from bounce_mjx.config.command_line import help_page, parse, parse_first
+from bounce_mjx.config.command_line import Flag, parse, parse_first
 from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.runs.config import TrainConfig, train_config
@@ -27,8 +25,8 @@ _SHORT_HELP = (
 class TrainCommand(TrainConfig, Start):
     """Trains a policy; by default, one that keeps the ball bouncing."""
 
-    env: Annotated[pydantic.SerializeAsAny[WorldConfig], tyro.conf.arg(name="")]
-    ppo: Annotated[pydantic.SerializeAsAny[PPOConfig], tyro.conf.arg(name="")] = PPOConfig()
+    env: Annotated[pydantic.SerializeAsAny[WorldConfig], Flag(name="")]
+    ppo: Annotated[pydantic.SerializeAsAny[PPOConfig], Flag(name="")] = PPOConfig()
     report: bool = True
     """Write report.html into the run's folder after the results are printed."""
     wandb: str | None = None
@@ -82,12 +80,11 @@ def read_command(args: Sequence[str], machine: Path | None = None) -> TrainComma
     start = parse_first(Start, [word for word in args if word not in helps], prog=PROG)
     base = start.base(machine)
     own_class = train_config(base.env.task, TrainCommand, type(base.ppo))
+    default = own_class(**dict(base))
     if helps:
-        shown = help_page(own_class(**dict(base)), () if "--help-all" in helps else _SHORT_HELP)
-        print(f"usage: {PROG} [FLAGS]\n\n{TrainCommand.__doc__ or ''}\n\n{shown}")
-        if "--help-all" not in helps:
-            print("\n--help-all lists every flag; each key of the config is one (docs/config.md).")
-        sys.exit(0)
-    command = parse(own_class, args, prog=PROG, default=own_class(**dict(base)))
+        keys, epilog = _SHORT_HELP, "--help-all lists every flag; each key of the config is one."
+        options = {} if "--help-all" in helps else {"shown": keys, "epilog": epilog}
+        parse(own_class, ["--help"], prog=PROG, default=default, **options)
+    command = parse(own_class, args, prog=PROG, default=default)
     settled = start.settle(command.training, base)
     return command.model_copy(update=dict(settled) | {"resume": start.run})

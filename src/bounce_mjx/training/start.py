@@ -3,8 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Any
 
-import tyro
-
+from bounce_mjx.config.command_line import Flag
 from bounce_mjx.config.files import differing_keys
 from bounce_mjx.config.settings import Steps, StrictModel, merged
 from bounce_mjx.config.validation import validate
@@ -17,9 +16,7 @@ from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file
 class Start(StrictModel):
     """What a training starts from: flags of the command, and arguments of `train`."""
 
-    config: Annotated[
-        tuple[Path, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="PATH")
-    ] = ()
+    config: Annotated[tuple[Path, ...], Flag(metavar="PATH", is_repeated=True)] = ()
     """Preset: the name of a YAML file in configs/, such as cpu or finetune; a task's own preset of
     that name, such as configs/track/cpu.yaml, has priority. The default is default on an
     accelerator, and cpu on a CPU. A YAML file of yours lies on that default, or on the preset that
