@@ -220,22 +220,13 @@ class WorldConfig(StrictModel):
         """A setting that has no effect is a mistake. A run's own config has all defaults."""
         unused = {f"robot.{name}": "robot.site" for name in OF_SITE} if not self.robot.site else {}
         if self.action.base == "measured":
-            unused["action.max_lead"] = "the action.base target"
+            unused["action.max_lead"] = unused["observation.servo_lead"] = "the action.base target"
         for key, needed in unused.items():
             group, name = (getattr(self, key.split(".")[0]), key.split(".")[1])
             if getattr(group, name) != type(group).model_fields[name].default:
                 raise ValueError(
                     f"{key} has no effect without {needed}; set that too, or leave {key} out"
                 )
-        return self
-
-    @pydantic.model_validator(mode="after")
-    def _check_servo_lead(self):
-        if self.observation.servo_lead and self.action.base != "target":
-            raise ValueError(
-                f"observation.servo_lead is {self.observation.servo_lead}, but actions add to the "
-                "measured angles; set action.base to target, or servo_lead to 0"
-            )
         return self
 
     @pydantic.field_validator("mjcf")
