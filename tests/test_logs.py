@@ -9,9 +9,10 @@ import pytest
 from bounce_mjx.commands.main import main
 from bounce_mjx.deploy.recorder import Recorder
 from bounce_mjx.errors import UserError
+from bounce_mjx.identify import Topics
 from bounce_mjx.identify.excitation import excite
 from bounce_mjx.identify.log import Log, align_clocks, check
-from bounce_mjx.identify.reading import Topics, is_bag, read_bag, read_csv, read_log
+from bounce_mjx.identify.reading import is_bag, read_bag, read_csv, read_log
 from bounce_mjx.identify.world import measure_camera
 from bounce_mjx.robot.model import find_addresses, load_model
 from bounce_mjx.runs.config import read_preset
@@ -325,7 +326,7 @@ class Bag:
         return folder
 
 
-TOPICS = Topics("/joint_states", "/targets", "/ball")
+TOPICS = Topics(targets="/targets")
 
 
 @pytest.mark.parametrize("storage", ["SQLITE3", "MCAP"])
@@ -344,9 +345,9 @@ def test_bags_are_read_as_logs(storage: str, tmp_path: Path) -> None:
         UserError,
         match=r"topic /commands of JointState or .+; it has /ball \(PointStamped\), /joint",
     ):
-        read_bag(folder, JOINTS, TOPICS._replace(targets="/commands"))
+        read_bag(folder, JOINTS, TOPICS.model_copy(update={"targets": "/commands"}))
     with pytest.raises(UserError, match=r"has no topic /joint_states of PointStamped or PoseSt"):
-        read_bag(folder, JOINTS, TOPICS._replace(ball="/joint_states"))
+        read_bag(folder, JOINTS, TOPICS.model_copy(update={"ball": "/joint_states"}))
     with pytest.raises(
         UserError, match=r"/joint_states in .+ has the joints left, right, and elbow is missing"
     ):

@@ -8,7 +8,8 @@ import pytest
 
 from bounce_mjx import load_policy
 from bounce_mjx.env.env import Env
-from bounce_mjx.identify.reading import Topics, read_log
+from bounce_mjx.identify import Topics
+from bounce_mjx.identify.reading import read_log
 from bounce_mjx.resources import POLICIES, resource_path
 from bounce_mjx.runs.config import load_run_config
 
@@ -142,9 +143,7 @@ def test_logs_are_those_that_identify_reads(simulators, monkeypatch, tmp_path: P
     world = simulators.WORLDS["20 + 10 ms"]
     simulators.record_logs("pretrained", "mujoco", world, tmp_path)
     model = model_of("pretrained")
-    arm, ball = (
-        read_log(tmp_path / f"{name}.csv", model, Topics("", "", "")) for name in ("arm", "ball")
-    )
+    arm, ball = (read_log(tmp_path / f"{name}.csv", model, Topics()) for name in ("arm", "ball"))
     assert len(arm.times) > 1900 and not len(arm.picture_times)
     assert np.ptp(arm.joint_angles, axis=0).min() > 0.05
     # A joint follows its target after the delay and about one time constant of the servo.

@@ -12,21 +12,11 @@ from bounce_mjx.config.command_line import Flag, parse
 from bounce_mjx.config.settings import NonNegative, StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.identify import Topics
 from bounce_mjx.runs.config import read_preset
 
 if TYPE_CHECKING:
     from bounce_mjx.identify.stages import Identified
-
-
-class TopicsConfig(StrictModel):
-    """Topics of a ROS bag."""
-
-    joints: str = "/joint_states"
-    """JointState with the measured joint angles."""
-    targets: str = "/servo_targets"
-    """JointState or Float64MultiArray with the servo targets."""
-    ball: str = "/ball"
-    """PointStamped or PoseStamped with the ball's position."""
 
 
 class IdentifyCommand(StrictModel):
@@ -46,7 +36,7 @@ class IdentifyCommand(StrictModel):
     joint_names: tuple[str, ...] = ()
     """The driver's names of the joints in the logs, in the policy's order; by default the robot's
     own."""
-    topics: TopicsConfig = TopicsConfig()
+    topics: Topics = Topics()
     """Topics of a bag."""
 
 
@@ -56,7 +46,7 @@ def main(args: Sequence[str]) -> None:
     command = parse(IdentifyCommand, args, prog="bounce-mjx identify")
     if not command.logs:
         raise UserError("no log is given; name the CSV files or bags to identify from")
-    from bounce_mjx.identify.reading import Topics, read_log
+    from bounce_mjx.identify.reading import read_log
     from bounce_mjx.identify.stages import identify, join
     from bounce_mjx.identify.world import compare, to_yaml
     from bounce_mjx.reports.identification import identification_page
@@ -75,9 +65,11 @@ def main(args: Sequence[str]) -> None:
         ranges = known.applied({})["randomization"]
         validate(type(config), config.model_dump() | {"randomization": ranges}, str(command.check))
     model = load_model(config.mjcf, config.physics_dt, visual=False, robot=config.robot)
-    names, topics = joint_names(model), Topics(**command.topics.model_dump())
+    names = joint_names(model)
     say = partial(Console(soft_wrap=True, highlight=False).print, markup=False)
-    log = join([read_log(path, model, topics, command.joint_names) for path in command.logs])
+    log = join(
+        [read_log(path, model, command.topics, command.joint_names) for path in command.logs]
+    )
     for warning in log.notes:
         say(f"warning: {warning}")
     set_up_jax(config)

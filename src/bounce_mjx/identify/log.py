@@ -1,6 +1,6 @@
 """A log of a robot's run, its checks and its clocks."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -93,24 +93,6 @@ class Rows(NamedTuple):
         notes.append(sentence)
         return Rows(*self[:2], *(array[~wrong] for array in self[2:]))
 
-    def without_gaps(self, notes: list[str], refused: float = np.inf) -> "Rows":
-        """The rows in which every number is finite."""
-        wrong = ~np.isfinite(np.column_stack(self[3:])).all(axis=1)
-        return self.without(
-            wrong, f"lacks one of its {self.values.shape[1]} numbers", notes, refused
-        )
-
-    def without_repeats(self, columns: np.ndarray, notes: list[str]) -> "Rows":
-        """The rows whose columns [R, k] differ from those of the row before."""
-        same = np.all(np.diff(columns, axis=0, prepend=np.nan) == 0.0, axis=1)
-        return self.without(same, "repeats the one before", notes)
-
-    def without_far_times(self, notes: list[str]) -> "Rows":
-        """The rows whose times are near the log's middle."""
-        middle = np.median(self.times) if len(self.times) else 0.0
-        far = np.abs(self.times - middle) > _FAR_IN_TIME
-        return self.without(far, "has a time far from the others", notes, *_ONE_CLOCK)
-
 
 _ONE_CLOCK = _WRONG_ROWS, "; give each its own time, of one clock"
 
@@ -129,9 +111,7 @@ def make_log(source: str, angles: Rows, targets: Rows, balls: Rows) -> Log:
     balls = Rows(*balls[:2], *(array[order] for array in balls[2:]))
     # An arm may have been recorded alone, with a tracker that saw no ball. Trackers, and logs of
     # control steps, hold the last picture until the next.
-    balls = balls.without_gaps(notes)
-    balls = balls.without_repeats(balls.values, notes).without_far_times(notes)
-    balls = balls.without(
+    balls = _clean(balls, notes, lambda rows: rows.values).without(
         np.any(np.abs(balls.values) > _FARTHEST_BALL, axis=1),
         f"is farther away than {_FARTHEST_BALL:g} m",
         notes,
@@ -146,11 +126,28 @@ def make_log(source: str, angles: Rows, targets: Rows, balls: Rows) -> Log:
     )  # fmt: skip
 
 
+def _clean(
+    rows: Rows, notes: list[str], told: Callable[[Rows], np.ndarray], refused: float = np.inf
+) -> Rows:
+    """The rows in which every number is finite, that do not tell the same as the one before, and
+    whose times are near the log's middle.
+
+    Args:
+      told: what rows tell [R, k].
+      refused: share of rows with gaps from which the log is refused.
+    """
+    wrong = ~np.isfinite(np.column_stack(rows[3:])).all(axis=1)
+    rows = rows.without(wrong, f"lacks one of its {rows.values.shape[1]} numbers", notes, refused)
+    same = np.all(np.diff(told(rows), axis=0, prepend=np.nan) == 0.0, axis=1)
+    rows = rows.without(same, "repeats the one before", notes)
+    middle = np.median(rows.times) if len(rows.times) else 0.0
+    far = np.abs(rows.times - middle) > _FAR_IN_TIME
+    return rows.without(far, "has a time far from the others", notes, *_ONE_CLOCK)
+
+
 def _in_order(rows: Rows, notes: list[str]) -> Rows:
     """The rows of a measurement of every control step: whole, once each, with increasing times."""
-    rows = rows.without_gaps(notes, 1.0)
-    rows = rows.without_repeats(np.column_stack([rows.times, rows.values]), notes)
-    rows = rows.without_far_times(notes)
+    rows = _clean(rows, notes, lambda rows: np.column_stack([rows.times, rows.values]), 1.0)
     early = np.diff(np.maximum.accumulate(rows.times), prepend=-np.inf) <= 0.0
     late = np.append(rows.times[:-1] >= np.minimum.accumulate(rows.times[::-1])[-2::-1], False)
     # A time that is too late makes all that follow early, and one too early all before it late.

@@ -5,13 +5,14 @@ import csv
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from bounce_mjx.deploy.loading import check_names
 from bounce_mjx.errors import UserError, needed, reason_of, shorten
+from bounce_mjx.identify import Topics
 from bounce_mjx.identify.log import Log, Rows, align_clocks, check, make_log
 from bounce_mjx.robot.model import find_addresses, joint_names
 
@@ -25,19 +26,8 @@ UNITS = {
 _TWO_CLOCKS = 1.0
 
 
-class Topics(NamedTuple):
-    """Topics of a bag."""
-
-    joints: str
-    """sensor_msgs/JointState with the measured joint angles."""
-    targets: str
-    """sensor_msgs/JointState with the servo targets, or std_msgs/Float64MultiArray with those of
-    all joints in the robot's order."""
-    ball: str
-    """geometry_msgs/PointStamped or PoseStamped with the ball's position."""
-
-
-_TYPES = Topics("JointState", "JointState or Float64MultiArray", "PointStamped or PoseStamped")
+# Of the topics.
+_TYPES = "JointState", "JointState or Float64MultiArray", "PointStamped or PoseStamped"
 
 
 def read_log(path: Path, model: mujoco.MjModel, topics: Topics, names: Sequence[str] = ()) -> Log:
@@ -165,7 +155,7 @@ def read_bag(path: Path, joint_names: Sequence[str], topics: Topics) -> Log:
         )
         for name, topic in (("joint angles", topics.joints), ("servo targets", topics.targets))
     )
-    for topic in topics[:2]:
+    for topic in (topics.joints, topics.targets):
         given = {joint for _, message in found[topic] for joint in getattr(message, "name", ())}
         missing = [joint for joint in joint_names if joint not in given]
         if given and missing:
@@ -189,16 +179,18 @@ def _read_messages(path: Path, topics: Topics) -> dict[str, list[tuple[float, An
     with needed("rosbags", "'bounce_mjx[identify]'"):
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
-    found: dict[str, list[tuple[float, Any]]] = {topic: [] for topic in topics}
+    found: dict[str, list[tuple[float, Any]]] = {
+        topic: [] for topic in topics.model_dump().values()
+    }
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as bag:
             present = {c.topic: c.msgtype.rpartition("/")[2] for c in bag.connections}
-            for topic, types in zip(topics, _TYPES, strict=True):
+            for topic, types in zip(topics.model_dump().values(), _TYPES, strict=True):
                 if present.get(topic) in types.split(" or "):
                     continue
                 # An arm may have been recorded alone.
                 if topic in present or topic != topics.ball:
-                    listed = (f"{name} ({kind})" for name, kind in sorted(present.items()))
+                    listed = (f"{other} ({kind})" for other, kind in sorted(present.items()))
                     raise UserError(
                         f"the bag {path} has no topic {topic} of {types}; it has "
                         f"{', '.join(listed) or 'none'}: name the topics by --topics.joints, "

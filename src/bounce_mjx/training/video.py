@@ -12,7 +12,7 @@ from bounce_mjx.training.callbacks import Event
 from bounce_mjx.training.log import TensorBoardLog
 from bounce_mjx.viewers.offscreen import choose_opengl
 from bounce_mjx.viewers.simulation import Simulation, make_policy_controller, resample
-from bounce_mjx.viewers.video import captioned
+from bounce_mjx.viewers.video import draw_frames
 
 
 class EvaluationVideo:
@@ -53,7 +53,7 @@ class EvaluationVideo:
         self._simulation.reset()
         recording = self._simulation.record(self._seconds)
         frames = resample(recording, self._simulation.env.dt, self._fps)
-        pictures = captioned(self._simulation.env, frames, self._size, self._fps)
+        pictures = draw_frames(self._simulation.env, frames, self._size, self._fps)
         first, *others = map(Image.fromarray, pictures)
         gif = io.BytesIO()
         duration = 1000 / self._fps

@@ -55,9 +55,10 @@ def show(
     present = {"recording": _recording, "native": _window, "browser": _page}[viewer](
         options, console
     )
+    each = max(1, options.num_envs // len(shown))
     with console.status("compiling"):
-        simulation = _simulate(shown, options, commands, has_sliders=viewer == "browser")
-    present(simulation, _page_start(shown, options))
+        simulation = _simulate(shown, each, options.seed, commands, viewer == "browser")
+    present(simulation, _page_start(shown, each))
 
 
 Present = Callable[[Simulation, PageStart], None]
@@ -139,26 +140,19 @@ def _page(options: ViewerOptions, console: Console) -> Present:
     return present
 
 
-def _robots_each(shown: Sequence[Shown], options: ViewerOptions) -> int:
-    """Number of robots of each controller."""
-    return max(1, options.num_envs // len(shown))
-
-
 def _simulate(
-    shown: Sequence[Shown],
-    options: ViewerOptions,
-    commands: dict[str, float],
-    has_sliders: bool,
+    shown: Sequence[Shown], each: int, seed: int, commands: dict[str, float], has_sliders: bool
 ) -> Simulation:
     """Compiles the simulation.
 
     Args:
+      each: number of robots of each controller.
       has_sliders: whether sliders change the world and the number of robots.
     """
     envs = [Env(with_sliders(one.config) if has_sliders else one.config) for one in shown]
     if len({fingerprint(env.mj_model) for env in envs}) > 1:
         raise UserError("the policies have different robots or time steps; show one at a time")
-    num_envs = _robots_each(shown, options)
+    num_envs = each
     # The page's slider goes up to the simulated number. On a CPU, MJX is too slow for 16.
     if has_sliders and len(shown) == 1 and envs[0].engine.name == "fused":
         num_envs = MAX_ENVS
@@ -168,16 +162,15 @@ def _simulate(
     for one, env in zip(shown, envs, strict=True):
         ranges = reset_ranges(one.config) if has_sliders else None
         controller = one.make_controller(env)
-        simulation = Simulation(env, controller, num_envs, options.seed, ranges, one.policy)
+        simulation = Simulation(env, controller, num_envs, seed, ranges, one.policy)
         simulation.command = commands
         simulation.world = None if is_sampled else {}
         simulations.append(simulation)
     return SideBySide(simulations) if len(simulations) > 1 else simulations[0]
 
 
-def _page_start(shown: Sequence[Shown], options: ViewerOptions) -> PageStart:
+def _page_start(shown: Sequence[Shown], each: int) -> PageStart:
     """The titles, and how many robots are shown."""
-    each = _robots_each(shown, options)
     if len(shown) == 1:
         return PageStart(shown[0].title, None, each)
     letters = string.ascii_uppercase[: len(shown)]

@@ -98,7 +98,7 @@ class VideoWriter:
           Interrupted: Ctrl-C came; no file is left.
         """
         frames = resample(recording, env.dt, self.fps)
-        shown = captioned(env, frames, self._size, self.fps, self._zoom)
+        shown = draw_frames(env, frames, self._size, self.fps, self._zoom)
         advice = "give another file with --video"
         with writable(self._path, advice), new_file(self._path) as new:
             encoder = subprocess.Popen(
@@ -127,7 +127,7 @@ class VideoWriter:
         return [*ffmpeg, *pictures.split(), *encoding, str(path)]
 
 
-def captioned(
+def draw_frames(
     env: Env, frames: EnvFrame, size: tuple[int, int], fps: float, zoom: float = 1.0
 ) -> Iterator[np.ndarray]:
     """The first environment in each of F frames of a rate, with a caption and the ball's path.

@@ -16,7 +16,6 @@ from flax import struct
 from bounce_mjx.adapters.randomization import randomized_task
 from bounce_mjx.config.validation import validate
 from bounce_mjx.env.env import Env, EnvState, State
-from bounce_mjx.errors import UserError
 from bounce_mjx.task.task import Task
 from bounce_mjx.tasks.registry import DEFAULT, task_config
 from bounce_mjx.viewers.offscreen import choose_opengl
@@ -52,16 +51,8 @@ class PipelineState:
 
     @property
     def x(self) -> brax.base.Transform:
-        """Positions [bodies, 3] and quaternions [bodies, 4] of the links in the world.
-
-        Raises:
-          UserError: the state has a batch axis.
-        """
-        if self.q.ndim != 1:
-            raise UserError(
-                f"the positions q have the shape {self.q.shape}, but the links of one environment "
-                "are computed at a time; take one with jax.tree.map(lambda x: x[0], state)"
-            )
+        """Positions [bodies, 3] and quaternions [bodies, 4] of the links in the world, of a state
+        without a batch axis."""
         data = mujoco.MjData(self.model.mj_model)
         data.qpos[:] = np.asarray(self.q)
         mujoco.mj_kinematics(self.model.mj_model, data)

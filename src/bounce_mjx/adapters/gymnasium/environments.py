@@ -81,6 +81,8 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
             argument is a TypeError too.
         """
         self.config = _task_config(task, settings)
+        self.dt = self.config.control_dt
+        """Time of one step, s."""
         self.num_envs = num_envs
         if num_envs < 1:
             raise UserError(f"num_envs is {num_envs}, but must be at least 1")
@@ -128,11 +130,6 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
     def task(self) -> Env:
         """The environment on JAX; equal environments share it."""
         return self._programs.task
-
-    @property
-    def dt(self) -> float:
-        """Time of one step, s."""
-        return self.config.control_dt
 
     @property
     def mj_model(self) -> mujoco.MjModel:
@@ -338,7 +335,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """Makes the environment; the arguments are those of `TaskVectorEnv` that are about one
         environment: `render_mode`, `width`, `height`, `camera`, and the settings."""
         self._envs = TaskVectorEnv(task, 1, autoreset_mode=AutoresetMode.DISABLED, **arguments)
-        self.episode_steps = self._envs.episode_steps
+        self.dt, self.episode_steps = self._envs.dt, self._envs.episode_steps
         self.metadata = self.metadata | {"render_fps": self._envs.metadata["render_fps"]}
         self.render_mode = self._envs.render_mode
         self.action_space = self._envs.single_action_space
@@ -350,11 +347,6 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def task(self) -> Env:
         """The environment on JAX; equal environments share it."""
         return self._envs.task
-
-    @property
-    def dt(self) -> float:
-        """Time of one step, s."""
-        return self._envs.dt
 
     @property
     def mj_model(self) -> mujoco.MjModel:
