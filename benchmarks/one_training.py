@@ -2,11 +2,14 @@
 
 import sys
 
-from bounce_mjx.training.setup import find_devices, set_up_gpu
+import jax
+
+from bounce_mjx.interrupt import in_daemon_thread
+from bounce_mjx.training.setup import set_up_gpu
 
 set_up_gpu()
 if sys.argv[sys.argv.index("--methods") + 1] == "ours":
-    find_devices()
+    in_daemon_thread(jax.devices)
 
 import jax_vs_torch  # noqa: E402
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from bounce_mjx.config.command_line import stdout
 from bounce_mjx.errors import exit_on_user_error
-from bounce_mjx.interrupt import leave
+from bounce_mjx.interrupt import in_daemon_thread, leave
 from bounce_mjx.runs.config import (
     default_preset,
     has_accelerator,
@@ -21,12 +21,14 @@ def main(args: Sequence[str]) -> None:
     with exit_on_user_error():
         machine = default_preset(has_plugin())
         command = read_command(args, machine)
-        from bounce_mjx.training.setup import find_devices, set_up_jax
+        import jax
+
+        from bounce_mjx.training.setup import set_up_jax
 
         set_up_jax(command.env)
         if not command.on_several_hosts:
-            # CUDA starts during the imports.
-            find_devices()
+            # CUDA starts during the imports; JAX reports an error where it needs the devices.
+            in_daemon_thread(jax.devices)
         from bounce_mjx.training import hosts
         from bounce_mjx.training.callbacks import WeightsAndBiases
         from bounce_mjx.training.console import say

@@ -230,15 +230,10 @@ class Job:
 
     def _advice(self) -> str:
         """The advice to the user after the death of a process or a device."""
-        latest = self._latest()
-        if latest is None:
-            return "start again, as no checkpoint had been saved yet"
-        return f"{self._go_on} (the last checkpoint is {latest.folder})"
-
-    def _latest(self) -> folders.Checkpoint | None:
         with contextlib.suppress(UserError):
-            return folders.latest_checkpoint(self.run)
-        return None
+            latest = folders.latest_checkpoint(self.run)
+            return f"{self._go_on} (the last checkpoint is {latest.folder})"
+        return "start again, as no checkpoint had been saved yet"
 
     def _remove_unstarted(self, error: type[BaseException] | None, *_) -> None:
         """Removes the folder of a new run without a checkpoint or a block that can be trained."""
@@ -510,10 +505,9 @@ class Job:
         if self._healthy():
             return
         self.saving.problem()
-        latest = self._latest()
         kept = "no checkpoint had been saved yet"
-        if latest is not None:
-            kept = f"the last good checkpoint is {latest.folder}"
+        with contextlib.suppress(UserError):
+            kept = f"the last good checkpoint is {folders.latest_checkpoint(self.run).folder}"
         raise UserError(
             f"training stopped because it diverged: {self.members[-1].progress.fault}; {kept}; "
             "start a new run with a lower learning rate or other rewards"

@@ -1,9 +1,7 @@
 """The TensorBoard log of a run."""
 
-import contextlib
 import math
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -78,25 +76,21 @@ class TensorBoardLog:
         """Writes everything to the file. A file with a point that is only half written ends there
         for its readers, so that a new one follows it."""
         self._flushed = time.monotonic()
-        with self._losing():
+        try:
             if self._writer is None:
                 number = f".{self._files}" if self._files else ""
                 self._files += 1
                 self._writer = self._new_writer(f"{self.run / 'events'}", self._suffix + number)
             self._writer.flush()
+        except OSError:
+            self._writer = None
 
     def _add(self, **content: Any) -> None:
         event = self._events.Event(wall_time=time.time(), **content)
-        with self._losing():
+        try:
             if self._writer is not None:
                 self._writer.write_event(event)
-        if time.monotonic() - self._flushed > _FLUSH_SECONDS:
-            self.flush()
-
-    @contextlib.contextmanager
-    def _losing(self) -> Iterator[None]:
-        """Around an operation on the file; after an error, nothing more goes there."""
-        try:
-            yield
         except OSError:
             self._writer = None
+        if time.monotonic() - self._flushed > _FLUSH_SECONDS:
+            self.flush()

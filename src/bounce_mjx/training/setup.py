@@ -1,9 +1,7 @@
 """JAX's settings in a command."""
 
-import contextlib
 import os
 import sys
-import threading
 from pathlib import Path
 
 import jax
@@ -51,17 +49,6 @@ def cache_compilations() -> None:
         except RuntimeError:
             # No home.
             pass
-
-
-def find_devices() -> None:
-    """Starts JAX's devices in the background; JAX waits for them where it needs them, and reports
-    an error there."""
-
-    def start() -> None:
-        with contextlib.suppress(Exception):
-            jax.devices()
-
-    threading.Thread(target=start, daemon=True).start()
 
 
 def set_up_gpu() -> None:
