@@ -140,6 +140,22 @@ def test_a_run_without_a_checkpoint_is_told_as_such(runs: Path) -> None:
             find(runs / "2026-01-03")
 
 
+@pytest.mark.parametrize("place", ["checkpoints", "checkpoints/9"])
+def test_a_training_is_not_resumed_through_a_link(runs: Path, place: str, capsys) -> None:
+    """It would write there, and remove the folders that look like checkpoints."""
+    run, other = runs / "2026-01-02", runs.parent / f"other {runs.name}"
+    shutil.copytree(run / "checkpoints", other)
+    before = contents(other)
+    shutil.rmtree(run / place, ignore_errors=True)
+    (run / place).parent.mkdir(exist_ok=True)
+    (run / place).symlink_to(other)
+    with pytest.raises(SystemExit) as exit_info:
+        train_command.main(["--resume", str(run)])
+    assert exit_info.value.code == 2
+    assert f"error: {run}/{place} is a link, and training" in capsys.readouterr().err
+    assert contents(other) == before
+
+
 # Runs from someone else
 
 

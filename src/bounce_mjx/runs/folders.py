@@ -136,6 +136,21 @@ def runs_of_seeds(run: Path) -> list[Path]:
     return sorted(path for path in seeds if not path.is_symlink()) or [run]
 
 
+def check_links(run: Path) -> None:
+    """Checks that a run's folder holds no links, through which training would write elsewhere;
+    those of Weights & Biases do not count, as it makes them anew.
+
+    Raises:
+      UserError: there is one, as there may be in a run from someone else.
+    """
+    for path in run.rglob("*"):
+        if path.is_symlink() and "wandb" not in path.relative_to(run).parts[:-1]:
+            raise UserError(
+                f"{path} is a link, and training writes only into the folder of its run; remove "
+                "it, or replace it with its target"
+            )
+
+
 def find_run(path: Path) -> Path:
     """Folder of the run that contains a path; the path may be the folder itself."""
     # Unlike os.path.isdir, Path.is_dir raises an error for a name that is too long.

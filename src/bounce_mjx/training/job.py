@@ -244,6 +244,7 @@ class Job:
             shutil.rmtree(self.run, ignore_errors=True)
 
     def _read_resumed(self) -> None:
+        folders.check_links(self.run)
         folders.refuse_brackets(self.run)
         if hosts.is_leader():
             # What a process that was killed was writing.
