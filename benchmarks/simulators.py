@@ -49,6 +49,8 @@ DROP = 0.3
 """Height of a drop, m."""
 STEP = 0.05
 """Step of a servo's target, rad."""
+ENCODER_NOISE, CAMERA_NOISE = 1e-4, 0.002
+"""Standard deviations of the joint angles (rad) and the ball's position (m) in a log."""
 BALL_SECONDS = 40.0
 """Length of a log with the ball, s."""
 RATE = 1000.0
@@ -657,22 +659,32 @@ def record_logs(policy: str, name: str, world: World, folder: Path) -> None:
     joints, home = acting.metadata.joint_names, np.array(acting.metadata.default_joint_angles)
     dt = acting.metadata.control_dt
     simulator = maker(name, env.mj_model, world, home)()
-    episode = Episode(acting, simulator, world)
+    episode, random = Episode(acting, simulator, world), np.random.default_rng(0)
+
+    def measure() -> dict[str, np.ndarray | float]:
+        measured = episode.measure()
+        for quantity, noise in (("joint_angles", ENCODER_NOISE), ("ball_position", CAMERA_NOISE)):
+            value = measured[quantity]
+            measured[quantity] = value + noise * random.standard_normal(np.shape(value))
+        return measured
+
     folder.mkdir(parents=True, exist_ok=True)
     motion = excite(config, seconds=20.0, max_velocity=1.0)
     episode.reset(home, np.array([[0.0, 10.0, 10.0]]), np.zeros((1, 3)))
     with Recorder(folder / "arm.csv", joints) as log:
         for time, target in zip(motion.times, motion.targets, strict=True):
-            measured = {k: x for k, x in episode.measure().items() if k.startswith("joint")}
+            measured = {k: x for k, x in measure().items() if k.startswith("joint")}
             log.step(measured | {"time": time}, target)
             episode.run(np.tile(target, (round(dt * RATE), 1)))
     episode.reset(home, np.array([config.ball_init_pos]), np.zeros((1, 3)))
     with Recorder(folder / "ball.csv", joints, {"target_height": "m"}) as log:
         for step in range(round(BALL_SECONDS / dt)):
             heights = {"target_height": (0.4, 0.5, 0.6)[int(step * dt / 3.0) % 3]}
-            measured = episode.measure() | heights | {"time": step * dt}
-            episode.control_step(heights)
-            log.step(measured, acting.commands(RATE)[-1])
+            measured = measure() | heights
+            acting.step(measured)
+            commands = acting.commands(RATE)
+            episode.run(commands)
+            log.step(measured | {"time": step * dt}, commands[-1])
     simulator.close()
 
 

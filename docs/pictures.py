@@ -14,7 +14,7 @@ import matplotlib
 matplotlib.use("svg")
 import matplotlib.pyplot as plt
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 IMAGES = CHECKOUT / "docs/images"
@@ -308,7 +308,7 @@ def two_policies():
         axes.axhline(0.5, color=LINES[2], lw=1, ls="--")
         for name, colour in (("pretrained", LINES[1]), ("robust", LINES[0])):
             eye = camera()
-            deploy.simulate(load_policy(name), eye, 5.0, 0.5)
+            deploy.simulate(load_policy(name), eye, 5.0, [0.5])
             time, height = np.array(eye.heights)[::10].T
             axes.plot(time, height, color=colour, lw=1.6, label=name)
         axes.set(title=title, xlabel="time, s", xlim=(0, 5), ylim=(0, 0.72))
@@ -452,9 +452,48 @@ def page():
         server.kill()
 
 
+def simulators():
+    """The policy `robust` with late actions and pictures of the ball in three simulators, side by
+    side, drawn by MuJoCo; needs the extra `simulators` and OpenGL."""
+    import jax
+
+    sys.path.insert(0, str(CHECKOUT / "benchmarks"))
+    import simulators as benchmark
+
+    from bounce_mjx.env.env import Env
+    from bounce_mjx.evaluation.episodes import reset_episodes
+    from bounce_mjx.resources import POLICIES, resource_path
+    from bounce_mjx.runs.config import load_run_config
+    from bounce_mjx.viewers.offscreen import Renderer
+
+    seed, every, steps = 3, 5, 400
+    config = load_run_config(resource_path(POLICIES["robust"])).env
+    env = Env(config.model_copy(update={"randomization": type(config.randomization)()}))
+    start = jax.jit(reset_episodes, static_argnums=(0, 2))(env, jax.random.key(seed), 1)
+    command = {name: float(x[..., 0]) for name, x in start.pipeline_state.command.items()}
+    names = {"bullet": "PyBullet", "physx": "SAPIEN", "mujoco": "MuJoCo"}
+    panels = []
+    for name, title in names.items():
+        world = benchmark.WORLDS["60 + 30 ms"]
+        _, path = benchmark.evaluate("robust", name, world, 1, seed)
+        with Renderer(env, 280, 280, zoom=1.3) as renderer:
+            pictures = [
+                Image.fromarray(renderer.render(qpos, command)) for qpos in path[:steps:every]
+            ]
+        for picture in pictures:
+            ImageDraw.Draw(picture).text((10, 250), title, "white", ImageFont.load_default(20))
+        panels.append(pictures)
+    first, *others = (Image.fromarray(np.hstack(row)) for row in zip(*panels, strict=True))
+    duration = round(1000 * every * env.dt)
+    first.save(
+        IMAGES / "simulators.webp", save_all=True, append_images=others, duration=duration,
+        loop=0, quality=30, method=4,
+    )  # fmt: skip
+
+
 PICTURES = (
     task, control_step, start_times, late_arms, episode, reward_terms, sensors, two_policies,
-    gradient, arms, page, parity,
+    gradient, arms, page, simulators, parity,
 )  # fmt: skip
 """`parity` is the last one, as it switches JAX to float64."""
 

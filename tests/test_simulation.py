@@ -196,7 +196,7 @@ def test_a_moved_slider_changes_the_world_at_once(played: Simulation, monkeypatc
     with served(played, monkeypatch) as client:
         wait_until(lambda: len(frames) > 100)
         assert worlds[-1] is None and not any(frame.over.any() for frame in frames)
-        client.set(client.control("action latency, ms"), 30)
+        client.set(client.control("action delay, ms"), 30)
         wait_until(lambda: worlds[-1] == NOMINAL | {"action_latency": (0.03,)})
         wait_until(lambda: any(frame.over.any() for frame in frames))
         for value in (1e9, -1e9, NAN, INFINITY, "much", [1], None):

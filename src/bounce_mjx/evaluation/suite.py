@@ -56,7 +56,7 @@ class Perturbation(StrictModel):
     settings: dict[str, Any] = {}
     """New values for settings of `env`, by dotted names."""
     trained_ranges: bool = False
-    """Draws from all ranges of the policy's training at once; replaces `terms`."""
+    """Samples from all ranges of the policy's training at once; replaces `terms`."""
 
 
 class Suite(StrictModel):

@@ -46,7 +46,7 @@ def choose_backend() -> str:
             return backend
     tried = f"MUJOCO_GL={wanted} does not work" if wanted else "neither EGL nor OSMesa works"
     raise UserError(
-        f"images cannot be rendered, because {tried} here; install an OpenGL library, on Debian "
+        f"pictures cannot be rendered, because {tried} here; install an OpenGL library, on Debian "
         "or Ubuntu with: apt-get install libegl1 libgl1-mesa-dri, or: apt-get install libosmesa6"
     )
 

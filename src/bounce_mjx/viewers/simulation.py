@@ -121,7 +121,7 @@ class Simulation:
         """Compiles the programs, which takes seconds, and resets all environments.
 
         Args:
-          ranges: from which the resets draw the worlds, see `Env.reset`.
+          ranges: from which the resets sample the worlds, see `Env.reset`.
           policy: the first value of `policy`.
         """
         self.env = env
@@ -339,7 +339,7 @@ def _apply(env: Env, states: State, changes: _Changes) -> State:
 
 
 def _replace_given(given: World, sampled: World) -> World:
-    """Drawn values by name, some of which are replaced; nan replaces none."""
+    """Sampled values by name, some of which are replaced; nan replaces none."""
     return sampled | {
         name: jnp.where(jnp.isnan(value), sampled[name], value) for name, value in given.items()
     }

@@ -37,8 +37,8 @@ class WorldSlider(NamedTuple):
 
 
 SLIDERS = (
-    WorldSlider("action latency, ms", "action_latency", (0.0, 50.0), 1.0, 1e-3),
-    WorldSlider("ball latency, ms", "ball_latency", (0.0, 50.0), 1.0, 1e-3),
+    WorldSlider("action delay, ms", "action_latency", (0.0, 50.0), 1.0, 1e-3),
+    WorldSlider("picture delay, ms", "ball_latency", (0.0, 50.0), 1.0, 1e-3),
     WorldSlider("ball noise, mm", "ball_position_noise", (0.0, 20.0), 0.5, 1e-3),
     WorldSlider("paddle tilt, degrees", "paddle_tilt", (0.0, 5.0), 0.1, math.radians(1.0)),
     WorldSlider("restitution", "restitution", (0.6, 0.98), 0.01),
@@ -63,7 +63,7 @@ def with_sliders(config: WorldConfig) -> WorldConfig:
 
 
 def reset_ranges(config: WorldConfig) -> Ranges:
-    """Ranges with which a reset of `with_sliders(config)` draws the worlds of `config`."""
+    """Ranges with which a reset of `with_sliders(config)` samples the worlds of `config`."""
     nominal = {
         name: jnp.full(TERMS[name].shape(config.num_joints), TERMS[name].nominal, jnp.float32)
         for name in with_sliders(config).randomization.terms
