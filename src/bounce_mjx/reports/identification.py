@@ -26,15 +26,16 @@ def identification_page(
       world: the file of the identified world.
     """
     listed = estimates(found, joint_names)
-    rows = [
-        [
-            e.label,
-            f"{e.value:.3g}",
-            f"{e.low:.3g} to {e.high:.3g}",
-            e.unit,
-            "" if e.seen else "not shown by the log",
-        ]
-        for e in sorted(listed, key=lambda e: not e.seen)
+    tables = [
+        table(
+            ["quantity", "estimate", "95% interval"],
+            [
+                [e.label, f"{e.value:.3g}", f"{e.low:.3g} to {e.high:.3g} {e.unit}".rstrip()]
+                for e in listed
+                if e.seen == seen
+            ],
+        )
+        for seen in (True, False)
     ]
     parts = found.before, found.after, found.held_out
     fits = [
@@ -47,12 +48,14 @@ def identification_page(
     said = "".join(f"<li>{html.escape(text)}</li>\n" for text in caveats or ["Nothing."])
     figures = {_TRACES: traces_figure(found, joint_names)}
     body = f"""<h1>Identified from {html.escape(source)}</h1>
-<p><b>Found:</b> the log shows {seen} of {len(listed)} quantities of the robot's world, which the
-table has first, each with the interval that contains it with 95% probability.</p>
+<p><b>Found:</b> the log shows {seen} of {len(listed)} quantities of the robot's world, each
+below with the interval that contains it with 95% probability.</p>
 <p><b>How sure:</b> {_describe_fit(found)}</p>
 <p><b>What to do:</b> {_advise(bool(doubts), world)}</p>
 <h2>Estimates</h2>
-{table(["quantity", "estimate", "95% interval", "unit", ""], rows)}
+{tables[0]}
+<h2>Not shown by the log: the prior stands</h2>
+{tables[1]}
 <h2>Errors in units of the sensors' noise</h2>
 {table(["sensor", "model's own world", "identified", "windows held out"], fits)}
 {figures_html(figures)}
