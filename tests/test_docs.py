@@ -1,5 +1,6 @@
 """The documentation: links resolve, commands and flags exist, and quotations are true."""
 
+import argparse
 import ast
 import dataclasses
 import functools
@@ -157,6 +158,13 @@ def test_shown_commands_are_understood(command, monkeypatch: pytest.MonkeyPatch)
     for module in [m for n, m in sys.modules.items() if n.startswith("bounce_mjx")]:
         if getattr(module, "parse", None) is real:
             monkeypatch.setattr(module, "parse", parse)
+    read = argparse.ArgumentParser.parse_args
+
+    def parse_args(*given, **named):
+        read(*given, **named)
+        raise Parsed
+
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parse_args)
     monkeypatch.setattr(hosts, "join", lambda *_: None)
     monkeypatch.setattr(sys, "argv", [name, *args])
     monkeypatch.syspath_prepend(str(path.parent))
