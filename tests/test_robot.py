@@ -14,7 +14,7 @@ from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.commands import adopt as adopt_command
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
-from bounce_mjx.robot.adopt import adopt
+from bounce_mjx.robot.adopt import adopt, check_as_alone
 from bounce_mjx.robot.arm import build_arm, compile_spec, locate, read_spec
 from bounce_mjx.robot.config import RobotConfig
 from bounce_mjx.robot.model import find_addresses, joint_names
@@ -381,3 +381,18 @@ def test_a_robot_is_read_on_top_of_a_preset(written, tmp_path) -> None:
     own = load_config(written["small"]).env
     assert config.env == own.model_copy(update={"episode_seconds": 3.0}) and config.seed == 4
     assert own.action_scale != 0.5
+
+
+@pytest.mark.parametrize("field", ["body_quat", "body_ipos", "body_mass", "jnt_axis"])
+def test_an_arm_that_changes_in_the_scene_is_refused(field, tmp_path) -> None:
+    """As an angle that is read in other units would change it."""
+    (tmp_path / "arm.xml").write_text(STYLES["turned flange"])
+    found = build_arm(tmp_path / "arm.xml", RobotConfig(site="tool"))
+    found.spec.compiler.fusestatic = False
+    model = compile_spec(found.spec, tmp_path)
+    check_as_alone(found, model)
+    joint = find_addresses(model).arm_joints[2]
+    index = model.jnt_bodyid[joint] if field.startswith("body") else joint
+    getattr(model, field)[index] += 1e-4
+    with pytest.raises(UserError, match=f"where its {field} differs by"):
+        check_as_alone(found, model)

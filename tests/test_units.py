@@ -45,6 +45,7 @@ robot: {site: s, ball: {radius: 19}}                     # mm
 robot: {limits: {velocity: [180], acceleration: [9]}}    # degrees a second
 action: {max_lead: 0.3}                                  # does nothing with the base measured
 randomization: {push_interval: [1, 2]}                   # does nothing without push_speed
+max_joint_velocity: true                                 # a switch is no number
 """
 
 

@@ -14,13 +14,22 @@ from pydantic import Field
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticKnownError
 
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
-NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+def _refuse_switch(value: Any) -> Any:
+    if isinstance(value, bool):  # pydantic would read true as 1.
+        raise PydanticKnownError("float_type")
+    return value
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
 
-UnitInterval = Annotated[float, Field(ge=0.0, le=1.0)]
+_Number = Annotated[float, pydantic.BeforeValidator(_refuse_switch)]
+
+Positive = Annotated[_Number, Field(gt=0.0, allow_inf_nan=False)]
+
+NonNegative = Annotated[_Number, Field(ge=0.0, allow_inf_nan=False)]
+
+Finite = Annotated[_Number, Field(allow_inf_nan=False)]
+
+UnitInterval = Annotated[_Number, Field(ge=0.0, le=1.0)]
 
 Length = Annotated[Positive, Field(le=10.0)]
 """m"""

@@ -8,6 +8,8 @@ import numpy as np
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.robot.arm import (
+    BALL_BODY_NAME,
+    PADDLE_BODY_NAME,
     Arm,
     ServoSettings,
     build_arm,
@@ -24,6 +26,10 @@ _HINGE_SPEED, _SLIDE_SPEED = 2.0, 0.6
 # A kept servo is at least this well damped, and answers within a factor of the others.
 _LEAST_DAMPING_RATIO = 0.5
 _LARGEST_SPREAD = 4.0
+# Largest difference of an arm in the scene from its file compiled alone: MuJoCo rounds frames that
+# are almost the same.
+_EQUAL = 1e-6
+_BODY_FIELDS = ("pos", "quat", "ipos", "iquat", "mass", "inertia")
 # Torque of a kept servo at the action 1, in multiples of the torque that holds the arm.
 _LEAST_HOLD = 1.5
 
@@ -63,6 +69,7 @@ def adopt(mjcf: Path, config: RobotConfig, control_dt: float, is_mount_given: bo
         # So every body stays: the search turns the paddle's.
         arm.spec.compiler.fusestatic = False
         model = compile_spec(arm.spec, path)
+        check_as_alone(arm, model)
         asked = Mount(config.paddle.position, config.paddle.quaternion)
         pose = find_pose(model, arm.force_limits, (asked,) if is_mount_given else mounts())
         servos, scale, are_kept = _servos(model, arm, pose, control_dt)
@@ -109,6 +116,31 @@ def _servos(
     made = zip(stiffness, damping, limits, strict=True)
     servos = tuple(ServoSettings(_four_digits(k), _four_digits(d), limit) for k, d, limit in made)
     return servos, _four_digits(scale), False
+
+
+def check_as_alone(arm: Arm, model: mujoco.MjModel) -> None:
+    """Compares the bodies of an arm in the task's scene to those of its file compiled alone.
+
+    Args:
+      model: the compiled scene, with all bodies.
+
+    Raises:
+      UserError: a body's pose, mass or inertia differs, or a joint's axis.
+    """
+    added = (BALL_BODY_NAME, PADDLE_BODY_NAME)
+    bodies = [b for b in range(1, model.nbody) if model.body(b).name not in added]
+    joints = find_addresses(model).arm_joints
+    for field, here, alone in (
+        *((f"body_{name}", bodies, arm.own.bodies) for name in _BODY_FIELDS),
+        *((f"jnt_{name}", joints, arm.own.joints) for name in ("pos", "axis")),
+    ):
+        expected = getattr(arm.own.model, field)[list(alone)]
+        error = np.max(np.abs(getattr(model, field)[list(here)] - expected))
+        if error > _EQUAL * np.max(np.abs(expected)):
+            raise UserError(
+                f"an arm that changes in the task's scene, where its {field} differs by "
+                f"{error:.2g}; write the MJCF in a plainer way, with angles as quaternions"
+            )
 
 
 def _four_digits(value: float) -> float:

@@ -45,6 +45,16 @@ class ServoSettings(NamedTuple):
     """N m, or N; None for no limit."""
 
 
+class Own(NamedTuple):
+    """The user's file compiled alone."""
+
+    model: mujoco.MjModel
+    joints: list[int]
+    """The acting joints in it."""
+    bodies: list[int]
+    """The bodies in it that the scene has too."""
+
+
 class Arm(NamedTuple):
     """An arm in the task's scene."""
 
@@ -57,6 +67,7 @@ class Arm(NamedTuple):
     """Largest force of the MJCF's actuator of each acting joint, N m or N; None for no limit."""
     changes: tuple[str, ...]
     """Changes to the user's model, one sentence each."""
+    own: Own
 
 
 def locate(mjcf: Path) -> Path:
@@ -204,7 +215,9 @@ class _Builder:
         self._disable_contacts_and_limits(joints)
         scene = self._attach(holder.name, position, quaternion)
         self._replace_servos(scene, names)
-        return Arm(scene, names, servos, limits, tuple(self._changes))
+        kept = [b for b in range(1, model.nbody) if not is_below(model, b, loose)]
+        own = Own(model, joints, kept)
+        return Arm(scene, names, servos, limits, tuple(self._changes), own)
 
     def _acting_joints(self, chain: list[int]) -> list[int]:
         model, given = self._model, self._config.joints
