@@ -151,14 +151,6 @@ def test_step_keeps_what_wrappers_added(env):
 # Trainers
 
 
-@pytest.fixture(scope="module")
-def quickly_compiled():
-    """The trainers compile for much longer than they run."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
 def train(trainer, env, networks, **settings):
     """brax's trainer with small networks: its results, and the metrics of each evaluation."""
     history = []
@@ -189,7 +181,7 @@ def example(name: str) -> dict:
 
 
 @pytest.fixture(scope="module")
-def ppo_example(tmp_path_factory, quickly_compiled):
+def ppo_example(tmp_path_factory):
     """The folder and the evaluations of `examples/brax_ppo.py`."""
     folder = tmp_path_factory.mktemp("brax")
     history = example("brax_ppo.py")["main"](
@@ -237,7 +229,7 @@ def test_brax_checkpoint_has_the_trained_policy(ppo_example):
 
 
 @pytest.mark.slow
-def test_brax_sac_trains_and_evaluates(env, quickly_compiled):
+def test_brax_sac_trains_and_evaluates(env):
     (make_policy, trained, _), history = train(
         brax_sac,
         env,
@@ -258,7 +250,7 @@ def test_brax_sac_trains_and_evaluates(env, quickly_compiled):
 
 
 @pytest.mark.slow
-def test_brax_apg_learns(quickly_compiled):
+def test_brax_apg_learns():
     """Gradients through the physics and the reward raise the return."""
     history = example("brax_apg.py")["main"](
         policy_updates=30, num_evals=2, num_envs=8, num_eval_envs=4, episode_length=20
