@@ -1,61 +1,248 @@
-"""Every setting of PPO has an effect: it changes the program of a training."""
+"""Every key of the config reference has an effect: it changes a program before it is compiled, or a
+value that the training resolves; or it is refused, as without another key it has none."""
 
+import contextlib
+import functools
 import re
+import types
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any, get_args
 
 import jax
 import numpy as np
 import pytest
+from rich.console import Console
 
+from arms import ARM
+from bounce_mjx.config.settings import StrictModel, merged
 from bounce_mjx.config.validation import validate
+from bounce_mjx.env.env import Env, State
+from bounce_mjx.errors import UserError
 from bounce_mjx.learning.ppo import PPO
+from bounce_mjx.physics import Control
+from bounce_mjx.robot.model import fingerprint
 from bounce_mjx.runs.config import TrainConfig, train_config
 from bounce_mjx.tasks.registry import find_task
-from bounce_mjx.training.ppo_trainer import episode_steps
+from bounce_mjx.training.evaluators import Evaluators
+from bounce_mjx.training.job import Job
+from bounce_mjx.training.ppo_trainer import PPOTrainer, episode_steps
+from bounce_mjx.training.trainer import in_whole_blocks
+from bounce_mjx.world.randomization import Term
 from test_ppo import TwoStates
 
 CONFIG = train_config(find_task("bounce"))
-FIELDS = type(CONFIG().ppo).model_fields
-SMALL = {"num_envs": 16, "rollout_length": 2, "num_minibatches": 2, "hidden_layers": (16,)}
+
+
+def keys(group: type[StrictModel], prefix: str = "") -> dict[str, Any]:
+    """The fields of a config by their dotted keys."""
+    found = {}
+    for name, field in group.model_fields.items():
+        if isinstance(field.annotation, type) and issubclass(field.annotation, StrictModel):
+            found |= keys(field.annotation, f"{prefix}{name}.")
+        else:
+            found[prefix + name] = field
+    return found
+
+
+KEYS = keys(CONFIG)
+
 # Other values, where neither half of the default nor one more of it is one.
 VALUES = {
-    "training_episode_seconds": 3.0, "entropy_cost": 0.01, "critic_metrics": ["ball_xy_error"],
-    "hidden_layers": [8], "critic_layers": [8], "min_learning_rate": 2e-5, "decay_steps": 1000,
+    "task": "catch", "seed": 1, "num_devices": 1000, "screening_episodes": 16,
+    "warm_start": "nowhere", "log_dir": "elsewhere",
+    "env.mjcf": "nowhere.xml", "env.friction": 0.2, "env.num_balls": 2,
+    "env.default_joint_angles": [0.1, 0.7, 1.9, 0.0, -1.0, 0.0], "env.ball_init_pos": [0.5, 0, 0.4],
+    "env.target_height_range": [0.4, 0.5], "env.control_dt": 0.02,
+    "env.robot.site": "nowhere", "env.robot.joints": ["Joint1"],
+    "env.robot.paddle.quaternion": [1, 0, 0, 0], "env.robot.ball.mass": 0.003,
+    "env.robot.ball.radius": 0.02, "env.robot.servo_stiffness": [100.0] * 6,
+    "env.robot.servo_damping": [10.0] * 6, "env.robot.servo_force_limit": [10.0] * 6,
+    "env.robot.limits.velocity": [2.0] * 6, "env.robot.limits.acceleration": [30.0] * 6,
+    "env.robot.limits.jerk": [9000.0] * 6, "env.robot.limits.torque": [20.0] * 6,
+    "env.randomization.shares": {"restitution": 0.5}, "env.randomization.warmup_steps": 1000,
+    "env.reward.target_y": 0.1, "ppo.training_episode_seconds": 3.0, "ppo.entropy_cost": 0.01,
+    "ppo.critic_metrics": ["ball_xy_error"], "ppo.hidden_layers": [8], "ppo.critic_layers": [8],
+    "algorithm": "own.py:Own",
+    "ppo.min_learning_rate": 2e-5, "env.randomization.camera_rate": [60, 90],
+    "env.randomization.command_interval": [1, 2], "env.physics": "mjx", "ppo.decay_steps": 1000,
 }  # fmt: skip
+
+# Keys that are refused alone, and the settings with which each has an effect; None where the
+# refusal is all that this test can see, as its value names what there is not.
+LIMITS = {"velocity": [1.0] * 6, "acceleration": [20.0] * 6, "jerk": [8000.0] * 6}
+WITH_LIMITS = {"robot": {"limits": LIMITS}, "action": {"base": "target"}}
+SERVOS = {
+    "servo_stiffness": [500.0] * 6, "servo_damping": [5.0] * 6, "servo_force_limit": [50.0] * 6,
+}  # fmt: skip
+ADOPTED = {
+    "mjcf": "arm.xml", "default_joint_angles": [0.0] * 6, "robot": {"site": "tool"} | SERVOS,
+    "ball_init_pos": [0.0, 0.0, 5.0], "target_height_range": [5.0, 6.0],
+}  # fmt: skip
+OF_SITE = [k for k in KEYS if k.startswith("env.robot.") and "limits" not in k]
+NEEDED = {
+    "env.action.max_lead": {"action": {"base": "target"}},
+    "env.observation.servo_lead": {"action": {"base": "target"}},
+    "env.randomization.first_command_range": {"randomization": {"warmup_steps": 1000}},
+    "env.randomization.push_interval": {"randomization": {"push_speed": [0.1, 0.1]}},
+    "env.randomization.restitution_slope": {"randomization": {"restitution": [0.8, 0.9]}},
+    **{f"env.robot.limits.{name}": WITH_LIMITS for name in LIMITS},
+    **dict.fromkeys(OF_SITE, ADOPTED),
+    **dict.fromkeys(("num_devices", "warm_start", "env.mjcf", "env.num_balls", "algorithm"), None),
+    **dict.fromkeys(("env.robot.site", "env.robot.joints"), None),
+}
+# Keys that describe others, and have an effect with them alone.
+WITH = {
+    "env.randomization.share": {"randomization": {"restitution": [0.8, 0.9]}},
+    "env.randomization.shares": {"randomization": {"restitution": [0.8, 0.9]}},
+}
 
 
 def other(key: str) -> Any:
     """Another value of a key than its default."""
-    value = FIELDS[key].default
+    field, value = KEYS[key], KEYS[key].default
     if key in VALUES:
         return VALUES[key]
+    for term in (mark for mark in field.metadata if isinstance(mark, Term)):
+        low, high = max(term.bounds[0], -0.1), min(term.bounds[1], 0.9)
+        return [0.5 * (low + high), high]
     if isinstance(value, bool):
         return not value
     if isinstance(value, str):
-        return next(x for x in reversed(get_args(FIELDS[key].annotation)) if x != value)
+        return next(x for x in reversed(get_args(field.annotation)) if x != value)
+    if isinstance(value, tuple):
+        return [0.5 * x for x in value]
     if isinstance(value, int):
         return value + 1 if value < 2 else 2 * value
     return 0.5 * value or 0.01
 
 
-def program(config: TrainConfig) -> tuple:
-    """The traced program of an iteration in a small environment, and the time limit."""
+def settings(key: str, value: Any) -> dict[str, Any]:
+    for name in reversed(key.split(".")):
+        value = {name: value}
+    return value
+
+
+def text(program: jax.stages.Traced) -> tuple:
+    """A traced program with its constants."""
+    constants = [np.asarray(x).tobytes() for x in program.jaxpr.consts]
+    return re.sub(r" at 0x[0-9a-f]+", "", str(program.jaxpr)), constants
+
+
+def of_model(config: TrainConfig) -> tuple:
+    """The engine and its model."""
+    return _of_model(Env(config.env))
+
+
+def _of_model(env: Env) -> tuple:
+    return env.engine.name, env.mj_model.opt.timestep, fingerprint(env.mj_model)
+
+
+def of_environment(config: TrainConfig) -> tuple:
+    """The programs of a reset and of a step but for the engine's, and the engine's model."""
+    env = Env(config.env)
+    reset = _reset(env)
+    numbers = env.config.num_substeps, env.config.episode_steps, env.warmup_steps
+    return text(reset), _step(env, reset.out_info), numbers, _of_model(env)
+
+
+def of_step(config: TrainConfig) -> tuple:
+    """The program of a step alone, from the state of the default environment."""
+    return _step(Env(config.env), _default_state())
+
+
+@functools.cache
+def _default_state() -> State:
+    return _reset(Env(CONFIG().env)).out_info
+
+
+def _reset(env: Env) -> jax.stages.Traced:
+    return jax.jit(env.reset).trace(jax.ShapeDtypeStruct((2,), "uint32"))
+
+
+def _step(env: Env, state: State) -> tuple:
+    def step(state: State, action: jax.Array) -> tuple[Control, State]:
+        control, actuation = env.control(state.pipeline_state, action)
+        return control, env.finish_step(state, action, actuation, state.pipeline_state.physics)
+
+    action = jax.ShapeDtypeStruct((env.action_size,), "float32")
+    return text(jax.jit(step).trace(state, action))
+
+
+def of_learning(config: TrainConfig) -> tuple:
+    """The program of an iteration in a small environment, and the time limit."""
+    small = {"num_envs": 16, "rollout_length": 2, "num_minibatches": 2, "hidden_layers": (16,)}
     changed = {name: x for name, x in config.ppo if x != getattr(CONFIG().ppo, name)}
     # A batch stays divisible.
-    small = SMALL | {name: 2 * SMALL[name] for name in changed if name in SMALL}
+    small |= {name: 2 * small[name] for name in changed if name in small}
     ppo = config.ppo.model_copy(update=small)
     trainer = PPO(ppo, TwoStates(1.0), episode_steps=1000)
-    traced = jax.jit(lambda key: trainer.run(trainer.init(key), 1)).trace(jax.random.key(0))
-    constants = [np.asarray(x).tobytes() for x in traced.jaxpr.consts]
-    return re.sub(r" at 0x[0-9a-f]+", "", str(traced.jaxpr)), constants, episode_steps(config)
+    program = jax.jit(lambda key: trainer.run(trainer.init(key), 1)).trace(jax.random.key(0))
+    return text(program), episode_steps(config)
 
 
-@pytest.fixture(scope="module")
-def default() -> tuple:
-    return program(CONFIG())
+def of_run(config: TrainConfig) -> tuple:
+    """What a run resolves: its blocks, evaluations, seeds and folder."""
+    blocks, measured = [], []
+    with contextlib.ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
+        config = in_whole_blocks(config)
+        job = Job(config, Console(quiet=True), None, (), stack, PPOTrainer)
+        job.open()
+
+        def run_block() -> None:
+            blocks.append(job.steps)
+            job.steps += job.block_steps
+
+        answers = {"_stopping": lambda: False, "_is_due": lambda: False, "_is_solved": lambda: True}
+        for name, answer in (answers | {"_run_block": run_block}).items():
+            patch.setattr(job, name, answer)
+        job.train()
+        nothing = types.SimpleNamespace(compile=lambda: None)
+        patch.setattr(Evaluators, "_lower", lambda _: nothing)
+        patch.setattr(Evaluators, "_measure", lambda *given, **_: measured.append(given[2]))
+        evaluators = Evaluators(config, job.env, job.trainer.mesh, job.pool)
+        evaluators.final(None)
+        seeds, task = str(job.trainer._seeds), type(job.env.task).__name__
+    return blocks, job.eval_steps, evaluators._chunk, measured, seeds, job.run.parent, task
+
+
+PARTS = {"env.physics": of_model, "env.robot.": of_model, "env.robot.limits": of_environment}
+PARTS |= {"env.reward.": of_step, "env.": of_environment, "ppo.": of_learning, "": of_run}
+
+
+@functools.cache
+def resolved(part: str, values: str) -> tuple:
+    """The programs and values of a config that a key changes.
+
+    Args:
+      part: the start of the key.
+      values: the settings as Python's text.
+    """
+    given = eval(values)
+    kind = train_config(find_task(given.get("task", "bounce")))
+    return PARTS[part](validate(kind, given, "my.yaml"))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory):
+    with contextlib.chdir(tmp_path_factory.mktemp("keys")):
+        Path("arm.xml").write_text(ARM)
+        yield
+
+
+@pytest.mark.parametrize("kind", [of_environment, of_step, of_learning, of_run])
+def test_equal_settings_have_equal_programs(kind: Callable) -> None:
+    assert kind(CONFIG()) == kind(CONFIG())
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("key", FIELDS)
-def test_a_setting_of_ppo_has_an_effect(key: str, default: tuple) -> None:
-    assert program(validate(CONFIG, {"ppo": {key: other(key)}}, "my.yaml")) != default
+@pytest.mark.parametrize("key", KEYS)
+def test_a_key_has_an_effect_or_is_refused(key: str) -> None:
+    part, changed = max(filter(key.startswith, PARTS), key=len), settings(key, other(key))
+    if key in NEEDED:
+        with pytest.raises(UserError):
+            resolved(part, repr(changed))
+    context = {"env": NEEDED.get(key) or WITH.get(key, {})}
+    if NEEDED.get(key, {}) is not None:
+        before, after = (resolved(part, repr(x)) for x in (context, merged(context, changed)))
+        assert before != after

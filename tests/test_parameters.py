@@ -7,8 +7,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from mujoco import rollout
 
 from against_c import (
+    States,
     assert_same_step,
     bouncing_states,
     c_models,
@@ -21,6 +23,7 @@ from against_c import (
     world,
 )
 from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation.c_episodes import full_states, physics_states
 from bounce_mjx.physics import (
     Control,
     PhysicsParameters,
@@ -30,7 +33,7 @@ from bounce_mjx.physics import (
 )
 from bounce_mjx.physics.parameters import shapes
 from bounce_mjx.robot.model import load_model, resting_activations
-from random_worlds import random_parameters
+from random_worlds import own_parameters, random_parameters
 
 # Parameters of the shipped model; test_friction.py and test_joint_friction.py cover friction.
 _NOT_IN_THE_MODEL = ("contact_friction", "force_limit", "frictionloss", "entries")
@@ -142,3 +145,50 @@ def test_filtered_servos_start_at_rest():
     mujoco.mj_forward(model, data)
     np.testing.assert_allclose(data.actuator_force, 0.0, atol=0.01)
     assert resting_activations(load_model(None, 0.001), list(data.qpos)) is None
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("float64")
+def test_each_number_alone_acts_as_in_mujoco(mj_model):
+    """In one batch with shared states and parameters, except for one random field."""
+    count, size = 8, 8 * len(FIELDS)
+    states, _ = random_states(mj_model, count, seed=1)
+    states = States(*(np.tile(x, (len(FIELDS), 1)) for x in states))
+    own = jax.tree.map(
+        lambda array: np.broadcast_to(array, (size, *np.shape(array))).copy(),
+        own_parameters(mj_model),
+    )
+    drawn = random_parameters(mj_model, size, seed=2)
+    for i, field in enumerate(FIELDS):
+        rows = slice(i * count, (i + 1) * count)
+        getattr(own, field)[rows] = getattr(drawn, field)[rows]
+    expected, _ = c_steps(c_models(mj_model, own, size), states)
+    assert_same_step(fused_steps(mj_model, own, states), expected)
+    shipped, _ = c_steps(mj_model, states)
+    change = np.abs(expected.qvel - shipped.qvel).max(axis=1).reshape(len(FIELDS), count)
+    assert np.all(change.max(axis=1) > 1e-4), dict(zip(FIELDS, change.max(axis=1), strict=True))
+
+
+def test_c_evaluation_carries_the_whole_state():
+    """Control steps of the evaluation equal an uninterrupted run of mj_step."""
+    model = edited('<position kp="20000"', '<position timeconst="0.02" kp="20000"')
+    rng = np.random.default_rng(0)
+    qpos = np.tile(model.qpos0, (2, 1)) + 0.1
+    act = np.array(qpos[:, :6])
+    start = PhysicsState(qpos.T, 0.1 * np.ones((model.nv, 2)), act.T)
+    states = full_states(model, start)
+    data = [mujoco.MjData(model) for _ in range(2)]
+    for i, d in enumerate(data):
+        d.qpos[:], d.qvel[:], d.act[:] = qpos[i], 0.1, act[i]
+    with rollout.Rollout(nthread=1) as pool:
+        for _ in range(3):
+            ctrl = qpos[:, :6] + rng.uniform(-0.05, 0.05, (2, 6))
+            control = np.repeat(ctrl[:, None], 10, axis=1)
+            states = pool.rollout([model], [mujoco.MjData(model)], states, control)[0][:, -1]
+            for d, targets in zip(data, ctrl, strict=True):
+                d.ctrl[:] = targets
+                mujoco.mj_step(model, d, nstep=10)
+    after = physics_states(model, states)
+    np.testing.assert_allclose(after.qpos.T, [d.qpos for d in data], rtol=1e-6)
+    np.testing.assert_allclose(after.qvel.T, [d.qvel for d in data], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(after.act.T, [d.act for d in data], rtol=1e-6)

@@ -437,3 +437,17 @@ def test_mjx_refuses_features_that_it_ignores(name):
     old, new, feature = MJX_ONLY[name]
     with pytest.raises(UserError, match=feature):
         make_engine(edited(old, new), "mjx")
+
+
+@pytest.mark.usefixtures("float64")
+def test_ten_substeps_are_ten_steps(mj_model, fused_step):
+    """The engine updates the ball's orientation once for all substeps."""
+    state = bouncing_states(mj_model, np.random.default_rng(0))
+    state.qpos[:, 8] -= 0.03  # many of the ten steps are then in contact
+    ctrl = state.qpos[:, :6] + 0.01
+    singly = state
+    for _ in range(10):
+        singly = fused_step(singly, ctrl, 1)
+    together = fused_step(state, ctrl, 10)
+    assert CEngine(mj_model, state).step(ctrl, 10) > 20
+    assert max(difference(together, singly)) < 1e-12

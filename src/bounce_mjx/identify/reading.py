@@ -48,7 +48,8 @@ def read_log(path: Path, model: mujoco.MjModel, topics: Topics, names: Sequence[
 
 
 def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
-    """Reads a CSV log.
+    """Reads a CSV log. Cells are separated by commas, semicolons or tabs, as the header's; beside
+    the last two, a decimal comma is read.
 
     Args:
       joint_names: the robot's joints, in the order of the result.
@@ -100,8 +101,11 @@ def _read_columns(path: Path) -> tuple[np.ndarray, dict[str, tuple[str, Sequence
     by its name."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
-            numbered = [(reader.line_num, row) for row in reader]
+            delimiter = max(",;\t", key=file.readline().count)
+            file.seek(0)
+            reader = csv.reader(file, delimiter=delimiter)
+            header = next(reader, [])
+            numbered = [(reader.line_num, row) for row in reader if any(row)]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise UserError(
             f"the log {path} cannot be read ({shorten(reason_of(error))}); give a CSV file in "
@@ -109,17 +113,21 @@ def _read_columns(path: Path) -> tuple[np.ndarray, dict[str, tuple[str, Sequence
         ) from error
     if not numbered:
         raise UserError(f"the log {path} is empty; record with bounce_mjx's Recorder")
-    lines, rows = zip(*numbered, strict=True)
     for line, row in numbered:
-        if None in row or None in row.values():
+        if len(row) != len(header):
             raise UserError(
-                f"{path} has another number of cells in row {line} than in its header; give each "
-                "row a cell for each column"
+                f"{path} has {len(row)} cells in row {line}, and its header has {len(header)}; "
+                "give each row a cell for each column"
             )
+        if delimiter != ",":
+            row[:] = [cell.replace(",", ".") for cell in row]
+    lines, rows = zip(*numbered, strict=True)
     columns: dict[str, tuple[str, Sequence[str]]] = {}
-    for title in reader.fieldnames:
+    for title, cells in zip(header, zip(*rows, strict=True), strict=True):
         name, unit = re.fullmatch(r"\s*(.*?)\s*(?:\[([^\[\]]*)\])?\s*", title).groups()
-        columns[name] = (unit or "").strip(), [row[title] for row in rows]
+        if name in columns:
+            raise UserError(f"{path} has two columns {shorten(name)}; leave one")
+        columns[name] = (unit or "").strip(), cells
     return np.array(lines), columns
 
 
@@ -143,7 +151,7 @@ def read_bag(path: Path, joint_names: Sequence[str], topics: Topics) -> Log:
     Raises:
       MissingPackage: rosbags is missing.
       UserError: the bag cannot be read, a topic is missing or of another type, no message has a
-        joint, or as `make_log`.
+        joint, the ball is in two frames, or as `make_log`.
     """
     found, num_joints = _read_messages(path, topics), len(joint_names)
     angles, targets = (
@@ -166,6 +174,14 @@ def read_bag(path: Path, joint_names: Sequence[str], topics: Topics) -> Log:
             )
     name = f"pictures of the ball of {topics.ball} in {path}"
     balls = _make_rows(name, found[topics.ball], 3, _read_position)
+    seen = np.flatnonzero(np.isfinite(balls.values).all(axis=1))
+    frames = sorted({found[topics.ball][i][1].header.frame_id for i in seen})
+    if len(frames) > 1:
+        named = ", ".join(shorten(frame) or "none" for frame in frames)
+        raise UserError(
+            f"the messages of {topics.ball} in {path} are in the frames {named}; record the ball "
+            "in one, that of the robot's base"
+        )
     own = np.isfinite(angles.times)
     if np.any(own) and abs(np.median((angles.arrivals - angles.times)[own])) > _TWO_CLOCKS:
         # Such as simulated time: pictures arrived when the angles of the same moment did.
