@@ -222,7 +222,7 @@ def test_ctrl_c_ends_a_command_that_compiles(tmp_path: Path) -> None:
 
     MJX's programs take XLA more than a second.
     """
-    command, program = "bounce_mjx.eval --physics mjx --episodes 4", "run"
+    command, program = "bounce_mjx.eval --physics mjx --episodes 4", "evaluate"
     log = tmp_path / "log"
     environment = {
         "JAX_LOG_COMPILES": "1",

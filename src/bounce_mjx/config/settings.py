@@ -14,22 +14,13 @@ from pydantic import Field
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticKnownError
 
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
-def _refuse_switch(value: Any) -> Any:
-    if isinstance(value, bool):  # pydantic would read true as 1.
-        raise PydanticKnownError("float_type")
-    return value
+NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 
+Finite = Annotated[float, Field(allow_inf_nan=False)]
 
-_Number = Annotated[float, pydantic.BeforeValidator(_refuse_switch)]
-
-Positive = Annotated[_Number, Field(gt=0.0, allow_inf_nan=False)]
-
-NonNegative = Annotated[_Number, Field(ge=0.0, allow_inf_nan=False)]
-
-Finite = Annotated[_Number, Field(allow_inf_nan=False)]
-
-UnitInterval = Annotated[_Number, Field(ge=0.0, le=1.0)]
+UnitInterval = Annotated[float, Field(ge=0.0, le=1.0)]
 
 Length = Annotated[Positive, Field(le=10.0)]
 """m"""
@@ -91,6 +82,14 @@ class StrictModel(pydantic.BaseModel):
     model_config = pydantic.ConfigDict(
         frozen=True, extra="forbid", use_attribute_docstrings=True, validate_default=True
     )
+
+    @pydantic.field_validator("*", mode="before")
+    @classmethod
+    def _refuse_switch(cls, value: Any, info: pydantic.ValidationInfo) -> Any:
+        # pydantic would read true as 1.
+        if isinstance(value, bool) and cls.model_fields[info.field_name].annotation is float:
+            raise PydanticKnownError("float_type")
+        return value
 
     @pydantic.model_validator(mode="before")
     @classmethod

@@ -29,7 +29,11 @@ def make_evaluator(env: Env, actor: Actor, episodes: int) -> Callable[..., Stati
     each from its own reset (`reset_episodes`). It stops when all episodes have ended or their time
     limit is reached. The ranges are optional."""
     measure = make_recording_evaluator(env, actor, episodes, recorded=0)
-    return jax.jit(lambda policy, key, ranges=None: measure(policy, key, ranges)[0])
+
+    def evaluate(policy: Policy, key: jax.Array, ranges: Ranges | None = None) -> Statistics:
+        return measure(policy, key, ranges)[0]
+
+    return jax.jit(evaluate)
 
 
 def make_recording_evaluator(
