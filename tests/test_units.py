@@ -46,6 +46,8 @@ robot: {limits: {velocity: [180], acceleration: [9]}}    # degrees a second
 action: {max_lead: 0.3}                                  # does nothing with the base measured
 randomization: {push_interval: [1, 2]}                   # does nothing without push_speed
 max_joint_velocity: true                                 # a switch is no number
+friction: true                                           # the same, where null is allowed
+target_height_range: [true, 2]                           # and in a list
 """
 
 

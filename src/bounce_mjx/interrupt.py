@@ -11,7 +11,7 @@ import threading
 import time
 import types
 from collections.abc import Callable
-from typing import Any, NoReturn, TypeVar
+from typing import Any, ClassVar, NoReturn, TypeVar
 
 Result = TypeVar("Result")
 
@@ -114,18 +114,20 @@ class DaemonThreads(concurrent.futures.Executor):
     """A thread for each call, for which the end of the process does not wait: for compilations,
     which cannot be stopped."""
 
-    def __init__(self):
-        self._futures: list[concurrent.futures.Future] = []
-        atexit.register(self._leave)
+    _running: ClassVar[set[concurrent.futures.Future]] = set()
+    """Those of all instances; a call that has ended is let go, with its result."""
 
     def submit(self, function: Callable[..., Result], /, *args: Any, **kwargs: Any):
         """Calls a function in a thread of its own."""
         future = in_daemon_thread(functools.partial(function, *args, **kwargs))
-        self._futures.append(future)
+        self._running.add(future)
+        future.add_done_callback(self._running.discard)
         return future
 
-    def _leave(self) -> None:
-        if not all(future.done() for future in self._futures):
+    @staticmethod
+    @atexit.register
+    def _leave() -> None:
+        if DaemonThreads._running:
             # After an exception that nobody caught, the interpreter has its value.
             leave(INTERRUPTED if hasattr(sys, "last_value") else 0)
 

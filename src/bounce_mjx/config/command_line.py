@@ -5,7 +5,7 @@ import functools
 import re
 import types
 import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, NoReturn, TypeVar
 
@@ -13,7 +13,7 @@ import pydantic
 from pydantic.fields import FieldInfo
 from rich.console import Console
 
-from bounce_mjx.config.settings import leaves
+from bounce_mjx.config.settings import leaves, types_in
 from bounce_mjx.config.validation import describe
 from bounce_mjx.errors import UserError, suggest
 
@@ -133,15 +133,18 @@ def _read(
         **options,
     )
     start, groups = default or command_class.model_construct(), {}
-    fields = {".".join(name for name, _ in path): path[-1][1] for path in leaves(command_class)}
-    for (key, field), path in zip(fields.items(), leaves(command_class), strict=True):
+    fields = {}
+    for path in leaves(command_class):
+        key, field = ".".join(name for name, _ in path), path[-1][1]
+        fields[key] = field
         value = functools.reduce(lambda at, name: getattr(at, name, None), key.split("."), start)
         text = " ".join((field.description or "").split()).replace("%", "%%")
         text = text if shown is None else re.split(r"(?<=[\w)])[.;] ", text)[0].rstrip(".")
         if value is not False and value not in (None, (), {}):
             text += f" (default: {_on_one_line(value)})"
         group = key.rpartition(".")[0] or "arguments"
-        groups.setdefault(group, parser.add_argument_group(group) if group not in groups else None)
+        if group not in groups:
+            groups[group] = parser.add_argument_group(group)
         own = {"help": text if shown is None or key in shown else argparse.SUPPRESS}
         if field.annotation is bool:
             own["action"] = argparse.BooleanOptionalAction
@@ -174,13 +177,13 @@ def _mark(field: FieldInfo) -> Flag:
 
 
 def _is_list(kind: Any) -> bool:
-    return not {tuple, dict}.isdisjoint(_types(kind))
+    return not {tuple, dict}.isdisjoint(types_in(kind))
 
 
 def _plain(kind: Any, words: str | list[str]) -> Any:
     """The words of a setting as pydantic reads them. A list may also have commas, except where a
     file's name may."""
-    kinds = set(_types(kind))
+    kinds = set(types_in(kind))
     parts = [
         None if part == "None" and type(None) in kinds else part
         for word in ([words] if isinstance(words, str) else words)
@@ -189,13 +192,6 @@ def _plain(kind: Any, words: str | list[str]) -> Any:
     if dict in kinds:
         return dict(zip(parts[::2], parts[1::2], strict=False))
     return parts if _is_list(kind) and parts != [None] else parts[0]
-
-
-def _types(kind: Any) -> Iterator[Any]:
-    """The types that a type consists of, such as tuple and int of tuple[int, ...]."""
-    yield typing.get_origin(kind) or kind
-    for inner in typing.get_args(kind):
-        yield from _types(inner)
 
 
 def _form(kind: Any) -> str:

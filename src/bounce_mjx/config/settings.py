@@ -6,6 +6,7 @@ are wide, and refuse the same quantity in another unit: millimetres, degrees or 
 """
 
 import re
+import typing
 from collections.abc import Iterator
 from typing import Annotated, Any
 
@@ -87,7 +88,9 @@ class StrictModel(pydantic.BaseModel):
     @classmethod
     def _refuse_switch(cls, value: Any, info: pydantic.ValidationInfo) -> Any:
         # pydantic would read true as 1.
-        if isinstance(value, bool) and cls.model_fields[info.field_name].annotation is float:
+        kinds = {*types_in(cls.model_fields[info.field_name].annotation)}
+        parts = value if isinstance(value, list | tuple) else [value]
+        if float in kinds and bool not in kinds and any(isinstance(x, bool) for x in parts):
             raise PydanticKnownError("float_type")
         return value
 
@@ -105,6 +108,13 @@ class StrictModel(pydantic.BaseModel):
             else value
             for name, value in values.items()
         }
+
+
+def types_in(kind: Any) -> Iterator[Any]:
+    """The types that a type consists of, such as tuple and int of tuple[int, ...]."""
+    yield typing.get_origin(kind) or kind
+    for inner in typing.get_args(kind):
+        yield from types_in(inner)
 
 
 def is_group(kind: Any) -> bool:

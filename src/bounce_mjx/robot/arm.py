@@ -367,9 +367,9 @@ class _Builder:
         self._remove("removed the grippers and loose objects", [bodies[b] for b in loose])
         self._remove("fixed the joints that do not act", fixed)
         for noun, found in (("equality constraint", arm.equalities), ("tendon", arm.tendons)):
-            for element in found:
+            if found:
                 raise UserError(
-                    f"the {noun} {element.name} on the arm, so it is not a serial chain; remove "
+                    f"the {noun} {found[0].name} on the arm, so it is not a serial chain; remove "
                     "it, or give a serial arm"
                 )
         others = [a for a in arm.actuators if a.target not in names]

@@ -23,9 +23,10 @@ def fault_of(metrics: Metrics, config: TrainConfig) -> str | None:
     # What follows an iteration that diverged is not due to the settings.
     faults = metrics["fault"] != 0
     counts = np.cumsum(faults, axis=1) <= faults
-    for name, values in metrics.items():
+    for name in filter(lambda name: name.startswith("reward/"), metrics):
+        values = metrics[name]
         wrong = counts & ~(np.abs(config.ppo.reward_scale * values) <= MAX_REWARD)
-        if name.startswith("reward/") and wrong.any(axis=1).all():
+        if wrong.any(axis=1).all():
             return (
                 f"the reward term {name.removeprefix('reward/')} is {values[wrong][0]:.3g} on "
                 f"average, not within {MAX_REWARD:g} after ppo.reward_scale; check the unit of its "
