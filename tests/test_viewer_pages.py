@@ -29,7 +29,8 @@ FLAGS = (
     "--disable-quic --no-first-run --disable-background-networking --disable-component-update "
     "--disable-sync"
 ).split()
-PATIENCE = 120.0
+# Software WebGL may take minutes when other tests have the cores.
+PATIENCE = 300.0
 
 
 class Watched:
@@ -37,6 +38,7 @@ class Watched:
 
     def __init__(self, page: Page):
         self.page, self.requests, self.complaints = page, [], []
+        page.set_default_timeout(1000 * PATIENCE)
         page.on("request", lambda request: self.requests.append(request.url))
         page.on("websocket", lambda socket: self.requests.append(socket.url))
         page.on("pageerror", lambda error: self.complaints.append(str(error)))
