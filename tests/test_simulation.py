@@ -14,6 +14,7 @@ from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import pretrained_checkpoint
 from bounce_mjx.runs.reading import read_policy
+from bounce_mjx.tasks.bounce import BounceConfig
 from bounce_mjx.viewers import show
 from bounce_mjx.viewers.display import Display
 from bounce_mjx.viewers.options import ViewerOptions
@@ -26,7 +27,7 @@ from bounce_mjx.viewers.simulation import (
     make_policy_controller,
     resample,
 )
-from bounce_mjx.viewers.world import SLIDERS, reset_ranges, with_sliders
+from bounce_mjx.viewers.world import SLIDERS, reset_ranges, sliders_for, with_sliders
 from bounce_mjx.world.randomization import RandomizationConfig
 from viewing import (
     GRAVITY,
@@ -171,6 +172,15 @@ def test_policies_of_different_tasks_are_not_shown_together() -> None:
 
 
 NOMINAL = {slider.term: slider.world_value(slider.nominal) for slider in SLIDERS}
+
+
+def test_a_slider_reaches_every_value_that_a_reset_samples() -> None:
+    own = RandomizationConfig(action_latency=(0.0, 0.08), paddle_tilt=((-0.1, 0.0), (0.02, 0.2)))
+    config = with_sliders(BounceConfig(randomization=own))
+    spans = {slider.term: slider.span for slider in sliders_for(config.randomization)}
+    assert spans["action_latency"] == pytest.approx((0.0, 0.08))
+    assert spans["paddle_tilt"] == pytest.approx((-0.1, 0.2))
+    assert spans["restitution"] == (0.6, 0.98)
 
 
 @pytest.fixture(scope="module")

@@ -40,7 +40,7 @@ SLIDERS = (
     WorldSlider("action delay, ms", "action_latency", (0.0, 50.0), 1.0, 1e-3),
     WorldSlider("picture delay, ms", "ball_latency", (0.0, 50.0), 1.0, 1e-3),
     WorldSlider("ball noise, mm", "ball_position_noise", (0.0, 20.0), 0.5, 1e-3),
-    WorldSlider("paddle tilt, degrees", "paddle_tilt", (0.0, 5.0), 0.1, math.radians(1.0)),
+    WorldSlider("paddle tilt, degrees", "paddle_tilt", (-5.0, 5.0), 0.1, math.radians(1.0)),
     WorldSlider("restitution", "restitution", (0.6, 0.98), 0.01),
 )
 
@@ -73,10 +73,12 @@ def reset_ranges(config: WorldConfig) -> Ranges:
 
 
 def sliders_for(config: RandomizationConfig) -> tuple[WorldSlider, ...]:
-    """Sliders with limits inside the ranges of the active terms."""
-    return tuple(
-        slider
-        for slider in SLIDERS
-        if (ends := getattr(config, slider.term)) is not None
-        and all(low <= slider.span[0] and slider.span[1] <= high for low, high in entries(ends))
-    )
+    """Sliders of the active terms whose ranges contain the sliders'; each spans the whole range."""
+    found = []
+    for slider in SLIDERS:
+        ends = getattr(config, slider.term)
+        spans = [] if ends is None else entries(ends)
+        if spans and all(low <= slider.span[0] and slider.span[1] <= high for low, high in spans):
+            limits = tuple(round(end / slider.scale, 6) for end in spans[0])
+            found.append(slider._replace(limits=limits))
+    return tuple(found)
