@@ -67,7 +67,7 @@ FAULTS = [
     ("the time limit is one step late", VECTOR,
      "truncated = (clock >= episode_steps)", "truncated = (clock > episode_steps)", "test_vector.py -k at_the_limit"),
     ("the final observation is the next episode's first", VECTOR,
-     "final_observation=stepped.obs.T", "final_observation=env_state.obs.T", "test_vector.py -k differs_from_the_final"),
+     "final_observation=stepped.obs.T", "final_observation=env_state.obs.T", "test_vector.py -k equals_a_loop"),
     ("an action is a control step too late", ACTUATION,
      "whole = jnp.floor(latency + 1e-4)", "whole = jnp.floor(latency + 1e-4) + 1.0", "test_randomization.py -k late_and_lagging"),
     ("a late action is early", ACTUATION,

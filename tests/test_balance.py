@@ -57,13 +57,6 @@ def test_the_point_moves_within_reach_at_the_commanded_speed() -> None:
     assert np.mean(visited > 0) > 0.8
 
 
-def test_without_a_speed_the_point_stays_where_it_is_set() -> None:
-    start = np.array([[0.02, 0.0, 0.03], [0.01, 0.0, 0.03]])
-    point = paths(start, np.zeros(3), np.full((4, 3), 0.9), 100)
-    np.testing.assert_allclose(point[-1, :, :2], start[:, :2], atol=1e-7)
-    np.testing.assert_allclose(point[-1, :, 2], REACH / np.sqrt(2.0), atol=1e-6)
-
-
 def test_the_ball_is_laid_on_the_paddle(env: Env) -> None:
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 256))
     truth = jax.vmap(env.kinematics)(state.pipeline_state)

@@ -1,4 +1,4 @@
-"""The benchmarks: figures of the ranking, of the comparison of trainers, and the search."""
+"""The benchmarks: figures of the ranking, and the search."""
 
 import importlib
 import re
@@ -22,7 +22,7 @@ def script(name: str):
     return module
 
 
-rank, jax_vs_torch, sweep = map(script, ("rank", "jax_vs_torch", "sweep"))
+rank, sweep = map(script, ("rank", "sweep"))
 
 
 def outcome(name: str, strength: float, lasted: float) -> ConditionOutcome:
@@ -46,43 +46,6 @@ def test_the_interval_is_that_of_the_mean(rank) -> None:
     assert mean == pytest.approx(values.mean(), abs=1e-3)
     np.testing.assert_allclose([low, high], [mean - half, mean + half], atol=0.15 * half)
     assert rank.interval([None], ".1f") == "-" and rank.interval([2.0, 2.0], ".1f") == "2.0"
-
-
-def evaluation(method, seed, steps, block_seconds, passed=False, run=1.0):
-    return {
-        "run": f"{method}-{seed}-{run}",
-        "method": method,
-        "seed": seed,
-        "device": "a device",
-        "num_envs": 8,
-        "total_steps": 400,
-        "steps": steps,
-        "block_seconds": block_seconds,
-        "process_seconds": 10.0 + steps,
-        "passed": passed,
-        "return": float(steps),
-        "results": {},
-    }
-
-
-def test_training_clock_excludes_compilation(jax_vs_torch):
-    seconds = (9.0, 3.0, 1.0, 2.0)
-    records = [evaluation("brax", 0, 100 * (i + 1), s) for i, s in enumerate(seconds)]
-    run = jax_vs_torch.newest_runs(records)["brax", 0]
-    assert [record["train_seconds"] for record in run] == [1.5, 3.0, 4.0, 6.0]
-
-
-def test_the_newest_run_counts_even_if_it_is_incomplete(jax_vs_torch):
-    old = [evaluation("ours", 0, 100, 1.0, passed=True)]
-    new = [evaluation("ours", 0, steps, 1.0, steps > 200, run=2.0) for steps in (100, 200, 300)]
-    whole = [evaluation("rsl_rl", 0, steps, 2.0, steps > 300) for steps in (100, 200, 300, 400)]
-    summary = jax_vs_torch.summarize(jax_vs_torch.newest_runs([*whole, *new, *old, *new]))
-    assert summary["ours"]["solved_steps"] == [300]
-    assert summary["ours"]["solved_train"] == [3.0]
-    assert summary["ours"]["return"] == [None]
-    assert summary["rsl_rl"]["return"] == [400.0]
-    assert summary["rsl_rl"]["solved_process"] == [410.0]
-    assert summary["rsl_rl"]["rate"] == [50.0]
 
 
 CONFIG = """

@@ -105,38 +105,6 @@ def test_brax_draws_the_links_where_mujoco_has_them():
 # Wrappers
 
 
-@pytest.fixture(scope="module")
-def brax_episode(env):
-    """Four environments in brax's own training wrappers, over two time-outs of 3 steps."""
-    wrapped = training.wrap(env, episode_length=3)
-    # brax reads the batch size from the shape of old-style keys.
-    states = [jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(8), 4))]
-    wrapped_step = jax.jit(wrapped.step)
-    actions = jax.random.uniform(jax.random.key(9), (6, 4, 6), minval=-1.0)
-    for action in actions:
-        states.append(wrapped_step(states[-1], action))
-    return states, actions
-
-
-def test_brax_episode_wrapper_truncates(brax_episode):
-    states, _ = brax_episode
-    for i, state in enumerate(states[1:], start=1):
-        timed_out = float(i % 3 == 0)
-        np.testing.assert_array_equal(state.done, timed_out)
-        np.testing.assert_array_equal(state.info["truncation"], timed_out)
-
-
-def test_brax_vmap_wrapper_equals_single_steps(brax_episode, env):
-    step = jax.jit(env.step)
-    states, actions = brax_episode
-    for i in range(4):
-        single = jax.tree.map(lambda x, i=i: x[i], states[0]).replace(info={})
-        for t in range(2):
-            single = step(single, actions[t, i])
-            np.testing.assert_allclose(states[t + 1].obs[i], single.obs, rtol=1e-5, atol=1e-5)
-            np.testing.assert_allclose(states[t + 1].reward[i], single.reward, rtol=1e-4)
-
-
 def test_step_keeps_what_wrappers_added(env):
     """A step keeps unknown metrics and info, as every brax environment does."""
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))

@@ -16,8 +16,6 @@ from rich.console import Console
 
 import bounce_mjx
 from bounce_mjx.commands import eval as eval_command
-from bounce_mjx.commands import train as train_command
-from bounce_mjx.commands.main import COMMANDS
 from bounce_mjx.commands.main import main as console_script
 from bounce_mjx.config.command_line import flags_of
 from bounce_mjx.resources import resource_path
@@ -146,12 +144,6 @@ def test_config_file_of_any_bytes_is_refused_in_one_sentence(
     assert len(sentence) < 5000 and sentence[:-1].isprintable()
 
 
-def test_flag_is_validated_on_top_of_the_config_file(refused: Refuse, tmp_path: Path) -> None:
-    (tmp_path / "my.yaml").write_text("ppo: {num_envs: 8, rollout_length: 8, num_minibatches: 4}")
-    line = "train --config my.yaml --num-envs 9 --rollout-length 5"
-    refused(line, "num_minibatches 4", "45 samples", "choose a divisor of 45")
-
-
 MJCF = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
 BAD_MJCF = {
     "text": ("hello", "does not compile", "correct it"),
@@ -251,17 +243,6 @@ def test_a_user_without_a_home_has_no_cache(monkeypatch) -> None:
         jax.config.update("jax_compilation_cache_dir", chosen)
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_help_shows_plain_forms_and_no_empty_default(command: str, monkeypatch, capsys) -> None:
-    monkeypatch.setenv("COLUMNS", "100")
-    with pytest.raises(SystemExit):
-        console_script([command, "--help"])
-    shown = " ".join(capsys.readouterr().out.replace("│", "").split())
-    assert f"usage: bounce-mjx {command} " in shown
-    for oddity in ("None}", "{None", "[[", "(default: )", "(default: None)", "{True"):
-        assert oddity not in shown
-
-
 def test_the_help_of_a_training_is_one_screen_and_the_whole_help_has_every_flag(capsys) -> None:
     pages = []
     for flag in ("--help", "--help-all"):
@@ -289,14 +270,6 @@ def test_presets_are_valid() -> None:
     assert (seed.ppo.num_epochs, seed.ppo.num_minibatches) == (15, 16)
     assert seed.ppo.learning_rate == 2e-4
     assert seed.ppo.hidden_layers == (512, 512, 512)
-
-
-def test_run_keeps_the_resolved_config(trained: Path) -> None:
-    kept = load_config(trained / "config.yaml")
-    command = train_command.read_command([*TINY, "--total-steps", str(STEPS)])
-    for key in TrainConfig.model_fields.keys() - {"log_dir"}:
-        assert getattr(kept, key) == getattr(command, key), key
-    assert kept.log_dir == trained.parent
 
 
 def test_run_holds_both_checkpoints_and_the_results(trained: Path) -> None:

@@ -7,7 +7,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import jax
@@ -118,25 +117,6 @@ def test_script_without_the_package(before: str, sentence: str) -> None:
     assert re.fullmatch(sentence + "train_jax.py\n", done.stderr), done.stderr
 
 
-@pytest.mark.parametrize(("module", "options"), [("bounce_mjx", ["-OO"]), ("bounce_mjx.eval", [])])
-def test_the_console_script_is_also_a_module(module: str, options: list[str]) -> None:
-    """It also runs without docstrings (`-OO`)."""
-    done = subprocess.run(
-        [
-            sys.executable,
-            *options,
-            "-m",
-            module,
-            *(["eval"] if module == "bounce_mjx" else []),
-            "--help",
-        ],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert "usage: bounce-mjx eval " in done.stdout
-
-
 # Libraries that read a command line and print its help; the last line has their dependencies.
 HELP_NEEDS = set(
     "bounce_mjx pydantic rich yaml annotated_types pydantic_core typing_extensions "
@@ -213,47 +193,6 @@ def test_the_innermost_request_receives_the_signal() -> None:
         with StopRequest() as stop:
             os.kill(os.getpid(), signal.SIGINT)
         assert stop.requested and not outer.requested
-
-
-@pytest.mark.slow
-def test_ctrl_c_ends_a_command_that_compiles(tmp_path: Path) -> None:
-    """The signal comes while XLA compiles the largest program, and takes effect before the
-    compilation ends.
-
-    MJX's programs take XLA more than a second.
-    """
-    command, program = "bounce_mjx.eval --physics mjx --episodes 4", "evaluate"
-    log = tmp_path / "log"
-    environment = {
-        "JAX_LOG_COMPILES": "1",
-        "JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache"),
-    }
-    # The command itself decides that XLA joins no loops of MJX, on which it would abort.
-    without_flags = {name: x for name, x in os.environ.items() if name != "XLA_FLAGS"}
-    with log.open("w") as stdout:
-        process = subprocess.Popen(
-            [sys.executable, "-u", "-m", *command.split()],
-            cwd=tmp_path,
-            env=without_flags | environment,
-            stdout=stdout,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-    try:
-        said = ""
-        for line in process.stderr:
-            said += line
-            if re.search(rf"to MLIR module conversion jit\({program}\)", line):
-                # Python still runs a few lines before XLA takes over.
-                time.sleep(0.3)
-                process.send_signal(signal.SIGINT)
-        assert process.wait(120.0) == -signal.SIGINT, said
-    finally:
-        process.kill()
-        process.wait()
-    assert f"conversion jit({program})" in said
-    assert f"Finished XLA compilation of jit({program})" not in said
-    assert "Traceback" not in said
 
 
 USUAL_SPELLINGS = {

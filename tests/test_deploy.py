@@ -29,7 +29,7 @@ from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import load_model
 from bounce_mjx.runs import reading
 from bounce_mjx.runs.config import TrainConfig, load_run_config, train_config
-from bounce_mjx.runs.folders import find_checkpoint, pretrained_checkpoint, save_config
+from bounce_mjx.runs.folders import find_checkpoint, save_config
 from bounce_mjx.runs.writing import save_checkpoint
 from bounce_mjx.tasks.registry import find_task
 from bounce_mjx.world.sensing import Sensing
@@ -551,17 +551,6 @@ def test_no_servo_targets_for_a_wrong_action(policies) -> None:
     for action in ([np.nan] * 6, [np.inf] * 6, [0.0] * 5, [[0.0]] * 6, "up", None, [5.0] * 6):
         with pytest.raises(UserError, match="the action .*give .*numbers .*from -1 to 1"):
             policy.servo_targets(action)
-
-
-@pytest.mark.parametrize("package", ["onnx", "onnxruntime"])
-def test_a_missing_package_is_named(package: str, monkeypatch) -> None:
-    monkeypatch.setitem(sys.modules, package, None)
-    use = {
-        "onnx": lambda: export_onnx(pretrained_checkpoint()),
-        "onnxruntime": lambda: load_policy("pretrained"),
-    }
-    with pytest.raises(UserError, match=f"^{package} cannot be imported.*pip install"):
-        use[package]()
 
 
 # All dependencies of the project except NumPy and onnxruntime.

@@ -3,7 +3,6 @@
 import functools
 import io
 import json
-import re
 from pathlib import Path
 
 import jax
@@ -14,14 +13,13 @@ import pytest
 from rich.console import Console
 
 from bounce_mjx import BounceBall, EnvConfig
-from bounce_mjx.commands import eval as eval_command
 from bounce_mjx.env.env import Env, Redraw, State
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import policy_evaluation
 from bounce_mjx.evaluation.c_episodes import episode_models, make_mujoco_evaluator
 from bounce_mjx.evaluation.config import EvaluationOptions
 from bounce_mjx.evaluation.episodes import make_evaluator, reset_episodes
-from bounce_mjx.evaluation.policy_evaluation import PolicyEvaluation, evaluate_policy
+from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
 from bounce_mjx.evaluation.results import Report, Result, judge
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
 from bounce_mjx.learning import policy
@@ -34,7 +32,6 @@ from bounce_mjx.reports.tables import (
     details_line,
     seeds_table,
 )
-from bounce_mjx.resources import resource_path
 from bounce_mjx.task import Tally, share_of_episodes
 from bounce_mjx.tasks.registry import find_task
 
@@ -441,31 +438,6 @@ def test_a_nominal_evaluation_draws_no_worlds(monkeypatch):
     assert 0.4 <= seen[1][1]["target_height"] <= 0.6
     assert seen[2][1] == {"target_height": 0.5}
     assert [report.results[SPEED].passed for report in reports] == [None, False, False]
-
-
-def test_eval_prints_missing_figures(env, monkeypatch, capsys, tmp_path):
-    """A missing figure is null in the file."""
-    report = judge(env, statistics(settled_bounces=0, accurate_bounces=0, apex_error=0))
-    evaluation = PolicyEvaluation(report, "mujoco")
-    said_first = []
-
-    def evaluate(*_, started):
-        started("mujoco")
-        said_first.append(capsys.readouterr().out)
-        return evaluation
-
-    monkeypatch.setattr(policy_evaluation, "evaluate_policy", evaluate)
-    results = tmp_path / "results.json"
-    with pytest.raises(SystemExit) as exit_info:
-        eval_command.main([str(resource_path("pretrained")), "--json", str(results)])
-    assert exit_info.value.code == 1
-    assert re.search(r"^checkpoint: .*/pretrained/checkpoints/(?:best/)?\d+ \(", said_first[0])
-    assert said_first[0].endswith("physics: mujoco  1,024 episodes of 20 s\n")
-    shown = capsys.readouterr().out
-    assert "apex error -," in shown
-    plain = json.loads(results.read_text(), parse_constant=pytest.fail)
-    assert plain["results"][HEIGHT]["value"] is None
-    assert plain["details"]["mean_apex_error_m"] is None
 
 
 # Another task

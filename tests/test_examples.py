@@ -81,12 +81,3 @@ def test_notebook_shows_two_rewards_and_compares(need, opengl, tmp_path, monkeyp
             (x["name"], "-" if x["value"] is None else f"{x['value']:.4g}") for x in results
         ]
         assert [(row[0], row[1 + i]) for row in rows[1:]] == expected
-
-
-def test_examples_are_short():
-    """Except robots' control loops, a task, and skrl, whose networks are the user's."""
-    for path in set(EXAMPLES.glob("*.py")) - {EXAMPLES / "deploy.py"}:
-        others = {"dribble_task.py": 120, "ur_rtde_bridge.py": 75, "ros2_bridge.py": 75}
-        others["skrl_ppo.py"] = 95
-        longest = others.get(path.name, 60)
-        assert 15 <= len(path.read_text().splitlines()) <= longest, path.name

@@ -78,16 +78,6 @@ def falling_actions(steps: int) -> np.ndarray:
     return actions.astype(np.float32)
 
 
-def episode(env, seed: int, steps: int) -> list:
-    """Copies of everything that an environment returns for given actions."""
-    given = [env.reset(seed=seed)]
-    rng = np.random.default_rng(0)
-    for _ in range(steps):
-        action = rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
-        given.append(env.step(action))
-    return copy.deepcopy(given)
-
-
 def assert_same(left, right, tolerance: float) -> None:
     """The same structure, keys, types and shapes, and nearly the same numbers."""
     assert type(left) is type(right)
@@ -235,20 +225,6 @@ def test_copies_and_pickles_continue_the_episodes(vectorised, single):
             assert data_equivalence(twin.step(action), expected, exact=True)
             assert data_equivalence(twin.render(), env.render(), exact=True)
             twin.close()
-
-
-def test_wrappers_work_on_the_vector(vectorised):
-    """The observations and rewards of Gymnasium's wrappers on its own vector."""
-    wrappers = gymnasium.wrappers.vector
-
-    def wrap(env):
-        env = wrappers.NormalizeObservation(wrappers.RecordEpisodeStatistics(env))
-        return wrappers.NormalizeReward(env)
-
-    given = episode(wrap(vectorised), 1, STEPS)
-    expected = episode(wrap(make_sync(AutoresetMode.NEXT_STEP)), 1, STEPS)
-    for left, right in zip(given, expected, strict=True):
-        assert_same(left, right, 1e-2)
 
 
 def test_torchrl_wraps_single_and_vectorised_environments(need):

@@ -1,7 +1,5 @@
 """The robot's model: which MJCF files are refused, and which edits are noticed."""
 
-import itertools
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -12,7 +10,7 @@ from against_c import XML
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics import PhysicsState
-from bounce_mjx.robot.model import find_addresses, load_model
+from bounce_mjx.robot.model import load_model
 
 SERVO_2 = '<position name="act2" joint="Joint2"/>'
 REFUSED = {
@@ -109,39 +107,3 @@ def test_with_a_gear_the_target_is_the_actuators_length(tmp_path):
         mujoco.mj_step(env.mj_model, data, nstep=10)
         after.append(data.qpos[:6].copy())
     np.testing.assert_allclose(*after, atol=1e-7)
-
-
-def dropped(mj_model: mujoco.MjModel, *positions: tuple[float, float, float]):
-    """A run of C in which the arm holds the level paddle and the balls fall from `positions`: the
-    heights [1500, B] of the balls, and the pairs of geoms that touched."""
-    at, data = find_addresses(mj_model), mujoco.MjData(mj_model)
-    data.qpos[at.arm_qpos,] = data.ctrl[at.actuators,] = EnvConfig().default_joint_angles
-    for ball, position in zip(at.balls, positions, strict=True):
-        data.qpos[ball.qpos[:3],] = position
-    heights, touched = [], set()
-    for _ in range(1500):
-        mujoco.mj_step(mj_model, data)
-        heights.append([data.qpos[ball.qpos[2]] for ball in at.balls])
-        touched |= {frozenset(map(int, pair)) for pair in data.contact.geom}
-    return np.array(heights), touched
-
-
-def test_further_balls_bounce_and_touch_each_other(num_balls=3):
-    model = load_model(None, 0.001, num_balls=num_balls)
-    at = find_addresses(model)
-    x, y, z = EnvConfig().ball_init_pos
-    # Each ball falls slower than the paddle returns it, and meets the one below in the air.
-    drops = [(x, y, z - 0.2 + 0.15 * i) for i in range(num_balls)]
-    heights, touched = dropped(model, *drops)
-    geoms = [ball.geom for ball in at.balls]
-    assert frozenset((at.paddle_geom, geoms[0])) in touched
-    assert {frozenset(pair) for pair in itertools.pairwise(geoms)} <= touched
-    assert model.nq == 6 + 7 * num_balls and at.balls[-1].qpos[-1] == model.nq - 1
-    # Apart from the others, each falls and bounces as the ball of the shipped model does.
-    apart = [(x + 0.02 * i, y + 0.05 * (i - 1), z) for i in range(num_balls)]
-    heights, touched = dropped(model, *apart)
-    alone = load_model(None, 0.001)
-    for i, position in enumerate(apart):
-        expected, _ = dropped(alone, position)
-        assert np.ptp(expected[200:]) > 0.2
-        np.testing.assert_allclose(heights[:400, i], expected[:400, 0], atol=1e-3)

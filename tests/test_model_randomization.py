@@ -8,7 +8,7 @@ import pytest
 from mujoco import mjx
 
 from against_c import assert_same_step, c_steps, converged, fused_steps, touching_states
-from bounce_mjx.adapters.randomization import domain_randomize, parameters_of
+from bounce_mjx.adapters.randomization import parameters_of
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics import Control, PhysicsState, make_engine
 from bounce_mjx.physics.edited import edited_model
@@ -160,16 +160,3 @@ def test_values_that_are_traced_are_refused(mj_model, base):
     model, axes = batch_of(base, body_mass=scaled(np.asarray(base.body_mass)))
     with pytest.raises(UserError, match="inside jax.jit"):
         jax.jit(jax.vmap(lambda one: parameters_of(mj_model, base, one), in_axes=(axes,)))(model)
-
-
-def test_the_projects_randomiser_draws_within_its_ranges(mj_model, base):
-    model, axes = domain_randomize(mj_model, base, jax.random.split(jax.random.PRNGKey(0), 32))
-    result = jax.vmap(lambda one: parameters_of(mj_model, base, one), in_axes=(axes,))(model)
-    ball = mj_model.body("ball_link")
-    share = np.asarray(result.entries[f"body_mass[{ball.id}]"]) / ball.mass
-    assert 0.7 <= share.min() < 0.8 and 1.2 < share.max() <= 1.3
-    fields = {name.partition("[")[0] for name in result.entries}
-    assert fields == {
-        *("body_mass", "geom_size", "pair_solref", "opt.gravity"),
-        *("actuator_gainprm", "actuator_biasprm"),
-    }

@@ -19,22 +19,20 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboardX import SummaryWriter
 
-from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.commands import plot as plot_command
 from bounce_mjx.commands import report as report_command
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.reports import page as report_page
-from bounce_mjx.reports.curves import LoggedCurve, group_runs, mean_and_band, read_curves
+from bounce_mjx.reports.curves import group_runs, mean_and_band, read_curves
 from bounce_mjx.reports.figures import (
     curves_figure,
-    evaluation_figure,
 )
 from bounce_mjx.runs.config import TrainConfig, load_config, train_config
 from bounce_mjx.runs.folders import save_config
 from bounce_mjx.runs.progress import load_results
-from bounce_mjx.task import Curve, Recording, term_names
+from bounce_mjx.task import Curve, term_names
 from bounce_mjx.tasks.bounce import Bounce, BounceReward
 from bounce_mjx.training.callbacks import Event, WeightsAndBiases
 from bounce_mjx.training.log import TensorBoardLog
@@ -158,64 +156,6 @@ def test_the_curves_are_in_the_displayed_units(runs: list[Path]) -> None:
         np.testing.assert_allclose(line.get_ydata(), curve.scale * np.array([*values.values()]))
         assert axes.get_title() == curve.title
     assert "cm" in CURVES[2].title and CURVES[2].scale == 100.0
-
-
-def test_evaluations_are_points_on_the_curves(runs: list[Path]) -> None:
-    """In the units of the curve."""
-    (group,) = group_runs(runs[3:])
-    points = {
-        "results/mean_apex_error_m": LoggedCurve(np.array([3000, 5000]), np.array([0.03, 0.02])),
-    }
-    run = group.runs[0]._replace(curves=group.runs[0].curves | points)
-    figure = curves_figure([group._replace(runs=[run])])
-    shown = [
-        (x, y)
-        for line in figure.axes[2].lines
-        if line.get_marker() == "o"
-        for x, y in zip(line.get_xdata(), line.get_ydata(), strict=True)
-    ]
-    assert shown == [(3000, 3.0), (5000, 2.0)]
-    words = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert "evaluation, without noise" in words
-    (without,) = curves_figure([group]).legends
-    assert "evaluation, without noise" not in [text.get_text() for text in without.get_texts()]
-
-
-def test_an_evaluation_is_drawn_from_its_recording() -> None:
-    """A recording of 4 s at 100 Hz of two invented episodes, the second of which ends after 3 s."""
-    env = BounceBall(EnvConfig(episode_seconds=4.0))
-    ball = np.zeros((400, 3, 2), np.float32)
-    ball[:, 2] = np.linspace(0.1, 0.7, 400)[:, None]
-    bounced, running = np.zeros((400, 2), bool), np.ones((400, 2), bool)
-    bounced[[100, 250, 350]] = True
-    running[300:, 1] = False
-    recording = Recording(
-        joint_angles=np.zeros((400, 6, 2), np.float32),
-        ball=ball,
-        paddle=np.zeros((400, 3, 2), np.float32),
-        command={"target_height": np.full((400, 2), 0.5, np.float32)},
-        task={
-            "bounced": bounced.astype(np.float32),
-            "apex": np.full((400, 2), 0.53, np.float32),
-        },
-        running=running,
-    )
-    heights, errors, hits = evaluation_figure(env, recording).axes
-
-    line = next(line for line in heights.lines if line.get_label() == "ball")
-    np.testing.assert_allclose(line.get_xdata(), 0.01 * np.arange(1, 401))
-    np.testing.assert_allclose(line.get_ydata(), ball[:, 2, 0])
-    level = next(line for line in heights.lines if line.get_label() == "target 0.50 m")
-    np.testing.assert_allclose(level.get_ydata(), 0.5)
-    # Three bounces after 2 s and before the end of the episode, all with the apex 3 cm too high.
-    counts = [bar for bar in errors.patches if bar.get_height()]
-    (bar,) = counts
-    assert bar.get_height() == 3
-    assert bar.get_x() <= 3.0 <= bar.get_x() + bar.get_width()
-    (outline,) = hits.patches
-    assert sorted((outline.get_width(), outline.get_height())) == pytest.approx([10.0, 13.0])
-    points = next(line for line in hits.lines if line.get_marker() == ".")
-    assert len(points.get_xdata()) == 3
 
 
 @pytest.mark.slow

@@ -28,7 +28,6 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from bounce_mjx.commands import train as train_command
-from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import judge
 from bounce_mjx.learning.policy import make_networks
@@ -40,7 +39,6 @@ from bounce_mjx.runs.folders import (
     latest_checkpoint,
     stored_checkpoints,
 )
-from bounce_mjx.runs.lock import lock_run
 from bounce_mjx.runs.reading import read_actor, read_policy, read_record
 from bounce_mjx.runs.writing import save_checkpoint
 from bounce_mjx.tasks.bounce_ball import BounceBall
@@ -261,25 +259,6 @@ def test_killed_at_any_moment(tmp_path: Path, straight: Path) -> None:
 
 
 # One writer
-
-
-def test_a_lock_ends_with_its_process(run: Path) -> None:
-    code = (
-        "import sys, time\n"
-        "from pathlib import Path\n"
-        "from bounce_mjx.runs.lock import lock_run\n"
-        "with lock_run(Path(sys.argv[1])):\n"
-        "    print('locked', flush=True)\n"
-        "    time.sleep(100)\n"
-    )
-    command = [sys.executable, "-c", code, str(run)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as holder:
-        assert holder.stdout.readline() == "locked\n"
-        with pytest.raises(UserError, match="is in use"), lock_run(run):
-            pass
-        holder.kill()
-    with lock_run(run):
-        pass
 
 
 # Readers

@@ -201,18 +201,6 @@ def test_one_step_in_random_worlds_is_mujocos(env) -> None:
     assert_same_step(fused_steps(model, parameters, states), expected)
 
 
-def test_the_links_keep_their_masses(written) -> None:
-    config = load_config(written["ur5e"]).env
-    model = BounceBall(config).mj_model
-    plain = mujoco.MjModel.from_xml_path(str(locate(config.mjcf)))
-    for name in joint_names(model)[:-1]:
-        body, own = model.joint(name).bodyid, plain.joint(name).bodyid
-        np.testing.assert_allclose(model.body_mass[body], plain.body_mass[own])
-        np.testing.assert_allclose(model.body_inertia[body], plain.body_inertia[own])
-    wrist = [m.body_mass[m.joint("wrist_3_joint").bodyid].item() for m in (model, plain)]
-    assert np.isclose(wrist[0] - wrist[1], config.robot.paddle.mass)
-
-
 @pytest.mark.parametrize("dt", [0.001, 0.002])
 def test_servos_step_without_overshoot_and_hold_the_arm(env, dt) -> None:
     """A step of every target overshoots little, and ends at rest, at physics steps up to 2 ms; the

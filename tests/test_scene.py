@@ -11,10 +11,7 @@ import pytest
 import viewing
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.resources import resource_path
-from bounce_mjx.task import term_names
 from bounce_mjx.tasks.bounce_rewards import BounceReward
-from bounce_mjx.training.watch import results_list
-from bounce_mjx.viewers.browser import reward_bars
 from bounce_mjx.viewers.controls import direction
 from bounce_mjx.viewers.display import (
     Display,
@@ -23,7 +20,7 @@ from bounce_mjx.viewers.display import (
     marker_body,
 )
 from bounce_mjx.viewers.scene import _grid as scene_grid
-from viewing import NAN, at_height, evaluated
+from viewing import NAN, at_height
 
 
 @pytest.fixture(scope="module")
@@ -92,15 +89,6 @@ ASPECTS = (0.46, 0.85, 2.0)
 HOMES = ((0.58856, 0.0, 0.05), (0.67, 0.0, 0.4), (0.0, 0.55, 0.25), (-0.6, 0.0, 0.3))
 
 
-def test_on_a_phone_the_panel_leaves_the_arm_and_the_ball_visible() -> None:
-    """It covers the lower three fifths."""
-    home = np.array(HOMES[0])
-    parts = np.array([(-0.1, 0.0, 0.0), home + (0.05, 0.0, 0.0), home + (0.0, 0.0, 0.8)])
-    points = projected(parts, home, 390 / 844, np.zeros((1, 3)))
-    assert np.all(np.abs(points[:, 0]) < 1.0)
-    assert np.all((points[:, 1] > 0.2) & (points[:, 1] < 1.0))
-
-
 @pytest.mark.parametrize("home", HOMES, ids=["default", "raised", "turned", "behind"])
 def test_the_camera_sees_every_robot(home) -> None:
     """Base, paddle, and the ball at the highest target."""
@@ -129,20 +117,3 @@ def test_pushes_follow_the_camera(case) -> None:
     view, towards, expected = case
     expected = np.array(expected) / np.linalg.norm(expected)
     np.testing.assert_allclose(direction(towards, np.array(view)), expected, atol=1e-12)
-
-
-def test_the_results_of_an_evaluation_are_shown() -> None:
-    text = results_list(evaluated(True, False, None), 3_000_000)
-    assert "evaluation at 3,000,000 steps" in text and "1 of 2 judged results met" in text
-    assert [text.count(mark) for mark in ("&#10003;", "&#10007;", "<td>-</td>")] == [1, 1, 1]
-
-
-def test_reward_bars_show_every_term() -> None:
-    """The bars show all terms, however many there are."""
-    terms = dict.fromkeys(term_names(BounceReward), 0.0) | {"position": 2.0, "alignment": -1.25}
-    terms["sixteenth_term"] = 0.5
-    text = reward_bars(terms)
-    for name in terms:
-        assert text.count(f">{name.replace('_', ' ')}<") == 1
-    assert ">2.00<" in text and ">-1.25<" in text and "sum 1.25" in text
-    assert "-0.00" not in reward_bars({"a": -0.001})

@@ -124,15 +124,6 @@ def test_runs_contain_the_events_under_test(unlimited, limited):
     assert results.truncated.sum() == 2 * NUM_ENVS and not results.terminated.any()
 
 
-def test_observation_is_the_next_state_and_differs_from_the_final_one_only_at_ends(unlimited):
-    results, states = unlimited
-    ended = results.terminated | results.truncated
-    for t in range(STEPS):
-        np.testing.assert_array_equal(results.observation[t], vector.observe(states[t + 1]))
-    same = (results.observation == results.final_observation).all(axis=2)
-    np.testing.assert_array_equal(same, ~ended)
-
-
 def test_termination_at_the_limit_is_not_a_time_out(unlimited, reset, step, actions):
     ended_at, i = np.argwhere(unlimited[0].terminated)[0]
     episode_steps = ended_at + 1
@@ -141,19 +132,6 @@ def test_termination_at_the_limit_is_not_a_time_out(unlimited, reset, step, acti
     one_less, _ = run(reset, step, actions[: episode_steps + 1], int(ended_at))
     assert one_less.truncated[ended_at - 1, i] and not one_less.terminated[ended_at - 1, i]
     assert not one_less.terminated[ended_at, i]
-
-
-def test_run_depends_on_the_reset_keys(unlimited, reset, step, actions):
-    """The runs differ only after the first end of an episode: before it the keys are not used."""
-    ended_at, i = np.argwhere(unlimited[0].terminated)[0]
-    state = unlimited[1][ended_at]
-    _, again = step(state, actions[ended_at], STEP_KEYS[ended_at], NO_LIMIT)
-    _, other = step(state, actions[ended_at], jax.random.key(99), NO_LIMIT)
-    np.testing.assert_array_equal(again.observation, unlimited[0].observation[ended_at])
-    np.testing.assert_array_equal(other.final_observation, again.final_observation)
-    assert np.all(other.observation[i, :6] != again.observation[i, :6])
-    others = np.flatnonzero(~unlimited[0].terminated[ended_at])
-    np.testing.assert_array_equal(other.observation[others], again.observation[others])
 
 
 def test_nan_action_ends_one_episode_and_leaves_the_others_alone(reset, step, actions):
