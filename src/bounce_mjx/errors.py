@@ -60,8 +60,13 @@ def exit_on_user_error() -> Iterator[None]:
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         # Not where a test or a notebook has put its own stream.
-        if stream is getattr(sys, f"__{name}__"):
-            setattr(sys, name, _lasting(stream))
+        if stream is not None and stream is getattr(sys, f"__{name}__"):
+            stream.flush()
+            output = io.BufferedWriter(_Output(stream.fileno(), "w", closefd=False))
+            lasting = io.TextIOWrapper(
+                output, stream.encoding, "backslashreplace", line_buffering=True
+            )
+            setattr(sys, name, lasting)
     try:
         yield
     except UserError as error:
@@ -82,20 +87,6 @@ class _Output(io.FileIO):
             # Also for the output of C++.
             os.dup2(os.open(os.devnull, os.O_WRONLY), self.fileno())
             return len(data)
-
-
-def _lasting(stream: io.TextIOWrapper | None) -> io.TextIOWrapper:
-    """A stream on an `_Output`. None stands for one that was closed at the start, as by `>&-`; the
-    lowest free descriptor is its own."""
-    if stream is None:
-        return open(os.open(os.devnull, os.O_WRONLY), "w", encoding="utf-8")
-    stream.flush()
-    return io.TextIOWrapper(
-        io.BufferedWriter(_Output(stream.fileno(), "w", closefd=False)),
-        encoding=stream.encoding,
-        errors="backslashreplace" if stream.errors == "strict" else stream.errors,
-        line_buffering=stream.line_buffering or stream.write_through,
-    )
 
 
 def on_one_line(text: str) -> str:

@@ -18,12 +18,11 @@ Result = TypeVar("Result")
 INTERRUPTED = 130
 """Exit status of a process that Ctrl-C ended, by the shells' convention."""
 
-# Windows does not interrupt an unlimited wait.
 _POLL_SECONDS = 0.1
-# Launchers forward a Ctrl-C to a process that has already received it from the terminal.
+# Launchers forward a Ctrl-C to a process that has already received it from the terminal, and a
+# terminal that goes away is reported by its shell and by the kernel.
 _SAME_REQUEST_SECONDS = 0.5
-# Windows has no SIGHUP.
-_SIGNALS = [getattr(signal, n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, n)]
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Interrupted(KeyboardInterrupt):
@@ -71,11 +70,6 @@ class StopRequest:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
 
-    def check(self) -> None:
-        """Raises `Interrupted` if a signal has come."""
-        if self.requested:
-            raise Interrupted
-
     def wait_for(self, future: concurrent.futures.Future) -> bool:
         """Waits until the future is done, and returns True; returns False as soon as a stop is
         requested."""
@@ -87,12 +81,10 @@ class StopRequest:
     def _handle(self, number: int, frame: types.FrameType | None) -> None:
         if self._requested_at is None:
             self._requested_at = time.monotonic()
-        # A terminal that goes away asks only once, but its shell and the kernel both say so.
-        elif number in (signal.SIGINT, signal.SIGTERM):
-            if time.monotonic() - self._requested_at > _SAME_REQUEST_SECONDS:
-                if callable(previous := self._previous.get(number)):
-                    previous(number, frame)
-                os._exit(128 + number)
+        elif time.monotonic() - self._requested_at > _SAME_REQUEST_SECONDS:
+            if callable(previous := self._previous.get(number)):
+                previous(number, frame)
+            os._exit(128 + number)
 
 
 def in_daemon_thread(function: Callable[[], Result]) -> concurrent.futures.Future[Result]:

@@ -10,7 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from bounce_mjx.lazy import silence_mjx
+from bounce_mjx.lazy import import_mjx
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS, PhysicsParameters, gives
 from bounce_mjx.robot.model import Addresses, BallAddresses, find_addresses
 
@@ -210,11 +210,8 @@ def _friction(m: mujoco.MjModel, parameters: PhysicsParameters) -> Iterator[Feat
 
 def _refused_by_mjx(mj_model: mujoco.MjModel) -> str | None:
     """MJX's own refusal."""
-    silence_mjx()
-    from mujoco import mjx
-
     try:
-        mjx.put_model(mj_model)
+        import_mjx().put_model(mj_model)
     except NotImplementedError as error:
         return f"a feature of the MJCF ({error})".replace(".)", ")")
     return None

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import jax
 
-from bounce_mjx.files import private_folder
 from bounce_mjx.world.config import WorldConfig
 
 LOOPS = "--xla_backend_extra_options"
@@ -37,8 +36,8 @@ def cache_compilations() -> None:
     if jax.config.jax_compilation_cache_dir is None:
         try:
             caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-            # Compiled programs are code, which no other user may write.
-            folder = private_folder(private_folder(caches / "bounce_mjx") / "jax")
+            folder = caches / "bounce_mjx" / "jax"
+            folder.mkdir(parents=True, exist_ok=True)
             jax.config.update("jax_compilation_cache_dir", str(folder))
         except OSError as error:
             print(

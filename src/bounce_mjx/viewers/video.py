@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import MissingPackage, UserError, install_command
 from bounce_mjx.files import new_file
-from bounce_mjx.interrupt import StopRequest
+from bounce_mjx.interrupt import Interrupted, StopRequest
 from bounce_mjx.runs.files import writable
 from bounce_mjx.viewers.display import Trail
 from bounce_mjx.viewers.offscreen import Renderer, choose_opengl
@@ -108,7 +108,8 @@ class VideoWriter:
                 # A broken pipe means that the encoder failed; it prints the reason.
                 with contextlib.suppress(BrokenPipeError), StopRequest() as stop:
                     for picture in shown:
-                        stop.check()
+                        if stop.requested:
+                            raise Interrupted
                         encoder.stdin.write(picture.tobytes())
                 _, errors = encoder.communicate()
                 if encoder.returncode:

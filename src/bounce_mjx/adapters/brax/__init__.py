@@ -6,10 +6,10 @@ Then `brax.envs.get_environment("bounce_ball", episode_seconds=30)` returns a
 """
 
 from bounce_mjx.errors import needed
-from bounce_mjx.lazy import silence_mjx
+from bounce_mjx.lazy import import_mjx
 
 with needed("brax", "bounce_mjx[brax]"):
-    silence_mjx()
+    import_mjx()
     import brax.envs
 
 from bounce_mjx.adapters.brax.checkpoints import load_brax_policy

@@ -1,8 +1,9 @@
 """Registers the environments with Gymnasium, before or after Gymnasium is imported."""
 
+import importlib.abc
+import importlib.machinery
 import sys
-
-from bounce_mjx.lazy import wrap_import
+from collections.abc import Sequence
 
 ENV_ID = "bounce_mjx/BounceBall-v0"
 """Name of the specification's environment."""
@@ -24,7 +25,22 @@ def register_when_imported() -> None:
     if "gymnasium" in sys.modules:
         register()
     else:
-        wrap_import("gymnasium", lambda load, module: (load(module), register()))
+        sys.meta_path.insert(0, _Finder())
+
+
+class _Finder(importlib.abc.MetaPathFinder):
+    """Finds Gymnasium, after whose import the environments are registered."""
+
+    def find_spec(
+        self, name: str, path: Sequence[str] | None, target: object = None
+    ) -> importlib.machinery.ModuleSpec | None:
+        if name != "gymnasium":
+            return None
+        spec = importlib.machinery.PathFinder.find_spec(name, path)
+        if spec is not None and spec.loader is not None:
+            load = spec.loader.exec_module
+            spec.loader.exec_module = lambda module: (load(module), register())
+        return spec
 
 
 def register() -> None:

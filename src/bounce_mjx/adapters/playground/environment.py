@@ -15,7 +15,7 @@ from bounce_mjx.config.validation import validate
 from bounce_mjx.env import env as core
 from bounce_mjx.env.env import Env, EnvState
 from bounce_mjx.errors import needed
-from bounce_mjx.lazy import silence_mjx
+from bounce_mjx.lazy import import_mjx
 from bounce_mjx.physics import PhysicsState
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.arm import locate
@@ -24,9 +24,8 @@ from bounce_mjx.tasks.registry import DEFAULT, task_config
 from bounce_mjx.viewers.offscreen import choose_opengl
 
 with needed("MuJoCo Playground", "playground<1"):
-    silence_mjx()
+    mjx = import_mjx()
     from ml_collections import config_dict
-    from mujoco import mjx
     from mujoco_playground import MjxEnv, State
 
 ENV_NAME = "BounceBall"
