@@ -1,6 +1,5 @@
-"""Writing of checkpoints with orbax, in a background thread."""
+"""Writing of checkpoints with orbax."""
 
-import concurrent.futures
 import contextlib
 import logging
 import os
@@ -8,7 +7,7 @@ import re
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,50 +22,6 @@ from bounce_mjx.runs.reading import POLICY, RECORD
 
 # Where orbax moves the checkpoints that are not kept any more.
 _REPLACED = "replaced"
-
-
-Write = Callable[[], None]
-
-
-class Saving:
-    """Writes a run in a background thread while it is entered. What could not be saved is lost: the
-    next save has newer data."""
-
-    def __init__(self, run: Path):
-        self._run = run
-        # One thread, so that the saves keep their order.
-        self._pool = concurrent.futures.ThreadPoolExecutor(1)
-        self._writing = self._pool.submit(lambda: None)
-        self._problem: str | None = None
-
-    def __enter__(self) -> "Saving":
-        return self
-
-    def __exit__(self, *_) -> None:
-        self._pool.shutdown()
-
-    def start(self, writes: Sequence[Write]) -> None:
-        """Starts a save; those after the first that fails are left out."""
-
-        def write_all() -> None:
-            for write in writes:
-                write()
-
-        self._writing = self._pool.submit(write_all)
-
-    def problem(self, wait: bool = True) -> str | None:
-        """Reason for the last save's failure, as part of a sentence; None if it succeeded.
-
-        Args:
-          wait: whether to wait for a save in progress; otherwise the result is of the save before.
-        """
-        if wait or self._writing.done():
-            self._problem = None
-            try:
-                self._writing.result()
-            except OSError as error:
-                self._problem = f"{self._run} cannot be written ({error.strerror})"
-        return self._problem
 
 
 def write_run(config: TrainConfig, steps: int, policy: Policy) -> Path:

@@ -55,7 +55,8 @@ def points_of(report: Report) -> dict[str, float]:
     """The points of an evaluation's curves."""
     values = {result.name.replace(" ", "_"): result.value for result in report.results}
     values |= report.details
-    return {f"results/{name}": value for name, value in values.items() if value is not None}
+    known = {name: x for name, x in values.items() if x is not None and math.isfinite(x)}
+    return {f"results/{name}": x for name, x in known.items()}
 
 
 class WeightsAndBiases:

@@ -11,7 +11,6 @@ import shlex
 import shutil
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,41 +22,26 @@ import bounce_mjx
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.evaluation.results import Report
-from bounce_mjx.files import UNFINISHED
 from bounce_mjx.interrupt import DaemonThreads, Interrupted, StopRequest
 from bounce_mjx.learning.policy import Policy
-from bounce_mjx.runs import folders, writing
+from bounce_mjx.runs import folders, reading, writing
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.files import to_json, writable, write_atomically
 from bounce_mjx.runs.lock import lock_run
 from bounce_mjx.runs.progress import RESULTS_FILE, Progress
-from bounce_mjx.runs.reading import (
-    NETWORKS,
-    POLICY,
-    TRAINING,
-    read_policy,
-    read_record,
-    read_training,
-)
-from bounce_mjx.runs.writing import Saving, Write
 from bounce_mjx.tasks.registry import is_file
 from bounce_mjx.training import hosts
 from bounce_mjx.training.callbacks import Callback, Event, block_means, call_all, points_of
-from bounce_mjx.training.console import Reporter, say
+from bounce_mjx.training.console import block_line, evaluation_line, say
 from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.first_block import fault_of
 from bounce_mjx.training.log import TensorBoardLog
 from bounce_mjx.training.ppo_trainer import PPOTrainer
-from bounce_mjx.training.trainer import (
-    Snapshot,
-    Trainer,
-    in_whole_blocks,
-    iterations_per_block,
-)
+from bounce_mjx.training.trainer import Snapshot, Trainer, in_whole_blocks, iterations_per_block
 from bounce_mjx.training.warm_start import read_start
 
 # Imported by name during the compilation, because these imports take half a second each.
-CHECKPOINT_MODULE, REPORT_MODULE = "orbax.checkpoint", "bounce_mjx.reports.page"
+_SLOW_MODULES = "orbax.checkpoint", "bounce_mjx.reports.page"
 
 
 @dataclasses.dataclass
@@ -75,14 +59,21 @@ class SeedRun:
     """The policy of the best checkpoint, as NumPy arrays, if this process trained it."""
     final: Report | None = None
     """Evaluation of the best checkpoint on fresh resets, after the end of the training."""
-    saved: tuple[Report | None, int, Policy | None] = (None, 0, None)
-    """Report, steps and policy of the best checkpoint on the disk."""
 
     @property
     def report(self) -> Report | None:
         """The figures of the best checkpoint; None if the seed diverged before its first
         evaluation."""
         return self.final or self.progress.best
+
+    def recall_best(self) -> None:
+        """Takes for the best what the best checkpoint on the disk says: a policy that could not be
+        saved is not the best one, and a process may have been killed before it wrote its state."""
+        self.best_policy, self.progress.best, self.progress.best_steps = None, None, 0
+        with contextlib.suppress(UserError):
+            best = reading.read_record(folders.best_checkpoint(self.run)).progress
+            stored = Progress.model_validate(best)
+            self.progress.best, self.progress.best_steps = stored.best, stored.best_steps
 
 
 class TrainingStopped(Interrupted):
@@ -164,7 +155,8 @@ class Job:
         self.steps = 0
         self.ended = False
         self.logs: dict[Path, TensorBoardLog] = {}
-        self.starting: concurrent.futures.Future[None] | None = None
+        self.opening = self.saving = self.pool.submit(lambda: None)
+        self.could_save = True
 
     def open(self) -> None:
         """Makes the folder of a new run, or reads the resumed one, and says what is trained."""
@@ -179,35 +171,40 @@ class Job:
         self.stack.push(self._remove_unstarted)
         if hosts.is_leader():
             self.stack.enter_context(lock_run(self.run))
-        seconds = self.clock.seconds
-        self.members = [SeedRun(self.run, config, seconds)]
+        self.stack.callback(lambda: concurrent.futures.wait([self.saving]))
+        alone = {self.run: config}
         if config.num_seeds > 1:
             seeds = range(config.seed, config.seed + config.num_seeds)
-            alone = [config.model_copy(update={"seed": seed, "num_seeds": 1}) for seed in seeds]
-            runs = [folders.seed_folder(self.run, seed) for seed in seeds]
-            self.members = [SeedRun(*each, seconds) for each in zip(runs, alone, strict=True)]
+            alone = {
+                folders.seed_folder(self.run, seed): config.model_copy(
+                    update={"seed": seed, "num_seeds": 1}
+                )
+                for seed in seeds
+            }
+        self.members = [SeedRun(*each, self.clock.seconds) for each in alone.items()]
         if self.resume is not None:
             self._read_resumed()
-        configs = {self.run: config} | {member.run: member.config for member in self.members}
-        for folder, own in configs.items() if hosts.is_leader() else ():
+        for folder, own in ({self.run: config} | alone).items() if hosts.is_leader() else ():
             # A new run has its own config.
             if self.resume is not None or folder != self.run:
                 with writable(folder, "make room there or make it writable"):
                     folder.mkdir(exist_ok=True)
                     folders.save_config(folder, own)
-        self.saving = self.stack.enter_context(Saving(self.run))
         mesh = self.trainer.mesh
         self.device = mesh.devices.flat[0].device_kind
         if mesh.size > 1:
             self.device = f"{mesh.size} x {self.device}"
-        say(self.console, f"physics: {self.env.engine.name} ({self.env.engine.reason})")
+        self.say(f"physics: {self.env.engine.name} ({self.env.engine.reason})")
         for term in config.env.unseen_noise:
-            say(self.console, f"warning: the policy does not see what {term} changes")
-        say(self.console, f"device: {self.device}  run: {self.run}")
+            self.say(f"warning: the policy does not see what {term} changes")
+        self.say(f"device: {self.device}  run: {self.run}")
         bound = "at most " if config.stop_when_solved else ""
-        blocks = f"in blocks of {self.block_steps:,}"
-        say(self.console, f"steps: {bound}{config.total_steps:,}, {blocks}")
+        self.say(f"steps: {bound}{config.total_steps:,}, in blocks of {self.block_steps:,}")
         self.clock.lap("setup")
+
+    def say(self, line: str) -> None:
+        """Prints a line."""
+        say(self.console, line)
 
     @property
     def _go_on(self) -> str:
@@ -218,7 +215,7 @@ class Job:
 
     def failure(self, error: jax.errors.JaxRuntimeError) -> str:
         """What a device's failure means to the user, once the last state is saved."""
-        self.saving.problem()
+        concurrent.futures.wait([self.saving])
         reason = shorten(reason_of(error), 200)
         if reason.startswith("RESOURCE_EXHAUSTED"):
             envs = f"{self.config.ppo.num_envs:,} environments"
@@ -238,30 +235,24 @@ class Job:
     def _remove_unstarted(self, error: type[BaseException] | None, *_) -> None:
         """Removes the folder of a new run without a checkpoint or a block that can be trained."""
         if error is not None and not self.keeps_folder and hosts.is_leader():
-            if self.starting is not None:
-                # A log that is opened later would make the folder again.
-                concurrent.futures.wait([self.starting])
+            # A log that is opened later would make the folder again.
+            concurrent.futures.wait([self.opening])
             shutil.rmtree(self.run, ignore_errors=True)
 
     def _read_resumed(self) -> None:
         folders.check_links(self.run)
         folders.refuse_brackets(self.run)
-        if hosts.is_leader():
-            # What a process that was killed was writing.
-            for path in self.run.rglob(f"{UNFINISHED}*"):
-                path.unlink(missing_ok=True)
         latest = folders.latest_checkpoint(self.run)
-        self.state, record = read_training(latest, self.trainer.state_template())
+        self.state, record = reading.read_training(latest, self.trainer.state_template())
         self.steps = record.steps
         evaluated = record.progress.get("seeds", [record.progress])
         for member, plain in zip(self.members, evaluated, strict=True):
-            member.progress = _resumed_progress(member.run, plain)
-            member.saved = (member.progress.best, member.progress.best_steps, None)
+            member.progress = Progress.model_validate(plain)
+            member.recall_best()
         solved = self.config.stop_when_solved and self._is_solved()
         if self._is_done() or solved:
             met = "has met all results" if solved else "has been trained to its end"
-            end = f"{self.run} {met}, {self.steps:,} steps"
-            say(self.console, f"{end}; add --total-steps N to train on")
+            self.say(f"{self.run} {met}, {self.steps:,} steps; add --total-steps N to train on")
 
     def compile(self, make_evaluators: Callable[..., Evaluators]) -> None:
         """Compiles the programs that training needs to start. Evaluations are compiled, logs are
@@ -274,9 +265,8 @@ class Job:
             compiling = self.trainer.compile(threads)
             mesh = self.trainer.mesh
             self.evaluators = make_evaluators(self.config, self.env, mesh, threads)
-            self.starting = self.pool.submit(self._start_logs)
-            for module in (CHECKPOINT_MODULE, REPORT_MODULE):
-                self.starting.add_done_callback(lambda _, m=module: importlib.import_module(m))
+            self.opening = self.pool.submit(self._open_logs)
+            self.opening.add_done_callback(lambda _: [*map(importlib.import_module, _SLOW_MODULES)])
             compiling.result()
 
         threads = DaemonThreads()
@@ -286,31 +276,27 @@ class Job:
                 raise Interrupted
         compiling.result()
         # A callback may refuse the run.
-        self.starting.result()
+        self.opening.result()
         self.stack.callback(call_all, self.callbacks, "close")
-        # A process that finds its programs in the cache waits here for a process that compiles
-        # them; otherwise the exchange between devices would time out after 30 s.
-        hosts.any_of(False)
+        if jax.process_count() > 1:
+            # A process that finds its programs in the cache waits here for a process that compiles
+            # them; otherwise the exchange between devices would time out after 30 s.
+            self.evaluators.wait()
+            hosts.any_of(False)
         self.trainer.start(self.state)
         self.state = None
         if self.first is not None:
             self.trainer.warm_start(*self.first)
-        reporter = Reporter(self.console, self.config, self.steps)
-        self.reporter = self.stack.enter_context(reporter)
-        self.stack.callback(self._flush)
         self.clock.lap("compile")
+        self.started, self.first_step = time.monotonic(), self.steps
 
-    def _start_logs(self) -> None:
+    def _open_logs(self) -> None:
         """Opens a log for each seed, and tells the callbacks; not where nothing is written."""
         for member in self.members if hosts.is_leader() else ():
-            log = self.logs[member.run] = TensorBoardLog(member.run)
-            log.start(member.config, None if self.resume is None else self.steps)
+            resumed = None if self.resume is None else self.steps
+            self.logs[member.run] = TensorBoardLog(member.run)
+            self.logs[member.run].start(member.config, resumed)
             call_all(self.callbacks, "start", member.run, member.config)
-
-    def _flush(self) -> None:
-        """Writes everything logged so far to the logs' files."""
-        for log in self.logs.values():
-            log.flush()
 
     def _tell(self, events: Sequence[Event]) -> None:
         """Logs an event of each seed, and tells the callbacks."""
@@ -336,14 +322,15 @@ class Job:
           TrainingStopped: a stop was requested.
         """
         stopping = self._stopping()
-        if stopping and not (self.resume or self.steps or self._evaluated()):
-            jax.distributed.shutdown()
-            raise Interrupted
-        if stopping and not self._evaluated():
+        is_run = self.resume is not None or self.steps > 0 or self._is_evaluated()
+        if is_run and stopping and not self._is_evaluated():
             self._save(self.trainer.snapshot(), {})
-        self._wait_until_saved()
+        if is_run:
+            self._wait_until_saved()
         evaluated = not stopping and self._evaluate_best()
         jax.distributed.shutdown()
+        if not is_run:
+            raise Interrupted
         if not evaluated:
             where = "" if stopping else ", before the final evaluation"
             raise TrainingStopped(f"stopped after {self.steps:,} steps{where}; {self._go_on}")
@@ -357,7 +344,7 @@ class Job:
     def _is_solved(self) -> bool:
         return all(member.progress.solved for member in self._healthy())
 
-    def _evaluated(self) -> bool:
+    def _is_evaluated(self) -> bool:
         return all(member.progress.has(self.steps) for member in self._healthy())
 
     def _is_done(self) -> bool:
@@ -369,7 +356,7 @@ class Job:
         trained = self.steps > 0 or self.first is not None
         at_evaluation = trained and (done or self.steps % self.eval_steps == 0)
         nothing = any(member.progress.best is None for member in self._healthy())
-        return (at_evaluation and not self._evaluated()) or (done and nothing)
+        return (at_evaluation and not self._is_evaluated()) or (done and nothing)
 
     def _evaluate(self) -> bool:
         """Evaluates and saves; returns False if a stop was requested meanwhile."""
@@ -382,7 +369,8 @@ class Job:
             for i, member in enumerate(self.members)
             if member.progress.fault is None
         ]
-        self.reporter.evaluation(self.steps, [report for *_, report in evaluated])
+        shown = [report for *_, report in evaluated]
+        self.say(evaluation_line(self.config.num_seeds, self.steps, shown))
         policies = snapshot.policies
         self._tell(
             [
@@ -390,12 +378,9 @@ class Job:
                 for i, member, report in evaluated
             ]
         )
-        # A policy that could not be saved is not the best one.
-        lost = hosts.any_of(self.saving.problem() is not None)
-        for member in self.members:
-            kept = member.progress.best, member.progress.best_steps, member.best_policy
-            member.saved = member.saved if lost else kept
-            member.progress.best, member.progress.best_steps, member.best_policy = member.saved
+        if hosts.any_of(self._saving_problem() is not None):
+            for member in self.members:
+                member.recall_best()
         seconds, scores = sum(self.clock.seconds.values()), {}
         for i, member, report in evaluated:
             is_best = member.progress.improves(report, self.steps, seconds)
@@ -412,7 +397,8 @@ class Job:
         evaluated = [member for member in self.members if member.progress.best is not None]
         for member in evaluated:
             if member.best_policy is None:
-                member.best_policy = read_policy(folders.best_checkpoint(member.run), member.config)
+                best = folders.best_checkpoint(member.run)
+                member.best_policy = reading.read_policy(best, member.config)
         # A seed that diverged before its first evaluation has no best policy; another seed's policy
         # takes its place in the batch.
         policies = [member.best_policy or evaluated[0].best_policy for member in self.members]
@@ -422,29 +408,14 @@ class Job:
         for member, report in zip(self.members, reports, strict=True):
             member.final = None if member.progress.best is None else report
         if hosts.is_leader():
-            self.saving.start([w for member in self.members for w in self._results(member)])
+            self.saving = self.pool.submit(self._write_results, self._results())
         self._wait_until_saved()
         return True
-
-    def _wait_until_saved(self) -> None:
-        """
-        Raises:
-          UserError: the end of the training could not be saved.
-        """
-        if problem := self.saving.problem():
-            raise UserError(
-                f"{problem}, so the end of the training is lost; make room, and {self._advice()}"
-            )
-        self.clock.lap("save")
 
     def _wait_for_reports(
         self, evaluate: Callable[[list[Policy]], list[Report]], policies: list[Policy]
     ) -> list[Report] | None:
         """Returns a report of each seed, or None if a stop was requested meanwhile."""
-        if jax.process_count() > 1:
-            # See `compile`.
-            self.evaluators.wait()
-            hosts.any_of(False)
         evaluating = self.pool.submit(evaluate, policies)
         # On several hosts, a process that stopped on its own would keep the others waiting.
         if not self.stop.wait_for(evaluating) and jax.process_count() == 1:
@@ -463,7 +434,7 @@ class Job:
             lambda: self.stop.requested and jax.process_count() == 1,
         )
         if not self.stop.wait_for(block):
-            self.reporter.say("stopping after this block; the same signal again ends it at once")
+            self.say("stopping after this block; the same signal again ends it at once")
         metrics = block.result()
         seconds = time.perf_counter() - started
         if self.steps == 0 and (wrong := fault_of(metrics, self.config)) is not None:
@@ -475,14 +446,18 @@ class Job:
         rate = done * self.config.num_seeds / seconds
         metrics["speed/steps_per_second"] = np.full((self.config.num_seeds, 1), rate)
         means = block_means(metrics)
-        self.reporter.block(self.steps, seconds, means)
+        # At the mean speed so far with its evaluations.
+        share = (self.config.total_steps - self.steps) / (self.steps - self.first_step)
+        left = share * (time.monotonic() - self.started)
+        self.say(block_line(self.config, self.steps, seconds, left, means))
+        if total := int(means["task/non_finite"].sum()):
+            self.say(f"states that were not finite, whose environments were reset: {total:,}")
         points = [
             {name: float(x[i]) for name, x in means.items() if np.isfinite(x[i])}
             for i in range(len(faults))
         ]
         members = zip(self.members, points, strict=True)
         self._tell([Event(member.run, member.config, self.steps, x) for member, x in members])
-        self.reporter.saving_problem(self.saving.problem(wait=False))
         self._check_faults(faults)
         self.clock.lap("train")
 
@@ -502,10 +477,10 @@ class Job:
             where = f"iteration {before + first + 1}"
             member.progress.fault = f"{quantity} became infinite or NaN at {where}"
             if self.config.num_seeds > 1:
-                self.reporter.say(f"seed {member.config.seed} diverged: {member.progress.fault}")
+                self.say(f"seed {member.config.seed} diverged: {member.progress.fault}")
         if self._healthy():
             return
-        self.saving.problem()
+        concurrent.futures.wait([self.saving])
         kept = "no checkpoint had been saved yet"
         with contextlib.suppress(UserError):
             kept = f"the last good checkpoint is {folders.latest_checkpoint(self.run).folder}"
@@ -514,6 +489,26 @@ class Job:
             "start a new run with a lower learning rate or other rewards"
         )
 
+    def _saving_problem(self) -> str | None:
+        """Waits for the last save; why it failed, as part of a sentence. What could not be saved is
+        lost: the next save has newer data."""
+        try:
+            self.saving.result()
+        except OSError as error:
+            return f"{self.run} cannot be written ({error.strerror})"
+        return None
+
+    def _wait_until_saved(self) -> None:
+        """
+        Raises:
+          UserError: the end of the training could not be saved.
+        """
+        if problem := self._saving_problem():
+            raise UserError(
+                f"{problem}, so the end of the training is lost; make room, and {self._advice()}"
+            )
+        self.clock.lap("save")
+
     def _save(self, snapshot: Snapshot, scores: dict[int, tuple[float, ...]]) -> None:
         """Starts to save the state, and with several seeds the policies of some of them.
 
@@ -521,67 +516,69 @@ class Job:
           scores: quality of the policies that were evaluated, by number of the seed; with several
             seeds, of those that are the best of their seed.
         """
-        # A second signal may end the process at any time, so the log must already hold every step
-        # of the checkpoint.
-        self._flush()
         # Each save waits for the one before.
-        self.reporter.saving_problem(self.saving.problem())
-        self.keeps_folder = True
+        problem = self._saving_problem()
+        if problem is not None and self.could_save:
+            meanwhile = "training continues, and saves at its next evaluation"
+            self.say(f"the state is not saved, as {problem}; make room: {meanwhile}")
+        elif problem is None and not self.could_save:
+            self.say("the state is saved again")
+        self.could_save, self.keeps_folder = problem is None, True
         if hosts.is_leader():
-            self.saving.start(self._writes(snapshot, scores))
+            # A copy, because the training reuses its buffers meanwhile.
+            copied = jax.tree.map(np.array, snapshot)
+            plain = [member.progress.model_dump() for member in self.members]
+            arguments = copied, self.steps, plain, scores, self._results()
+            self.saving = self.pool.submit(self._write, *arguments)
         self.clock.lap("save")
 
-    def _writes(self, snapshot: Snapshot, scores: dict[int, tuple[float, ...]]) -> list[Write]:
-        """What writes a state."""
-        # A copy, because the training reuses its buffers meanwhile.
-        policies, state, networks = jax.tree.map(np.array, snapshot)
-        plain = [member.progress.model_dump() for member in self.members]
-        several, writes = len(self.members) > 1, []
-
-        def add(run: Path, config: TrainConfig, *rest: Any) -> None:
-            writes.append(partial(writing.save_checkpoint, run, config, self.steps, *rest))
-
-        for i, member in enumerate(self.members):
-            items = {POLICY: policies[i]}
-            if networks is not None:
-                items[NETWORKS] = networks[i]
-            if not several:
-                items[TRAINING] = state
-            if i in scores or not several:
-                add(member.run, member.config, items, plain[i], scores.get(i, ()))
-            writes += self._results(member)
-        if several:
-            # Last, as it refers to the best policies of the seeds.
+    def _write(
+        self,
+        snapshot: Snapshot,
+        steps: int,
+        progress: list[dict[str, Any]],
+        scores: dict[int, tuple[float, ...]],
+        results: dict[Path, str],
+    ) -> None:
+        policies, state, networks = snapshot
+        networks = networks or [None] * len(policies)
+        items = [
+            {reading.POLICY: policy, reading.NETWORKS: network}
+            for policy, network in zip(policies, networks, strict=True)
+        ]
+        if len(items) == 1:
+            everything = items[0] | {reading.TRAINING: state}, progress[0], scores.get(0, ())
+        else:
+            for i, score in scores.items():
+                member = self.members[i]
+                best = items[i], progress[i], score
+                writing.save_checkpoint(member.run, member.config, steps, *best)
             stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *policies)
-            add(self.run, self.config, {POLICY: stacked, TRAINING: state}, {"seeds": plain})
-        return writes
+            everything = {reading.POLICY: stacked, reading.TRAINING: state}, {"seeds": progress}
+        # Last, as it refers to the best policies of the seeds.
+        writing.save_checkpoint(self.run, self.config, steps, *everything)
+        self._write_results(results)
 
-    def _results(self, member: SeedRun) -> list[Write]:
-        """What writes the seed's results.json; nothing before its first evaluation."""
-        if member.report is None:
-            return []
-        results = member.progress.results(
-            member.report,
-            fresh_resets=member.final is not None,
-            trained_steps=self.steps,
-            seconds=self.clock.seconds,
-            device=self.device,
-            version=bounce_mjx.__version__,
-        )
-        return [partial(write_atomically, member.run / RESULTS_FILE, to_json(results))]
+    def _results(self) -> dict[Path, str]:
+        """The content of each seed's results.json; none before its first evaluation."""
+        return {
+            member.run / RESULTS_FILE: to_json(
+                member.progress.results(
+                    member.report,
+                    fresh_resets=member.final is not None,
+                    trained_steps=self.steps,
+                    seconds=self.clock.seconds,
+                    device=self.device,
+                    version=bounce_mjx.__version__,
+                )
+            )
+            for member in self.members
+            if member.report is not None
+        }
 
-
-def _resumed_progress(run: Path, plain: dict[str, Any]) -> Progress:
-    """The evaluations of a seed before it is resumed. The best checkpoint's own record says which
-    one is the best: with several seeds, the process may have been killed between its save and that
-    of the latest one."""
-    progress = Progress.model_validate(plain)
-    progress.best, progress.best_steps = None, 0
-    with contextlib.suppress(UserError):
-        best = folders.best_checkpoint(run)
-        stored = Progress.model_validate(read_record(best).progress)
-        progress.best, progress.best_steps = stored.best, stored.best_steps
-    return progress
+    def _write_results(self, results: dict[Path, str]) -> None:
+        for path, content in results.items():
+            write_atomically(path, content)
 
 
 class Clock:

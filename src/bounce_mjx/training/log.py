@@ -1,41 +1,29 @@
 """The TensorBoard log of a run."""
 
-import math
 import time
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from bounce_mjx.config.files import dump_config, flat
 from bounce_mjx.reports.tables import results_markdown
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training.callbacks import Event
 
-# Time after which points appear in TensorBoard, s.
-_FLUSH_SECONDS = 10.0
-
 
 class TensorBoardLog:
-    """A log for TensorBoard. What cannot be written, as on a full disk, is lost up to the next
-    `flush` that succeeds.
+    """A log for TensorBoard. What cannot be written, as on a full disk, is lost.
 
     TensorboardX's `SummaryWriter` has a thread, which the first error ends, and then its queue
     blocks for ever.
     """
 
-    def __init__(self, run: Path, suffix: str = ""):
-        """
-        Args:
-          suffix: suffix of the file's name; two logs opened in the same second need different ones.
-        """
+    def __init__(self, run: Path):
         from tensorboardX import event_file_writer, summary
         from tensorboardX.proto import event_pb2
 
         self.summary, self._events = summary, event_pb2
         self._new_writer = event_file_writer.EventsWriter
-        self.run, self._suffix, self._files = run, suffix, 0
-        self._writer, self._flushed = None, time.monotonic()
+        self.run, self._writer = run, None
         run.mkdir(parents=True, exist_ok=True)
         self.flush()
 
@@ -57,16 +45,12 @@ class TensorBoardLog:
             self.add(part, 0)
 
     def __call__(self, event: Event) -> None:
-        """Logs the points of an event, and the table of an evaluation."""
+        """Writes the points of an event, and the table of an evaluation."""
         for name, value in event.metrics.items():
-            if math.isfinite(value):
-                self.add(self.summary.scalar(name, value), event.steps)
+            self.add(self.summary.scalar(name, value), event.steps)
         if event.report is not None:
             self.add(self.summary.text("results", results_markdown(event.report)), event.steps)
-
-    def add_image(self, name: str, pixels: np.ndarray, steps: int) -> None:
-        """Adds a picture [height, width, 3]."""
-        self.add(self.summary.image(name, pixels, dataformats="HWC"), steps)
+        self.flush()
 
     def add(self, summary: Any, steps: int) -> None:
         """Adds a summary as tensorboardX makes it."""
@@ -75,22 +59,18 @@ class TensorBoardLog:
     def flush(self) -> None:
         """Writes everything to the file. A file with a point that is only half written ends there
         for its readers, so that a new one follows it."""
-        self._flushed = time.monotonic()
         try:
             if self._writer is None:
-                number = f".{self._files}" if self._files else ""
-                self._files += 1
-                self._writer = self._new_writer(f"{self.run / 'events'}", self._suffix + number)
+                # Logs that are opened in the same second need different names.
+                self._writer = self._new_writer(f"{self.run / 'events'}", f".{time.time_ns()}")
             self._writer.flush()
         except OSError:
             self._writer = None
 
     def _add(self, **content: Any) -> None:
-        event = self._events.Event(wall_time=time.time(), **content)
         try:
             if self._writer is not None:
+                event = self._events.Event(wall_time=time.time(), **content)
                 self._writer.write_event(event)
         except OSError:
             self._writer = None
-        if time.monotonic() - self._flushed > _FLUSH_SECONDS:
-            self.flush()

@@ -184,7 +184,7 @@ def leave_report(seed: job.SeedRun, console: Console) -> None:
     is already saved, so a failure only prints one line."""
     started = time.perf_counter()
     try:
-        # Imported during the compilation (`job.REPORT_MODULE`).
+        # Imported during the compilation (`Job.compile`).
         from bounce_mjx.reports import figures, page
 
         recording = seed.report.recording
@@ -192,8 +192,9 @@ def leave_report(seed: job.SeedRun, console: Console) -> None:
             recording = page.record_checkpoint(folders.find_checkpoint(seed.run))
         path, evaluation = page.write_report(seed.run, recording)
         # A new file, because the log of the training is already closed.
-        log = TensorBoardLog(seed.run, suffix=".report")
-        log.add_image("evaluation", figures.pixels(evaluation), seed.progress.best_steps)
+        log = TensorBoardLog(seed.run)
+        picture = log.summary.image("evaluation", figures.pixels(evaluation), dataformats="HWC")
+        log.add(picture, seed.progress.best_steps)
         log.flush()
     except Exception as error:
         again = shlex.join([str(seed.run), *job.named_task(seed.config)])
