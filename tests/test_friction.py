@@ -34,7 +34,6 @@ from bounce_mjx.physics import (
     PhysicsState,
     make_engine,
 )
-from bounce_mjx.physics.support import unsupported_feature
 from random_worlds import random_parameters
 
 MODELS = {
@@ -197,8 +196,8 @@ def with_own_friction() -> mujoco.MjModel:
     """Friction in the MJCF of four joints, with impedances and references of all formats."""
     model = mujoco.MjModel.from_xml_string(XML)
     model.dof_frictionloss[:6] = [20.0, 5.0, 0.0, 2.0, 1.0, 0.0]
-    model.dof_solref[:4] = [(0.01, 1.0), (1e-4, 1.0), (0.0, -50.0), (0.03, -1.0)]
-    model.dof_solimp[:3] = [(0.5, 0.9, 0.01, 0.5, 2), (0.99, 0.9, 0, 0.5, 2), (0, 1, 1, 0.5, 2)]
+    model.dof_solref[:4] = [(0.01, 1.0), (1e-4, 1.0), (0.0, -50.0), (0.02, 1.0)]
+    model.dof_solimp[:3] = [(0.5, 0.9, 0.01, 0.5, 2), (0.99, 0.9, 1, 0.5, 2), (0, 1, 1, 0.5, 2)]
     model.dof_solimp[3] = (0.3, 0.3, 0.01, 0.5, 2)
     return model
 
@@ -241,9 +240,8 @@ def sticking_and_sliding(
 
 @pytest.mark.parametrize("name", WORLDS)
 @pytest.mark.usefixtures("float64")
-def test_one_step_with_dry_friction_is_mujocos(name, record_property, tmp_path, monkeypatch):
+def test_one_step_with_dry_friction_is_mujocos(name, record_property):
     """In each state, some of the joints stick, some slide, and some are close to the limit."""
-    monkeypatch.chdir(tmp_path)  # for MuJoCo's log: mixed formats are worth a warning
     make, draws_all = WORLDS[name]
     model, parameters = make(), PhysicsParameters()
     if draws_all is not None:
@@ -277,21 +275,6 @@ def test_dry_friction_follows_its_flag():
     without, _ = c_steps(model, states)
     assert np.abs(without.qvel - expected.qvel).max() > 1e-3
     assert_same_step(fused_steps(model, given, states), without)
-
-
-def test_the_noslip_solver_is_refused_only_with_friction():
-    """C changes the step by it, which the fused engine lacks."""
-    plain = mujoco.MjModel.from_xml_string(XML)
-    plain.opt.noslip_iterations = 3
-    assert unsupported_feature(plain, "fused") is None
-    for with_friction in (with_own_friction(), frictional()):
-        with_friction.opt.noslip_iterations = 3
-        assert "noslip_iterations" in unsupported_feature(with_friction, "fused")
-    state = PhysicsState(jnp.asarray(plain.qpos0), jnp.zeros(plain.nv))
-    for name, value in (("contact_friction", jnp.ones(())), ("frictionloss", jnp.ones(6))):
-        with pytest.raises(UserError, match="noslip_iterations.* with friction"):
-            given = PhysicsParameters(**{name: value})
-            make_engine(plain, "auto").step(given, state, Control(jnp.zeros(plain.nu)), 1)
 
 
 def test_mjx_refuses_given_dry_friction(mj_model):

@@ -83,58 +83,56 @@ class EditedModel:
 
     def __init__(self, mj_model: mujoco.MjModel):
         self.model, self.addresses = mj_model, find_addresses(mj_model)
-        self.fields: dict[str, np.ndarray] = {}
-        """The entries, as Python objects, of each field in which some are edited or follow."""
-        self._edited: dict[str, np.ndarray] = {}
-        self._unread: dict[str, np.ndarray] = {}
+        self._edited: dict[tuple[str, int], Scalar] = {}
+        self._derived: dict[tuple[str, int], Scalar] = {}
+        self._read: set[tuple[str, int]] = set()
+
+    @property
+    def fields(self) -> set[str]:
+        """Names of the fields in which entries are edited or follow from edited ones."""
+        return {field for field, _ in self._derived | self._edited}
 
     def __getitem__(self, key: tuple) -> Any:
         field, *index = key
-        if field in self._unread:
-            self._unread[field][tuple(index)] = False
+        self._read.update(self._keys(field, tuple(index)))
         return self.peek(*key)
 
     def peek(self, field: str, *index: Any) -> Any:
         """A number, or a tuple of numbers, without a record."""
-        found = self.fields.get(field, _field(self.model, field))[index]
-        if isinstance(found, np.ndarray):
-            return tuple(found.tolist())
-        return found.item() if isinstance(found, np.generic) else found
+        own, values = _field(self.model, field), self._derived | self._edited
+        numbers = [values.get(x, own.flat[x[1]].item()) for x in self._keys(field, index)]
+        return tuple(numbers) if np.ndim(own[index]) else numbers[0]
 
     def put(self, field: str, index: Any, values: Iterable[Scalar]) -> None:
         """Edits entries."""
-        self._set(field, index, values, follows=False)
-        self._edited[field][index] = True
-        self._unread.setdefault(field, np.zeros_like(self._edited[field]))[index] = True
+        self._edited |= zip(self._keys(field, index), values, strict=True)
 
     def follow(self, field: str, index: Any, values: Iterable[Scalar]) -> None:
         """Sets entries that follow from edited ones, where they are not edited themselves."""
-        self._set(field, index, values, follows=True)
+        self._derived |= zip(self._keys(field, index), values, strict=True)
 
-    def _set(self, field: str, index: Any, values: Iterable[Scalar], follows: bool) -> None:
+    def _keys(self, field: str, index: Any) -> list[tuple[str, int]]:
+        """Keys of entries: the field, and the place in it."""
         own = _field(self.model, field)
-        entries = self.fields.setdefault(field, own.astype(object)).reshape(-1)
-        edited = self._edited.setdefault(field, np.zeros(own.shape, bool)).reshape(-1)
         places = np.arange(own.size).reshape(own.shape)[index]
-        for place, value in zip(places.ravel().tolist(), values, strict=True):
-            if not (follows and edited[place]):
-                entries[place] = value
+        return [(field, place) for place in np.ravel(places).tolist()]
 
     def rows(self, field: str) -> list[int]:
         """First indices of the edited entries of a field."""
-        return np.unique(np.argwhere(self._edited.get(field, []))[:, :1]).tolist()
+        return sorted({self._index(key)[0] for key in self._edited if key[0] == field})
+
+    def _index(self, key: tuple[str, int]) -> list[int]:
+        return np.stack(np.unravel_index(key[1], _field(self.model, key[0]).shape)).tolist()
 
     def unread(self) -> list[str]:
         """Names of the edited entries that nothing has read."""
-        return [
-            f"{field}[{', '.join(map(str, index))}]"
-            for field, unread in self._unread.items()
-            for index in np.argwhere(unread).tolist()
-        ]
+        unread = sorted(self._edited.keys() - self._read)
+        return [f"{key[0]}[{', '.join(map(str, self._index(key)))}]" for key in unread]
 
     def array(self, field: str) -> Array:
         """The field's array; a NumPy array without traced entries."""
-        own, values = _field(self.model, field), self.fields[field].ravel().tolist()
+        own = _field(self.model, field)
+        values = self.peek(field, ...)
         if not any(isinstance(value, jax.Array) for value in values):
             return np.reshape(np.array(values, own.dtype), own.shape)
         dtype = jnp.result_type(float)
@@ -199,39 +197,33 @@ def _set_flags(m: EditedModel) -> None:
 def _derive(m: EditedModel) -> None:
     """Sets the entries that MuJoCo's compiler derives from edited ones. An inertia follows the
     mass, and a ball's also the square of the radius."""
-
-    def growth(field: str, *index: int) -> Scalar:
-        own = _field(m.model, field)[index].item()
-        return mul(m.peek(field, *index), 1.0 / own) if own else 1.0
-
-    def follow_inertia(body: int, factor: Scalar) -> None:
-        m.follow("body_inertia", body, scale(tuple(m.model.body_inertia[body].tolist()), factor))
-
-    masses, sizes = m.rows("body_mass"), m.rows("geom_size")
-    for body in masses:
-        follow_inertia(body, growth("body_mass", body))
-    for ball in m.addresses.balls:
-        if ball.geom in sizes:
-            radius, factor = m.peek("geom_size", ball.geom, 0), growth("geom_size", ball.geom, 0)
-            follow_inertia(ball.body, mul(growth("body_mass", ball.body), mul(factor, factor)))
+    c, balls, sizes = m.model, {x.body: x for x in m.addresses.balls}, m.rows("geom_size")
+    heavy = m.rows("body_mass")
+    for body in {*heavy, *(x.body for x in balls.values() if x.geom in sizes)}:
+        ball, mass, own = balls.get(body), m.peek("body_mass", body), c.body_mass[body].item()
+        factor = mul(mass, 1.0 / own) if own else 1.0
+        if ball and ball.geom in sizes:
+            radius = m.peek("geom_size", ball.geom, 0)
+            growth = mul(radius, 1.0 / c.geom_size[ball.geom, 0].item())
+            factor = mul(factor, mul(growth, growth))
             m.follow("geom_rbound", ball.geom, [radius])
             m.follow("geom_aabb", (ball.geom, slice(3, 6)), [radius] * 3)
-        if ball.geom in sizes or ball.body in masses:
-            mass, inertia = m.peek("body_mass", ball.body), m.peek("body_inertia", ball.body)
+        m.follow("body_inertia", body, scale(tuple(c.body_inertia[body].tolist()), factor))
+        if ball:
+            inertia = m.peek("body_inertia", body)
             # Inverses of the mass and of the inertia.
-            moving, turning = m.model.body_invweight0[ball.body].tolist()
-            moving *= m.model.body_mass[ball.body].item()
-            turning *= m.model.body_inertia[ball.body, 0].item()
-            m.follow("body_invweight0", ball.body, [moving / mass, turning / inertia[0]])
+            moving, turning = c.body_invweight0[body].tolist()
+            moving, turning = moving * own, turning * c.body_inertia[body, 0].item()
+            m.follow("body_invweight0", body, [moving / mass, turning / inertia[0]])
             # MuJoCo stores the constant inertia matrix of a free body in the model.
             m.follow("dof_M0", np.array(ball.qvel), (mass,) * 3 + inertia)
-    if masses:
+    if heavy:
         # MuJoCo numbers parents before children.
-        total = list(m.peek("body_mass", slice(None)))
-        for body in range(m.model.nbody - 1, 0, -1):
-            parent = m.model.body_parentid[body]
+        total = list(m.peek("body_mass", ...))
+        for body in range(c.nbody - 1, 0, -1):
+            parent = c.body_parentid[body]
             total[parent] = add(total[parent], total[body])
-        m.follow("body_subtreemass", slice(None), total)
+        m.follow("body_subtreemass", ..., total)
 
 
 def edited_model(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> mujoco.MjModel:

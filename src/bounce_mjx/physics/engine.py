@@ -12,7 +12,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.physics import fused
 from bounce_mjx.physics.control import Control
 from bounce_mjx.physics.parameters import PhysicsParameters, PhysicsState, check_shapes
-from bounce_mjx.physics.support import unsupported_feature, unsupported_parameter
+from bounce_mjx.physics.support import unsupported_feature
 from bounce_mjx.robot.model import find_addresses
 
 
@@ -45,12 +45,18 @@ def make_engine(mj_model: mujoco.MjModel, choice: str) -> Engine:
     """
     # Its programs are traced later, when somebody may have edited the model.
     mj_model = copy.copy(mj_model)
-    name = "fused" if is_fused(mj_model, choice) else "mjx"
-    _check(name, lambda engine: unsupported_feature(mj_model, engine))
+    name, other = ("fused", "mjx") if is_fused(mj_model, choice) else ("mjx", "fused")
+    lacking = {
+        engine: f"the {engine} physics does not support {feature}"
+        for engine in (name, "fused")
+        if (feature := unsupported_feature(mj_model, engine)) is not None
+    }
+    if name in lacking:
+        remedy = "change the MJCF" if len(lacking) == 2 else f"use --physics {other}"
+        raise UserError(f"{', and '.join(lacking.values())}; {remedy}")
     reason = f"chosen by --physics {choice}"
     if choice == "auto":
-        beyond = unsupported_feature(mj_model, "fused")
-        reason = "the model qualifies" if beyond is None else _lack("fused", beyond)
+        reason = lacking.get("fused", "the model qualifies")
     if name == "fused":
         implementation = fused
     else:
@@ -63,23 +69,6 @@ def make_engine(mj_model: mujoco.MjModel, choice: str) -> Engine:
         parameters: PhysicsParameters, state: PhysicsState, control: Control, num_substeps: int
     ) -> PhysicsState:
         check_shapes(parameters, num_joints)
-        _check(name, lambda engine: unsupported_parameter(mj_model, engine, parameters))
         return implementation.step(constants, parameters, state, control, num_substeps)
 
     return Engine(name, reason, step, functools.partial(implementation.paddle_position, constants))
-
-
-def _check(engine: str, feature_beyond: Callable[[str], str | None]) -> None:
-    """Refuses a feature that the engine lacks, and tells of one that the other engine lacks."""
-    beyond = feature_beyond(engine)
-    if beyond is None:
-        return
-    other = "mjx" if engine == "fused" else "fused"
-    beyond_other = feature_beyond(other)
-    if beyond_other is None:
-        raise UserError(f"{_lack(engine, beyond)}; use --physics {other}")
-    raise UserError(f"{_lack(engine, beyond)}, and {_lack(other, beyond_other)}; change the MJCF")
-
-
-def _lack(engine: str, feature: str) -> str:
-    return f"the {engine} physics does not support {feature}"

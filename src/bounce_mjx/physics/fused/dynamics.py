@@ -18,7 +18,7 @@ from bounce_mjx.physics.fused import chain, joint_friction
 from bounce_mjx.physics.fused.model import FusedModel, Servo, read_model
 from bounce_mjx.physics.fused.response import contact_response, paddle_origin
 from bounce_mjx.physics.fused.turning import Turning, advance_turning, read_turning, spin_in_ball
-from bounce_mjx.physics.parameters import PhysicsParameters, PhysicsState
+from bounce_mjx.physics.parameters import PhysicsParameters, PhysicsState, gives
 from bounce_mjx.physics.scalars import (
     ZERO3,
     Scalar,
@@ -69,8 +69,8 @@ def step(
     """
     at = model.addresses
     qpos, qvel = (_entries(x, range(len(x))) for x in (state.qpos, state.qvel))
-    world = _in_any_world(model, parameters)
-    turns = world.contacts[0].friction is not None or control.air_lift is not None
+    slides = gives(parameters, "contact_friction", "pair_friction")
+    turns = slides or model.contacts[0].friction is not None or control.air_lift is not None
     turnings = [
         read_turning(_entries(qpos, x.qpos[3:]), _entries(qvel, x.qvel[3:])) for x in at.balls
     ]
@@ -112,28 +112,8 @@ def _put(coordinates: list[Scalar], indices: Sequence[int], values: Sequence[Sca
         coordinates[i] = value
 
 
-def _in_any_world(model: FusedModel, parameters: PhysicsParameters) -> FusedModel:
-    """The model in a world with these parameters given, all of them 1.
-
-    Raises:
-      UserError: as `read_model`.
-    """
-
-    def ones(array: jax.Array) -> Scalar | tuple[Scalar, ...]:
-        return (1.0,) * len(array) if jnp.ndim(array) else 1.0
-
-    return _in_world_of_ones(model, jax.tree.structure(jax.tree.map(ones, parameters)))
-
-
-@functools.lru_cache(maxsize=16)
-def _in_world_of_ones(model: FusedModel, given: jax.tree_util.PyTreeDef) -> FusedModel:
-    ones = given.unflatten([1.0] * given.num_leaves)
-    return read_model(model.mj_model, ones)
-
-
 def paddle_position(model: FusedModel, parameters: PhysicsParameters, qpos: jax.Array) -> jax.Array:
     """World position [3] (m) of the paddle's centre at qpos [nq]."""
-    _in_any_world(model, parameters)
     fields = ("body_pos[", "geom_pos[", "qpos0[")
     entries = {x: y for x, y in (parameters.entries or {}).items() if x.startswith(fields)}
     relevant = PhysicsParameters(

@@ -35,6 +35,7 @@ from bounce_mjx.physics.scalars import (
     symmetric,
     vadd,
 )
+from bounce_mjx.physics.support import unsupported_friction
 from bounce_mjx.robot.model import Addresses, BallAddresses, fingerprint, to_direct_solref
 
 
@@ -122,7 +123,8 @@ def read_model(
       parameters: numbers, or tuples of numbers: Python floats or scalars.
 
     Raises:
-      UserError: the engine does not read an entry that the parameters change.
+      UserError: the engine does not read an entry that the parameters change, or lacks the
+        friction that they bring.
     """
     m = edited(mj_model, parameters)
     c, addresses = m.model, m.addresses
@@ -154,6 +156,9 @@ def read_model(
         implicit_servos=implicit,
         implicit_damping=implicit or not explicit_damping,
     )
+    friction = unsupported_friction(c, m.peek("pair_dim", slice(None)))
+    if friction is not None:
+        raise UserError(f"the fused physics does not support {friction}; use --physics mjx")
     for name in m.unread():
         raise UserError(
             f"the fused physics cannot vary {name} between environments, so a change of it would "
@@ -204,7 +209,6 @@ def _read_joint(m: EditedModel, joint: int, frame: Frame) -> chain.Link:
     springs = not c.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SPRING
     dry = not c.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
     dmin, dmax = _impedance_limits(c.dof_solimp[dof, :2])
-    d = dmin if c.dof_solimp[dof, 2] > mujoco.mjMINVAL else 0.5 * (dmin + dmax)
     frictionloss = m["dof_frictionloss", dof]
     return chain.Link(
         offset=frame.origin,
@@ -220,8 +224,8 @@ def _read_joint(m: EditedModel, joint: int, frame: Frame) -> chain.Link:
         stiffness=m["jnt_stiffness", joint] if springs else 0.0,
         spring_position=m["qpos_spring", at],
         frictionloss=frictionloss if dry else 0.0,
-        friction_softness=float((1.0 - d) / d * c.dof_invweight0[dof]),
-        friction_damping=_reference_damping(c, c.dof_solref[dof], dmax),
+        friction_softness=float((1.0 - dmin) / dmin * c.dof_invweight0[dof]),
+        friction_damping=float(to_direct_solref(c.dof_solref[dof], c.opt.timestep)[1] / dmax),
     )
 
 
@@ -379,18 +383,3 @@ def _direct_solref(
 def _impedance_limits(solimp: np.ndarray) -> np.ndarray:
     """Impedances of a `solimp` within MuJoCo's limits (mjMINIMP, mjMAXIMP)."""
     return np.clip(solimp, 1e-4, 1.0 - 1e-4)
-
-
-def _reference_damping(mj_model: mujoco.MjModel, solref: np.ndarray, max_impedance: float) -> float:
-    """b of the reference acceleration: `solref` is (time constant, damping ratio) or (-k, -b); a
-    time constant of 0.02 s, MuJoCo's default, replaces one of mixed signs."""
-    if (solref[0] > 0.0) != (solref[1] > 0.0):
-        solref = np.array([0.02, 1.0])
-    if solref[0] > 0.0:
-        return float(2.0 / (max_impedance * _time_constant(mj_model, solref)))
-    return float(-solref[1] / max_impedance)
-
-
-def _time_constant(mj_model: mujoco.MjModel, solref: np.ndarray) -> float:
-    """Time constant of a `solref`, at least two steps, s."""
-    return max(solref[0], 2.0 * mj_model.opt.timestep)
