@@ -46,7 +46,8 @@ def measure(path: Path, seed: int, episodes: int, physics: str) -> Report:
     ranges = jax.tree.map(lambda end: jnp.asarray(end, jnp.float32)[None], ranges)
     make = make_mujoco_evaluator if physics == "mujoco" else make_evaluator
     evaluate = make(env, actor(env), episodes)
-    return judge(env, evaluate(policy, jax.random.PRNGKey(DEFAULT_SEED), ranges), commands)
+    measured = evaluate(policy, jax.random.PRNGKey(DEFAULT_SEED), ranges)
+    return judge(env, *measured, commands)
 
 
 def main() -> None:

@@ -40,7 +40,6 @@ from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import judge
-from bounce_mjx.evaluation.statistics import Statistics
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.learning.statistics import init_normalizer
@@ -181,7 +180,7 @@ class _Judge:
         params = self._networks.policy_network.init(jax.random.PRNGKey(0))
         return Policy(init_normalizer(self._env.observation_size), params)
 
-    def _compile(self) -> Callable[[Policy, jax.Array], Statistics]:
+    def _compile(self) -> Callable[[Policy, jax.Array], tuple]:
         evaluate = make_evaluator(self._env, self._networks, self._config.eval_episodes)
         return evaluate.lower(self._policy, self._key).compile(compiler_options())
 
@@ -190,7 +189,7 @@ class _Judge:
         policy = jax.tree.map(
             lambda x, like: jax.numpy.asarray(x, like.dtype), policy, self._policy
         )
-        report = judge(self._env, self._evaluator.result()(policy, self._key))
+        report = judge(self._env, *self._evaluator.result()(policy, self._key))
         process_seconds = time.time() - self._started
         record = {
             "run": f"{method}-{config.seed}-{self._started:.3f}",

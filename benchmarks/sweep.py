@@ -129,7 +129,7 @@ def run_trial(trial: "optuna.Trial", command: Command, base: TrainConfig) -> flo
     while steps < command.steps:
         state, _ = run(state)
         steps += iterations * config.batch_steps
-        statistics = jax.device_get(evaluate(policies(state), eval_key))
+        statistics = jax.device_get(evaluate(policies(state), eval_key)[0])
         reports = [
             judge(env, jax.tree.map(lambda x, i=i: x[i], statistics)) for i in range(command.seeds)
         ]

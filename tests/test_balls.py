@@ -309,22 +309,17 @@ def test_c_moves_several_balls_as_the_engine_does():
     count, num_steps = 2, env.config.num_substeps
     keys = jax.random.split(jax.random.PRNGKey(0), count)
     states = jax.vmap(env.reset, out_axes=-1)(keys)
-    physics = states.pipeline_state.physics
+    now = states.pipeline_state
+    physics = now.physics
     spins = [i for ball in find_addresses(env.mj_model).balls for i in ball.qvel[3:]]
     physics = physics._replace(qvel=physics.qvel.at[np.array(spins)].set(30.0))
     push = jnp.arange(6.0).reshape(2, 3, 1) * jnp.ones(count)
     air = {"air_drag": jnp.full(count, 0.5), "air_lift": jnp.full(count, 0.02)}
     control = Control(physics.qpos[:6], **air, ball_push=push)
     targets = jax.vmap(servo_targets, in_axes=(-1, None))(control, num_steps)
-    simulated = c_episodes.full_states(env.mj_model, physics)
-    balls = c_episodes._ball_velocity(env.mj_model)
-    simulated[:, balls] += np.asarray(push).reshape(-1, count).T
-    models, data = [env.mj_model] * count, [mujoco.MjData(env.mj_model)]
-    with mujoco.rollout.Rollout(nthread=0) as pool:
-        simulated = c_episodes._next_states(
-            pool, models, data, simulated, np.asarray(targets), *map(np.asarray, air.values())
-        )
-    expected = c_episodes.physics_states(env.mj_model, simulated)
+    now = now._replace(physics=physics)
+    with mujoco.rollout.Rollout(nthread=2) as pool:
+        expected = c_episodes._Physics(env, now, pool).step(control, targets, now)
     step = jax.vmap(lambda s, c: env.engine.step(MODEL, s, c, num_steps), in_axes=-1, out_axes=-1)
     for ours, theirs in zip(step(physics, control), expected, strict=True):
         if theirs is not None:

@@ -261,7 +261,7 @@ def test_upward_speed_is_judged_only_for_low_targets(env):
         for speed, passed in ((900, True), (9000, False)):
             figures = statistics(rising_speed=speed)
             reports = (
-                judge(configured, figures), judge(env, figures, {"target_height": (low, high)})
+                judge(configured, figures), judge(env, figures, commands={"target_height": (low, high)})
             )  # fmt: skip
             for report in reports:
                 assert report.results[SPEED].passed is (passed if judged else None)
@@ -354,8 +354,8 @@ def test_c_evaluates_each_episode_in_its_own_world(networks, random_policy):
     )
     key = jax.random.PRNGKey(0)
     env = BounceBall(config, randomize=heavy_and_light)
-    c = make_mujoco_evaluator(env, networks, 6)(random_policy, key)
-    ours = make_evaluator(env, networks, 6)(random_policy, key)
+    c = make_mujoco_evaluator(env, networks, 6)(random_policy, key)[0]
+    ours = make_evaluator(env, networks, 6)(random_policy, key)[0]
     np.testing.assert_allclose(c.episode_return, ours.episode_return, rtol=1e-3, atol=1e-2)
 
     masses = jax.vmap(env.reset, out_axes=-1)(jax.random.split(key, 6)).pipeline_state.parameters
@@ -370,9 +370,9 @@ def test_mujoco_evaluator_agrees_with_the_fused_one(networks, random_policy):
     env = BounceBall(EnvConfig(episode_seconds=1.0))
     assert env.backend == "fused"
     key = jax.random.key(31)
-    fused = flat(make_evaluator(env, networks, 8)(random_policy, key))
+    fused = flat(make_evaluator(env, networks, 8)(random_policy, key)[0])
     evaluate_on_c = make_mujoco_evaluator(env, networks, 8)
-    mujoco = flat(evaluate_on_c(random_policy, key))
+    mujoco = flat(evaluate_on_c(random_policy, key)[0])
     assert np.any(fused.n_bounces > 0), "a contact is wanted"
     assert not np.all(fused.running), "an end is wanted"
     np.testing.assert_array_equal(mujoco.running, fused.running)
@@ -384,7 +384,7 @@ def test_mujoco_evaluator_agrees_with_the_fused_one(networks, random_policy):
     np.testing.assert_allclose(mujoco.episode_return, fused.episode_return, rtol=1e-2, atol=15)
 
     params = jax.tree.map(lambda x: jnp.nan * x, random_policy.params)
-    broken = evaluate_on_c(random_policy._replace(params=params), key)
+    broken = evaluate_on_c(random_policy._replace(params=params), key)[0]
     np.testing.assert_array_equal(broken.steps, 1)
     assert np.isfinite(broken.episode_return).all() and not np.any(broken.running)
 
@@ -394,12 +394,12 @@ def seen_worlds(monkeypatch, config: EnvConfig, *options: EvaluationOptions):
     reports; without a simulation."""
     seen, reports = [], []
 
-    def make_evaluator(env, networks, episodes):
+    def make_evaluator(env, networks, episodes, recorded):
         def evaluate(policy, key, ranges):
             start = reset_episodes(env, key, episodes, ranges)
             state = jax.tree.map(lambda x: x[..., 0], start.pipeline_state)
             seen.append((state.world, state.command))
-            return statistics(rising_speed=9000)
+            return statistics(rising_speed=9000), None
 
         return evaluate
 
@@ -505,7 +505,7 @@ def test_evaluator_equals_a_python_loop(networks):
     episodes, key = 6, jax.random.key(21)
     env = BounceBall(EnvConfig(episode_seconds=2.6))
     networks, holding = holding_policy(networks)
-    actual = flat(make_evaluator(env, networks, episodes)(holding, key))
+    actual = flat(make_evaluator(env, networks, episodes)(holding, key)[0])
     del actual["tally"]
 
     reset, step = jax.jit(env.reset), jax.jit(env.step)

@@ -67,7 +67,7 @@ def test_an_impact_sends_the_ball_to_its_target(env: Env, apex: float) -> None:
 def test_the_law_keeps_the_ball_up(env: Env) -> None:
     """Far longer than a ball bounces on a paddle at rest; a paddle that does not tilt loses it."""
     evaluate = make_evaluator(env, MirrorLaw(env), episodes=16)
-    report = judge(env, evaluate(None, jax.random.PRNGKey(5)))
+    report = judge(env, *evaluate(None, jax.random.PRNGKey(5)))
     values = {result.name: result.value for result in report.results}
     assert values["stable"] == values["consecutive bounces"] == 100.0
     assert values["height"] > 90.0 and values["horizontal position"] > 95.0

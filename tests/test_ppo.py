@@ -400,7 +400,7 @@ def test_ppo_learns_to_bounce():
     ]
     evaluate = make_evaluator(env, networks, episodes=64).lower(policies[0], unseen)
     evaluate = evaluate.compile()
-    before, after = (judge(env, evaluate(p, unseen)).details for p in policies)
+    before, after = (judge(env, *evaluate(p, unseen)).details for p in policies)
     assert after["mean_return"] > 3 * before["mean_return"]
     assert after["mean_consecutive_bounces"] > before["mean_consecutive_bounces"] + 2
     rewards = np.asarray(metrics["reward"])

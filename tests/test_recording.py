@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bounce_mjx import BounceBall, EnvConfig
-from bounce_mjx.evaluation.episodes import make_recording_evaluator
+from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.recording import paddle_points
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, make_networks
@@ -38,7 +38,7 @@ def policy(networks) -> Policy:
 @pytest.fixture(scope="module")
 def evaluated(env: BounceBall, networks, policy: Policy):
     """Statistics and recording."""
-    evaluate = make_recording_evaluator(env, networks, EPISODES, RECORDED)
+    evaluate = make_evaluator(env, networks, EPISODES, RECORDED)
     return jax.device_get(evaluate(policy, jax.random.PRNGKey(2)))
 
 

@@ -321,7 +321,7 @@ def test_the_best_is_reported_on_fresh_resets(straight: Path, capfd) -> None:
 
     def mean_return(seed: int) -> float:
         key = jax.random.split(jax.random.PRNGKey(np.uint32(seed)))[0]
-        return judge(env, evaluate(policy, key)).details["mean_return"]
+        return judge(env, *evaluate(policy, key)).details["mean_return"]
 
     assert selected["details"]["mean_return"] == pytest.approx(mean_return(config.eval_seed))
     fresh = mean_return(config.eval_seed + 2**31)
@@ -384,7 +384,7 @@ def test_the_chunks_of_an_evaluation_are_its_episodes(straight: Path) -> None:
     _, key = jax.random.split(jax.random.PRNGKey(np.uint32(config.eval_seed)))
     networks = make_networks(config.ppo, env.observation_size, env.action_size)
     evaluate = make_evaluator(env, networks, config.eval_episodes)
-    first_three = jax.tree.map(lambda x: x[:3], evaluate(policy, key))
+    first_three = jax.tree.map(lambda x: x[:3], evaluate(policy, key)[0])
     assert screening.screening
     assert screening.details == pytest.approx(judge(env, first_three).details)
 

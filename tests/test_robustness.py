@@ -261,12 +261,13 @@ def test_every_condition_gets_its_own_ranges_and_outcome(tmp_path: Path, monkeyp
                 "rising_steps": np.ones(count),
                 "rising_speed": speed,
             }
-            return Statistics(
+            measured = Statistics(
                 running=np.ones(count, bool),
                 steps=100.0 + 1000.0 * late + rate,
                 episode_return=np.zeros(count),
                 tally=Tally(sums, {"n_bounces": np.zeros(count)}),
             )
+            return measured, None
 
         return evaluate
 

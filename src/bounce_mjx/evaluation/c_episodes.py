@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from mujoco import rollout
+from scipy.spatial.transform import Rotation
 
 from bounce_mjx.env.env import Env, EnvState, State, world_model
 from bounce_mjx.evaluation.episodes import Batch, add_step, begin, reset_episodes
@@ -21,7 +22,6 @@ from bounce_mjx.physics import (
     servo_targets,
 )
 from bounce_mjx.physics.edited import contact_pairs
-from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.task.shown import Recording
 from bounce_mjx.world.actuation import Actuation
 from bounce_mjx.world.randomization import Ranges
@@ -32,20 +32,13 @@ _CTRL_AND_FORCE = _CTRL | mujoco.mjtState.mjSTATE_XFRC_APPLIED
 _NUM_THREADS = os.cpu_count() or 1
 
 
-def make_mujoco_evaluator(env: Env, actor: Actor, episodes: int) -> Callable[..., Statistics]:
+def make_mujoco_evaluator(
+    env: Env, actor: Actor, episodes: int, recorded: int = 0
+) -> Callable[..., tuple[Statistics, Recording]]:
     """Like `evaluation.make_evaluator`, with `mj_step` (float64) in place of the env's engine.
 
     Each episode is simulated in the world that its reset drew.
     """
-    measure = make_recording_mujoco_evaluator(env, actor, episodes, recorded=0)
-    return lambda policy, key, ranges=None: measure(policy, key, ranges)[0]
-
-
-def make_recording_mujoco_evaluator(
-    env: Env, actor: Actor, episodes: int, recorded: int
-) -> Callable[..., tuple[Statistics, Recording]]:
-    """Like `make_mujoco_evaluator`, but also returns a recording of the first `recorded`
-    episodes."""
 
     @jax.jit
     def start(key: jax.Array, ranges: Ranges | None) -> Batch:
@@ -70,7 +63,7 @@ def make_recording_mujoco_evaluator(
     ) -> tuple[Statistics, Recording]:
         now = start(key, ranges)
         with rollout.Rollout(nthread=_NUM_THREADS) as pool:
-            physics = _Physics(env, now.states, pool)
+            physics = _Physics(env, now.states.pipeline_state, pool)
             for step in range(env.config.episode_steps):
                 actions, actuation, control, targets = decide(policy, now.states)
                 after = physics.step(control, targets, now.states.pipeline_state)
@@ -85,16 +78,20 @@ def make_recording_mujoco_evaluator(
 class _Physics:
     """The physics of N episodes on MuJoCo's C engine, in threads."""
 
-    def __init__(self, env: Env, states: State, pool: rollout.Rollout):
+    def __init__(self, env: Env, now: EnvState, pool: rollout.Rollout):
         """
         Args:
-          states: the episodes' first states, batch last.
+          now: the episodes' first states, batch last.
         """
-        now = states.pipeline_state
-        self._mj_model, self._pool = env.mj_model, pool
+        self._mj_model, self._pool, balls = env.mj_model, pool, env.addresses.balls
         self._models = episode_models(env, now.parameters)
         self._data = [mujoco.MjData(self._models[0]) for _ in range(_NUM_THREADS)]
         self._states = full_states(env.mj_model, now.physics)
+        self._bodies = [ball.body for ball in balls]
+        # A state begins with the time and the positions.
+        self._orientations = 1 + np.array([ball.qpos[3:] for ball in balls])
+        velocities = 1 + env.mj_model.nq + np.array([ball.qvel for ball in balls])
+        self._velocities, self._spins = np.split(velocities, 2, axis=1)
 
     def step(self, control: Control, targets: jax.Array, now: EnvState) -> PhysicsState:
         """The physics [..., N] after one more control step.
@@ -104,83 +101,49 @@ class _Physics:
           targets: its servo targets [N, substeps, nu].
           now: the states before it; an impact may have changed the contact's damping.
         """
+        damping = None if now.impact is None else now.parameters.contact_damping
         push, drag, lift, targets, damping = (
             None if x is None else np.asarray(x, np.float64)
-            for x in (
-                control.ball_push, control.air_drag, control.air_lift, targets,
-                None if now.impact is None else now.parameters.contact_damping,
-            )
-        )  # fmt: skip
+            for x in (control.ball_push, control.air_drag, control.air_lift, targets, damping)
+        )
         if damping is not None:
             pairs = contact_pairs(self._mj_model)
             for model, value in zip(self._models, damping, strict=True):
                 model.pair_solref[pairs, 1] = -value
         if push is not None:
             push = push.reshape(-1, len(self._states)).T
-            self._states[:, _ball_velocity(self._mj_model)] += push
-        self._states = _next_states(
-            self._pool, self._models, self._data, self._states, targets, drag, lift
-        )
+            self._states[:, self._velocities.ravel()] += push
+        if drag is None and lift is None:
+            self._advance(targets, _CTRL)
+        else:
+            # The forces of the air need the velocity in each physics step.
+            for target in np.moveaxis(targets, 1, 0):
+                forces = self._air_forces(drag, lift).reshape(len(target), -1)
+                self._advance(np.concatenate([target, forces], axis=1)[:, None], _CTRL_AND_FORCE)
         return physics_states(self._mj_model, self._states)
 
+    def _advance(self, controls: np.ndarray, kind: mujoco.mjtState) -> None:
+        """Advances by physics steps with controls [N, steps, size] of a kind."""
+        trajectory, _ = self._pool.rollout(
+            self._models, self._data, self._states, controls, control_spec=kind
+        )
+        self._states = trajectory[:, -1]
 
-def _next_states(
-    pool: rollout.Rollout,
-    models: list[mujoco.MjModel],
-    data: list[mujoco.MjData],
-    states: np.ndarray,
-    targets: np.ndarray,
-    air_drag: np.ndarray | None = None,
-    air_lift: np.ndarray | None = None,
-) -> np.ndarray:
-    """States [N, size] after one control step. The forces of the air need the velocity in each
-    physics step.
-
-    Args:
-      targets: servo targets [N, substeps, nu].
-      air_drag: that of `Control` for each state [N].
-      air_lift: likewise.
-    """
-    if air_drag is None and air_lift is None:
-        trajectory, _ = pool.rollout(models, data, states, targets, control_spec=_CTRL)
-        return trajectory[:, -1]
-    balls = find_addresses(models[0]).balls
-    bodies, first_velocity = [ball.body for ball in balls], 1 + models[0].nq
-    mass = np.array([model.body_mass[bodies] for model in models])
-    drag, lift = (0.0 if x is None else x[:, None] * mass for x in (air_drag, air_lift))
-    forces = np.zeros((len(states), models[0].nbody, 6))
-
-    def ball_entries(start: int, entries: list[tuple[int, ...]]) -> np.ndarray:
-        return states[:, start + np.array(entries)]
-
-    for target in np.moveaxis(targets, 1, 0):
-        velocity = ball_entries(first_velocity, [ball.qvel[:3] for ball in balls])
-        speed = np.linalg.norm(velocity, axis=2)
-        forces[:, bodies, :3] = -(drag * speed)[:, :, None] * velocity
-        if air_lift is not None:
-            spin = _rotate(
-                ball_entries(1, [ball.qpos[3:] for ball in balls]),
-                ball_entries(first_velocity, [ball.qvel[3:] for ball in balls]),
-            )
-            forces[:, bodies, :3] += lift[:, :, None] * np.cross(spin, velocity)
-        control = np.concatenate([target, forces.reshape(len(states), -1)], axis=1)[:, None]
-        trajectory, _ = pool.rollout(models, data, states, control, control_spec=_CTRL_AND_FORCE)
-        states = trajectory[:, 0]
-    return states
-
-
-def _rotate(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Vectors [..., 3] of a body's frame in the world, at its orientation [..., 4]."""
-    unit = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
-    w, axis = unit[..., :1], unit[..., 1:]
-    across = 2.0 * np.cross(axis, vector)
-    return vector + w * across + np.cross(axis, across)
-
-
-def _ball_velocity(mj_model: mujoco.MjModel) -> np.ndarray:
-    """Indices [3 B] of the balls' velocities in a state of mjSTATE_FULLPHYSICS."""
-    velocities = [ball.qvel[:3] for ball in find_addresses(mj_model).balls]
-    return np.concatenate(velocities) + 1 + mj_model.nq
+    def _air_forces(self, drag: np.ndarray | None, lift: np.ndarray | None) -> np.ndarray:
+        """Forces and torques [N, bodies, 6] on the balls, from those of `Control` [N]."""
+        mass = np.array([model.body_mass[self._bodies] for model in self._models])[:, :, None]
+        velocity, states = self._states[:, self._velocities], len(self._states)
+        forces = np.zeros((states, self._mj_model.nbody, 6))
+        if drag is not None:
+            speed = np.linalg.norm(velocity, axis=2, keepdims=True)
+            forces[:, self._bodies, :3] -= drag[:, None, None] * mass * speed * velocity
+        if lift is not None:
+            quaternions = np.roll(self._states[:, self._orientations].reshape(-1, 4), -1, axis=1)
+            spins = self._states[:, self._spins].reshape(-1, 3)
+            turned = Rotation.from_quat(quaternions).apply(spins)
+            across = np.cross(turned.reshape(velocity.shape), velocity)
+            forces[:, self._bodies, :3] += lift[:, None, None] * mass * across
+        return forces
 
 
 def episode_models(env: Env, parameters: PhysicsParameters) -> list[mujoco.MjModel]:

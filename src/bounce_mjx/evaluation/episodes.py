@@ -24,22 +24,12 @@ class Batch(NamedTuple):
     """Control steps so far [], int32."""
 
 
-def make_evaluator(env: Env, actor: Actor, episodes: int) -> Callable[..., Statistics]:
-    """A jitted function (policy, key, ranges) -> statistics of `episodes` deterministic episodes,
-    each from its own reset (`reset_episodes`). It stops when all episodes have ended or their time
-    limit is reached. The ranges are optional."""
-    measure = make_recording_evaluator(env, actor, episodes, recorded=0)
-
-    def evaluate(policy: Policy, key: jax.Array, ranges: Ranges | None = None) -> Statistics:
-        return measure(policy, key, ranges)[0]
-
-    return jax.jit(evaluate)
-
-
-def make_recording_evaluator(
-    env: Env, actor: Actor, episodes: int, recorded: int
+def make_evaluator(
+    env: Env, actor: Actor, episodes: int, recorded: int = 0
 ) -> Callable[..., tuple[Statistics, Recording]]:
-    """Like `make_evaluator`, but also returns a recording of the first `recorded` episodes."""
+    """A jitted function (policy, key, ranges) -> statistics of `episodes` deterministic episodes,
+    each from its own reset (`reset_episodes`), and a recording of the first `recorded`. It stops
+    when all episodes have ended or their time limit is reached. The ranges are optional."""
 
     def evaluate(
         policy: Policy, key: jax.Array, ranges: Ranges | None = None

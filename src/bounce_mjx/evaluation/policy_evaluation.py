@@ -7,12 +7,9 @@ import jax
 import jax.numpy as jnp
 
 from bounce_mjx.env.env import Env
-from bounce_mjx.evaluation.c_episodes import (
-    make_mujoco_evaluator,
-    make_recording_mujoco_evaluator,
-)
+from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
 from bounce_mjx.evaluation.config import DEFAULT_OPTIONS, EvaluationOptions, on_engine
-from bounce_mjx.evaluation.episodes import make_evaluator, make_recording_evaluator
+from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.recording import RECORDED_EPISODES
 from bounce_mjx.evaluation.results import Report, judge
 from bounce_mjx.evaluation.suite import neutral_commands
@@ -36,6 +33,7 @@ def evaluate_policy(
     actor: Callable[[Env], Actor],
     options: EvaluationOptions = DEFAULT_OPTIONS,
     started: Callable[[str], None] = lambda engine: None,
+    recorded: int = 0,
 ) -> PolicyEvaluation:
     """Measures the results of a policy without action noise.
 
@@ -43,6 +41,7 @@ def evaluate_policy(
       env_config: the world and the task of the policy's training.
       actor: what acts with the policy, such as the networks of its training (`networks_of`).
       started: called with the engine's name before anything is compiled.
+      recorded: number of episodes in the report's recording.
 
     Raises:
       UserError: the engine does not support the model.
@@ -52,9 +51,9 @@ def evaluate_policy(
     engine = "mujoco" if on_c else env.engine.name
     started(engine)
     make = make_mujoco_evaluator if on_c else make_evaluator
-    evaluate = make(env, actor(env), options.episodes)
-    statistics = evaluate(policy, jax.random.PRNGKey(options.seed), ranges)
-    return PolicyEvaluation(judge(env, statistics, commands), engine)
+    evaluate = make(env, actor(env), options.episodes, recorded)
+    measured = evaluate(policy, jax.random.PRNGKey(options.seed), ranges)
+    return PolicyEvaluation(judge(env, *measured, commands), engine)
 
 
 def recorded_episodes(
@@ -64,11 +63,9 @@ def recorded_episodes(
     options: EvaluationOptions = DEFAULT_OPTIONS,
 ) -> Recording:
     """A recording of `RECORDED_EPISODES` episodes; the arguments are those of `evaluate_policy`."""
-    env, _, ranges = _prepare(env_config, options)
-    on_c = options.physics == "mujoco"
-    make = make_recording_mujoco_evaluator if on_c else make_recording_evaluator
-    evaluate = make(env, actor(env), RECORDED_EPISODES, RECORDED_EPISODES)
-    return jax.device_get(evaluate(policy, jax.random.PRNGKey(options.seed), ranges)[1])
+    options = options._replace(episodes=RECORDED_EPISODES)
+    evaluation = evaluate_policy(policy, env_config, actor, options, recorded=RECORDED_EPISODES)
+    return evaluation.report.recording
 
 
 def _prepare(

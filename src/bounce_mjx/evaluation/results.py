@@ -68,11 +68,13 @@ class Report:
 def judge(
     env: Env,
     statistics: Statistics,
+    recording: Recording | None = None,
     commands: dict[str, tuple[float, float]] | None = None,
 ) -> Report:
     """The report of an evaluation, from the statistics of E episodes.
 
     Args:
+      recording: of the first episodes.
       commands: ranges of commands in these episodes, where they are not the config's.
     """
     s = jax.tree.map(lambda x: jax.device_get(x).astype(float), statistics)
@@ -84,4 +86,4 @@ def judge(
         "mean_return": float(s.episode_return.mean()),
         "mean_length_s": float(s.steps.mean() * env.dt),
     }
-    return Report(env.task.results(episodes), details)
+    return Report(env.task.results(episodes), details, jax.device_get(recording))

@@ -140,7 +140,7 @@ def measure_conditions(
             # Padding the last call with a repeated condition avoids compiling another shape.
             padded = batch + [batch[-1]] * (size - len(batch))
             ranges = _stack_ranges(names, padded)
-            statistics = evaluate(policy, jax.random.PRNGKey(options.seed), ranges)
+            statistics, _ = evaluate(policy, jax.random.PRNGKey(options.seed), ranges)
             for i, condition in enumerate(batch):
                 own = slice(i * options.episodes, (i + 1) * options.episodes)
                 part = jax.tree.map(lambda x, own=own: x[own], statistics)
@@ -153,7 +153,7 @@ def measure_conditions(
 def _outcome(
     env: Env, condition: Condition, statistics: Statistics, engine: str
 ) -> ConditionOutcome:
-    report = judge(env, statistics, condition.commands)
+    report = judge(env, statistics, commands=condition.commands)
     return ConditionOutcome(
         perturbation=condition.perturbation.name,
         group=condition.perturbation.group,

@@ -4,6 +4,7 @@
 """
 
 import math
+from functools import reduce
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -220,20 +221,12 @@ def _condition(
 
 def _with_changes(env: WorldConfig, settings: dict[str, Any], source: str) -> WorldConfig:
     """A config with changed settings."""
-    if not settings:
-        return env
     values = env.model_dump()
     for name, value in settings.items():
-        *groups, key = name.split(".")
-        group = values
-        for part in groups:
-            group = group.setdefault(part, {}) if isinstance(group, dict) else group
-        if "randomization" in (*groups, key) or not isinstance(group, dict):
-            raise UserError(
-                f"{source}: {shorten(name)} is not a setting to perturb; give a key of env, and "
-                "terms of the randomisation under terms"
-            )
-        group[key] = value
+        if name.partition(".")[0] == "randomization":
+            raise UserError(f"{source}: give {shorten(name)} under terms, without its group")
+        nested = reduce(lambda inner, key: {key: inner}, reversed(name.split(".")), value)
+        values = merged(values, nested)
     changed = validate(type(env), values, source)
     if changed.layout != env.layout:
         raise UserError(

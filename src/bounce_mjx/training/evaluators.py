@@ -144,7 +144,7 @@ class Evaluators:
         if config.num_seeds == 1:
             recorded = min(RECORDED_EPISODES, episodes)
             recording = _joined(recordings[: -(-recorded // self._chunk)], recorded)
-            return [dataclasses.replace(judge(self._env, statistics), recording=recording)]
+            return [judge(self._env, statistics, recording)]
         return [
             judge(self._env, jax.tree.map(lambda x, i=i: x[i], statistics))
             for i in range(config.num_seeds)
