@@ -20,7 +20,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from bounce_mjx import load_policy
-from bounce_mjx.deploy.chain import Chain
+from bounce_mjx.deploy.chain import paddle_pose
 from bounce_mjx.deploy.faults import EARLIER, FLYING, faults, make_bounds, picture_age
 from bounce_mjx.deploy.metadata import Metadata
 from bounce_mjx.env.env import Env, State
@@ -95,7 +95,7 @@ def facts(metadata: Metadata, episode: dict[str, np.ndarray], window: int) -> di
     """The facts of each step [T] for the rules, as the supervisor finds them."""
     angles, ball, age = episode["angles"], episode["ball"], episode["age"]
     sent = np.concatenate([angles[:1], episode["commands"][:-1]])
-    paddle, _ = Chain(metadata).paddle(angles)
+    paddle, _ = paddle_pose(metadata, angles)
     times = np.arange(len(angles)) * metadata.control_dt
     is_new = np.append(True, np.any(ball[1:] != ball[:-1], axis=(1, 2)))
     newest = np.maximum.accumulate(np.where(is_new, np.arange(len(angles)), 0))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bounce_mjx import BounceBall, EnvConfig, load_policy
-from bounce_mjx.deploy.chain import Chain
+from bounce_mjx.deploy.chain import paddle_pose
 from bounce_mjx.deploy.faults import picture_age
 from bounce_mjx.deploy.metadata import CommandLimits
 from bounce_mjx.deploy.policy import DeployedPolicy
@@ -159,7 +159,7 @@ def flying(i: int, **others: Any) -> dict[str, Any]:
 
 def test_a_command_outside_of_the_box_is_a_fault() -> None:
     policy = limited()
-    paddle = Chain(policy.metadata).paddle(HOME)[0]
+    paddle = paddle_pose(policy.metadata, HOME)[0]
     low, high = (list(paddle + d) for d in (-0.005, 0.005))
     arm = Arm(policy.supervise(1000, box=(low, high)))
     arm.until("ready", 20)
@@ -231,7 +231,7 @@ def supervised(name: str) -> tuple[Any, np.ndarray, Any]:
     """A supervisor of a shipped policy, the arm's home, and measurements of a ball above it."""
     policy = load_policy(name)
     home = np.array(policy.metadata.default_joint_angles)
-    place = Chain(policy.metadata).paddle(home)[0]
+    place = paddle_pose(policy.metadata, home)[0]
 
     def seen(angles: np.ndarray, step: int, height: float) -> dict[str, Any]:
         given = measured(angles, joint_velocities=np.zeros(len(home)), ball_age=0.005)

@@ -60,7 +60,8 @@ class Hinge(NamedTuple):
     position: Vector
     """A point on the axis, m."""
     quaternion: tuple[float, float, float, float]
-    """Orientation at the angle `reference`, in the order w, x, y, z."""
+    """Orientation at the angle `reference`: always 1, 0, 0, 0, as every frame then has the axes of
+    the world."""
     axis: Vector
     """Unit vector along the axis."""
     reference: float

@@ -5,10 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from bounce_mjx.deploy.histories import Histories, Measurements
 from bounce_mjx.deploy.metadata import PER_BALL, UNITS, Metadata, measurement_sizes
 from bounce_mjx.deploy.motion import Motion
-from bounce_mjx.deploy.network import OnnxNetwork
+from bounce_mjx.deploy.network import Measurements, OnnxNetwork
 from bounce_mjx.deploy.supervisor import Supervisor
 from bounce_mjx.errors import MissingPackage, UserError
 
@@ -78,7 +77,6 @@ class DeployedPolicy:
         count = len(self.metadata.joint_names)
         if targets is not None:
             targets = _array("the targets", targets, count, "rad", _LARGEST)
-        self._histories: Histories | None = None
         self._network.reset()
         self._measured: Measurements = {}
         self._first: float | None = None
@@ -124,19 +122,12 @@ class DeployedPolicy:
         steps = self._steps_since(time)
         if steps == 0:
             return self._action.copy()
-        if self._histories is None:
-            self._histories = Histories(self.metadata, self._network.observed, measured)
-        else:
-            for i in range(1, steps):
-                between = {
-                    name: value + (1.0 - i / steps) * (self._measured.get(name, value) - value)
-                    for name, value in measured.items()
-                }
-                self._histories.add(between, self._action)
-                if self._network.memory:
-                    self._network.step(self._histories.values, self._histories.newest)
-            self._histories.add(measured, self._action)
-        action = self._network.step(self._histories.values, self._histories.newest)
+        for left in reversed(range(steps)):
+            between = {
+                name: value + left / steps * (self._measured.get(name, value) - value)
+                for name, value in measured.items()
+            }
+            action = self._network.step(between, self._action)
         self._measured, self._action = measured, action
         self.step_number += steps
         if self._first is None and time is not None:
@@ -221,10 +212,7 @@ class DeployedPolicy:
     def observation(self) -> np.ndarray:
         """Inputs of the network at the last step in one vector, with the newest value of each
         quantity first; empty before the first step."""
-        if self._histories is None:
-            return np.zeros(0)
-        values = self._histories.values | self._network.memory
-        return np.concatenate([values[i.name].ravel() for i in self.metadata.observation])
+        return self._network.observation
 
     def _needs(self) -> tuple[str, ...]:
         reads = self._network.reads

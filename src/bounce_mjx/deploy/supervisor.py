@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from bounce_mjx.deploy.chain import Chain
+from bounce_mjx.deploy.chain import paddle_pose
 from bounce_mjx.deploy.faults import EARLIER, FLYING, first_fault, make_bounds, picture_age
-from bounce_mjx.deploy.histories import Measurements
+from bounce_mjx.deploy.network import Measurements
 from bounce_mjx.errors import UserError
 
 if TYPE_CHECKING:
@@ -58,7 +58,6 @@ class Supervisor:
         if corners.shape != (2, 3) or not np.all(corners[0] < corners[1]):
             raise UserError(f"the box is {box}; give its lowest and its highest x, y and z, m")
         self._allowed = make_bounds(metadata, age, max_steps_late, corners)
-        self._chain = Chain(metadata)
         self.state: State = "homing"
         self.fault: str | None = None
         """Code of the rule that was broken, such as `ball_lost`; `measurement` for a measurement
@@ -173,7 +172,7 @@ class Supervisor:
         self._idle = self._idle + 1 if policy.step_number == last else 0
         if self._idle:
             policy.motion.hold()
-        target = self._chain.paddle(policy.targets)[0]
+        target = paddle_pose(policy.metadata, policy.targets)[0]
         if not self._is_fine({"idle": self._idle, "target": target}):
             policy.motion.withdraw()
 
@@ -185,11 +184,11 @@ class Supervisor:
 
     def _facts(self, measured: Measurements) -> dict[str, Any]:
         """The facts of a running episode, for the rules."""
-        angles, dt = measured["joint_angles"], self._policy.metadata.control_dt
+        angles, metadata = measured["joint_angles"], self._policy.metadata
         facts: dict[str, Any] = self._window(angles)
-        facts["paddle"] = self._chain.paddle(angles)[0]
+        facts["paddle"] = paddle_pose(metadata, angles)[0]
         last = self._time
-        self._time = float(measured["time"][0]) if "time" in measured else (last or 0.0) + dt
+        self._time = float(measured["time"][0]) if "time" in measured else (last or 0.0) + metadata.control_dt
         if last is not None:
             self._time = max(self._time, last)
             facts["elapsed"] = self._time - last
