@@ -260,9 +260,8 @@ def test_upward_speed_is_judged_only_for_low_targets(env):
         configured = BounceBall(EnvConfig(target_height_range=(low, high)))
         for speed, passed in ((900, True), (9000, False)):
             figures = statistics(rising_speed=speed)
-            reports = (
-                judge(configured, figures), judge(env, figures, commands={"target_height": (low, high)})
-            )  # fmt: skip
+            given = {"target_height": (low, high)}
+            reports = judge(configured, figures), judge(env, figures, commands=given)
             for report in reports:
                 assert report.results[SPEED].passed is (passed if judged else None)
                 np.testing.assert_allclose(report.results[SPEED].value, speed / 900)

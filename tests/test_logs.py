@@ -12,7 +12,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.identify import Topics
 from bounce_mjx.identify.excitation import excite
 from bounce_mjx.identify.log import Log, align_clocks, check
-from bounce_mjx.identify.reading import is_bag, read_bag, read_csv, read_log
+from bounce_mjx.identify.reading import read_bag, read_csv, read_log
 from bounce_mjx.identify.world import measure_camera
 from bounce_mjx.robot.model import find_addresses, load_model
 from bounce_mjx.runs.config import read_preset
@@ -116,7 +116,7 @@ def swapped(lines: list[str]) -> list[str]:
 @pytest.mark.parametrize(
     "change, sentence",
     [
-        (lambda lines: [], r"the log .+ is empty; record with"),
+        (lambda lines: [], r"the log .+ has 0 rows of 0 cells, .+ record with"),
         (lambda lines: lines[:40], r"log.csv has 39 joint angles; record at least 100"),
         (
             without_column("joint_angles.right [rad]"),
@@ -126,7 +126,10 @@ def swapped(lines: list[str]) -> list[str]:
             lambda lines: [lines[0], *(changed(x, 0, 2, "") for x in lines[1:])],
             r"120 of the 120 joint angles in .+: row 2 lacks one of its 2 numbers",
         ),
-        (lambda lines: [*lines[:5], lines[5] + ",1", *lines[6:]], r"13 cells in row 6, .+ has 12"),
+        (
+            lambda lines: [*lines[:5], lines[5] + ",1", *lines[6:]],
+            r"cannot be read \(the number of columns changed from 12 to 13",
+        ),
         (
             scaled("joint_angles", 57.3),
             r"joint_angles\.right .+ is -28\.\d+ rad .+ if these are degrees, write .+ \[deg\]",
@@ -138,7 +141,10 @@ def swapped(lines: list[str]) -> list[str]:
             renamed,
             r"no column joint_angles\.left .+ joint_angles\.shoulder, .+ give .+ --joint-names",
         ),
-        (lambda lines: [*lines[:3], "\x00\x01", *lines[3:]], r"in row 4|cannot be read"),
+        (
+            lambda lines: [*lines[:3], "\x00\x01", *lines[3:]],
+            r"cannot be read \(the number of columns",
+        ),
     ],
 )
 def test_a_wrong_log_is_refused_by_one_sentence(change, sentence: str, tmp_path: Path) -> None:
@@ -375,7 +381,6 @@ def test_a_bag_that_cannot_be_read_is_refused_with_a_hint(tmp_path: Path) -> Non
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(file.read_bytes()[:-100])
     for path in (folder, cut, tmp_path / "none.bag"):
-        assert is_bag(path)
         with pytest.raises(UserError, match=r"cannot be read .+ ros2 bag reindex or mcap recover"):
             read_bag(path, JOINTS, TOPICS)
 
@@ -451,26 +456,3 @@ def test_excitation_keeps_to_the_limits_of_the_robot() -> None:
         largest = np.max(np.abs(np.diff(motion.targets, order, axis=0)), axis=0)
         assert np.all(largest / config.control_dt**order <= limit)
     assert np.all(np.ptp(motion.targets, axis=0) > 0.01)
-
-
-@pytest.mark.parametrize("separator, point", [(";", ","), ("\t", ".")])
-def test_other_separators_and_decimal_commas_are_read(separator, point, tmp_path: Path) -> None:
-    """And titles without a space before the unit."""
-    good = recorded(tmp_path / "good.csv")
-    path = tmp_path / "log.csv"
-    text = good.read_text().replace(",", separator).replace(" [", "[")
-    head, _, rows = text.partition("\n")
-    path.write_text(f"{head}\n{rows.replace('.', point)}")
-    for one, other in zip(log_of(good)[1:-1], log_of(path)[1:-1], strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
-def test_a_ball_in_two_frames_is_refused(tmp_path: Path) -> None:
-    bag = Bag().fill(20)
-    frames = iter(["base", "camera_link"] * 10)
-    bag.rows = [
-        (t, a, bag.point(a, (1.0, 2.0, a), next(frames)) if t == "/ball" else m)
-        for t, a, m in bag.rows
-    ]
-    with pytest.raises(UserError, match=r"of /ball in .+ are in the frames base, camera_link"):
-        read_bag(bag.write(tmp_path / "bag"), JOINTS, TOPICS)

@@ -188,7 +188,11 @@ class Supervisor:
         facts: dict[str, Any] = self._window(angles)
         facts["paddle"] = paddle_pose(metadata, angles)[0]
         last = self._time
-        self._time = float(measured["time"][0]) if "time" in measured else (last or 0.0) + metadata.control_dt
+        self._time = (
+            float(measured["time"][0])
+            if "time" in measured
+            else (last or 0.0) + metadata.control_dt
+        )
         if last is not None:
             self._time = max(self._time, last)
             facts["elapsed"] = self._time - last

@@ -6,7 +6,7 @@ Pereyra (1973) in the linearised problem.
 """
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -286,26 +286,28 @@ def _list_differences(
     angles, pictures, both = slice(0, split), slice(split, None), slice(0, None)
     joints = [slice(j, split, n) for j in range(n)]
 
-    def turn_inside(step: np.ndarray) -> np.ndarray:
-        """Differences, with the other sign where they would leave the limits."""
-        ahead = layout.clip(vector + size * step) - vector
-        return np.where(np.abs(ahead) < 0.5 * np.abs(size * step), -size, size) * step
-
-    steps, ball_steps = turn_inside(layout.step), turn_inside(layout.ball_step)
-    column = {int(p): f for f, p in enumerate(unknowns)}
     found = []
+
+    def add(places: Sequence[int], step: float, rows: list[slice]) -> None:
+        """Unknowns of one simulation, with the other sign where they would leave the limits."""
+        at, moved = np.array(places), vector.copy()
+        moved[at] += size * step
+        turned = np.abs(layout.clip(moved)[at] - vector[at]) < 0.5 * np.abs(size * step)
+        steps = np.where(turned, -size, size) * step
+        found.append(_Difference(np.searchsorted(unknowns, at), steps, rows))
+
     for name, place in layout.slices().items():
-        if place.start not in column:
+        if place.start not in unknowns:
             continue
         unknown, places = layout.unknowns[name], range(place.start, place.stop)
-        if unknown.own:
-            found.append(_Difference(np.array([column[p] for p in places]), steps[place], joints))
         rows = pictures if name not in ARM else both if unknown.ball_step is None else angles
+        if unknown.own:
+            add(places, unknown.step, joints)
         for p in places:
             if not unknown.own:
-                found.append(_Difference(np.array([column[p]]), steps[[p]], [rows]))
+                add([p], unknown.step, [rows])
             if unknown.ball_step:
-                found.append(_Difference(np.array([column[p]]), ball_steps[[p]], [pictures]))
+                add([p], unknown.ball_step, [pictures])
     start_steps = size * _scale_starts(problem.windows)[1]
     columns = len(unknowns) + np.arange(len(entries))
     arm = np.flatnonzero(entries < n)

@@ -184,11 +184,6 @@ def align_clocks(log: Log) -> Log:
             f"the time stamps of the pictures in {log.source} advance by {1.0 - slope:.4g} s each "
             "second, and 1 s is expected; if they are milliseconds, write ball_time [ms]"
         )
-    elif total > 5.0 * _DRIFT:
-        notes.append(
-            f"the pictures in {log.source} grow older by {1e3 * total:.1f} ms over the log, faster "
-            "than clocks drift; this counts as latency"
-        )
     offset *= abs(offset) > _LARGEST_AGE
     if offset:
         notes.append(

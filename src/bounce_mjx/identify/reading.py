@@ -24,8 +24,6 @@ UNITS = {
 """Units that a column may state in place of the one in SI, and their factors."""
 # Time by which stamps and arrivals differ, s, beyond which they are of two clocks.
 _TWO_CLOCKS = 1.0
-
-
 # Of the topics.
 _TYPES = "JointState", "JointState or Float64MultiArray", "PointStamped or PoseStamped"
 
@@ -42,14 +40,14 @@ def read_log(path: Path, model: mujoco.MjModel, topics: Topics, names: Sequence[
     """
     own = joint_names(model)
     names = check_names(names or own, own, "--joint-names")
-    log = read_bag(path, names, topics) if is_bag(path) else read_csv(path, names)
+    is_bag = path.is_dir() or path.suffix.lower() in (".mcap", ".db3", ".bag", ".zstd")
+    log = read_bag(path, names, topics) if is_bag else read_csv(path, names)
     check(log, names, model.jnt_range[list(find_addresses(model).arm_joints)])
     return align_clocks(log)
 
 
 def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
-    """Reads a CSV log. Cells are separated by commas, semicolons or tabs, as the header's; beside
-    the last two, a decimal comma is read.
+    """Reads a CSV log.
 
     Args:
       joint_names: the robot's joints, in the order of the result.
@@ -58,7 +56,7 @@ def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
       UserError: the file cannot be read, a column is missing or states an unknown unit, or as
         `make_log`.
     """
-    lines, columns = _read_columns(path)
+    columns = _read_columns(path)
 
     def column(name: str, unit: str) -> np.ndarray:
         if name not in columns:
@@ -67,13 +65,13 @@ def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
                 f"{', '.join(map(shorten, list(columns)[:30]))}; if the joints have other names, "
                 "give the log's robot with --robot, or the names in this order with --joint-names"
             )
-        given, cells = columns[name]
+        given, numbers = columns[name]
         if given not in UNITS[unit]:
             raise UserError(
                 f"{path} has the column {name} [{shorten(given)}], whose unit must be one of "
                 f"{', '.join(UNITS[unit])}; write {name} [{unit}]"
             )
-        return np.array([_read_number(cell) for cell in cells]) * UNITS[unit][given]
+        return numbers * UNITS[unit][given]
 
     times = column("time", "s")
 
@@ -81,7 +79,7 @@ def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
         """The rows with any cell of a measurement."""
         values = np.stack([column(name, unit) for name in names], axis=1)
         used = ~np.all(np.isnan(values), axis=1)
-        arrays = lines, column(stamp, "s"), times, values
+        arrays = 2 + np.arange(len(times)), column(stamp, "s"), times, values
         return Rows(f"{what} in {path}", "row {}", *(array[used] for array in arrays))
 
     angles, targets = (
@@ -96,52 +94,38 @@ def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
     return make_log(str(path), angles, targets, balls)
 
 
-def _read_columns(path: Path) -> tuple[np.ndarray, dict[str, tuple[str, Sequence[str]]]]:
-    """Line numbers [R] of a CSV file's rows, and the stated unit and the cells [R] of each column
-    by its name."""
+def _read_columns(path: Path) -> dict[str, tuple[str, np.ndarray]]:
+    """The stated unit and the numbers [R] of each column of a CSV file, by its name; NaN for a cell
+    that holds none."""
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            delimiter = max(",;\t", key=file.readline().count)
-            file.seek(0)
-            reader = csv.reader(file, delimiter=delimiter)
-            header = next(reader, [])
-            numbered = [(reader.line_num, row) for row in reader if any(row)]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        header, *lines = path.read_text("utf-8-sig").splitlines() or [""]
+        titles = next(csv.reader([header]), [])
+        options = dict(delimiter=",", comments=None, quotechar='"', ndmin=2, encoding=None)
+        cells = np.loadtxt(lines, converters=_read_number, **options) if lines else np.zeros((0, 0))
+    except (OSError, ValueError) as error:
         raise UserError(
             f"the log {path} cannot be read ({shorten(reason_of(error))}); give a CSV file in "
             "UTF-8, or a ROS bag"
         ) from error
-    if not numbered:
-        raise UserError(f"the log {path} is empty; record with bounce_mjx's Recorder")
-    for line, row in numbered:
-        if len(row) != len(header):
-            raise UserError(
-                f"{path} has {len(row)} cells in row {line}, and its header has {len(header)}; "
-                "give each row a cell for each column"
-            )
-        if delimiter != ",":
-            row[:] = [cell.replace(",", ".") for cell in row]
-    lines, rows = zip(*numbered, strict=True)
-    columns: dict[str, tuple[str, Sequence[str]]] = {}
-    for title, cells in zip(header, zip(*rows, strict=True), strict=True):
+    if cells.shape[1] != len(titles) or not cells.size:
+        raise UserError(
+            f"the log {path} has {len(cells)} rows of {cells.shape[1]} cells, and its header has "
+            f"{len(titles)}; record with bounce_mjx's Recorder"
+        )
+    columns: dict[str, tuple[str, np.ndarray]] = {}
+    for title, numbers in zip(titles, cells.T, strict=True):
         name, unit = re.fullmatch(r"\s*(.*?)\s*(?:\[([^\[\]]*)\])?\s*", title).groups()
         if name in columns:
             raise UserError(f"{path} has two columns {shorten(name)}; leave one")
-        columns[name] = (unit or "").strip(), cells
-    return np.array(lines), columns
+        columns[name] = (unit or "").strip(), numbers
+    return columns
 
 
 def _read_number(text: str) -> float:
-    """A cell's number; NaN if it holds none, or one that is not finite."""
     try:
-        return float(text) if np.isfinite(float(text)) else np.nan
+        return float(text)
     except ValueError:
         return np.nan
-
-
-def is_bag(path: Path) -> bool:
-    """Whether a log is a ROS bag: a folder, or a file of one of their types."""
-    return path.is_dir() or path.suffix.lower() in (".mcap", ".db3", ".bag", ".zstd")
 
 
 def read_bag(path: Path, joint_names: Sequence[str], topics: Topics) -> Log:
@@ -151,7 +135,7 @@ def read_bag(path: Path, joint_names: Sequence[str], topics: Topics) -> Log:
     Raises:
       MissingPackage: rosbags is missing.
       UserError: the bag cannot be read, a topic is missing or of another type, no message has a
-        joint, the ball is in two frames, or as `make_log`.
+        joint, or as `make_log`.
     """
     found, num_joints = _read_messages(path, topics), len(joint_names)
     angles, targets = (
@@ -174,14 +158,6 @@ def read_bag(path: Path, joint_names: Sequence[str], topics: Topics) -> Log:
             )
     name = f"pictures of the ball of {topics.ball} in {path}"
     balls = _make_rows(name, found[topics.ball], 3, _read_position)
-    seen = np.flatnonzero(np.isfinite(balls.values).all(axis=1))
-    frames = sorted({found[topics.ball][i][1].header.frame_id for i in seen})
-    if len(frames) > 1:
-        named = ", ".join(shorten(frame) or "none" for frame in frames)
-        raise UserError(
-            f"the messages of {topics.ball} in {path} are in the frames {named}; record the ball "
-            "in one, that of the robot's base"
-        )
     own = np.isfinite(angles.times)
     if np.any(own) and abs(np.median((angles.arrivals - angles.times)[own])) > _TWO_CLOCKS:
         # Such as simulated time: pictures arrived when the angles of the same moment did.
@@ -195,13 +171,12 @@ def _read_messages(path: Path, topics: Topics) -> dict[str, list[tuple[float, An
     with needed("rosbags", "'bounce_mjx[identify]'"):
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
-    found: dict[str, list[tuple[float, Any]]] = {
-        topic: [] for topic in topics.model_dump().values()
-    }
+    wanted = dict(zip(topics.model_dump().values(), _TYPES, strict=True))
+    found: dict[str, list[tuple[float, Any]]] = {topic: [] for topic in wanted}
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as bag:
             present = {c.topic: c.msgtype.rpartition("/")[2] for c in bag.connections}
-            for topic, types in zip(topics.model_dump().values(), _TYPES, strict=True):
+            for topic, types in wanted.items():
                 if present.get(topic) in types.split(" or "):
                     continue
                 # An arm may have been recorded alone.
@@ -212,8 +187,8 @@ def _read_messages(path: Path, topics: Topics) -> dict[str, list[tuple[float, An
                         f"{', '.join(listed) or 'none'}: name the topics by --topics.joints, "
                         "--topics.targets and --topics.ball"
                     )
-            wanted = [c for c in bag.connections if c.topic in found]
-            for connection, arrival, raw in bag.messages(connections=wanted):
+            connections = [c for c in bag.connections if c.topic in found]
+            for connection, arrival, raw in bag.messages(connections):
                 message = bag.deserialize(raw, connection.msgtype)
                 found[connection.topic].append((1e-9 * arrival, message))
     except UserError:
@@ -243,9 +218,8 @@ def _make_rows(
             times[i] = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
         if len(given := read(message)) == size:
             values[i] = given
-    # Drivers that start before the clock, of a simulation say, stamp 0.
-    stamped = np.any(times) and np.median(times) > 0.0
-    times = np.where(times == 0.0, np.nan, times) if stamped else arrivals
+    # Some programs stamp no message, or 0 before their clock has started.
+    times = np.where(times == 0.0, np.nan, times) if np.any(times) else arrivals
     return Rows(name, "message {}", 1 + np.arange(len(times)), times, arrivals, values)
 
 

@@ -105,16 +105,6 @@ class Layout(NamedTuple):
         """Prior standard deviation [P]."""
         return self._fill(lambda unknown: unknown.deviation)
 
-    @property
-    def step(self) -> np.ndarray:
-        """Differences [P] for the derivatives."""
-        return self._fill(lambda unknown: unknown.step)
-
-    @property
-    def ball_step(self) -> np.ndarray:
-        """Differences [P] for the derivatives of the pictures."""
-        return self._fill(lambda u: u.step if u.ball_step is None else u.ball_step)
-
     def free(self, stages: Sequence[str]) -> np.ndarray:
         """Which entries [P] the stages vary."""
         return self._fill(lambda unknown: unknown.stage in stages)
@@ -126,11 +116,10 @@ class Layout(NamedTuple):
     def interior(self, vector: np.ndarray, steps: float) -> np.ndarray:
         """The vector [P] with a delay from which the differences of derivatives, `steps` times
         each, leave a latency of at least 0: at 0, delay and variance would have one effect."""
-        places = self.slices()
-        delay, variance = places["delay"].start, places["delay_variance"].start
-        mean = self._lag_mean(vector[variance] + steps * self.step[variance])
-        moved = vector.copy()
-        moved[delay] = max(vector[delay], mean + steps * self.step[delay])
+        delay, variance = (self.unknowns[name].step for name in ("delay", "delay_variance"))
+        places, moved = self.slices(), vector.copy()
+        mean = self._lag_mean(vector[places["delay_variance"]] + steps * variance)
+        moved[places["delay"]] = np.maximum(vector[places["delay"]], mean + steps * delay)
         return moved
 
     def _lag_mean(self, variance: np.ndarray) -> np.ndarray:
