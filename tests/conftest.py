@@ -23,6 +23,8 @@ import jax
 import mujoco
 import pytest
 
+import tiny_runs
+from bounce_mjx import BounceBall
 from bounce_mjx.commands.main import main
 from bounce_mjx.errors import UserError
 from bounce_mjx.robot.model import load_model
@@ -111,6 +113,18 @@ def mj_model() -> mujoco.MjModel:
     return load_model(None, EnvConfig().physics_dt)
 
 
+@pytest.fixture(scope="session")
+def env() -> BounceBall:
+    """The environment with all its defaults."""
+    return BounceBall()
+
+
+@pytest.fixture(scope="session")
+def trained() -> Path:
+    """The folder of a run of 256 steps, for reading alone."""
+    return tiny_runs.shared_run()
+
+
 @pytest.fixture
 def refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
@@ -131,7 +145,7 @@ def refused(
             main(line.split() if isinstance(line, str) else [str(word) for word in line])
         said, sentence = capfd.readouterr()
         assert ended.value.code == 2 and "Traceback" not in said
-        assert re.fullmatch(r"error: .+\n", sentence), sentence
+        assert re.fullmatch(r"error: .+\n", sentence) and sentence[:-1].isprintable(), sentence
         assert not [word for word in words if word not in sentence], sentence
         assert contents() == before
         return sentence

@@ -17,7 +17,7 @@ from brax.training.agents.ppo import checkpoint as brax_checkpoint
 from brax.training.agents.sac import networks as sac_networks
 from brax.training.agents.sac import train as brax_sac
 
-from bounce_mjx import BounceBall, EnvConfig
+from bounce_mjx import EnvConfig
 from bounce_mjx.adapters.brax import (
     BraxBounceBall,
     device_put_replicated,
@@ -27,11 +27,6 @@ from bounce_mjx.adapters.brax import (
 from bounce_mjx.errors import UserError
 from bounce_mjx.task import term_names
 from bounce_mjx.tasks.bounce_rewards import BounceReward
-
-
-@pytest.fixture(scope="module")
-def env():
-    return BounceBall()
 
 
 def all_finite(tree) -> bool:

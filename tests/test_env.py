@@ -25,11 +25,6 @@ FLOAT32_EPS = 1.2e-7
 
 
 @pytest.fixture(scope="module")
-def env():
-    return BounceBall()
-
-
-@pytest.fixture(scope="module")
 def reset(env):
     return jax.jit(env.reset)
 

@@ -2,6 +2,7 @@
 
 import functools
 import io
+import itertools
 import json
 from pathlib import Path
 
@@ -39,11 +40,6 @@ BOUNCES, HORIZONTAL, HEIGHT, SPEED, STABLE = range(5)
 TARGET_X = 0.58856
 DRIBBLE = f"{Path(__file__).parent.parent / 'examples' / 'dribble_task.py'}:Dribble"
 METRICS = "bounced", "n_bounces", "apex_error", "apex_offset"
-
-
-@pytest.fixture(scope="module")
-def env():
-    return BounceBall()
 
 
 # Counting
@@ -388,55 +384,34 @@ def test_mujoco_evaluator_agrees_with_the_fused_one(networks, random_policy):
     assert np.isfinite(broken.episode_return).all() and not np.any(broken.running)
 
 
-def seen_worlds(monkeypatch, config: EnvConfig, *options: EvaluationOptions):
-    """The world and the command of the first episode in evaluations with these options, and the
-    reports; without a simulation."""
-    seen, reports = [], []
+def test_worlds_and_commands_are_those_of_the_training_or_of_the_options(monkeypatch):
+    """A given command replaces a drawn one, also where the world of the training changes it. A
+    nominal evaluation draws no world, and its commands are the task's. The report is judged by the
+    commands that were drawn."""
+    drawn = {"command_interval": (2.0, 4.0), "air_drag": (0.1, 0.2)}
+    config = EnvConfig(target_height_range=(0.3, 0.8), randomization=drawn)
+    seen, passed = [], []
 
     def make_evaluator(env, networks, episodes, recorded):
         def evaluate(policy, key, ranges):
-            start = reset_episodes(env, key, episodes, ranges)
-            state = jax.tree.map(lambda x: x[..., 0], start.pipeline_state)
-            seen.append((state.world, state.command))
+            state = reset_episodes(env, key, episodes, ranges).pipeline_state
+            seen.append(jax.tree.map(lambda x: x[..., 0], (state.world, state.command)))
+            # Too fast for a low target; at others the speed is not judged.
             return statistics(rising_speed=9000), None
 
         return evaluate
 
     monkeypatch.setattr(policy_evaluation, "make_evaluator", make_evaluator)
-    for each in options:
-        reports.append(evaluate_policy(None, config, networks_of(PPOConfig()), each).report)
-    return seen, reports
-
-
-def test_one_value_replaces_a_drawn_command(monkeypatch):
-    """Also where the world of the training draws and changes it; the rest of the world stays. The
-    report is judged by that value."""
-    drawn = {"command_interval": (2.0, 4.0), "air_drag": (0.1, 0.2)}
-    config = EnvConfig(target_height_range=(0.3, 0.8), randomization=drawn)
-    options = EvaluationOptions(episodes=2)
-    fixed = options._replace(commands={"target_height": 0.5})
-    ((world, command), (own_world, own_command)), reports = seen_worlds(
-        monkeypatch, config, fixed, options
-    )
-    assert command["target_height"] == 0.5 != own_command["target_height"]
-    assert world.keys() == {"air_drag"} and 0.1 <= world["air_drag"] <= 0.2
-    assert own_world.keys() == drawn.keys()
-    # Too fast for a low target; at others the speed is not judged.
-    assert [report.results[SPEED].passed for report in reports] == [False, None]
-
-
-def test_a_nominal_evaluation_draws_no_worlds(monkeypatch):
-    """Its commands are the task's, if the training had wider ranges: the speed is judged."""
-    config = EnvConfig(target_height_range=(0.3, 0.8), randomization={"air_drag": (0.1, 0.2)})
-    options = EvaluationOptions(episodes=2)
-    nominal = options._replace(nominal=True)
-    fixed = nominal._replace(commands={"target_height": 0.5})
-    seen, reports = seen_worlds(monkeypatch, config, options, nominal, fixed)
-    assert 0.1 <= seen[0][0]["air_drag"] <= 0.2
-    assert seen[1][0] == seen[2][0] == {}
-    assert 0.4 <= seen[1][1]["target_height"] <= 0.6
-    assert seen[2][1] == {"target_height": 0.5}
-    assert [report.results[SPEED].passed for report in reports] == [None, False, False]
+    for nominal, commands in itertools.product((False, True), ({}, {"target_height": 0.5})):
+        options = EvaluationOptions(episodes=2, nominal=nominal, commands=commands)
+        evaluated = evaluate_policy(None, config, networks_of(PPOConfig()), options)
+        passed.append(evaluated.report.results[SPEED].passed)
+    (own, height), (own_but_one, given), (none, tasks), (still_none, also_given) = seen
+    assert own.keys() == drawn.keys() and own_but_one.keys() == {"air_drag"}
+    assert 0.1 <= own_but_one["air_drag"] <= 0.2 and none == still_none == {}
+    assert given == also_given == {"target_height": 0.5} != height
+    assert 0.4 <= tasks["target_height"] <= 0.6
+    assert passed == [None, False, False, False]
 
 
 # Another task

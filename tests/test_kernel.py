@@ -33,11 +33,6 @@ def in_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dynamics, "elementwise", partial(kernel.elementwise, interpret=True))
 
 
-@pytest.fixture(scope="module")
-def env() -> BounceBall:
-    return BounceBall()
-
-
 def moving(env: BounceBall, batch: int) -> tuple[PhysicsState, jax.Array]:
     """States that move, the batch last, and servo targets; in some the ball is in the paddle."""
     keys = jax.random.split(jax.random.PRNGKey(0), batch)

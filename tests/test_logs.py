@@ -227,11 +227,6 @@ def test_stated_units_are_converted(tmp_path: Path) -> None:
         np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-9)
 
 
-def test_a_log_without_a_ball_is_read(tmp_path: Path) -> None:
-    log = log_of(recorded(tmp_path / "log.csv", ball=False))
-    assert len(log.times) == ROWS and not len(log.picture_times)
-
-
 def camera_log(
     seconds: float = 60.0, drift: float = 0.0, offset: float = 0.0, lost: float = 0.0
 ) -> tuple[Log, np.ndarray]:

@@ -36,19 +36,13 @@ from bounce_mjx.task import Curve, term_names
 from bounce_mjx.tasks.bounce import Bounce, BounceReward
 from bounce_mjx.training.callbacks import Event, WeightsAndBiases
 from bounce_mjx.training.log import TensorBoardLog
-from tiny_runs import TINY, shared_run
+from tiny_runs import TINY
 
 TERMS = term_names(BounceReward)
 CURVES = (
     Curve("episode/return", "", title="return of an episode"),
     *(curve for curve in Bounce.curves if curve.title),
 )
-
-
-@pytest.fixture(scope="module")
-def trained() -> Path:
-    """The folder of a run of 256 steps."""
-    return shared_run()
 
 
 def write_run(folder: Path, config: TrainConfig, scalars: dict[str, dict[int, float]]) -> Path:

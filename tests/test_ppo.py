@@ -251,11 +251,6 @@ def tiny():
 
 
 @pytest.fixture(scope="module")
-def env():
-    return BounceBall()
-
-
-@pytest.fixture(scope="module")
 def trainer(tiny, env):
     return ppo.PPO(tiny, env, env.config.episode_steps)
 

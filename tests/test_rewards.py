@@ -30,21 +30,9 @@ def evaluate(config: BounceReward, states: dict[str, np.ndarray]) -> dict[str, n
 
 
 def state(
-    *,
-    dx=0.0,
-    dy=0.0,
-    z=0.5,
-    vz=0.0,
-    target=0.5,
-    paddle_z=0.05,
-    paddle_dx=0.0,
-    paddle_dy=0.0,
-    n_bounces=0,
-    bounced=False,
-    action=0.0,
-    last_action=0.0,
-    joint_velocity=0.0,
-) -> dict[str, np.ndarray]:
+    *, dx=0.0, dy=0.0, z=0.5, vz=0.0, target=0.5, paddle_z=0.05, paddle_dx=0.0, paddle_dy=0.0,
+    n_bounces=0, bounced=False, action=0.0, last_action=0.0, joint_velocity=0.0,
+) -> dict[str, np.ndarray]:  # fmt: skip
     """One state as a batch of one; `dx`, `dy` and `paddle_dx`, `paddle_dy` are offsets from the
     target."""
     return {

@@ -156,9 +156,6 @@ def test_a_training_is_not_resumed_through_a_link(runs: Path, place: str, capsys
     assert contents(other) == before
 
 
-# Runs from someone else
-
-
 # The robot of a run
 
 
@@ -386,24 +383,10 @@ def test_json_has_null_where_there_is_no_finite_number(progress: Progress) -> No
     assert (plain["numpy"], plain["tuple"]) == (None, [None, 1])
 
 
-BAD_RESULTS = {
-    "list": "[]",
-    "results of another shape": {"results": [3]},
-    "infinite value": {"seconds": {"train": math.inf}},
-}
-
-
-@pytest.mark.parametrize("change", BAD_RESULTS.values(), ids=BAD_RESULTS)
+@pytest.mark.parametrize("change", [None, {"results": [3]}, {"seconds": {"train": math.inf}}])
 def test_results_of_another_shape(tmp_path: Path, progress: Progress, change) -> None:
-    if isinstance(change, dict):
-        change = json.dumps(results_of(progress) | change)
     path = tmp_path / "results.json"
-    path.write_bytes(change.encode() if isinstance(change, str) else change)
-    with pytest.raises(UserError) as error_info:
+    path.write_text(json.dumps(results_of(progress) | change if change else []))
+    with pytest.raises(UserError, match=rf"^{path} is damaged \(.*delete it to continue") as found:
         load_results(tmp_path)
-    sentence = str(error_info.value)
-    assert sentence.startswith(f"{path} is damaged (") and "delete it to continue" in sentence
-    assert "\n" not in sentence and len(sentence) < 500
-
-
-# Precision
+    assert len(str(found.value)) < 500

@@ -183,9 +183,6 @@ def test_skrl_gets_terminal_observations(env):
     assert torch.equal(skrl_env.state()[:, :29], after)
 
 
-# The randomisation
-
-
 # Policies
 
 

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bounce_mjx import BounceBall
 from bounce_mjx.env import vector
 
 NUM_ENVS = 4
@@ -13,11 +12,6 @@ STEPS = 70
 NO_LIMIT = 10**6
 RESET_KEY = jax.random.key(11)
 STEP_KEYS = jax.random.split(jax.random.key(12), STEPS)
-
-
-@pytest.fixture(scope="module")
-def env():
-    return BounceBall()
 
 
 @pytest.fixture(scope="module")
