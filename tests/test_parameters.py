@@ -32,7 +32,6 @@ from bounce_mjx.physics import (
     make_engine,
 )
 from bounce_mjx.physics.parameters import shapes
-from bounce_mjx.robot.model import load_model, resting_activations
 from random_worlds import own_parameters, random_parameters
 
 # Parameters of the shipped model; test_friction.py and test_joint_friction.py cover friction.
@@ -77,28 +76,24 @@ def test_one_given_number_leaves_the_others_to_the_model(mj_model, field):
 @pytest.mark.slow
 @pytest.mark.separate_loops
 @pytest.mark.usefixtures("float64")
-def test_mjx_carries_activations_and_worlds(record_property):
+def test_mjx_carries_worlds(mj_model, record_property):
     """Free run against C over control steps, in random worlds with friction, spin in air and
-    filtered servos at their limits."""
+    servos at their limits."""
     count, num_substeps, air_drag, air_lift = 4, 5, 0.2, 0.05
-    model = edited('<position kp="20000"', '<position timeconst="0.02" kp="20000"')
-    assert model.na == 6
-    start = bouncing_states(model, np.random.default_rng(1))
+    start = bouncing_states(mj_model, np.random.default_rng(1))
     start.qpos[:, 8] -= 0.03
-    state = PhysicsState(
-        *(jnp.asarray(x[:count]) for x in start[:2]), jnp.asarray(start.qpos[:count, :6])
-    )
-    parameters = random_parameters(model, count, seed=9)
+    state = PhysicsState(*(jnp.asarray(x[:count]) for x in start[:2]))
+    parameters = random_parameters(mj_model, count, seed=9)
     parameters = parameters._replace(
         contact_friction=np.array([0.01, 0.1, 0.4, 1.0]),
         force_limit=np.tile([300.0, 100.0, 30.0, 10.0, 3.0, 1.0], (count, 1)),
     )
     data = []
     for i in range(count):
-        c_model = edited_model(model, world(parameters, i))
+        c_model = edited_model(mj_model, world(parameters, i))
         data.append((c_model, mujoco.MjData(c_model)))
-        data[i][1].qpos[:], data[i][1].qvel[:], data[i][1].act[:] = (x[i] for x in state)
-    engine = make_engine(model, "mjx")
+        data[i][1].qpos[:], data[i][1].qvel[:] = (x[i] for x in state)
+    engine = make_engine(mj_model, "mjx")
     control = partial(Control, air_drag=air_drag, air_lift=air_lift)
     step = jax.jit(jax.vmap(lambda p, s, u: engine.step(p, s, control(u), num_substeps)))
     contacts, flight, touched = 0, [], set()
@@ -114,7 +109,7 @@ def test_mjx_carries_activations_and_worlds(record_property):
                 touched |= {j} if d.ncon else set()
             if j not in touched:
                 flight.append(np.max(np.abs(state.qvel[j] - d.qvel)))
-    expected = (np.array([getattr(d, name) for _, d in data]) for name in ("qpos", "qvel", "act"))
+    expected = (np.array([getattr(d, name) for _, d in data]) for name in ("qpos", "qvel"))
     error = max(
         float(np.max(np.abs(np.asarray(x) - y))) for x, y in zip(state, expected, strict=True)
     )
@@ -134,17 +129,6 @@ def test_a_parameter_of_another_shape_is_refused(mj_model):
         wrong = PhysicsParameters(**{field: jnp.ones((*shape, 2))})
         with pytest.raises(UserError, match=field):
             engine.step(wrong, state, Control(jnp.zeros(mj_model.nu)), 1)
-
-
-def test_filtered_servos_start_at_rest():
-    """Also with a gear: the activations are the actuators' lengths, so no servo exerts a force."""
-    model = edited('<position kp="20000"', '<position timeconst="0.02" gear="-2" kp="20000"')
-    data = mujoco.MjData(model)
-    data.qpos[:6] = np.linspace(-1.0, 1.0, 6)
-    data.act[:] = resting_activations(model, [jnp.asarray(x) for x in data.qpos])
-    mujoco.mj_forward(model, data)
-    np.testing.assert_allclose(data.actuator_force, 0.0, atol=0.01)
-    assert resting_activations(load_model(None, 0.001), list(data.qpos)) is None
 
 
 @pytest.mark.slow
@@ -169,17 +153,16 @@ def test_each_number_alone_acts_as_in_mujoco(mj_model):
     assert np.all(change.max(axis=1) > 1e-4), dict(zip(FIELDS, change.max(axis=1), strict=True))
 
 
-def test_c_evaluation_carries_the_whole_state():
+def test_c_evaluation_carries_the_whole_state(mj_model):
     """Control steps of the evaluation equal an uninterrupted run of mj_step."""
-    model = edited('<position kp="20000"', '<position timeconst="0.02" kp="20000"')
+    model = mj_model
     rng = np.random.default_rng(0)
     qpos = np.tile(model.qpos0, (2, 1)) + 0.1
-    act = np.array(qpos[:, :6])
-    start = PhysicsState(qpos.T, 0.1 * np.ones((model.nv, 2)), act.T)
+    start = PhysicsState(qpos.T, 0.1 * np.ones((model.nv, 2)))
     states = full_states(model, start)
     data = [mujoco.MjData(model) for _ in range(2)]
     for i, d in enumerate(data):
-        d.qpos[:], d.qvel[:], d.act[:] = qpos[i], 0.1, act[i]
+        d.qpos[:], d.qvel[:] = qpos[i], 0.1
     with rollout.Rollout(nthread=1) as pool:
         for _ in range(3):
             ctrl = qpos[:, :6] + rng.uniform(-0.05, 0.05, (2, 6))
@@ -191,4 +174,3 @@ def test_c_evaluation_carries_the_whole_state():
     after = physics_states(model, states)
     np.testing.assert_allclose(after.qpos.T, [d.qpos for d in data], rtol=1e-6)
     np.testing.assert_allclose(after.qvel.T, [d.qvel for d in data], rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(after.act.T, [d.act for d in data], rtol=1e-6)

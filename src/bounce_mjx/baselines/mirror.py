@@ -89,8 +89,7 @@ class MirrorLaw:
         gear = model.actuator_gear[self._servos, 0] ** 2
         stiffness = gear * model.actuator_gainprm[self._servos, 0]
         damping = model.dof_damping[dofs] - gear * model.actuator_biasprm[self._servos, 2]
-        filters = model.actuator_dyntype[self._servos] != mujoco.mjtDyn.mjDYN_NONE
-        self._lag = damping / stiffness + filters * model.actuator_dynprm[self._servos, 0]
+        self._lag = damping / stiffness
         data = mujoco.MjData(model)
         data.qpos[self._arm] = self._home
         mujoco.mj_forward(model, data)

@@ -26,7 +26,6 @@ from bounce_mjx.robot.model import (
     fingerprint,
     joint_names,
     load_model,
-    resting_activations,
 )
 from bounce_mjx.robot.setpoints import Setpoint
 from bounce_mjx.task.rewards import check_names
@@ -385,7 +384,7 @@ class Env:
                 qpos[ball.qpos[i]] = jnp.asarray(coordinate, dtype)
             for i in range(3):
                 qvel[ball.qvel[i]] = velocity[i]
-        return PhysicsState(jnp.stack(qpos), jnp.stack(qvel), resting_activations(model, qpos))
+        return PhysicsState(jnp.stack(qpos), jnp.stack(qvel))
 
     def _first_metrics(self, state: EnvState, truth: Kinematics) -> dict[str, jax.Array]:
         """The metrics of a reset, which are zero except for the privileged ones."""

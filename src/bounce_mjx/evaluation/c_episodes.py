@@ -165,17 +165,13 @@ def full_states(mj_model: mujoco.MjModel, physics: PhysicsState) -> np.ndarray:
     mujoco.mj_getState(mj_model, mujoco.MjData(mj_model), fresh, _FULL_PHYSICS)
     coordinates = np.concatenate(jax.tree.leaves(physics)).T
     states = np.tile(fresh, (len(coordinates), 1))
-    # The order: time, positions, velocities, activations, histories of sensors.
+    # The order: time, positions, velocities, histories of sensors.
     states[:, 1 : 1 + coordinates.shape[1]] = coordinates
     return states
 
 
 def physics_states(mj_model: mujoco.MjModel, states: np.ndarray) -> PhysicsState:
     """The `PhysicsState` [..., N], in float32, of states [N, size] of mjSTATE_FULLPHYSICS."""
-    ends = 1 + np.cumsum([mj_model.nq, mj_model.nv, mj_model.na])
-    qpos, qvel, activations = np.split(states[:, 1 : ends[-1]], ends[:-1] - 1, axis=1)
-    return PhysicsState(
-        qpos=jnp.asarray(qpos.T, jnp.float32),
-        qvel=jnp.asarray(qvel.T, jnp.float32),
-        act=jnp.asarray(activations.T, jnp.float32) if mj_model.na else None,
-    )
+    end = 1 + mj_model.nq + mj_model.nv
+    coordinates = jnp.asarray(states[:, 1:end].T, jnp.float32)
+    return PhysicsState(coordinates[: mj_model.nq], coordinates[mj_model.nq :])

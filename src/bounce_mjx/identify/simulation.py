@@ -15,7 +15,7 @@ from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.unknowns import CAMERA_ROTATION, Layout
 from bounce_mjx.identify.windows import Windows
 from bounce_mjx.physics import Control, PhysicsState, make_engine
-from bounce_mjx.robot.model import find_addresses, resting_activations
+from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import physics_parameters
 
@@ -101,7 +101,7 @@ def _compile(config: WorldConfig, n: int) -> Callable[..., tuple[jax.Array, jax.
         moving = np.array((*addresses.arm_qvel, *ball.qvel))
         qvel = jnp.zeros(model.nv, start.dtype)
         qvel = qvel.at[moving].set(jnp.concatenate([velocities, ball_speeds]))
-        return PhysicsState(qpos, qvel, resting_activations(model, list(qpos)))
+        return PhysicsState(qpos, qvel)
 
     def advance(parameters, state, target, drag):
         # One scalar per joint, which XLA fuses with the physics.

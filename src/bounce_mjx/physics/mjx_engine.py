@@ -58,10 +58,8 @@ def step(
         if control.ball_push is not None:
             pushed = np.concatenate([ball.qvel[:3] for ball in balls])
             data = data.replace(qvel=data.qvel.at[pushed].add(jnp.ravel(control.ball_push)))
-        if state.act is not None:
-            data = data.replace(act=state.act)
         data = jax.lax.fori_loop(0, num_substeps, substep, data)
-    return PhysicsState(data.qpos, data.qvel, None if state.act is None else data.act)
+    return PhysicsState(data.qpos, data.qvel)
 
 
 def _by_air(control: Control, ball: BallAddresses, data: mjx.Data) -> jax.Array:

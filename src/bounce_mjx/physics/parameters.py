@@ -20,8 +20,6 @@ class PhysicsState(NamedTuple):
     """Positions [nq]: joint angles in rad; each ball's position in m, quaternion [w, x, y, z]."""
     qvel: jax.Array
     """Velocities [nv]: joints in rad/s; each ball in m/s (world) and rad/s (its frame)."""
-    act: jax.Array | None = None
-    """Activations [na] of the actuators; None if the model has none."""
 
 
 class PhysicsParameters(NamedTuple):

@@ -7,8 +7,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 
@@ -252,15 +250,14 @@ def _check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
             f"an actuator ({name}) with {mj_model.actuator_ctrlnum[several[0]]} controls; drive "
             "each joint by a <position>, which has one"
         )
-    # An integrated control would be a velocity.
-    dynamics = mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT
     for joint, actuator in zip(addresses.arm_joints, addresses.actuators, strict=True):
-        direct = int(mj_model.actuator_dyntype[actuator]) in dynamics
+        direct = mj_model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_NONE
         if not (direct and is_position_servo(mj_model, actuator)):
             name = joint_name(mj_model, joint)
             raise UserError(
                 f"an actuator on {name} that is not a position servo; drive it by "
-                f'<position joint="{name}"/>'
+                f'<position joint="{name}"/>, without a timeconst (env.randomization.servo_lag '
+                "simulates a lag)"
             )
 
 
@@ -327,22 +324,6 @@ def _servos(mj_model: mujoco.MjModel) -> dict[int, int]:
     if not servos:
         raise UserError("no actuator on a hinge or slide; give each joint of the arm a <position>")
     return dict(sorted(servos.items()))
-
-
-def resting_activations(mj_model: mujoco.MjModel, qpos: Sequence[jax.Array]) -> jax.Array | None:
-    """Activations [na] at which the servos hold the joint positions qpos [nq] (a servo with a
-    `timeconst` filters its target); None where the model has none."""
-    if mj_model.na == 0:
-        return None
-    activations = [jnp.zeros_like(qpos[0])] * mj_model.na
-    for actuator in range(mj_model.nu):
-        if mj_model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT:
-            joint = mj_model.actuator_trnid[actuator, 0]
-            length = mj_model.actuator_gear[actuator, 0] * qpos[mj_model.jnt_qposadr[joint]]
-            first = mj_model.actuator_actadr[actuator]
-            for i in range(first, first + mj_model.actuator_actnum[actuator]):
-                activations[i] = length
-    return jnp.stack(activations)
 
 
 def fingerprint(mj_model: mujoco.MjModel) -> bytes:

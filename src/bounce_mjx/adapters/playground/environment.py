@@ -58,8 +58,6 @@ class TaskData:
     """Positions [nq]."""
     qvel: jax.Array
     """Velocities [nv]."""
-    act: jax.Array | None
-    """Activations [na] of the actuators; None if the model has none."""
     time: jax.Array
     """Time since the reset [], s."""
     ctrl: jax.Array
@@ -118,7 +116,7 @@ class PlaygroundBounceBall(MjxEnv):
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one control step under the action [action_size]."""
         data = state.data
-        physics = PhysicsState(data.qpos, data.qvel, data.act)
+        physics = PhysicsState(data.qpos, data.qvel)
         before = core.State(data.task._replace(physics=physics), **_common(state))
         after = self.task.step(before, action)
         acted = after.pipeline_state.last_action
