@@ -222,14 +222,14 @@ def difference(a: PhysicsState, b: PhysicsState) -> tuple[float, float]:
     )
 
 
-def assert_same_step(actual: PhysicsState, expected: PhysicsState) -> float:
-    """Checks each state to ONE_STEP times its largest speed; returns the largest ratio."""
+def assert_same_step(actual: PhysicsState, expected: PhysicsState) -> None:
+    """Checks each state to ONE_STEP times its largest speed, and prints the largest ratio."""
     fastest = np.max(np.abs(expected.qvel), axis=1, keepdims=True)
     error = np.max(np.abs(np.asarray(actual.qvel) - expected.qvel) / fastest)
+    print(f"largest difference: {error:.1e}")
     assert error < ONE_STEP
     # The comparison includes the orientation, which has no unit of length.
     assert np.max(np.abs(np.asarray(actual.qpos) - expected.qpos) / fastest) < ONE_STEP * DT + 1e-15
-    return float(error)
 
 
 def push_by_air(model: mujoco.MjModel, data: mujoco.MjData, drag: float, lift: float) -> None:

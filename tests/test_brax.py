@@ -33,9 +33,6 @@ def all_finite(tree) -> bool:
     return all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(tree))
 
 
-# Registry
-
-
 def test_brax_makes_the_environment():
     env = brax.envs.get_environment("bounce_ball", target_height_range=(0.7, 0.7))
     assert isinstance(env, BraxBounceBall) and isinstance(env.task, brax.envs.Env)
@@ -81,9 +78,6 @@ def test_randomization_by_brax_acts_on_the_physics():
     )
 
 
-# Pictures
-
-
 def test_brax_draws_the_links_where_mujoco_has_them():
     """The page of `brax.io.html` shows every geom of the model at the links' poses."""
     env = brax.envs.get_environment("bounce_ball")
@@ -97,9 +91,6 @@ def test_brax_draws_the_links_where_mujoco_has_them():
     assert sum(map(len, drawn["geoms"].values())) == env.mj_model.ngeom
 
 
-# Wrappers
-
-
 def test_step_keeps_what_wrappers_added(env):
     """A step keeps unknown metrics and info, as every brax environment does."""
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))
@@ -109,9 +100,6 @@ def test_step_keeps_what_wrappers_added(env):
     assert after.metrics["mine"] == 1.0
     np.testing.assert_array_equal(after.info["lap"], 1.0)
     assert after.metrics["reward/height"] > 0.0
-
-
-# Trainers
 
 
 def train(trainer, env, networks, **settings):
@@ -221,9 +209,6 @@ def test_brax_apg_learns():
     first, last = (metrics["eval/episode_reward"] for metrics in history)
     assert_evaluated(history[-1])
     assert last > first
-
-
-# jax.device_put_replicated
 
 
 def test_device_put_replicated_exists_only_in_the_context(monkeypatch):

@@ -182,9 +182,6 @@ def test_a_policy_that_is_not_finite_is_refused(part: str, tmp_path: Path, state
             reads()
 
 
-# Damage
-
-
 def mutate(step: Path, other: Path, draw: random.Random) -> str:
     """Damages one file of a checkpoint; returns a description of the damage."""
     files = sorted(p for p in step.rglob("*") if p.is_file())
@@ -242,9 +239,6 @@ def test_checkpoint_of_another_run_is_refused(run: Path, state: TrainingState) -
     save_checkpoint(run, config, 64, items_of(state))
     with pytest.raises(UserError, match="a different config.*differs in seed;.*restore that file"):
         load_both(run, state)
-
-
-# Malicious checkpoints
 
 
 class Payload:

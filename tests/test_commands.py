@@ -54,6 +54,7 @@ MISTAKES = (
     ("train --config nope", "no preset is named nope", "cpu, default, finetune"),
     ("train --robot nope", "no robot is named nope", "iiwa, panda, peitian, ur5e"),
     ("train --mjcf a.xml", "a.xml", "does not exist", "give the path"),
+    ("train --log-dir exp[lr]", "exp[lr] has a square bracket"),
     ("eval --target-height -1", "--target-height is -1.0", ">= 0.001"),
     ("eval --json nowhere/a.json", "nowhere/a.json", "make it"),
     ("evl", "unknown command evl", "did you mean eval?", "bounce-mjx --help"),
@@ -153,12 +154,6 @@ def test_bad_mjcf(refused: Refuse, tmp_path: Path, case: tuple[str, ...]) -> Non
 def test_log_dir_that_cannot_be_made(refused: Refuse, tmp_path: Path, log_dir: str) -> None:
     (tmp_path / "file").write_text("mine")
     refused(["train", *TINY, "--log-dir", log_dir], f"{log_dir} ", "choose", "--log-dir")
-
-
-def test_run_without_checkpoint(refused: Refuse, run: Path) -> None:
-    shutil.rmtree(run / "checkpoints")
-    for line in ("eval run", "train --resume run"):
-        refused(line, "run", "no checkpoint", "give another")
 
 
 @pytest.mark.parametrize(

@@ -96,9 +96,6 @@ def assert_identical(first, second):
         np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
 
 
-# Attributes and observation
-
-
 @pytest.fixture(scope="module")
 def walked(reset, step):
     """A state in motion, with a spinning ball so that no entry of the observation is trivial."""
@@ -127,9 +124,6 @@ def test_the_observation_is_mujocos_state(walked, model):
         np.testing.assert_allclose(walked.obs[entries], values, rtol=0, atol=1e-6)
     assert walked.obs.shape == (29,) and walked.obs.dtype == jnp.float32
     assert walked.obs[28] == walked.pipeline_state.command["target_height"]
-
-
-# Reset
 
 
 N_RESETS = 2000
@@ -195,9 +189,6 @@ def test_noise_free_reset_has_the_paddle_at_home():
     np.testing.assert_allclose(obs[25:28], [0.59356, 0, 0.04980], atol=1e-5)
     np.testing.assert_allclose(obs[25:28], PADDLE_HOME, atol=1e-5)
     assert obs[28] == np.float32(0.8)
-
-
-# Actions
 
 
 def test_servo_target_is_clipped_to_the_joint_range(env, reset, model):
@@ -266,9 +257,6 @@ def test_step_equals_ten_substeps_of_mujoco(env, reset, step, model):
         np.testing.assert_allclose(after.qpos, data.qpos, rtol=0, atol=2e-6)
         np.testing.assert_allclose(after.qvel, data.qvel, rtol=0, atol=1e-4)
     assert touched >= 6
-
-
-# Reward and metrics
 
 
 @pytest.fixture(scope="module")
@@ -430,9 +418,6 @@ def test_step_reports_the_bounce(reset, finish, apex=0.47, error=0.03):
     assert falling.metrics["apex_error"] == 0
 
 
-# Ends
-
-
 def test_ball_ends_the_episode_beyond_its_bound(reset, finish):
     """It fell, is too high above its target, or too far away along an axis."""
     state = reset(jax.random.key(0))
@@ -458,9 +443,6 @@ def test_fast_joint_ends_the_episode(reset, finish):
             assert finish(state, jnp.zeros(6), moving).done == done
     fast = with_ball(physics, velocity=(7, 7, 7), spin=(50, 50, 50))
     assert finish(state, jnp.zeros(6), fast).done == 0
-
-
-# Faults
 
 
 @pytest.fixture(scope="module")
@@ -513,9 +495,6 @@ def test_nan_action_ends_the_episode_and_acts_as_zero(config):
         assert after.done == 1 and after.metrics["non_finite"] == 1 and at_rest.done == 0
         metrics = at_rest.metrics | {"non_finite": after.metrics["non_finite"]}
         assert_identical(after, at_rest.replace(done=after.done, metrics=metrics))
-
-
-# Derivative
 
 
 @pytest.mark.slow

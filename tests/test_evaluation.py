@@ -42,9 +42,6 @@ DRIBBLE = f"{Path(__file__).parent.parent / 'examples' / 'dribble_task.py'}:Drib
 METRICS = "bounced", "n_bounces", "apex_error", "apex_offset"
 
 
-# Counting
-
-
 def states(rows) -> State:
     """A batch (batch axis last) from one dict of values per episode."""
     defaults = {
@@ -313,9 +310,6 @@ def test_score_orders_by_results_met_and_margin_and_then_by_return():
     assert scores == sorted(scores) and len(set(scores)) == len(scores)
 
 
-# Evaluators
-
-
 @pytest.fixture(scope="module")
 def networks():
     return policy.make_networks(PPOConfig(hidden_layers=(16,)), 29, 6)
@@ -412,9 +406,6 @@ def test_worlds_and_commands_are_those_of_the_training_or_of_the_options(monkeyp
     assert given == also_given == {"target_height": 0.5} != height
     assert 0.4 <= tasks["target_height"] <= 0.6
     assert passed == [None, False, False, False]
-
-
-# Another task
 
 
 @pytest.fixture(scope="module")

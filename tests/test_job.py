@@ -169,16 +169,6 @@ def fail(monkeypatch: pytest.MonkeyPatch, *saves: int) -> None:
     monkeypatch.setattr(writing, "save_checkpoint", full)
 
 
-# The best and the latest
-
-
-def test_the_newest_and_the_best_state_are_kept(tmp_path: Path) -> None:
-    run = train(tmp_path, {1: 5.0, 2: 9.0, 3: 1.0})
-    assert results_of(run)["best_steps"] == 2 * BLOCK
-    assert iterations_of(best_checkpoint(run)) == 2
-    assert iterations_of(latest_checkpoint(run)) == 3
-
-
 def test_a_resumed_training_knows_the_best_policy(tmp_path: Path) -> None:
     run = train(tmp_path, {1: 9.0, 2: 1.0})
     train(tmp_path, {3: 2.0, 4: 3.0, 1: 9.0}, run)
@@ -212,9 +202,6 @@ def test_a_failed_screening_is_no_evaluation(tmp_path: Path) -> None:
     assert [e["screening"] for e in results_of(run)["evaluations"]] == [True, True]
     # The end reports all episodes.
     assert results_of(run)["screening"] is False
-
-
-# The end
 
 
 @pytest.mark.parametrize(("given", "trained"), [(170, 192), (80, 64)])
@@ -302,9 +289,6 @@ def test_an_error_in_a_callback_ends_the_training(tmp_path: Path) -> None:
     assert results_of(run)["best_steps"] == 2 * BLOCK
 
 
-# Signals
-
-
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_a_signal_saves_and_says_how_to_resume(tmp_path: Path, number: signal.Signals) -> None:
     signalled = before(2, lambda: os.kill(os.getpid(), number))
@@ -353,9 +337,6 @@ def test_an_evaluation_that_was_stopped_is_repeated(tmp_path: Path) -> None:
     assert results_of(run)["best_steps"] == BLOCK
 
 
-# One writer, and its log
-
-
 def test_a_training_holds_the_lock_of_its_run(tmp_path: Path) -> None:
     run = train(tmp_path, {1: 1.0})
     refusals = []
@@ -372,9 +353,6 @@ def test_a_training_holds_the_lock_of_its_run(tmp_path: Path) -> None:
     with lock_run(run), pytest.raises(UserError, match=f"{run} is in use by another training"):
         train(tmp_path, RETURNS, run)
     assert contents(run) == saved
-
-
-# Full disks
 
 
 def test_a_training_goes_on_while_it_cannot_save(tmp_path: Path, monkeypatch) -> None:
@@ -405,9 +383,6 @@ def test_a_training_that_ends_without_room_says_so(tmp_path: Path, monkeypatch) 
     assert iterations_of(latest_checkpoint(run)) == 1
     train(tmp_path, {2: 9.0, 3: 7.0}, run)
     assert results_of(run)["best_steps"] == 2 * BLOCK and iterations_of(best_checkpoint(run)) == 2
-
-
-# Faults
 
 
 class Diverging(CountingTrainer):
@@ -447,9 +422,6 @@ def test_a_full_device_is_told_in_one_sentence(tmp_path: Path) -> None:
     reason = r"too little memory for 8 environments \(RESOURCE_EXHAUSTED: Out of memory\)"
     with pytest.raises(UserError, match=f"cpu has {reason}; lower num_envs"):
         train(tmp_path, RETURNS, trainer=before(1, full))
-
-
-# Several seeds
 
 
 def test_each_seed_has_a_run_of_its_own_and_the_best_one_is_found(tmp_path: Path) -> None:

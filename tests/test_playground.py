@@ -140,19 +140,6 @@ def test_example_films_randomised_worlds(tmp_path, opengl, need):
     assert len(set(heights.tolist())) == 3
 
 
-def test_program_without_playground_gives_one_sentence(tmp_path):
-    (tmp_path / "mujoco_playground.py").write_text("raise ImportError('it is not installed')")
-    done = subprocess.run(
-        [sys.executable, "-m", "bounce_mjx.adapters.playground"],
-        capture_output=True,
-        text=True,
-        env=os.environ | {"PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"},
-    )
-    assert done.returncode == 2
-    sentence = "error: MuJoCo Playground cannot be imported (it is not installed); install it with"
-    assert done.stderr == f"{sentence}: pip install 'playground<1'\n"
-
-
 @pytest.mark.slow
 def test_playgrounds_program_runs_to_its_end(tmp_path, opengl, need):
     """`train-jax-ppo` trains in randomised worlds, saves a checkpoint and films the policy."""

@@ -152,15 +152,6 @@ def test_the_curves_are_in_the_displayed_units(runs: list[Path]) -> None:
     assert "cm" in CURVES[2].title and CURVES[2].scale == 100.0
 
 
-@pytest.mark.slow
-def test_plot_of_one_run(trained: Path, tmp_path: Path, capsys) -> None:
-    out = tmp_path / "a/plots"
-    plot_command.main([str(trained), "--out", str(out)])
-    names = {f"{name}.{x}" for name in ("curves", "rewards", "evaluation") for x in ("png", "svg")}
-    assert {path.name for path in out.iterdir()} == names
-    assert {Path(line).name for line in capsys.readouterr().out.splitlines()} == names
-
-
 def test_plot_of_several_runs(trained: Path, tmp_path: Path) -> None:
     other = shutil.copytree(trained, tmp_path / "other")
     save_config(other, load_config(trained / "config.yaml").model_copy(update={"seed": 1}))

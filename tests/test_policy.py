@@ -45,9 +45,6 @@ def normalizer(seen):
     return update(init_statistics(N), jnp.asarray(seen)).normalizer
 
 
-# Normalisation
-
-
 def test_far_observations_are_clipped(normalizer):
     far = normalize(jnp.full(N, 1e6), normalizer)
     np.testing.assert_array_equal(np.delete(far, CONSTANT), 10.0)
@@ -77,9 +74,6 @@ def test_statistics_equal_brax(seen):
             normalize(batch, ours.normalizer), expected, rtol=1e-5, atol=1e-5
         )
     assert int(ours.count) == int(theirs.count) == 4800
-
-
-# Networks
 
 
 @pytest.fixture(scope="module")

@@ -40,9 +40,6 @@ def assert_identical(first, second):
     jax.tree.map(np.testing.assert_array_equal, plain(first), plain(second))
 
 
-# Generalised advantages
-
-
 def advantages_by_definition(reward, value, next_value, terminated, truncated, discount, lam):
     """Each advantage as a separate sum of discounted errors, forward in time, up to the end of the
     episode."""
@@ -76,9 +73,6 @@ def test_advantages_equal_their_definition(discount, lam):
     actual = generalized_advantages(**rollout, discount=discount, gae_lambda=lam)
     expected = advantages_by_definition(*rollout.values(), discount, lam)
     np.testing.assert_allclose(actual, expected, rtol=1e-4, atol=1e-4)
-
-
-# Learning rate
 
 
 @pytest.fixture(scope="module")
@@ -116,9 +110,6 @@ def test_learning_rate_stays_in_its_limits(rate_config):
     # Without a target it is fixed.
     fixed = rate_config.model_copy(update={"target_kl": 0.0})
     np.testing.assert_allclose([adapted(fixed, kl) for kl in (0.0, 1.0)], 1e-3, rtol=1e-6)
-
-
-# Bootstrapping, end to end
 
 
 class TwoStates:
@@ -238,9 +229,6 @@ def test_episodes_do_not_all_time_out_together():
     steps = np.asarray(trainer.init(jax.random.key(0)).env.clock)
     assert steps.min() >= 0 and steps.max() < 1000
     assert len(np.unique(steps)) > 8
-
-
-# The trainer as a pure function
 
 
 @pytest.fixture(scope="module")
@@ -371,9 +359,6 @@ def test_random_orders_are_uniform(size):
     # Neighbours are independent: the second is larger than the first in half of the orders.
     rises = np.mean(orders[:, 1:] > orders[:, :-1], axis=0)
     assert np.abs(rises - 0.5).max() <= 5 * 0.5 / np.sqrt(2000)
-
-
-# Learning
 
 
 @pytest.mark.slow

@@ -31,7 +31,6 @@ from bounce_mjx.commands import train as train_command
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import judge
 from bounce_mjx.learning.policy import make_networks
-from bounce_mjx.learning.ppo import CHECKED, first_fault
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import (
     best_checkpoint,
@@ -95,26 +94,9 @@ def run(half: Path, tmp_path: Path) -> Path:
     return shutil.copytree(half, tmp_path / "run")
 
 
-# Resuming
-
-
 def test_resumed_training_is_the_same(run: Path, straight: Path) -> None:
     resume(run, "--total-steps", str(STEPS))
     assert_same_training(run, straight)
-
-
-def test_edited_config_is_refused_by_name(run: Path, capfd) -> None:
-    config = run / "config.yaml"
-    config.write_text(config.read_text().replace("discount: 0.98", "discount: 0.9", 1))
-    with pytest.raises(SystemExit) as exit_info:
-        resume(run)
-    assert exit_info.value.code == 2
-    sentence = capfd.readouterr().err
-    assert "which differs in ppo.discount;" in sentence
-    assert re.fullmatch(r"error: .+\n", sentence)
-
-
-# Signals
 
 
 def resume_command(said: str) -> list[str]:
@@ -258,9 +240,6 @@ def test_killed_at_any_moment(tmp_path: Path, straight: Path) -> None:
     assert logged == sorted(set(logged))
 
 
-# One writer
-
-
 # Readers
 
 
@@ -291,20 +270,6 @@ def test_a_reader_reads_the_next_checkpoint_where_a_training_replaces_one(run: P
             assert all((leaf == checkpoint.steps).all() for leaf in jax.tree.leaves(marked))
 
 
-# Paths
-
-
-def test_a_path_with_a_square_bracket_is_refused(tmp_path: Path, straight: Path, capsys) -> None:
-    with pytest.raises(SystemExit):
-        train(tmp_path / "exp[lr]", STEPS)
-    assert "exp[lr] has a square bracket" in capsys.readouterr().err
-    assert not (tmp_path / "exp[lr]").exists()
-    moved = shutil.copytree(straight, tmp_path / "moved[1]")
-    with pytest.raises(SystemExit):
-        resume(moved, "--total-steps", str(2 * STEPS))
-    assert "moved[1] has a square bracket" in capsys.readouterr().err
-
-
 # Evaluations and logs
 
 
@@ -327,9 +292,6 @@ def test_the_best_is_reported_on_fresh_resets(straight: Path, capfd) -> None:
     fresh = mean_return(config.eval_seed + 2**31)
     assert results["details"]["mean_return"] == pytest.approx(fresh)
     assert fresh != pytest.approx(mean_return(config.eval_seed))
-
-
-# Starts
 
 
 COUNTED = """
@@ -389,9 +351,6 @@ def test_the_chunks_of_an_evaluation_are_its_episodes(straight: Path) -> None:
     assert screening.details == pytest.approx(judge(env, first_three).details)
 
 
-# Numbers that are not finite
-
-
 def change_state(monkeypatch, iteration: int, change: Callable) -> None:
     """Changes the state of every training before the given iteration."""
     run = PPOTrainer.run
@@ -421,29 +380,6 @@ def test_divergence_ends_the_training_and_keeps_the_last_good_state(
     assert "loss/policy became infinite or NaN at iteration 4;" in sentence
     assert f"the last good checkpoint is {latest_checkpoint(run).folder}" in sentence
     assert_same_training(run, half)
-
-
-@pytest.mark.parametrize("quantity", CHECKED)
-def test_first_fault_names_the_first_quantity(quantity: str) -> None:
-    def value(name: str):
-        """The value of a quantity: NaN from the first broken quantity on, as everything computed
-        after it would be."""
-        return jnp.where(CHECKED.index(name) >= CHECKED.index(quantity), jnp.nan, 1.0)
-
-    def minibatches(name: str):
-        return jnp.ones((2, 3)).at[1, 1].set(value(name)).at[1, 2].set(value("parameters"))
-
-    minibatch_metrics = {
-        "loss/value": minibatches("loss/value"),
-        "loss/policy": minibatches("loss/policy"),
-        "loss/gradient_norm": minibatches("gradient"),
-    }
-    if quantity == "parameters":
-        minibatch_metrics = dict.fromkeys(minibatch_metrics, jnp.ones((2, 3)))
-    number = first_fault(
-        value("reward"), {"mean": value("observation")}, minibatch_metrics, value("parameters")
-    )
-    assert CHECKED[number - 1] == quantity
 
 
 @pytest.mark.slow

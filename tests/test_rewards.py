@@ -202,9 +202,6 @@ def test_terms_and_reference_equal_values_by_hand():
         assert terms[name][row] == pytest.approx(expected, rel=1e-9, abs=1e-12), (name, row)
 
 
-# Gradients
-
-
 def reward(config: BounceReward, inputs: dict[str, jax.Array]):
     return sum(terms_of(config, inputs).values())
 

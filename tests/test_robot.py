@@ -115,9 +115,6 @@ def test_a_file_of_a_package_is_found_by_name() -> None:
         locate(folder)
 
 
-# Adopted arms
-
-
 @pytest.fixture(scope="module")
 def written(tmp_path_factory) -> dict[str, Path]:
     """Configs of a small arm with motors and a gripper, and of the UR5e."""
@@ -221,9 +218,6 @@ def test_servos_step_without_overshoot_and_hold_the_arm(env, dt) -> None:
     assert np.all(np.abs(data.qvel[list(addresses.arm_qvel)]) < 0.02)
     assert np.all(np.max(travelled, axis=0) < np.maximum(end, 0.02) + 0.006)
     assert np.all(np.abs(end - 0.02) < 0.025) and np.median(end) > 0.018
-
-
-# Models in other people's styles, as MuJoCo compiles them
 
 
 def styled(compiler: str = "", servo: str = 'kv="20"', names: str = "abcde") -> str:

@@ -2,7 +2,6 @@
 
 import io
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,6 @@ from rich.console import Console
 
 from bounce_mjx import EnvConfig
 from bounce_mjx.commands import robustness as robustness_command
-from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import robustness
 from bounce_mjx.evaluation.config import EvaluationOptions
@@ -22,17 +20,14 @@ from bounce_mjx.evaluation.robustness import (
     measure_conditions,
 )
 from bounce_mjx.evaluation.statistics import Statistics
-from bounce_mjx.evaluation.suite import Condition, load_suite, read_suite
+from bounce_mjx.evaluation.suite import load_suite, read_suite
 from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.learning.policy import Networks, Policy, networks_of
+from bounce_mjx.learning.policy import networks_of
 from bounce_mjx.reports.robustness import (
     load_robustness,
     robustness_table,
 )
 from bounce_mjx.resources import resource_path
-from bounce_mjx.runs.config import load_run_config
-from bounce_mjx.runs.folders import pretrained_checkpoint
-from bounce_mjx.runs.reading import read_policy
 from bounce_mjx.task import Tally
 from bounce_mjx.tasks.registry import find_task
 from bounce_mjx.world.randomization import TERMS
@@ -48,9 +43,6 @@ def suite(tmp_path: Path, *perturbations: object, trained: EnvConfig | None = No
     nominal, *others = load_suite(path, trained or EnvConfig())
     assert (nominal.perturbation.name, nominal.ranges, nominal.trained) == ("nominal", {}, True)
     return others
-
-
-# The suite
 
 
 def test_the_shipped_suite_has_every_term() -> None:
@@ -182,54 +174,6 @@ def test_a_mistake_in_a_suite_is_one_sentence(name: str, refused) -> None:
     refused("robustness --suite suite.yaml --out out", "suite.yaml", words)
 
 
-# The episodes
-
-
-@pytest.fixture(scope="module")
-def shipped() -> tuple[Policy, Callable[[Env], Networks], EnvConfig]:
-    checkpoint = pretrained_checkpoint()
-    config = load_run_config(checkpoint.run)
-    # Long enough for a settled bounce.
-    return (
-        read_policy(checkpoint, config),
-        networks_of(config.ppo),
-        config.env.model_copy(update={"episode_seconds": 3.0}),
-    )
-
-
-def three_conditions(tmp_path: Path, env: EnvConfig) -> list[Condition]:
-    """Nominal condition, a condition that the shipped policy masters, and a condition that is too
-    hard for it."""
-    drag = dict(name="drag", strengths=[0.1], terms={"air_drag": "strength"})
-    tilt = dict(name="tilt", unit="deg", strengths=[3], terms={"paddle_tilt": [0, "strength"]})
-    path = tmp_path / "suite.yaml"
-    path.write_text(yaml.safe_dump({"perturbations": [drag, tilt]}), encoding="utf-8")
-    return load_suite(path, env)
-
-
-@pytest.mark.slow
-def test_both_engines_give_the_same_verdicts(shipped, tmp_path: Path) -> None:
-    policy, ppo, env = shipped
-    conditions = three_conditions(tmp_path, env)
-    fused, c = (
-        measure_conditions(policy, ppo, conditions, EvaluationOptions(4, physics=engine))
-        for engine in ("fused", "mujoco")
-    )
-    assert [o.physics for o in (*fused, *c)] == ["fused"] * 3 + ["mujoco"] * 3
-    for ours, reference in zip(fused, c, strict=True):
-        assert ours.failed == reference.failed
-        assert ours.values["stable"] == reference.values["stable"]
-        assert ours.values["stable"] == 100.0 * ours.lasted == 100.0 * reference.lasted
-        assert ours.mean_length_s == pytest.approx(reference.mean_length_s, abs=0.03)
-        assert ours.values["upward speed"] == pytest.approx(
-            reference.values["upward speed"], abs=0.02
-        )
-    nominal, drag, tilt = fused
-    assert nominal.passed and drag.passed and "stable" in tilt.failed
-    # The worlds differ.
-    assert drag.values["upward speed"] < nominal.values["upward speed"] - 0.005
-
-
 def test_every_condition_gets_its_own_ranges_and_outcome(tmp_path: Path, monkeypatch) -> None:
     """In every program and call; the statistics of this fake evaluator depend on the ranges."""
     conditions = suite(
@@ -295,9 +239,6 @@ def test_every_condition_gets_its_own_ranges_and_outcome(tmp_path: Path, monkeyp
     ]
 
 
-# Table and figure
-
-
 def outcome(name: str, strength: float | None = None, **changes) -> ConditionOutcome:
     values = dict(zip(RESULTS, (100.0, 99.0, 98.0, 1.4, 100.0), strict=True))
     given = dict(
@@ -342,9 +283,6 @@ def test_table_tells_every_figure(report: RobustnessReport) -> None:
     assert "U  upward speed: what upward speed means, m/s" in described
 
 
-# The command
-
-
 @pytest.fixture
 def measured(report: RobustnessReport, monkeypatch) -> RobustnessReport:
     """Makes the command return this report's outcomes without a simulation."""
@@ -374,9 +312,6 @@ def test_command_writes_its_results(measured, tmp_path: Path, monkeypatch, capsy
         robustness_command.main(["--out", str(tmp_path / "other")])
     assert exit_info.value.code == 0
     assert json.loads((tmp_path / "other" / "robustness.json").read_text())["outcomes"]
-
-
-# Another task
 
 
 def test_a_perturbation_of_one_task_is_skipped_for_others(tmp_path: Path) -> None:

@@ -67,9 +67,6 @@ def progress() -> Progress:
     return progress
 
 
-# Folders
-
-
 def test_runs_started_at_once_have_folders_of_their_own(tmp_path: Path) -> None:
     number = 16
     start = threading.Barrier(number)
@@ -154,9 +151,6 @@ def test_a_training_is_not_resumed_through_a_link(runs: Path, place: str, capsys
     assert exit_info.value.code == 2
     assert f"error: {run}/{place} is a link, and training" in capsys.readouterr().err
     assert contents(other) == before
-
-
-# The robot of a run
 
 
 @pytest.fixture
@@ -343,9 +337,6 @@ def test_a_group_given_in_part_keeps_its_other_defaults(tmp_path: Path) -> None:
     assert default.reward.rest.weight != type(default.reward.rest)().weight
 
 
-# Configs
-
-
 def test_whole_numbers_may_have_an_exponent(tmp_path: Path) -> None:
     path = tmp_path / "my.yaml"
     path.write_text("total_steps: 1e6\nppo: {num_envs: 2e2, hidden_layers: [1.6e1, 8]}\nseed: 1e0")
@@ -356,9 +347,6 @@ def test_whole_numbers_may_have_an_exponent(tmp_path: Path) -> None:
         path.write_text(f"total_steps: {bad}")
         with pytest.raises(UserError, match="total_steps is"):
             load_config(path)
-
-
-# Results
 
 
 def test_results_are_read_as_they_were_written(tmp_path: Path, progress: Progress) -> None:

@@ -6,8 +6,6 @@ import json
 import re
 import shutil
 import socket
-import subprocess
-import sys
 from pathlib import Path
 
 import jax
@@ -65,9 +63,6 @@ def assert_equal_up_to_rounding(ours: dict[str, np.ndarray], theirs: dict[str, n
             np.testing.assert_allclose(ours[name], theirs[name], rtol=0, atol=1e-3, err_msg=name)
 
 
-# Shuffling in groups
-
-
 def test_groups_hold_the_samples_of_their_environments():
     length, batch, groups = 3, 8, 4
     environment_ids = jnp.broadcast_to(jnp.arange(batch), (length, batch))
@@ -77,9 +72,6 @@ def test_groups_hold_the_samples_of_their_environments():
         expected = {(env, t) for env in (2 * i, 2 * i + 1) for t in range(length)}
         assert {tuple(sample) for sample in samples.tolist()} == expected
         assert len(samples) == len(expected)
-
-
-# Several seeds
 
 
 @pytest.mark.slow
@@ -105,9 +97,6 @@ def test_several_seeds_resume_exactly(seeds: Path, tmp_path: Path):
         assert both[0]["best_steps"] == both[1]["best_steps"]
 
 
-# Several devices
-
-
 @pytest.mark.slow
 def test_eight_devices_train_as_one(alone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """And one device resumes what eight began."""
@@ -120,52 +109,6 @@ def test_eight_devices_train_as_one(alone: Path, tmp_path: Path, monkeypatch: py
     total = ["--total-steps", str(2 * STEPS)]
     train_command.main(["--resume", str(run), "--num-devices", "1", "--no-report", *total])
     assert_equal_up_to_rounding(arrays(latest_checkpoint(run)), arrays(latest_checkpoint(alone)))
-
-
-MESSAGES = """
-import functools, jax, re
-from bounce_mjx import BounceBall
-from bounce_mjx.gpu import elementwise, rows
-from bounce_mjx.physics.fused import dynamics
-from bounce_mjx.training import devices
-from bounce_mjx.learning import ppo
-from bounce_mjx.learning.config import PPOConfig
-rows.has_kernels = lambda: True
-dynamics.elementwise = functools.partial(elementwise.elementwise, interpret=True)
-# No other size of the program is a multiple of 104.
-config = PPOConfig(num_envs=104, rollout_length=4, num_minibatches=2, hidden_layers=(8,))
-env = BounceBall()
-trainer = ppo.PPO(config, env, 100)
-mesh = devices.make_mesh(8, config)
-shapes = jax.eval_shape(trainer.init, jax.random.PRNGKey(0))
-sharding = devices.state_sharding(mesh, shapes)
-run = jax.jit(
-    lambda state: trainer.run(state, 1),
-    in_shardings=(sharding,), out_shardings=(sharding, devices.replicated(mesh)),
-)
-text = run.lower(shapes).compile().as_text()
-names = r"(all-reduce|all-gather|all-to-all|collective-permute|reduce-scatter)(?:-start)?[(]"
-print(*re.findall(names, text))
-arrays = {tuple(map(int, shape.split(","))) for shape in re.findall(r"\\w\\[([0-9,]+)\\]", text)}
-print(*[shape for shape in arrays if any(n and n % config.num_envs == 0 for n in shape)])
-"""
-
-
-@pytest.mark.slow
-def test_devices_exchange_only_sums(monkeypatch: pytest.MonkeyPatch):
-    """No device sends samples or environments to another, or computes those of another; each
-    minibatch needs one message. On a GPU the physics is a kernel, here in Pallas' interpreter,
-    and the loop carries rows."""
-    monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=8")
-    command = [sys.executable, "-c", MESSAGES]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    messages, whole_batches = done.stdout.splitlines()
-    messages = messages.split()
-    assert set(messages) == {"all-reduce"}
-    assert not whole_batches
-    # One per minibatch, two for the advantages of an epoch, a few for the rollout's statistics.
-    assert len(messages) <= 8
 
 
 @pytest.mark.parametrize(
@@ -182,9 +125,6 @@ def test_devices_that_cannot_share(monkeypatch, num_devices, num_envs, num_seeds
     config = PPOConfig(num_envs=num_envs, num_minibatches=1)
     with pytest.raises(UserError, match=sentence):
         devices.make_mesh(num_devices, config, num_seeds)
-
-
-# Several hosts
 
 
 def free_port() -> int:

@@ -321,9 +321,6 @@ def test_latency_without_a_camera_and_velocity_by_differences() -> None:
         np.testing.assert_allclose(velocity[5:], np.diff(expected, axis=0)[4:] / DT, atol=1e-6)
 
 
-# Random numbers
-
-
 COUNT = 20_000
 
 

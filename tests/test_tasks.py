@@ -126,9 +126,6 @@ def test_every_library_takes_another_task(library: str) -> None:
     assert adapters()[library]()[-1] == find_task(DRIBBLE).Config().layout.size
 
 
-# A task in a file
-
-
 @pytest.fixture
 def mine(tmp_path: Path) -> Path:
     """A copy of the example that no other test has named."""

@@ -59,9 +59,6 @@ def random_actions(steps: int) -> torch.Tensor:
     return 1.5 * torch.randn(steps, NUM_ENVS, 6, generator=torch.Generator().manual_seed(0))
 
 
-# Memory
-
-
 def test_actions_and_results_share_the_memory_of_jax(env, monkeypatch):
     seen, arrays = [], []
     env.reset()
@@ -90,9 +87,6 @@ def test_tensors_of_a_step_outlive_the_following_steps(env):
         kept += [result.observation, result.final_observation, result.reward, result.metrics]
         copies += [tensor.clone() for tensor in kept[-4:]]
     assert all(torch.equal(*pair) for pair in zip(kept, copies, strict=True))
-
-
-# The same steps
 
 
 def test_steps_equal_vector_steps(task, env):
@@ -147,9 +141,6 @@ def test_wrong_environment_is_refused(task):
         TorchVectorEnv(task, NUM_ENVS).step(torch.zeros(NUM_ENVS, 6))
 
 
-# rsl_rl
-
-
 def test_rsl_rl_gets_time_outs_and_terminal_observations(env):
     vec_env = RslRlVecEnv(env)
     vec_env.episode_length_buf = torch.tensor([EPISODE_STEPS - 1, 0, 0, EPISODE_STEPS - 2])
@@ -167,9 +158,6 @@ def test_rsl_rl_gets_time_outs_and_terminal_observations(env):
     assert terminal[0, 28] != after["policy"][0, 28]
 
 
-# skrl
-
-
 def test_skrl_gets_terminal_observations(env):
     skrl_env = SkrlEnv(env)
     skrl_env.reset()
@@ -181,9 +169,6 @@ def test_skrl_gets_terminal_observations(env):
     assert torch.equal(terminal[1:], after[1:]) and not torch.equal(terminal[0], after[0])
     assert skrl_env.state_space.shape == skrl_env.state().shape[1:] == (30,)
     assert torch.equal(skrl_env.state()[:, :29], after)
-
-
-# Policies
 
 
 class Trained(NamedTuple):

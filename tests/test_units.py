@@ -121,9 +121,6 @@ def test_other_arms_and_balls_are_accepted(case: str) -> None:
     config(name, **env)
 
 
-# A user's own task
-
-
 class Reward(task.StrictModel):
     low: task.Gaussian = task.Gaussian()
     slow: task.Gaussian = task.Gaussian()
@@ -184,9 +181,6 @@ def test_a_mistyped_name_in_a_task_is_one_sentence(wrong: str, reason: str, monk
 def test_a_task_has_its_own_config() -> None:
     with pytest.raises(UserError, match="the task Other has no Config of its own"):
         type("Other", (Mistyped,), {})
-
-
-# The first block
 
 
 def first_block(ended=64.0, too_fast=0.0, non_finite=0.0, height=1.0, fault=0.0) -> dict:
