@@ -123,7 +123,7 @@ def episodes(error: np.ndarray, lasted: np.ndarray) -> task.Episodes:
     return task.Episodes(sums, {}, lasted, {})
 
 
-def test_the_results_are_those_of_the_issue() -> None:
+def test_the_results_are_judged_with_pushes_and_without() -> None:
     error, lasted = np.array([0.006] * 50 + [0.014] * 50), np.arange(100) > 0
     pushed, alone = Config(), Config(randomization=RandomizationConfig())
     judged = [Balance(config).results(episodes(error, lasted)) for config in (pushed, alone)]

@@ -135,20 +135,12 @@ def example(name: str) -> dict:
 def ppo_example(tmp_path_factory):
     """The folder and the evaluations of `examples/brax_ppo.py`."""
     folder = tmp_path_factory.mktemp("brax")
-    history = example("brax_ppo.py")["main"](
-        folder,
-        rollout_steps=2,
-        num_timesteps=400,
-        episode_length=20,
-        num_evals=2,
-        num_envs=8,
-        num_eval_envs=4,
-        unroll_length=5,
-        batch_size=8,
-        num_minibatches=2,
-        num_updates_per_batch=2,
-        max_devices_per_host=1,
-    )
+    small = {
+        "rollout_steps": 2, "num_timesteps": 400, "episode_length": 20, "num_evals": 2,
+        "num_envs": 8, "num_eval_envs": 4, "unroll_length": 5, "batch_size": 8,
+        "num_minibatches": 2, "num_updates_per_batch": 2, "max_devices_per_host": 1,
+    }  # fmt: skip
+    history = example("brax_ppo.py")["main"](folder, **small)
     return folder, history
 
 

@@ -151,19 +151,8 @@ def draw_inputs(name: str, runs: dict[str, Path]) -> tuple[dict, np.ndarray]:
         name: observation[:, layout[name]].reshape(1000, count, -1)
         for name, count in counts.items()
     }
-    return inputs, network_of(config, policy)(inputs)
-
-
-def network_of(config: TrainConfig, policy: Policy):
-    """Function: histories [N, H, size] by the names of the quantities -> actions [N, n] of JAX."""
-    networks = make_networks(config.ppo, config.env.layout.size, config.env.num_joints)
-
-    def network(histories: dict[str, np.ndarray]) -> np.ndarray:
-        parts = [np.asarray(histories[name]) for name in config.env.observation.lengths()]
-        flat = np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
-        return np.asarray(networks.act(policy, flat))
-
-    return network
+    networks = make_networks(config.ppo, layout.size, config.env.num_joints)
+    return inputs, np.asarray(networks.act(policy, observation))
 
 
 def session_of(run: Path) -> onnxruntime.InferenceSession:

@@ -15,7 +15,7 @@ from bounce_mjx.identify.simulation import make_targets
 from bounce_mjx.identify.stages import Identified, _check_frame, identify
 from bounce_mjx.identify.unknowns import make_layout
 from bounce_mjx.identify.windows import Windows, cut
-from bounce_mjx.identify.world import compare, estimates, sentences, to_yaml
+from bounce_mjx.identify.world import compare, estimates, to_yaml
 from bounce_mjx.reports.identification import identification_page
 from bounce_mjx.runs.config import read_preset
 from bounce_mjx.world.named import read_world
@@ -191,27 +191,6 @@ def test_a_ball_beside_the_paddle_is_refused(shift) -> None:
     np.testing.assert_allclose(list(map(float, found.split(", "))), shift, atol=0.015)
 
 
-def test_estimates_far_from_the_prior_are_warnings() -> None:
-    layout, log = make_layout(6, True, 0.001), flight_log()
-    vector, places = layout.mean.copy(), layout.slices()
-    spread = np.diag((0.1 * layout.deviation) ** 2)
-
-    def said(vector: np.ndarray) -> list[str]:
-        known = Fit(vector, np.zeros(0)), np.linalg.inv(spread), spread
-        found = Identified(layout, windows_of(log), None, *known, {}, {"b": 1.0}, {}, 0)
-        return [text for text in sentences(found, NAMES) if text.startswith("warning: ")]
-
-    assert not said(vector)
-    vector[places["ball_position_bias"]] = 0.01, 0.0, 0.05
-    vector[places["encoder_bias"]] = 0.0, 0.0, 0.0, 0.0, 0.04, 0.0
-    vector[places["ball_latency"]] = 0.07
-    joint, latency, frame = said(vector)
-    assert joint.startswith("warning: encoder_bias of Joint5 is 0.04 rad, 4.0 deviations")
-    assert "ball_latency is 0.07 s" in latency and "the unit or the clock of ball_time" in latency
-    assert "ball_position_bias z is 0.05 m" in frame
-    assert "frame" in frame and "swapped columns" in frame and "paddle_offset" in frame
-
-
 def unseen() -> Identified:
     """A log that shows nothing: all deviations are those of the prior."""
     layout, windows = make_layout(6, False, 0.001), windows_of(flight_log())
@@ -223,7 +202,7 @@ def unseen() -> Identified:
 
 
 def test_the_page_begins_with_the_answer() -> None:
-    """What the log leaves open comes last; no figure has more than three digits."""
+    """What the log leaves open comes last."""
     found = unseen()
     page = identification_page(found, "log.csv", NAMES, Path("world.yaml"))
     parts = "<b>Found:", "<b>How sure:", "<b>What to do:", "<h2>Estimates", "<h2>What the log"
@@ -232,11 +211,7 @@ def test_the_page_begins_with_the_answer() -> None:
     right = found._replace(held_out={"joint_angles": 1.0})
     better = identification_page(right, "log.csv", NAMES, Path("world.yaml"))
     assert "bounce-mjx identify LOG --check world.yaml" in better
-    listed = estimates(found, NAMES)
-    assert all(entry.label in page for entry in listed)
-    cells = re.findall(r"<td[^>]*>(-?[0-9.]+)(?:e[-+]?[0-9]+)?</td>", page)
-    digits = [cell.strip("-").replace(".", "").lstrip("0") for cell in cells]
-    assert len(cells) > len(listed) and max(map(len, digits)) <= 3
+    assert all(entry.label in page for entry in estimates(found, NAMES))
 
 
 @pytest.mark.slow

@@ -160,7 +160,7 @@ def test_the_policy_sees_the_ball_that_lands_next() -> None:
         np.testing.assert_allclose(seen, np.concatenate(expected), atol=2e-6)
 
 
-def test_results_judge_what_the_issue_asks_for() -> None:
+def test_each_result_is_judged_by_its_own_figure() -> None:
     """Each result turns with its own figure alone."""
     count = 200
     good = task.Episodes(

@@ -174,16 +174,12 @@ def test_rows_hold_every_type(monkeypatch):
         np.testing.assert_array_equal(twice[name][1], expected)
 
 
-def test_there_is_no_kernel_on_a_cpu(monkeypatch):
+def test_only_supported_gpus_use_kernels_unless_they_are_off(monkeypatch):
     assert not availability.has_kernels()
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    monkeypatch.setenv("BOUNCE_MJX_GPU_KERNEL", "off")
-    assert not availability.has_kernels()
-
-
-def test_only_supported_gpus_use_kernels(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     for capability, expected in (("9.0", True), ("10.0", True), ("8.6", False), ("gfx90a", False)):
         device = type("Device", (), {"compute_capability": capability})
         monkeypatch.setattr(jax, "local_devices", lambda backend=None, device=device: [device])
         assert availability.has_kernels() is expected
+    monkeypatch.setenv("BOUNCE_MJX_GPU_KERNEL", "off")
+    assert not availability.has_kernels()

@@ -22,16 +22,14 @@ RANGES = np.array([[-1.0, 1.0], [0.0, 0.0]])
 ROWS = 120
 
 
-def recorded(path: Path, ball: bool = True, step: float = 0.01) -> Path:
+def recorded(path: Path) -> Path:
     with Recorder(path, JOINTS, {"target_height": "m"}) as recorder:
         for k in range(ROWS):
-            time = 1.7e9 + k * step
-            measured = {"time": time, "joint_angles": [0.001 * k, -0.5], "target_height": 0.5}
-            if ball:
-                # A picture every second step, taken 12 ms before the step in which it arrived.
-                measured["ball_position"] = [0.1, 0.2, 0.3 + 0.01 * (k // 2)]
-                measured["ball_age"] = 0.012 + 0.01 * (k % 2)
-            recorder.step(measured, [0.002 * k, -0.5])
+            measured = {"time": 1.7e9 + 0.01 * k, "joint_angles": [0.001 * k, -0.5]}
+            # A picture every second step, taken 12 ms before the step in which it arrived.
+            ball = {"ball_position": [0.1, 0.2, 0.3 + 0.01 * (k // 2)]}
+            ball |= {"ball_age": 0.012 + 0.01 * (k % 2), "target_height": 0.5}
+            recorder.step(measured | ball, [0.002 * k, -0.5])
     return path
 
 

@@ -144,30 +144,16 @@ def test_example_films_randomised_worlds(tmp_path, opengl, need):
 def test_playgrounds_program_runs_to_its_end(tmp_path, opengl, need):
     """`train-jax-ppo` trains in randomised worlds, saves a checkpoint and films the policy."""
     need("mediapy")
-    flags = dict(
-        env_name=ENV_NAME,
-        num_timesteps=64,
-        num_evals=1,
-        run_evals=False,
-        num_envs=8,
-        unroll_length=4,
-        batch_size=8,
-        num_minibatches=2,
-        num_updates_per_batch=1,
-        episode_length=4,
-        policy_hidden_layer_sizes=8,
-        value_hidden_layer_sizes=8,
-        domain_randomization=True,
-        logdir=tmp_path,
+    flags = (
+        f"--env_name={ENV_NAME} --num_timesteps=64 --num_evals=1 --run_evals=False --num_envs=8 "
+        "--unroll_length=4 --batch_size=8 --num_minibatches=2 --num_updates_per_batch=1 "
+        "--episode_length=4 --policy_hidden_layer_sizes=8 --value_hidden_layer_sizes=8 "
+        f"--domain_randomization=True --logdir={tmp_path}"
     )
-    done = subprocess.run(
-        [sys.executable, "-m", "bounce_mjx.adapters.playground"]
-        + [f"--{name}={value}" for name, value in flags.items()],
-        capture_output=True,
-        text=True,
-        # It computes little.
-        env=os.environ | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"},
-    )
+    command = [sys.executable, "-m", "bounce_mjx.adapters.playground", *flags.split()]
+    # It computes little.
+    environment = os.environ | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stderr[-2000:]
     (video,) = tmp_path.glob("BounceBall-*/rollout0.mp4")
     assert video.stat().st_size > 1000

