@@ -125,6 +125,6 @@ def test_eval_counts_them(capsys: pytest.CaptureFixture, tmp_path) -> None:
     file = tmp_path / "results.json"
     with pytest.raises(SystemExit):
         main(["eval", "pretrained", "--episodes", "4", "--contacts", "--json", str(file)])
-    assert "contacts of the arm in 32 episodes: " in capsys.readouterr().out
+    assert "contacts of the arm in 4 episodes: " in capsys.readouterr().out
     found = json.loads(file.read_text())["contacts"]
     assert all("the floor" in contact["bodies"] for contact in found)

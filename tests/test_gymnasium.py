@@ -180,6 +180,7 @@ def test_wrong_arguments_and_options_give_one_sentence(vectorised):
         ({"render_mode": "human"}, "render_mode is 'human'"),
         ({"max_episode_steps": 3000}, "must be from 1 to the 2000 steps .* episode_seconds makes"),
         ({"num_envs": 0}, "num_envs is 0, but must"),
+        ({"target_hight_range": (0, 1)}, "keyword argument 'target_hight_range'; did you mean"),
         ({"render_mode": "rgb_array", "camera": "top"}, "no camera 'top'; its .* overview, side"),
     ):
         with pytest.raises(UserError, match=sentence):
@@ -201,7 +202,7 @@ def test_use_before_reset_or_with_a_wrong_action_gives_one_sentence(vectorised):
         with pytest.raises(UserError, match="before its reset"):
             env.step(env.action_space.sample())
         env.reset(seed=0)
-    with pytest.raises(UserError, match=r"shape \(5,\), but must have \(6,\)"):
+    with pytest.raises(UserError, match=r"shape \(1, 5\), but must have \(1, 6\)"):
         single.step(np.zeros(5))
     with pytest.raises(UserError, match=r"shape \(6,\), but must have \(3, 6\)"):
         vector.step(np.zeros(6))

@@ -449,3 +449,26 @@ def test_excitation_keeps_to_the_limits_of_the_robot() -> None:
         largest = np.max(np.abs(np.diff(motion.targets, order, axis=0)), axis=0)
         assert np.all(largest / config.control_dt**order <= limit)
     assert np.all(np.ptp(motion.targets, axis=0) > 0.01)
+
+
+@pytest.mark.parametrize("separator, point", [(";", ","), ("\t", ".")])
+def test_other_separators_and_decimal_commas_are_read(separator, point, tmp_path: Path) -> None:
+    """And titles without a space before the unit."""
+    good = recorded(tmp_path / "good.csv")
+    path = tmp_path / "log.csv"
+    text = good.read_text().replace(",", separator).replace(" [", "[")
+    head, _, rows = text.partition("\n")
+    path.write_text(f"{head}\n{rows.replace('.', point)}")
+    for one, other in zip(log_of(good)[1:-1], log_of(path)[1:-1], strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_a_ball_in_two_frames_is_refused(tmp_path: Path) -> None:
+    bag = Bag().fill(20)
+    frames = iter(["base", "camera_link"] * 10)
+    bag.rows = [
+        (t, a, bag.point(a, (1.0, 2.0, a), next(frames)) if t == "/ball" else m)
+        for t, a, m in bag.rows
+    ]
+    with pytest.raises(UserError, match=r"of /ball in .+ are in the frames base, camera_link"):
+        read_bag(bag.write(tmp_path / "bag"), JOINTS, TOPICS)

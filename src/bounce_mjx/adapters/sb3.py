@@ -92,27 +92,18 @@ class Sb3VecEnv(VecEnv):
         """A common attribute of the environments, once for each index."""
         return [getattr(self, attr_name)] * len(self._get_indices(indices))
 
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> NoReturn:
-        """Refuses: the environments are one program.
+    def set_attr(self, *_: Any, **__: Any) -> NoReturn:
+        """Refuses, as does `env_method`: the environments are one program.
 
         Raises:
           UserError: always.
         """
         raise UserError(
-            f"the attribute {attr_name} of compiled environments cannot be set; give the settings "
-            "to Sb3VecEnv, or the commands of the next reset to set_options"
+            "environments of a batch have no attributes to set and no methods; give settings "
+            "to Sb3VecEnv, and the commands of the next reset to set_options"
         )
 
-    def env_method(self, method_name: str, *_: Any, indices: Any = None, **__: Any) -> NoReturn:
-        """Refuses: the environments are one program.
-
-        Raises:
-          UserError: always.
-        """
-        raise UserError(
-            f"a single environment of a compiled batch has no method {method_name}; call seed, "
-            "set_options, reset and render of the whole one"
-        )
+    env_method = set_attr
 
     def env_is_wrapped(
         self, wrapper_class: type[gymnasium.Wrapper], indices: Any = None

@@ -48,7 +48,7 @@ def main(args: Sequence[str]) -> None:
     command = parse(AdoptCommand, args, prog="bounce-mjx adopt")
     from bounce_mjx.env.env import Env
     from bounce_mjx.robot.adopt import adopt
-    from bounce_mjx.runs.files import writable, write_output
+    from bounce_mjx.runs.files import write_output
     from bounce_mjx.training.setup import set_up_jax
 
     set_up_jax()
@@ -69,8 +69,7 @@ def main(args: Sequence[str]) -> None:
     out = command.out or Path(f"{command.mjcf.stem}.yaml")
     head = f"An arm with a paddle: bounce-mjx adopt {command.mjcf} --site {adoption.config.site}"
     text = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)
-    with writable(out, "choose another --out"):
-        write_output(out, f"# {on_one_line(head)}\n{text}")
+    write_output(out, f"# {on_one_line(head)}\n{text}")
     console.print(f"config: {out}", markup=False)
     named = [] if command.task == DEFAULT else ["--task", command.task]
     flags = [*named, "--robot", str(out)]

@@ -6,6 +6,7 @@ import platform
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from importlib import import_module
 from pathlib import Path
 
 import bounce_mjx
@@ -44,8 +45,9 @@ def describe() -> Iterator[tuple[str, str]]:
     yield "processors", f"{os.cpu_count()}"
     yield "devices", _try(_devices)
     yield "cache", _try(_cache)
-    yield "pictures", _try(_opengl)
-    yield "videos", _try(_ffmpeg)
+    viewers = "bounce_mjx.viewers"
+    yield "pictures", _try(lambda: import_module(f"{viewers}.offscreen").choose_backend())
+    yield "videos", _try(lambda: import_module(f"{viewers}.video").find_ffmpeg())
     for extra, packages in sorted(extras().items()):
         missing = [package for package in packages if version_of(package) is None]
         command = install_command(f"{_DISTRIBUTION}[{extra}]")
@@ -107,15 +109,3 @@ def _cache() -> str:
         return "none"
     sizes = [path.stat().st_size for path in Path(folder).glob("*") if path.is_file()]
     return f"{folder}, {len(sizes)} files, {sum(sizes) / 1e6:.0f} MB"
-
-
-def _opengl() -> str:
-    from bounce_mjx.viewers.offscreen import choose_backend
-
-    return choose_backend()
-
-
-def _ffmpeg() -> str:
-    from bounce_mjx.viewers.video import find_ffmpeg
-
-    return find_ffmpeg()

@@ -3,9 +3,7 @@
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
-
-from rich.console import Console
+from typing import Annotated
 
 from bounce_mjx.commands.run_options import OneActorCommand, WorldCommand, parse_with_commands
 from bounce_mjx.config.command_line import Flag, stdout
@@ -30,11 +28,11 @@ class EvalCommand(WorldCommand, OneActorCommand):
     nominal: bool = False
     """Evaluate without domain randomisation; else each episode samples a world, as in training."""
     contacts: bool = False
-    """Also count contacts of the arm with itself and the floor, which the physics leaves out, in 32
-    episodes."""
+    """Also count contacts of the arm with itself and the floor, which the physics leaves out, in
+    the first 32 episodes."""
     limits: bool = False
     """Also show how much of the arm's own limits of velocity, acceleration and jerk its commands at
-    1 kHz use, in 32 episodes."""
+    1 kHz use, in the first 32 episodes."""
     physics: Physics = "config"
     """Physics engine: mujoco is MuJoCo's C engine; config is the engine used in training."""
     json_file: Annotated[Path | None, Flag(name="json")] = None
@@ -45,9 +43,12 @@ class EvalCommand(WorldCommand, OneActorCommand):
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 0 if all results pass, 1 if one fails, 2 on a mistake."""
     command, given_commands = parse_with_commands(EvalCommand, args, prog="bounce-mjx eval")
+    from bounce_mjx.evaluation.contacts import arm_contacts, describe_contacts
+    from bounce_mjx.evaluation.limits import describe_limits, limit_shares
     from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
+    from bounce_mjx.evaluation.recording import RECORDED_EPISODES
     from bounce_mjx.reports.tables import details_line, results_table
-    from bounce_mjx.runs.files import check_output, to_json, writable, write_output
+    from bounce_mjx.runs.files import check_output, to_json, write_output
     from bounce_mjx.runs.reading import read_actor
     from bounce_mjx.training.setup import set_up_jax
 
@@ -70,6 +71,8 @@ def main(args: Sequence[str]) -> None:
     options = EvaluationOptions(
         command.episodes, command.seed, command.physics, command.nominal, commands
     )
+    checks = [("contacts", arm_contacts, describe_contacts)] * command.contacts
+    checks += [("limits", limit_shares, describe_limits)] * command.limits
     length = f"{command.episodes:,} episodes of {config.env.episode_seconds:g} s"
     with console.status("evaluating"):
         report, engine = evaluate_policy(
@@ -78,35 +81,18 @@ def main(args: Sequence[str]) -> None:
             actor,
             options,
             started=lambda engine: console.out(f"physics: {engine}  {length}", highlight=False),
+            recorded=RECORDED_EPISODES if checks else 0,
         )
     console.print(results_table(report, "the results"))
     console.print(details_line(report), highlight=False, soft_wrap=True)
-    found = _check_arm(command, (policy, config.env, actor, options), console)
+    found = {}
+    for name, measure, describe in checks:
+        entries = measure(config.env, report.recording)
+        text = describe(entries, report.recording.running.shape[-1])
+        console.print(text, markup=False, highlight=False, soft_wrap=True)
+        found[name] = [entry._asdict() for entry in entries]
     if command.json_file is not None:
         plain = {"checkpoint": str(checkpoint.folder), "physics": engine, **report.to_dict()}
         plain |= {"seed": command.seed, "commands": commands, "nominal": command.nominal, **found}
-        with writable(command.json_file, "give another file with --json"):
-            write_output(command.json_file, to_json(plain))
+        write_output(command.json_file, to_json(plain))
     sys.exit(0 if report.passed else 1)
-
-
-def _check_arm(command: EvalCommand, evaluated: tuple, console: Console) -> dict[str, Any]:
-    """The arm's contacts and the share of its limits in recorded episodes, printed and as data.
-
-    Args:
-      evaluated: the arguments of `recorded_episodes`.
-    """
-    from bounce_mjx.evaluation.contacts import arm_contacts, describe_contacts
-    from bounce_mjx.evaluation.limits import describe_limits, limit_shares
-    from bounce_mjx.evaluation.policy_evaluation import recorded_episodes
-    from bounce_mjx.evaluation.recording import RECORDED_EPISODES
-
-    checks = [("contacts", arm_contacts, describe_contacts)] * command.contacts
-    checks += [("limits", limit_shares, describe_limits)] * command.limits
-    recording, found = recorded_episodes(*evaluated) if checks else None, {}
-    for name, measure, describe in checks:
-        entries = measure(evaluated[1], recording)
-        text = describe(entries, RECORDED_EPISODES)
-        console.print(text, markup=False, highlight=False, soft_wrap=True)
-        found[name] = [entry._asdict() for entry in entries]
-    return found

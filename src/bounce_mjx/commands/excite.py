@@ -33,12 +33,11 @@ def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 2 on a mistake."""
     command = parse(ExciteCommand, args, prog="bounce-mjx excite")
     from bounce_mjx.identify.excitation import excite, to_csv
-    from bounce_mjx.runs.files import writable, write_output
+    from bounce_mjx.runs.files import write_output
 
     config = read_preset(Path("default"), command.robot).env
     motion = excite(config, command.seconds, command.max_velocity, command.table_height)
-    with writable(command.out, "choose another --out"):
-        write_output(command.out, to_csv(motion))
+    write_output(command.out, to_csv(motion))
     console = Console(soft_wrap=True, highlight=False)
     for name, amplitude in zip(motion.joint_names, motion.amplitudes, strict=True):
         console.print(f"  {name}: up to {amplitude:.3f} rad from the start pose", markup=False)

@@ -24,7 +24,7 @@ def main(args: Sequence[str]) -> None:
     if command.onnx is None:
         raise UserError("there is no file to write; give --onnx FILE")
     from bounce_mjx.deploy.export import export_onnx
-    from bounce_mjx.runs.files import check_output, writable, write_output
+    from bounce_mjx.runs.files import check_output, write_output
     from bounce_mjx.runs.folders import choose_checkpoint
     from bounce_mjx.training.setup import set_up_jax
 
@@ -35,6 +35,5 @@ def main(args: Sequence[str]) -> None:
     console.out(f"checkpoint: {checkpoint.folder} ({checkpoint.steps:,} steps)", highlight=False)
     command.config(checkpoint.run)
     content = export_onnx(checkpoint)
-    with writable(command.onnx, "give another file with --onnx"):
-        write_output(command.onnx, content)
+    write_output(command.onnx, content)
     console.out(f"written: {command.onnx} ({len(content) / 1000:.0f} kB)", highlight=False)

@@ -51,7 +51,7 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.identify.world import compare, to_yaml
     from bounce_mjx.reports.identification import identification_page
     from bounce_mjx.robot.model import joint_names, load_model
-    from bounce_mjx.runs.files import check_output, writable, write_output
+    from bounce_mjx.runs.files import check_output, write_output
     from bounce_mjx.training.setup import set_up_jax
     from bounce_mjx.world.named import read_world
 
@@ -87,8 +87,7 @@ def main(args: Sequence[str]) -> None:
         page: identification_page(found, log.source, names, command.out),
     }
     for path, content in files.items():
-        with writable(path, "choose another --out"):
-            write_output(path, content)
+        write_output(path, content)
         say(str(path))
 
 

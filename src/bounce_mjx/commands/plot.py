@@ -47,10 +47,10 @@ def main(args: Sequence[str]) -> None:
     if len(checkpoints) == 1:
         recording = record_checkpoint(checkpoints[0])
         drawn["evaluation"] = figures.evaluation_figure(Env(configs[0].env), recording)
+    with writable(command.out, "choose another folder with --out"):
+        command.out.mkdir(parents=True, exist_ok=True)
     for name, figure in drawn.items():
         for suffix in command.formats:
             path = command.out / f"{name}.{suffix}"
-            with writable(path, "choose another folder with --out"):
-                command.out.mkdir(parents=True, exist_ok=True)
-                write_output(path, figures.image(figure, suffix))
+            write_output(path, figures.image(figure, suffix))
             print(path)

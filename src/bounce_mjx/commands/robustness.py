@@ -122,13 +122,12 @@ def _write_report(report: "RobustnessReport", out: Path, console: Console) -> No
         robustness_figure,
         robustness_table,
     )
-    from bounce_mjx.runs.files import to_json, writable, write_output
+    from bounce_mjx.runs.files import to_json, write_output
 
     console.print(robustness_table(report))
     figure = robustness_figure(report)
     files = {ROBUSTNESS_FILE: to_json(report.model_dump())}
     files |= {f"robustness.{suffix}": image(figure, suffix) for suffix in ("png", "svg")}
     for name, content in files.items():
-        with writable(out, "choose another folder with --out"):
-            write_output(out / name, content)
+        write_output(out / name, content)
     print(*(out / name for name in files), sep="\n")

@@ -11,21 +11,21 @@ class Motion:
     policy has them, else a target for the whole control step."""
 
     def __init__(self, metadata: Metadata):
-        ranges, limits = metadata.joint_ranges, metadata.limits
-        self._duration = metadata.control_dt
-        self._low = np.array([-np.inf if x is None else x[0] for x in ranges])
-        self._high = np.array([np.inf if x is None else x[1] for x in ranges])
+        limits, self._duration = metadata.limits, metadata.control_dt
+        self.ranges = np.array(
+            [(-np.inf, np.inf) if x is None else x for x in metadata.joint_ranges]
+        ).T
+        """Lower and upper ends [2, J] of the joints' ranges, rad."""
         self._limits = None
         if limits is not None:
             velocity, acceleration = np.array(limits.velocity), np.array(limits.acceleration)
             smoothing = None if limits.jerk is None else 2.0 * acceleration / np.array(limits.jerk)
-            span = (self._low, self._high)
-            self._limits = JointLimits(velocity, acceleration, smoothing, span)
+            self._limits = JointLimits(velocity, acceleration, smoothing, tuple(self.ranges))
         self._start = self._end = None
 
     def rest(self, angles: np.ndarray | None) -> None:
         """The arm rests, with its servos at these angles [J]; None: at those of the next step."""
-        still = np.zeros(len(self._low))
+        still = np.zeros(self.ranges.shape[1])
         self._start = None
         self._end = None if angles is None else Setpoint(np.array(angles, float), still, still)
 
@@ -33,7 +33,7 @@ class Motion:
         """Begins a control step where the last one ended, the first one at the measured angles
         [J]."""
         if self._end is None:
-            self.rest(self.clip(angles))
+            self.rest(np.clip(angles, *self.ranges))
         self._start = self._end
 
     def withdraw(self) -> None:
@@ -78,7 +78,8 @@ class Motion:
     def aim(self, target: np.ndarray) -> None:
         """Moves the joints toward a target [J], to be there at the end of the control step."""
         # An arm beyond its range comes back by its own speed.
-        low, high = np.minimum(self._low, self.position), np.maximum(self._high, self.position)
+        low, high = self.ranges
+        low, high = np.minimum(low, self.position), np.maximum(high, self.position)
         target = np.clip(target, low, high)
         if self._limits is None:
             still = np.zeros(len(target))
@@ -92,7 +93,3 @@ class Motion:
             return np.tile(self._end.position, (len(times), 1))
         acceleration, smoothing = self._end.acceleration, self._limits.smoothing
         return command(self._start, acceleration, np.asarray(times)[:, None], np, smoothing)
-
-    def clip(self, angles: np.ndarray) -> np.ndarray:
-        """Angles [J] within the joints' ranges."""
-        return np.clip(angles, self._low, self._high)

@@ -281,23 +281,20 @@ class DeployedPolicy:
                 f"no ball of the training farther than {farthest:.3g} m; give metres in the "
                 "robot's frame"
             )
-        for name in self.metadata.commands.keys() & measured.keys():
-            low, high = self.metadata.commands[name].range
-            room, value = max(high - low, _OUTSIDE), float(measured[name][0])
+        ranges = [
+            (name, measured[name][0], *command.range, max(np.ptp(command.range), _OUTSIDE))
+            for name, command in self.metadata.commands.items()
+            if name in measured
+        ]
+        angles = measured.get("joint_angles", ())
+        joints = zip(self.metadata.joint_names, angles, *self.motion.ranges, strict=False)
+        ranges += [("the angle of " + joint, *given, _OUTSIDE) for joint, *given in joints]
+        for name, value, low, high, room in ranges:
             if not low - room <= value <= high + room:
                 raise UserError(
-                    f"the command {name} is {value:g}, but the training had {low:g} to {high:g} "
-                    f"({self.units[name]}); give one near this range"
+                    f"{name} is {value:.3g}, but the training had {low:.3g} to {high:.3g} "
+                    f"({self.units.get(name, 'rad')}); give this unit, and the policy's order"
                 )
-        angles = measured.get("joint_angles", np.array(self.metadata.default_joint_angles))
-        outside = np.abs(angles - self.motion.clip(angles))
-        worst = np.argmax(outside)
-        if outside[worst] > _OUTSIDE:
-            raise UserError(
-                f"the measurement joint_angles has {angles[worst]:.3g} for "
-                f"{self.metadata.joint_names[worst]}, {outside[worst]:.2g} rad outside its range; "
-                "give rad, in the policy's order"
-            )
 
 
 def _array(label: str, value: Any, size: int, unit: str, limit: float, rows: int = 1) -> np.ndarray:

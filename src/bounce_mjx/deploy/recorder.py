@@ -1,5 +1,6 @@
 """A log of a robot's run: one CSV file, from which `bounce-mjx identify` estimates its world."""
 
+import contextlib
 import csv
 import itertools
 import os
@@ -16,7 +17,7 @@ _OF_JOINTS = {"joint_angles": "rad", "joint_velocities": "rad/s", "servo_targets
 _SAME_PICTURE = 1e-4
 
 
-class Recorder:
+class Recorder(contextlib.AbstractContextManager):
     """Writes what a policy saw and sent into a CSV file, a row for each control step.
 
     A row has the ball's cells filled if a picture arrived since the last row; pictures between two
@@ -88,9 +89,6 @@ class Recorder:
     def close(self) -> None:
         """Closes the file."""
         self._file.close()
-
-    def __enter__(self) -> "Recorder":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

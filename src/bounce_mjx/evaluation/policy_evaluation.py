@@ -10,11 +10,9 @@ from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
 from bounce_mjx.evaluation.config import DEFAULT_OPTIONS, EvaluationOptions, on_engine
 from bounce_mjx.evaluation.episodes import make_evaluator
-from bounce_mjx.evaluation.recording import RECORDED_EPISODES
 from bounce_mjx.evaluation.results import Report, judge
 from bounce_mjx.evaluation.suite import neutral_commands
 from bounce_mjx.learning.policy import Actor, Policy
-from bounce_mjx.task.shown import Recording
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import RandomizationConfig, Ranges
 
@@ -54,18 +52,6 @@ def evaluate_policy(
     evaluate = make(env, actor(env), options.episodes, recorded)
     measured = evaluate(policy, jax.random.PRNGKey(options.seed), ranges)
     return PolicyEvaluation(judge(env, *measured, commands), engine)
-
-
-def recorded_episodes(
-    policy: Policy | None,
-    env_config: WorldConfig,
-    actor: Callable[[Env], Actor],
-    options: EvaluationOptions = DEFAULT_OPTIONS,
-) -> Recording:
-    """A recording of `RECORDED_EPISODES` episodes; the arguments are those of `evaluate_policy`."""
-    options = options._replace(episodes=RECORDED_EPISODES)
-    evaluation = evaluate_policy(policy, env_config, actor, options, recorded=RECORDED_EPISODES)
-    return evaluation.report.recording
 
 
 def _prepare(

@@ -47,7 +47,8 @@ def read_log(path: Path, model: mujoco.MjModel, topics: Topics, names: Sequence[
 
 
 def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
-    """Reads a CSV log.
+    """Reads a CSV log. Cells are separated by commas, semicolons or tabs, as the header's; beside
+    the last two, a decimal comma is read.
 
     Args:
       joint_names: the robot's joints, in the order of the result.
@@ -99,8 +100,11 @@ def _read_columns(path: Path) -> dict[str, tuple[str, np.ndarray]]:
     that holds none."""
     try:
         header, *lines = path.read_text("utf-8-sig").splitlines() or [""]
-        titles = next(csv.reader([header]), [])
-        options = dict(delimiter=",", comments=None, quotechar='"', ndmin=2, encoding=None)
+        delimiter = max(",;\t", key=header.count)
+        titles = next(csv.reader([header], delimiter=delimiter), [])
+        if delimiter != ",":
+            lines = [line.replace(",", ".") for line in lines]
+        options = dict(delimiter=delimiter, comments=None, quotechar='"', ndmin=2)
         cells = np.loadtxt(lines, converters=_read_number, **options) if lines else np.zeros((0, 0))
     except (OSError, ValueError) as error:
         raise UserError(
@@ -135,7 +139,7 @@ def read_bag(path: Path, joint_names: Sequence[str], topics: Topics) -> Log:
     Raises:
       MissingPackage: rosbags is missing.
       UserError: the bag cannot be read, a topic is missing or of another type, no message has a
-        joint, or as `make_log`.
+        joint, the ball is in two frames, or as `make_log`.
     """
     found, num_joints = _read_messages(path, topics), len(joint_names)
     angles, targets = (
@@ -158,6 +162,13 @@ def read_bag(path: Path, joint_names: Sequence[str], topics: Topics) -> Log:
             )
     name = f"pictures of the ball of {topics.ball} in {path}"
     balls = _make_rows(name, found[topics.ball], 3, _read_position)
+    seen = np.flatnonzero(np.isfinite(balls.values).all(axis=1))
+    frames = {found[topics.ball][i][1].header.frame_id for i in seen}
+    if len(frames) > 1:
+        raise UserError(
+            f"the messages of {topics.ball} in {path} are in the frames "
+            f"{', '.join(map(shorten, sorted(frames)))}; record the ball in the robot's base frame"
+        )
     own = np.isfinite(angles.times)
     if np.any(own) and abs(np.median((angles.arrivals - angles.times)[own])) > _TWO_CLOCKS:
         # Such as simulated time: pictures arrived when the angles of the same moment did.

@@ -109,9 +109,14 @@ class Layout(NamedTuple):
         """Which entries [P] the stages vary."""
         return self._fill(lambda unknown: unknown.stage in stages)
 
+    @property
+    def limits(self) -> np.ndarray:
+        """Lower and upper limits [2, P]."""
+        return np.stack([self._fill(lambda unknown, i=i: unknown.limits[i]) for i in (0, 1)])
+
     def clip(self, vector: np.ndarray) -> np.ndarray:
         """The vector [..., P] within the limits of each unknown."""
-        return np.clip(vector, self._fill(lambda u: u.limits[0]), self._fill(lambda u: u.limits[1]))
+        return np.clip(vector, *self.limits)
 
     def interior(self, vector: np.ndarray, steps: float) -> np.ndarray:
         """The vector [P] with a delay from which the differences of derivatives, `steps` times

@@ -39,18 +39,10 @@ _MOTIONS = {
 }
 # Deviations of the prior beyond which an estimate is a mistake, and what is likely to be wrong.
 _SURPRISING = 3.0
-_FRAME = (
-    "the frame of the ball's position (of the robot's base, in metres, z up), swapped columns, or "
-    "where and how the paddle is mounted, which the log cannot tell from these: paddle_offset has "
-    "its prior"
-)
-_PICTURES = "the unit or the clock of ball_time, the unit of the ball's position, or another ball"
-_ARM = (
-    "another arm than --robot's, swapped columns of joints, a joint's zero, the unit of the "
-    "angles, the clock of the servo targets, or the frame of the ball"
-)
-_MISTAKES = dict.fromkeys([*BALL, CAMERA_ROTATION, "gravity_tilt"], _FRAME) | dict.fromkeys(
-    ("air_drag", "ball_latency", "restitution", "contact_friction"), _PICTURES
+_MISTAKES = (
+    "Look at the frame of the ball's position (the robot's base, in metres, z up), the unit and "
+    "clock of ball_time and of the servo targets, swapped columns, a joint's zero, --robot, and "
+    "how the paddle is mounted, which the log cannot tell from these: paddle_offset has its prior."
 )
 
 
@@ -147,19 +139,16 @@ def sentences(found: Identified, joint_names: Sequence[str]) -> list[str]:
 
 def _describe_mistakes(found: Identified, joint_names: Sequence[str]) -> list[str]:
     """Warnings of estimates that are several deviations of the prior away."""
-    layout, listed, said = found.layout, estimates(found, joint_names), []
-    for name, place in layout.slices().items():
-        unknown = layout.unknowns[name]
-        off = (found.fit.vector[place] - unknown.mean) / unknown.deviation
-        at_limit = np.isin(found.fit.vector[place], [end for end in unknown.limits if end])
-        for i in np.flatnonzero((np.abs(off) > _SURPRISING) | at_limit):
-            entry = listed[place][i]
-            said.append(
-                f"warning: {entry.label} is {entry.value:.4g} {entry.unit}".rstrip()
-                + f", {abs(off[i]):.1f} deviations of the prior from {unknown.mean:g}; look at "
-                f"{_MISTAKES.get(name, _ARM)}."
-            )
-    return said
+    layout, vector = found.layout, found.fit.vector
+    off = np.abs(vector - layout.mean) / layout.deviation
+    at_limit = np.any((layout.limits == vector) & (layout.limits != 0.0), axis=0)
+    said = [
+        f"warning: {entry.label} is {entry.value:.4g} {entry.unit}".rstrip()
+        + f", {off[i]:.1f} deviations of the prior from {layout.mean[i]:g}."
+        for i, entry in enumerate(estimates(found, joint_names))
+        if off[i] > _SURPRISING or at_limit[i]
+    ]
+    return [*said, _MISTAKES] if said else []
 
 
 def _describe_unseen(found: Identified, joint_names: Sequence[str]) -> list[str]:

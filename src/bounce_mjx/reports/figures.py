@@ -10,10 +10,10 @@ from collections.abc import Sequence
 import jax
 import matplotlib
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
@@ -25,8 +25,6 @@ from bounce_mjx.task.shown import Curve, Histogram, Hits, Recording
 RETURN = "episode/return"
 """Tag of the return in a training's log."""
 _REWARD = "reward/"
-# Okabe and Ito's palette, whose colours colour-blind readers can distinguish.
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _GREY = "#777777"
 _STYLE = {
     "font.size": 9,
@@ -39,8 +37,11 @@ _STYLE = {
     "legend.frameon": False,
     # The same figure gives the same file.
     "svg.hashsalt": "bounce_mjx",
+    # Okabe and Ito's palette, whose colours colour-blind readers can distinguish.
+    "axes.prop_cycle": matplotlib.cycler(
+        color=("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+    ),
 }
-_POINTS = dict(marker="o", markersize=4.0, linestyle="none")
 PANEL_WIDTH = 2.6
 """Width of a panel in inches: two of them fit a phone."""
 style = functools.partial(matplotlib.rc_context, _STYLE)
@@ -58,14 +59,11 @@ def curves_figure(groups: Sequence[Group], columns: int = 3) -> Figure:
     for group in groups:
         shown += [curve for curve in group.task_curves if curve.title and curve not in shown]
     figure, panels = make_panels(len(shown), columns, height=2.4)
-    has_evaluations = False
     for axes, curve in zip(panels, shown, strict=True):
         _draw_curve(axes, groups, curve)
-        has_evaluations |= _draw_evaluations(axes, groups, curve)
         axes.set_ylim(bottom=0.0)
         axes.set_xlabel("environment steps")
-    points = [Line2D([], [], color=_GREY, label="evaluation, without noise", **_POINTS)]
-    _add_legend(figure, groups, points if has_evaluations else [])
+    _add_legend(figure)
     return figure
 
 
@@ -80,7 +78,7 @@ def rewards_figure(groups: Sequence[Group], columns: int = 5) -> Figure:
         _draw_curve(axes, groups, Curve(name, "", title=title))
     title = "weighted reward terms over environment steps,\nmean of a control step"
     figure.suptitle(title, fontsize=10)
-    _add_legend(figure, groups)
+    _add_legend(figure)
     return figure
 
 
@@ -125,10 +123,6 @@ def literal(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-def _with_colours(groups: Sequence[Group]) -> list[tuple[Group, str]]:
-    return [(group, _COLOURS[i % len(_COLOURS)]) for i, group in enumerate(groups)]
-
-
 def make_panels(count: int, columns: int, height: float) -> tuple[Figure, list[Axes]]:
     """A figure with a number of panels in rows of a height in inches."""
     columns = max(1, min(columns, count))
@@ -143,54 +137,40 @@ def make_panels(count: int, columns: int, height: float) -> tuple[Figure, list[A
 
 def _draw_curve(axes: Axes, groups: Sequence[Group], shown: Curve) -> None:
     """One line for a group of one run; for several runs, faint lines, their mean, and a band of one
-    standard deviation on each side. A dotted line shows where a run first met all results."""
-    name, factor = shown.tag, shown.scale
-    for group, colour in _with_colours(groups):
-        for run in group.runs:
-            if run.solved_steps is not None:
-                axes.axvline(run.solved_steps, color=colour, linestyle=":", linewidth=1.0)
-        curves = [run.curves[name] for run in group.runs if name in run.curves]
-        if not curves:
-            continue
+    standard deviation on each side. A point for each evaluation, in which actions are not sampled,
+    and a dotted line where a run first met all results."""
+    evaluated = "mean_return" if shown.tag == RETURN else f"mean_{shown.metric}_m"
+    for i, group in enumerate(groups):
+        colour, curves = f"C{i}", [x.curves[shown.tag] for x in group.runs if shown.tag in x.curves]
+        if curves:
+            steps, mean, deviation = mean_and_band(curves)
+            low, mean, high = (shown.scale * (mean + side * deviation) for side in (-1, 0, 1))
+            axes.plot(steps, mean, color=colour, linewidth=1.6, label=literal(group.label))
         if len(curves) > 1:
             for curve in curves:
-                axes.plot(curve.steps, factor * curve.values, color=colour, alpha=0.3, lw=0.7)
-        steps, mean, deviation = mean_and_band(curves)
-        mean, deviation = factor * mean, factor * deviation
-        axes.plot(steps, mean, color=colour, linewidth=1.6)
-        if len(curves) > 1:
-            axes.fill_between(
-                steps, mean - deviation, mean + deviation, color=colour, alpha=0.2, linewidth=0
-            )
+                axes.plot(curve.steps, shown.scale * curve.values, color=colour, alpha=0.3, lw=0.7)
+            axes.fill_between(steps, low, high, color=colour, alpha=0.2, linewidth=0)
+    for i, group in enumerate(groups):
+        for run in group.runs:
+            if (points := run.curves.get(f"results/{evaluated}")) is not None:
+                label, heights = "evaluation, without noise", shown.scale * points.values
+                axes.plot(points.steps, heights, "o", color=f"C{i}", ms=4.0, label=label)
+            if (steps := run.solved_steps) is not None:
+                axes.axvline(steps, color=f"C{i}", ls=":", lw=1.0, label="all results met")
     axes.set_title(literal(shown.title))
     axes.set_xlim(left=0)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
 
 
-def _draw_evaluations(axes: Axes, groups: Sequence[Group], shown: Curve) -> bool:
-    """A point for each evaluation of the quantity, in which actions are not sampled; whether there
-    is one."""
-    name = "mean_return" if shown.tag == RETURN else f"mean_{shown.metric}_m"
-    found = False
-    for group, colour in _with_colours(groups):
-        for run in group.runs:
-            if (curve := run.curves.get(f"results/{name}")) is not None:
-                axes.plot(curve.steps, shown.scale * curve.values, color=colour, **_POINTS)
-                found = True
-    return found
-
-
-def _add_legend(figure: Figure, groups: Sequence[Group], others: Sequence[Line2D] = ()) -> None:
-    handles = [
-        Line2D([], [], color=colour, linewidth=1.6, label=literal(group.label))
-        for group, colour in _with_colours(groups)
-    ]
-    if any(run.solved_steps is not None for group in groups for run in group.runs):
-        handles.append(Line2D([], [], color=_GREY, linestyle=":", label="all results met"))
-    handles += others
-    columns = max(1, round(figure.get_figwidth() / PANEL_WIDTH))
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(columns, len(handles)))
+def _add_legend(figure: Figure) -> None:
+    """A legend of what any panel shows."""
+    handles: dict[str, Artist] = {}
+    for axes in figure.axes:
+        lines, labels = axes.get_legend_handles_labels()
+        handles |= zip(labels, lines, strict=True)
+    columns = max(1, min(round(figure.get_figwidth() / PANEL_WIDTH), len(handles)))
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
 
 
 def _draw_heights(axes: Axes, env: Env, recording: Recording) -> None:
@@ -206,9 +186,9 @@ def _draw_heights(axes: Axes, env: Env, recording: Recording) -> None:
         heights = [level[name] for level in levels]
         constant = f" {heights[0]:.2f} m" if len(set(heights)) == 1 else ""
         label = literal(f"{name}{constant}")
-        axes.plot(time, heights, color=_COLOURS[(2 + i) % len(_COLOURS)], label=label)
-    axes.plot(time, recording.ball[:steps, ..., 2, 0], color=_COLOURS[0], label="ball")
-    axes.plot(time, recording.paddle[:steps, 2, 0], color=_COLOURS[1], label="paddle")
+        axes.plot(time, heights, color=f"C{2 + i}", label=label)
+    axes.plot(time, recording.ball[:steps, ..., 2, 0], color="C0", label="ball")
+    axes.plot(time, recording.paddle[:steps, 2, 0], color="C1", label="paddle")
     axes.set_xlim(0.0, env.config.episode_seconds)
     if axes.dataLim.y0 >= 0.0:
         axes.set_ylim(bottom=0.0)
@@ -225,9 +205,9 @@ def _draw_histogram(axes: Axes, plot: Histogram) -> None:
         _note(axes, f"no {plot.counted}")
         return
     half = max(1.25 * bound, 1.05 * float(np.abs(values).max()))
-    axes.hist(values, bins=51, range=(-half, half), color=_COLOURS[0])
+    axes.hist(values, bins=51, range=(-half, half), color="C0")
     for side in (-1, 1):
-        axes.axvline(side * bound, color=_COLOURS[2], linestyle="--")
+        axes.axvline(side * bound, color="C2", linestyle="--")
     axes.axvline(0.0, color=_GREY, linewidth=0.8)
 
 
@@ -241,12 +221,12 @@ def _draw_hits(axes: Axes, env: Env, plot: Hits, points: np.ndarray) -> None:
             2.0 * half_y,
             2.0 * half_x,
             facecolor="#f6ebe0",
-            edgecolor=_COLOURS[1],
+            edgecolor="C1",
         )
     )
     axes.plot([0], [0], "+", color=_GREY)
     x, y = 100.0 * points.T[:2]
-    axes.plot(y, x, ".", markersize=3, alpha=0.4, color=_COLOURS[0], markeredgewidth=0)
+    axes.plot(y, x, ".", markersize=3, alpha=0.4, color="C0", markeredgewidth=0)
     axes.set(
         title=literal(f"{plot.title} ({len(points):,})"),
         xlabel="paddle's y",

@@ -13,7 +13,9 @@ from matplotlib.figure import Figure
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
-from bounce_mjx.evaluation.policy_evaluation import recorded_episodes
+from bounce_mjx.evaluation.config import EvaluationOptions
+from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
+from bounce_mjx.evaluation.recording import RECORDED_EPISODES
 from bounce_mjx.reports.curves import group_runs
 from bounce_mjx.reports.figures import (
     PANEL_WIDTH,
@@ -25,7 +27,7 @@ from bounce_mjx.reports.html_page import data_url, figures_html, page, table
 from bounce_mjx.reports.robustness import load_robustness, robustness_figure
 from bounce_mjx.reports.tables import details_line, figure_text, result_cells, robot_name
 from bounce_mjx.runs.config import TrainConfig, load_run_config
-from bounce_mjx.runs.files import writable, write_atomically
+from bounce_mjx.runs.files import write_output
 from bounce_mjx.runs.folders import Checkpoint
 from bounce_mjx.runs.progress import Results, load_results
 from bounce_mjx.runs.reading import read_actor
@@ -48,7 +50,9 @@ def record_checkpoint(checkpoint: Checkpoint) -> Recording:
     """Records some episodes of a checkpoint's policy, on the physics engine of its config."""
     config = load_run_config(checkpoint.run)
     _, policy, actor = read_actor(checkpoint, config)
-    return recorded_episodes(policy, config.env, actor)
+    options = EvaluationOptions(RECORDED_EPISODES)
+    evaluated = evaluate_policy(policy, config.env, actor, options, recorded=RECORDED_EPISODES)
+    return evaluated.report.recording
 
 
 def write_report(run: Path, recording: Recording) -> tuple[Path, Figure]:
@@ -81,8 +85,7 @@ def write_report(run: Path, recording: Recording) -> tuple[Path, Figure]:
         figures["Perturbed worlds"] = robustness_figure(robustness)
     replay = replay_first_episode(env, recording)
     path = run / REPORT_FILE
-    with writable(path, "make the folder writable"):
-        write_atomically(path, _html(run, config, env.engine.name, results, figures, replay))
+    write_output(path, _html(run, config, env.engine.name, results, figures, replay))
     return path, evaluation
 
 

@@ -6,7 +6,6 @@ from itertools import groupby
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, PowerNorm
 from matplotlib.figure import Figure
@@ -73,7 +72,7 @@ def robustness_table(report: RobustnessReport) -> Table:
     table.add_column("strength", justify="right")
     for header in (*(f"{letter} " for letter in letters.values()), ""):
         table.add_column(header, justify="right")
-    for rows in _perturbations(report.outcomes):
+    for _, rows in _rows(report.outcomes):
         for i, outcome in enumerate(rows):
             name = escape(outcome.perturbation) if i == 0 else ""
             strength = "" if outcome.strength is None else f"{outcome.strength:g} {outcome.unit}"
@@ -115,7 +114,19 @@ def robustness_figure(report: RobustnessReport) -> Figure:
     for y, (label, (_, outcomes)) in enumerate(zip(axes.get_yticklabels(), rows, strict=True)):
         label.set_fontweight("normal" if outcomes else "bold")
         for x, outcome in enumerate(outcomes):
-            _draw_cell(axes, x, y, outcome, letters, report.worst_share(outcome))
+            shade = float(_SCALE(100.0 * report.worst_share(outcome)))
+            edge = _INK if outcome.trained else "none"
+            cell = Rectangle(
+                (x + 0.05, y + 0.06), 0.9, 0.88, facecolor=_COLOURS(shade), edgecolor=edge
+            )
+            axes.add_patch(cell)
+            strength = "" if outcome.strength is None else f"{outcome.strength:g}"
+            missed = "".join(letters[name] for name in outcome.failed)
+            ink = _INK if 0.2 < shade < 0.8 else _PAPER
+            place = dict(ha="center", va="center", color=ink)
+            axes.text(x + 0.5, y + 0.3, strength, fontsize=7.5, **place)
+            size = 6 if missed else 8
+            axes.text(x + 0.5, y + 0.7, missed or _TICK, fontsize=size, **place)
     scale = ScalarMappable(_SCALE, _COLOURS)
     bar = figure.colorbar(
         scale, ax=axes, location="bottom", ticks=(0, 50, 75, 90, 100), shrink=0.5, aspect=50
@@ -127,39 +138,13 @@ def robustness_figure(report: RobustnessReport) -> Figure:
     return figure
 
 
-def _perturbations(outcomes: Sequence[ConditionOutcome]) -> list[list[ConditionOutcome]]:
-    """Outcomes grouped by perturbation, in the order of the suite."""
-    return [list(rows) for _, rows in groupby(outcomes, lambda outcome: outcome.perturbation)]
-
-
 def _rows(outcomes: Sequence[ConditionOutcome]) -> list[tuple[str, list[ConditionOutcome]]]:
-    """Each perturbation and its outcomes, below the heading of its group, without outcomes."""
-    rows = []
-    for group, members in groupby(_perturbations(outcomes), lambda row: row[0].group):
-        if group != NOMINAL:
-            rows.append((group, []))
-        for row in members:
-            unit = f", {row[0].unit}" if row[0].unit else ""
-            rows.append((row[0].perturbation + unit, row))
+    """Each perturbation and its outcomes, below the heading of its group, without outcomes, in the
+    order of the suite."""
+    rows: list[tuple[str, list[ConditionOutcome]]] = []
+    for group, members in groupby(outcomes, lambda outcome: outcome.group):
+        rows += [(group, [])] if group != NOMINAL else []
+        for name, cells in groupby(members, lambda outcome: outcome.perturbation):
+            row = list(cells)
+            rows.append((f"{name}, {row[0].unit}".rstrip(", "), row))
     return rows
-
-
-def _draw_cell(
-    axes: Axes,
-    x: float,
-    y: float,
-    outcome: ConditionOutcome,
-    letters: dict[str, str],
-    share: float,
-) -> None:
-    shade = float(_SCALE(100.0 * share))
-    ink = _INK if 0.2 < shade < 0.8 else _PAPER
-    edge = _INK if outcome.trained else "none"
-    axes.add_patch(
-        Rectangle((x + 0.05, y + 0.06), 0.9, 0.88, facecolor=_COLOURS(shade), edgecolor=edge)
-    )
-    strength = "" if outcome.strength is None else f"{outcome.strength:g}".replace("-", "\u2212")
-    missed = "".join(letter for name, letter in letters.items() if name in outcome.failed)
-    place = dict(ha="center", va="center", color=ink)
-    axes.text(x + 0.5, y + 0.3, strength, fontsize=7.5, **place)
-    axes.text(x + 0.5, y + 0.7, missed or _TICK, fontsize=6 if missed else 8, **place)

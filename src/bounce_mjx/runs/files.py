@@ -79,10 +79,15 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 def write_output(path: Path, content: str | bytes) -> None:
     """Writes a file that the user named, like `write_atomically`; a device or a pipe, such as
-    /dev/stdout, stays one."""
+    /dev/stdout, stays one.
+
+    Raises:
+      UserError: it cannot be written.
+    """
     content = content.encode() if isinstance(content, str) else content
-    is_special = path.exists() and not path.is_file()
-    (Path.write_bytes if is_special else write_atomically)(path, content)
+    with writable(path, "give another file or folder"):
+        is_special = path.exists() and not path.is_file()
+        (Path.write_bytes if is_special else write_atomically)(path, content)
 
 
 @contextlib.contextmanager

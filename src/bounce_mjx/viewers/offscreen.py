@@ -1,5 +1,6 @@
 """Rendering without a screen."""
 
+import contextlib
 import functools
 import importlib
 import os
@@ -70,7 +71,7 @@ def choose_opengl() -> None:
     gl_context.GLContext = importlib.import_module(f"mujoco.{choose_backend()}").GLContext
 
 
-class Renderer:
+class Renderer(contextlib.AbstractContextManager):
     """Renders one environment. A context manager, which frees the GPU's memory."""
 
     def __init__(
@@ -111,10 +112,7 @@ class Renderer:
         self._renderer = mujoco.Renderer(model, height, width)
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = not plain
 
-    def __enter__(self) -> "Renderer":
-        return self
-
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

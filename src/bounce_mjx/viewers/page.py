@@ -1,13 +1,11 @@
 """The replay page: episodes in one HTML file, for any browser, offline."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import jax
 import numpy as np
 
 from bounce_mjx.env.env import Env
-from bounce_mjx.runs.files import writable, write_output
 from bounce_mjx.task.shown import Recording
 from bounce_mjx.viewers.guard import open_server
 from bounce_mjx.viewers.scene import Scene
@@ -17,26 +15,6 @@ SUFFIXES = (".html",)
 _DEFAULT_FPS = 30
 _EPISODE_SECONDS = 10.0
 _VISER_TITLE = "<title>Viser</title>"
-
-
-def write_page(
-    path: Path,
-    env: Env,
-    recording: EnvFrame,
-    fps: int | None,
-    names: Sequence[str] | None = None,
-) -> None:
-    """Writes a recording [T, N, ...] as a page.
-
-    Args:
-      names: see `Scene`.
-
-    Raises:
-      UserError: the file cannot be written.
-    """
-    text = replay(env, recording, fps or _DEFAULT_FPS, names)
-    with writable(path, "make room there, or give another file"):
-        write_output(path, text)
 
 
 def replay_first_episode(env: Env, recording: Recording) -> str:
@@ -61,9 +39,14 @@ def replay_first_episode(env: Env, recording: Recording) -> str:
 
 
 def replay(
-    env: Env, recording: EnvFrame, fps: int = _DEFAULT_FPS, names: Sequence[str] | None = None
+    env: Env, recording: EnvFrame, fps: int | None = None, names: Sequence[str] | None = None
 ) -> str:
-    """A page (HTML) that replays a recording [T, N, ...]."""
+    """A page (HTML) that replays a recording [T, N, ...], at 30 frames per second or another rate.
+
+    Args:
+      names: see `Scene`.
+    """
+    fps = fps or _DEFAULT_FPS
     frames = resample(recording, env.dt, fps)
     with open_server("127.0.0.1", 0) as server:
         scene = Scene(server, env, frames.time.shape[1], names)

@@ -12,7 +12,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.interrupt import Interrupted, StopRequest
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.robot.model import fingerprint
-from bounce_mjx.runs.files import check_output
+from bounce_mjx.runs.files import check_output, write_output
 from bounce_mjx.viewers.native import check_display, has_display, show_window
 from bounce_mjx.viewers.options import MAX_ENVS, Address, PageStart, ViewerOptions
 from bounce_mjx.viewers.simulation import Controller, SideBySide, Simulation
@@ -90,7 +90,7 @@ def _recording(options: ViewerOptions, console: Console) -> Present:
         check_output(options.video, "--video", SUFFIXES)
         film = VideoWriter(options.video, options.size, options.fps, options.zoom)
     if options.html is not None:
-        from bounce_mjx.viewers.page import SUFFIXES, write_page
+        from bounce_mjx.viewers.page import SUFFIXES, replay
 
         check_output(options.html, "--html", SUFFIXES)
 
@@ -98,7 +98,8 @@ def _recording(options: ViewerOptions, console: Console) -> Present:
         with console.status("recording"):
             recording = simulation.record(options.seconds or _RECORDED_SECONDS)
             if options.html is not None:
-                write_page(options.html, simulation.env, recording, options.fps, start.names)
+                page = replay(simulation.env, recording, options.fps, start.names)
+                write_output(options.html, page)
             if film is not None:
                 film.write(simulation.env, recording)
         for path in (options.video, options.html):

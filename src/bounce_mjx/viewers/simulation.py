@@ -96,11 +96,6 @@ def frame_readings(env: Env, frame: EnvFrame, index: int = 0) -> dict[str, str]:
     return env.task.readings(at_index(frame.command, index), at_index(frame.metrics, index))
 
 
-def stack(frames: Sequence[EnvFrame]) -> EnvFrame:
-    """T frames as a recording."""
-    return jax.tree.map(lambda *values: np.stack(values), *frames)
-
-
 def frame_at(recording: EnvFrame, i: int) -> EnvFrame:
     """One frame of a recording."""
     return jax.tree.map(lambda values: values[i], recording)
@@ -186,7 +181,7 @@ class Simulation:
         """The current frame and the frames of the following `seconds`."""
         frames = [self.frame]
         frames += [self.step() for _ in range(round(seconds / self.env.dt))]
-        return stack(frames)
+        return jax.tree.map(lambda *values: np.stack(values), *frames)
 
     def _inputs(self) -> tuple:
         """Arguments of the program of a step."""

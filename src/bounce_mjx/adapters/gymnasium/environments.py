@@ -23,11 +23,11 @@ from gymnasium.vector.utils import batch_space
 from bounce_mjx.adapters.gymnasium.programs import Episodes, Programs, Step, shared_programs
 from bounce_mjx.config.validation import validate
 from bounce_mjx.env.env import Env
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import UserError, suggest
 from bounce_mjx.task.task import Task
 from bounce_mjx.tasks.registry import DEFAULT, task_config
 from bounce_mjx.viewers.offscreen import Renderer
-from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.viewers.simulation import at_index
 
 # The process in which a program has run. JAX's threads are lost when this process forks.
 _jax_process: int | None = None
@@ -37,7 +37,8 @@ Commands = dict[str, float | np.ndarray]
 
 
 class UnexpectedArgument(UserError, TypeError):
-    """An argument with an unknown name; libraries that try several expect a TypeError."""
+    """An argument with an unknown name; libraries that try several expect a TypeError with these
+    words of Python's own."""
 
 
 class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -80,7 +81,11 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
           UserError: an argument is wrong, or there is no OpenGL library for rendering; an unknown
             argument is a TypeError too.
         """
-        self.config = _task_config(task, settings)
+        kind = task_config(task)
+        for name in settings.keys() - kind.model_fields.keys():
+            advice = suggest(name, kind.model_fields) or f"give {', '.join(kind.model_fields)}"
+            raise UnexpectedArgument(f"got an unexpected keyword argument {name!r}; {advice}")
+        self.config = validate(kind, settings, "the environment's settings")
         self.dt = self.config.control_dt
         """Time of one step, s."""
         self.num_envs = num_envs
@@ -230,7 +235,9 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
                 f"the episodes of the environments {np.flatnonzero(before).tolist()} have ended; "
                 'reset them with reset(options={"reset_mask": terminated | truncated})'
             )
-        actions = checked_actions(actions, self.action_space.shape)
+        actions, shape = np.asarray(actions, np.float32), self.action_space.shape
+        if actions.shape != shape:
+            raise UserError(f"the action has the shape {actions.shape}, but must have {shape}")
         self._check_started()
         _check_process()
         same_step = mode is AutoresetMode.SAME_STEP
@@ -258,10 +265,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         if self._renderer is None:
             self._open_renderer()
         env, state = self._episodes.env, self._episodes.env.pipeline_state
-        command, metrics = (
-            {name: float(value[index]) for name, value in values.items()}
-            for values in (state.command, env.metrics)
-        )
+        command, metrics = (at_index(values, index) for values in (state.command, env.metrics))
         return self._renderer.render(np.array(state.physics.qpos[:, index]), command, metrics)
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
@@ -374,8 +378,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         Returns:
           Observation [N], reward, terminated, truncated, and the environment's metrics.
         """
-        action = checked_actions(action, self.action_space.shape)
-        observation, reward, terminated, truncated, info = self._envs.step(action[None])
+        observation, reward, terminated, truncated, info = self._envs.step(np.asarray([action]))
         metrics = {name: float(x[0]) for name, x in info.items() if not name.startswith("_")}
         return observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), metrics
 
@@ -388,18 +391,6 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._envs.close()
 
 
-def checked_actions(actions: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """The actions as an array, float32.
-
-    Raises:
-      UserError: they have another shape.
-    """
-    array = np.asarray(actions, np.float32)
-    if array.shape != shape:
-        raise UserError(f"the action has the shape {array.shape}, but must have {shape}")
-    return array
-
-
 def _mask(values: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]:
     if not mask.any():
         return {}
@@ -408,19 +399,6 @@ def _mask(values: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarr
         masked[name] = np.where(mask, value, value.dtype.type(0))
         masked[f"_{name}"] = mask.copy()
     return masked
-
-
-def _task_config(task: str | type[Task], settings: dict[str, Any]) -> WorldConfig:
-    config = task_config(task)
-    try:
-        return validate(config, settings, "the environment's settings")
-    except UserError as error:
-        unknown = [name for name in settings if name not in config.model_fields]
-        if not unknown:
-            raise
-        # Libraries look for this part of Python's own message.
-        python = f"got an unexpected keyword argument {unknown[0]!r}"
-        raise UnexpectedArgument(f"{error} ({python})") from error
 
 
 def _check_process() -> None:

@@ -23,7 +23,7 @@ class Episodes(NamedTuple):
     length: jax.Array
     """Steps since the reset [B], int32."""
     key: jax.Array
-    """Key of each environment's later resets [B, ...]."""
+    """Key of each environment's later resets [..., B]."""
 
 
 class Step(NamedTuple):
@@ -86,10 +86,10 @@ def _start(
       seeds: [B]; where `seeded` [B] is false, the environment continues its random numbers.
       commands: each [B]; NaN samples one.
     """
-    keys = jax.vmap(jax.random.PRNGKey)(seeds)
+    keys = jax.vmap(jax.random.PRNGKey, out_axes=-1)(seeds)
     if episodes is not None:
-        keys = jnp.where(seeded[:, None], keys, episodes.key)
-    keys, now = _split(keys)
+        keys = jnp.where(seeded, keys, episodes.key)
+    keys, now = jax.vmap(jax.random.split, -1, -1)(keys)
 
     def reset_one(key: jax.Array, commands: dict[str, jax.Array]) -> State:
         ranges = task.ranges()
@@ -98,7 +98,7 @@ def _start(
             ranges[name] = tuple(jnp.where(jnp.isnan(given), end, given) for end in ends)
         return task.reset(key, ranges)
 
-    env = jax.vmap(reset_one, out_axes=-1)(now, commands)
+    env = jax.vmap(reset_one, -1, -1)(now, commands)
     started = Episodes(env, jnp.zeros(seeds.shape, jnp.int32), keys)
     return started if episodes is None else _choose(mask, started, episodes)
 
@@ -118,9 +118,9 @@ def _step(
       reset_before: environments that start a new episode instead of a step [B], bool.
       reset_after: whether an ended episode is followed by a new one in the same step [].
     """
-    keys, now = _split(episodes.key)
-    fresh = jax.vmap(task.reset, out_axes=-1)(now)
-    stepped = jax.vmap(task.step, in_axes=-1, out_axes=-1)(episodes.env, actions.T)
+    keys, now = jax.vmap(jax.random.split, -1, -1)(episodes.key)
+    fresh = jax.vmap(task.reset, -1, -1)(now)
+    stepped = jax.vmap(task.step, -1, -1)(episodes.env, actions.T)
     length = episodes.length + 1
     terminated = (stepped.done > 0) & ~reset_before
     # The limit counts even if the task ended the episode too, as in Gymnasium's TimeLimit.
@@ -142,14 +142,4 @@ def _step(
 
 def _choose(mask: jax.Array, chosen: Episodes, other: Episodes) -> Episodes:
     """The episodes `chosen` where the mask [B] is true, and the others elsewhere."""
-    env = jax.tree.map(lambda a, b: jnp.where(mask, a, b), chosen.env, other.env)
-    return Episodes(
-        env,
-        jnp.where(mask, chosen.length, other.length),
-        jnp.where(mask[:, None], chosen.key, other.key),
-    )
-
-
-def _split(keys: jax.Array) -> tuple[jax.Array, jax.Array]:
-    pairs = jax.vmap(jax.random.split)(keys)
-    return pairs[:, 0], pairs[:, 1]
+    return jax.tree.map(lambda a, b: jnp.where(mask, a, b), chosen, other)

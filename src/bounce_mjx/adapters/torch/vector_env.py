@@ -195,16 +195,11 @@ def _committed_key(seed: int) -> jax.Array:
 
 def _shared_device() -> torch.device:
     """The torch device of JAX's default device."""
-    device = jax.devices()[0]
-    if device.platform == "gpu" and not torch.cuda.is_available():
-        raise UserError(
-            f"JAX computes on {device.device_kind}, but this PyTorch has no CUDA; install a "
-            "PyTorch with CUDA, or start with JAX_PLATFORMS=cpu"
-        )
     try:
         return torch.from_dlpack(jnp.zeros(1)).device
     except Exception as error:
         raise UserError(
-            f"PyTorch cannot use the memory of JAX's {device.platform} device "
-            f"({str(error).splitlines()[0]}); start with JAX_PLATFORMS=cpu"
+            f"PyTorch cannot use the memory of JAX's {jax.default_backend()} "
+            f"({str(error).splitlines()[0]}); install a PyTorch for this device, or start with "
+            "JAX_PLATFORMS=cpu"
         ) from error
