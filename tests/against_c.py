@@ -209,7 +209,6 @@ class CEngine:
 
     @property
     def state(self) -> PhysicsState:
-        """Copy of all states."""
         return PhysicsState(
             np.array([data.qpos for data in self.data]), np.array([data.qvel for data in self.data])
         )

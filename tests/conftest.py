@@ -115,7 +115,6 @@ def mj_model() -> mujoco.MjModel:
 
 @pytest.fixture(scope="session")
 def env() -> BounceBall:
-    """The environment with all its defaults."""
     return BounceBall()
 
 
@@ -161,7 +160,6 @@ def need() -> Callable[[str], types.ModuleType]:
 
 @pytest.fixture(scope="session")
 def torch_libraries() -> None:
-    """PyTorch and its trainers."""
     if OPTIONAL and not HAS_TORCH:
         pytest.skip("PyTorch is missing; pip install -e '.[torch]'")
 

@@ -30,8 +30,6 @@ ARMS = ((3, 0), (5, 1), (7, 2))
 
 
 class Arm(NamedTuple):
-    """A model and its addresses."""
-
     model: mujoco.MjModel
     at: Addresses
 

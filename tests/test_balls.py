@@ -27,13 +27,7 @@ from bounce_mjx import task
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import c_episodes
-from bounce_mjx.physics import (
-    Control,
-    PhysicsParameters,
-    PhysicsState,
-    make_engine,
-    servo_targets,
-)
+from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, make_engine, servo_targets
 from bounce_mjx.physics.support import unsupported_feature
 from bounce_mjx.robot.model import find_addresses, load_model
 from bounce_mjx.world.randomization import RandomizationConfig
@@ -43,8 +37,7 @@ from test_friction import sticking_and_sliding
 
 
 def balls_model(
-    num_balls: int,
-    friction: float | tuple[float, float] | None = None,
+    num_balls: int, friction: float | tuple[float, float] | None = None
 ) -> mujoco.MjModel:
     """Shipped model with several balls, and a C solver that converges to rounding error; `friction`
     is that along both tangents, or along each."""
@@ -82,7 +75,6 @@ def hostile_states(model: mujoco.MjModel, count: int, seed: int) -> States:
 
 
 def compiled_steps(model: mujoco.MjModel, parameters: PhysicsParameters, states: States):
-    """One fused step from each state."""
     step = make_engine(model, "fused").step
     axes = jax.tree.map(lambda x: 0, parameters)
     steps = jax.jit(jax.vmap(lambda p, s, u: step(p, s, Control(u), 1), in_axes=(axes, 0, 0)))

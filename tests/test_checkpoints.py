@@ -53,7 +53,6 @@ def items_of(state: TrainingState) -> dict:
 
 
 def write_run(folder: Path, state: TrainingState, steps: int = 64) -> Path:
-    """Writes a run with one checkpoint."""
     run = create_run(CONFIG.model_copy(update={"log_dir": folder}))
     progress = {"best": None, "best_steps": 0, "solved_steps": None, "evaluations": []}
     save_checkpoint(run, CONFIG, steps, items_of(state), progress)

@@ -131,7 +131,6 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.fixture(scope="module")
 def policies(runs: dict[str, Path]) -> dict[str, DeployedPolicy]:
-    """Policies of the runs."""
     return {name: load_policy(run) for name, run in runs.items()}
 
 
@@ -156,7 +155,6 @@ def draw_inputs(name: str, runs: dict[str, Path]) -> tuple[dict, np.ndarray]:
 
 
 def session_of(run: Path) -> onnxruntime.InferenceSession:
-    """The exported graph of a run."""
     model = export_onnx(find_checkpoint(run))
     return onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
 
@@ -404,7 +402,6 @@ def test_a_policy_of_two_balls_sees_what_the_environment_sees(tmp_path: Path) ->
 
 
 def measured_once() -> dict:
-    """Valid measurements for every policy of these tests."""
     return {
         "joint_angles": np.array([0.0, 0.7, 1.9, 0.0, -1.0, 0.0]),
         "joint_velocities": np.linspace(-0.1, 0.1, 6),

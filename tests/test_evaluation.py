@@ -29,10 +29,7 @@ from bounce_mjx.learning.networks import Gaussian
 from bounce_mjx.learning.policy import networks_of
 from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.physics import PhysicsParameters
-from bounce_mjx.reports.tables import (
-    details_line,
-    seeds_table,
-)
+from bounce_mjx.reports.tables import details_line, seeds_table
 from bounce_mjx.task import Tally, share_of_episodes
 from bounce_mjx.tasks.registry import find_task
 
@@ -241,7 +238,6 @@ def test_nothing_to_measure_fails(env):
 
 
 def show(table) -> str:
-    """A table as rich prints it on a terminal of 80 columns."""
     console = Console(width=80, file=io.StringIO())
     console.print(table)
     return console.file.getvalue()
@@ -317,7 +313,6 @@ def networks():
 
 @pytest.fixture(scope="module")
 def random_policy(networks):
-    """A policy before any training."""
     params = networks.policy_network.init(jax.random.key(5))
     return policy.Policy(init_normalizer(29), params)
 

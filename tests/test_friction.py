@@ -28,12 +28,7 @@ from against_c import (
     world,
 )
 from bounce_mjx.errors import UserError
-from bounce_mjx.physics import (
-    Control,
-    PhysicsParameters,
-    PhysicsState,
-    make_engine,
-)
+from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, make_engine
 from random_worlds import random_parameters
 
 MODELS = {
@@ -58,8 +53,7 @@ def frictional(old: str = "condim", new: str = "condim") -> mujoco.MjModel:
 
 
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(n, marks=() if n in FAST_MODELS else pytest.mark.slow) for n in MODELS],
+    "name", [pytest.param(n, marks=() if n in FAST_MODELS else pytest.mark.slow) for n in MODELS]
 )
 @pytest.mark.usefixtures("float64")
 def test_one_step_of_a_frictional_model_is_mujocos(name):

@@ -66,7 +66,6 @@ def test_the_time_limit_is_that_of_the_config() -> None:
 
 
 def make_sync(mode, wrap=lambda env: env) -> SyncVectorEnv:
-    """Gymnasium's vector of single environments."""
     made = [lambda: wrap(gymnasium.make(ENV_ID, max_episode_steps=LIMIT))] * NUM_ENVS
     return SyncVectorEnv(made, autoreset_mode=mode)
 

@@ -130,7 +130,6 @@ def text(program: jax.stages.Traced) -> tuple:
 
 
 def of_model(config: TrainConfig) -> tuple:
-    """The engine and its model."""
     return _of_model(Env(config.env))
 
 

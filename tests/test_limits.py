@@ -80,8 +80,7 @@ WORLDS = {
 
 
 @pytest.fixture(
-    scope="module",
-    params=[pytest.param(world, id=name) for name, world in WORLDS.items()],
+    scope="module", params=[pytest.param(world, id=name) for name, world in WORLDS.items()]
 )
 def world(request: pytest.FixtureRequest) -> tuple:
     return *request.param, rolled_out(*request.param)

@@ -33,11 +33,7 @@ def measured(angles: np.ndarray = HOME, **others: Any) -> dict[str, Any]:
     still = {"ball_velocity": np.zeros(3), "joint_velocities": np.zeros(6)}
     return (
         still
-        | {
-            "joint_angles": angles,
-            "ball_position": [0.589, 0.0, 0.45],
-            "target_height": 0.5,
-        }
+        | {"joint_angles": angles, "ball_position": [0.589, 0.0, 0.45], "target_height": 0.5}
         | others
     )
 

@@ -27,10 +27,7 @@ from bounce_mjx.training.watch import TrainingPage
 from bounce_mjx.viewers import browser
 from bounce_mjx.viewers.guard import open_server
 from bounce_mjx.viewers.scene import Scene
-from bounce_mjx.viewers.simulation import (
-    Simulation,
-    make_zero_controller,
-)
+from bounce_mjx.viewers.simulation import Simulation, make_zero_controller
 from viewing import Client, LeanConfig, evaluated, served, wait_until, watch
 
 

@@ -24,13 +24,7 @@ from against_c import (
 )
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.c_episodes import full_states, physics_states
-from bounce_mjx.physics import (
-    Control,
-    PhysicsParameters,
-    PhysicsState,
-    edited_model,
-    make_engine,
-)
+from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, edited_model, make_engine
 from bounce_mjx.physics.parameters import shapes
 from random_worlds import own_parameters, random_parameters
 

@@ -24,12 +24,7 @@ from against_c import (
     random_states,
 )
 from bounce_mjx.errors import UserError
-from bounce_mjx.physics import (
-    Control,
-    PhysicsState,
-    make_engine,
-    mjx_engine,
-)
+from bounce_mjx.physics import Control, PhysicsState, make_engine, mjx_engine
 from bounce_mjx.physics.support import unsupported_feature
 from bounce_mjx.robot.model import Addresses, find_addresses
 
@@ -300,11 +295,7 @@ UNSUPPORTED = {
     "condim 6": ('condim="1"', 'condim="6"', "condim 6"),
     "second pair": ("</contact>", '<pair geom1="floor" geom2="ball"/></contact>', "contact pairs"),
     "no pair": (piece("<pair ", "  </contact>"), "", "contact pair"),
-    "pair with the floor": (
-        'pair geom1="blocker"',
-        'pair geom1="floor"',
-        "contact pairs",
-    ),
+    "pair with the floor": ('pair geom1="blocker"', 'pair geom1="floor"', "contact pairs"),
     "colliding geoms": ('<geom contype="0"', '<geom contype="1"', "contype"),
     "margin": ("<pair ", '<pair margin="0.001" ', "margin"),
     "gap": ("<pair ", '<pair gap="0.001" ', "gap"),

@@ -83,7 +83,6 @@ def config() -> PPOConfig:
 
 @pytest.fixture(scope="module")
 def brax_networks(config):
-    """The same networks in brax."""
     orthogonal = jax.nn.initializers.orthogonal
     return make_ppo_networks(
         {"state": (N,), "critic": (N + 2,)},

@@ -17,12 +17,7 @@ from bounce_mjx.evaluation.config import EvaluationOptions
 from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import make_networks, networks_of
-from bounce_mjx.resources import (
-    ARM_POLICIES,
-    POLICIES,
-    TASK_POLICIES,
-    resource_path,
-)
+from bounce_mjx.resources import ARM_POLICIES, POLICIES, TASK_POLICIES, resource_path
 from bounce_mjx.runs.config import (
     TrainConfig,
     in_world,
@@ -42,7 +37,6 @@ LOG_DIR = TrainConfig().log_dir
 
 @pytest.fixture(scope="module")
 def shipped() -> dict:
-    """The results in results.json."""
     return json.loads((FOLDER / "results.json").read_text(encoding="utf-8"))
 
 

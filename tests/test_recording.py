@@ -37,7 +37,6 @@ def policy(networks) -> Policy:
 
 @pytest.fixture(scope="module")
 def evaluated(env: BounceBall, networks, policy: Policy):
-    """Statistics and recording."""
     evaluate = make_evaluator(env, networks, EPISODES, RECORDED)
     return jax.device_get(evaluate(policy, jax.random.PRNGKey(2)))
 
@@ -91,7 +90,6 @@ def drawn(recording: Recording, **settings) -> tuple[Histogram, Hits]:
 
 
 def made_up(steps: int, episodes: int) -> Recording:
-    """An empty recording for a test to fill."""
     return Recording(
         joint_angles=np.zeros((steps, 6, episodes), np.float32),
         ball=np.zeros((steps, 3, episodes), np.float32),

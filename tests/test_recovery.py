@@ -50,7 +50,6 @@ from tiny_runs import STEPS, TIMEOUT, TINY, arrays, job, shared_run
 
 
 def train(log_dir: Path, steps: int, *flags: str) -> Path:
-    """The folder of a new run."""
     before = set(log_dir.glob("*"))
     train_command.main([*TINY, "--total-steps", str(steps), "--log-dir", str(log_dir), *flags])
     (run,) = set(log_dir.glob("*")) - before
@@ -78,13 +77,11 @@ def assert_same_training(run: Path, straight: Path) -> None:
 
 @pytest.fixture(scope="module")
 def straight() -> Path:
-    """A run of 256 steps without an interruption."""
     return shared_run()
 
 
 @pytest.fixture(scope="module")
 def half(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of 128 steps."""
     return train(tmp_path_factory.mktemp("half"), STEPS // 2)
 
 

@@ -21,7 +21,6 @@ pytestmark = [
 
 
 def call(*words: object, folder: Path, status: int = 0, **variables: str) -> str:
-    """The output of a program."""
     hidden = ("PYTHONPATH", "VIRTUAL_ENV")
     environ = {name: value for name, value in os.environ.items() if name not in hidden}
     done = subprocess.run(

@@ -18,7 +18,6 @@ X_TARGET = 0.58856
 
 
 def terms_of(config: BounceReward, inputs: dict[str, jax.Array]) -> dict[str, jax.Array]:
-    """The package's weighted terms of one state."""
     return weighted_terms(config, RewardInputs(**inputs, home=config))
 
 
@@ -49,7 +48,6 @@ def state(
 
 
 def stack(states: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Join batches of states into one."""
     return {name: np.concatenate([s[name] for s in states]) for name in states[0]}
 
 
@@ -86,9 +84,7 @@ def random_states(seed: int) -> dict[str, np.ndarray]:
         "paddle_position": np.column_stack([paddle_xy, paddle_z]),
         "target_height": target,
         "n_bounces": np.where(
-            rng.random(N_STATES) < 0.5,
-            rng.integers(0, 5, N_STATES),
-            rng.integers(0, 61, N_STATES),
+            rng.random(N_STATES) < 0.5, rng.integers(0, 5, N_STATES), rng.integers(0, 61, N_STATES)
         ),
         "bounced": rng.random(N_STATES) < 0.5,
         "action": rng.uniform(-1.0, 1.0, (N_STATES, 6)),

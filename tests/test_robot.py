@@ -63,11 +63,7 @@ BROKEN = {
         "ball joint j4",
     ),
     "loop": (
-        mjcf(
-            arm(),
-            motors(ARM_JOINTS),
-            '<equality><joint joint1="j2" joint2="j3"/></equality>',
-        ),
+        mjcf(arm(), motors(ARM_JOINTS), '<equality><joint joint1="j2" joint2="j3"/></equality>'),
         "tool",
         "equality constraint",
         "serial",
@@ -316,14 +312,6 @@ def test_a_start_pose_lies_inside_the_limits(tmp_path) -> None:
         assert np.all(angles >= low + noise) and np.all(angles <= high - noise)
 
 
-def test_adopting_names_the_next_commands(tmp_path, capsys) -> None:
-    (tmp_path / "arm.xml").write_text(ARM)
-    args = [f"{tmp_path}/arm.xml", "--site", "tool", "--out", f"{tmp_path}/arm.yaml"]
-    adopt_command.main([*args, "--task", "juggle"])
-    said = capsys.readouterr().out
-    assert len(re.findall(r": bounce-mjx (?:view|train) --task juggle --robot ", said)) == 2
-
-
 LIFT = link(
     SLIDE.format("lift", "0 0 1"),
     "0 0 0.3",
@@ -335,11 +323,14 @@ LIFT = link(
 )
 
 
-def test_three_joints_suffice_to_lift_and_tilt(tmp_path) -> None:
+def test_three_joints_suffice_to_lift_and_tilt(tmp_path, capsys) -> None:
     """Also on a base with a free joint, which is fixed; the observation has 2n + 17 numbers."""
     base = f'<body><freejoint/><geom size="0.1"/>{LIFT}</body>'
     (tmp_path / "arm.xml").write_text(mjcf(base, motors("lift roll pitch", 60.0)))
-    adopt_command.main(f"{tmp_path}/arm.xml --site tool --out {tmp_path}/arm.yaml".split())
+    line = f"{tmp_path}/arm.xml --site tool --out {tmp_path}/arm.yaml --task juggle"
+    adopt_command.main(line.split())
+    said = capsys.readouterr().out
+    assert len(re.findall(r": bounce-mjx (?:view|train) --task juggle --robot ", said)) == 2
     env = BounceBall(load_config(tmp_path / "arm.yaml").env)
     state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
     after = jax.eval_shape(env.step, state, jax.ShapeDtypeStruct((3,), np.float32))

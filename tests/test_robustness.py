@@ -14,19 +14,12 @@ from bounce_mjx.commands import robustness as robustness_command
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import robustness
 from bounce_mjx.evaluation.config import EvaluationOptions
-from bounce_mjx.evaluation.robustness import (
-    ConditionOutcome,
-    RobustnessReport,
-    measure_conditions,
-)
+from bounce_mjx.evaluation.robustness import ConditionOutcome, RobustnessReport, measure_conditions
 from bounce_mjx.evaluation.statistics import Statistics
 from bounce_mjx.evaluation.suite import load_suite, read_suite
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import networks_of
-from bounce_mjx.reports.robustness import (
-    load_robustness,
-    robustness_table,
-)
+from bounce_mjx.reports.robustness import load_robustness, robustness_table
 from bounce_mjx.resources import resource_path
 from bounce_mjx.task import Tally
 from bounce_mjx.tasks.registry import find_task
@@ -138,10 +131,7 @@ MISTAKES = {
         [LATE | {"terms": {"target_height": {"from": 0, "to": "strength"}}}],
         "'late' at 0.01: target_height is 0, but must be a finite number >= 0.001",
     ),
-    "unused strengths": (
-        [LATE | {"terms": {"action_latency": 0.01}}],
-        "with the word strength",
-    ),
+    "unused strengths": ([LATE | {"terms": {"action_latency": 0.01}}], "with the word strength"),
     "nothing": ([dict(name="late")], "give terms or settings"),
     "same name": ([LATE, LATE], "'late': the name is taken"),
     "length": (

@@ -102,7 +102,7 @@ def test_the_newest_run_is_introduced(runs: Path, name: Path | None, capsys) -> 
     """A result that is not judged counts neither as met nor as missed."""
     assert choose_checkpoint(name, runs, Console()).run == runs / "2026-01-02"
     assert capsys.readouterr().out.splitlines() == [
-        f"using the newest run: {runs}/2026-01-02 (0 of 4 judged results met)",
+        f"using the newest run: {runs}/2026-01-02 (0 of 4 judged results met)"
     ]
 
 

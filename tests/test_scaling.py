@@ -18,9 +18,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.learning import ppo
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.folders import (
-    latest_checkpoint,
-)
+from bounce_mjx.runs.folders import latest_checkpoint
 from bounce_mjx.training import devices, hosts
 from bounce_mjx.training.command import read_command
 from tiny_runs import STEPS, TINY, arrays, job
@@ -31,7 +29,6 @@ SEEDS = 3
 
 
 def train(log_dir: Path, *flags: str) -> Path:
-    """The folder of a new run."""
     train_command.main([*SHARED, "--log-dir", str(log_dir), *flags])
     (run,) = log_dir.iterdir()
     return run
@@ -39,13 +36,11 @@ def train(log_dir: Path, *flags: str) -> Path:
 
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of seed 0 on one device."""
     return train(tmp_path_factory.mktemp("alone"))
 
 
 @pytest.fixture(scope="module")
 def seeds(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of three seeds."""
     return train(tmp_path_factory.mktemp("seeds"), "--num-seeds", str(SEEDS))
 
 

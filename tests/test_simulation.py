@@ -21,10 +21,7 @@ from bounce_mjx.tasks.bounce import BounceConfig
 from bounce_mjx.tasks.bounce_rewards import BounceReward
 from bounce_mjx.viewers import show
 from bounce_mjx.viewers.controls import direction
-from bounce_mjx.viewers.display import (
-    Display,
-    marker_body,
-)
+from bounce_mjx.viewers.display import Display, marker_body
 from bounce_mjx.viewers.options import ViewerOptions
 from bounce_mjx.viewers.simulation import (
     EnvFrame,

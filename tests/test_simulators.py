@@ -18,7 +18,6 @@ BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 
 @pytest.fixture
 def simulators(monkeypatch):
-    """The module of the benchmark."""
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     import simulators
 
@@ -26,18 +25,7 @@ def simulators(monkeypatch):
 
 
 def model_of(policy: str) -> mujoco.MjModel:
-    """The environment's compiled model."""
     return Env(load_run_config(resource_path(POLICIES[policy])).env).mj_model
-
-
-def home_and_above(model: mujoco.MjModel, simulators) -> tuple[np.ndarray, np.ndarray]:
-    """Angles of the level paddle [6], and the centre [3] of a ball that touches it."""
-    home = np.array(load_policy("pretrained").metadata.default_joint_angles)
-    addresses, data = simulators.find_addresses(model), mujoco.MjData(model)
-    data.qpos[list(addresses.arm_qpos)] = home
-    mujoco.mj_forward(model, data)
-    height = model.geom_size[addresses.paddle_geom].min() + simulators.make_parts(model).radius
-    return home, data.geom_xpos[addresses.paddle_geom] + (0.0, 0.0, height)
 
 
 @pytest.mark.parametrize("policy", ["pretrained", "ur5e"])
@@ -123,18 +111,6 @@ def test_commands_and_pictures_are_late(simulators, timestep: float, steps: int)
     assert [x["ball_age"] for x in seen[:5]] == pytest.approx([0.0, 0.01, 0.02, 0.03, 0.03])
     begun = round(0.2 / timestep)
     assert seen[23]["ball_position"][0, 0] == begun
-
-
-def test_bullet_rebounds_and_moves_as_it_was_tuned(simulators) -> None:
-    """With the two constants of `tune`: restitution 0.85, and the step of MuJoCo's servos."""
-    pytest.importorskip("pybullet")
-    model = model_of("pretrained")
-    parts, (home, above) = simulators.make_parts(model), home_and_above(model, simulators)
-    arm = simulators.bullet(parts, simulators.World(), simulators.Tuning(0.835, 0.0101))
-    assert simulators.drop(arm, parts, home, above) == pytest.approx(0.85, abs=0.01)
-    own = simulators.lag(simulators.own_engine(model), parts, home, 0.001)
-    assert simulators.lag(arm, parts, home, 0.001) == pytest.approx(own, rel=0.05)
-    arm.close()
 
 
 def test_logs_are_those_that_identify_reads(simulators, monkeypatch, tmp_path: Path) -> None:

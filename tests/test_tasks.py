@@ -238,8 +238,6 @@ def test_a_robot_serves_another_task() -> None:
 
 
 class _Rising(rest_task.Rest):
-    """The commanded height rises."""
-
     class Config(rest_task.Rest.Config):
         commands: ClassVar = {"height": task.Command(0.4, 0.4)}
 

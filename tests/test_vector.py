@@ -16,7 +16,6 @@ STEP_KEYS = jax.random.split(jax.random.key(12), STEPS)
 
 @pytest.fixture(scope="module")
 def single(env):
-    """Compiled `reset` and `step` of one environment."""
     return jax.jit(env.reset), jax.jit(env.step)
 
 
@@ -53,13 +52,17 @@ def run(reset, step, actions, episode_steps):
 @pytest.fixture(scope="module")
 def unlimited(reset, step, actions):
     """A run in which episodes end only by termination."""
-    return run(reset, step, actions, NO_LIMIT)
+    results, states = run(reset, step, actions, NO_LIMIT)
+    assert results.terminated.any() and results.metrics["bounced"].any()
+    return results, states
 
 
 @pytest.fixture(scope="module")
 def limited(reset, step, actions):
     """A run with a time-out after 25 steps, before any ball has come down to the paddle."""
-    return run(reset, step, actions, 25)
+    results, states = run(reset, step, actions, 25)
+    assert results.truncated.sum() == 2 * NUM_ENVS and not results.terminated.any()
+    return results, states
 
 
 def python_loop(single, actions, episode_steps, i):
@@ -108,14 +111,6 @@ def test_run_equals_a_loop_over_single_environments(
             getattr(results, name)[:, i], expected[name], rtol=0, atol=5e-3, err_msg=name
         )
     np.testing.assert_array_equal(results.metrics["n_bounces"][:, i], expected["n_bounces"])
-
-
-def test_runs_contain_the_events_under_test(unlimited, limited):
-    results, _ = unlimited
-    assert results.terminated.any() and not results.truncated.any()
-    assert results.metrics["bounced"].any()
-    results, _ = limited
-    assert results.truncated.sum() == 2 * NUM_ENVS and not results.terminated.any()
 
 
 def test_termination_at_the_limit_is_not_a_time_out(unlimited, reset, step, actions):

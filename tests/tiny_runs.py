@@ -61,8 +61,6 @@ def contents(folder: Path) -> dict[Path, bytes | None]:
 
 
 class Job:
-    """A process of train_jax.py."""
-
     def __init__(self, log: Path, args: list[str], program: list[str]):
         self._log = log
         with log.open("wb") as file:
@@ -75,7 +73,6 @@ class Job:
 
     @property
     def said(self) -> str:
-        """The output of the process so far."""
         return self._log.read_text()
 
     def wait_until_said(self, text: str, times: int = 1) -> None:
@@ -87,7 +84,6 @@ class Job:
             time.sleep(0.01)
 
     def wait(self) -> int:
-        """The exit status."""
         return self.process.wait(TIMEOUT)
 
 

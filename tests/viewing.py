@@ -23,11 +23,7 @@ from bounce_mjx.baselines.mirror import MirrorLaw
 from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.viewers import show
 from bounce_mjx.viewers.options import PageStart, ViewerOptions
-from bounce_mjx.viewers.simulation import (
-    EnvFrame,
-    Simulation,
-    make_policy_controller,
-)
+from bounce_mjx.viewers.simulation import EnvFrame, Simulation, make_policy_controller
 from bounce_mjx.world.config import WorldConfig
 
 GRAVITY = 9.81
@@ -94,7 +90,6 @@ class Client:
         return self._controls[label]
 
     def press(self, label: str) -> None:
-        """Triggers the command of a key."""
         self.send({"type": "CommandTriggerMessage", "uuid": self.control(label)})
 
     def labels(self) -> list[str]:
@@ -103,7 +98,6 @@ class Client:
         return self._labels
 
     def receive(self) -> None:
-        """Reads the next messages of the server."""
         window = self._socket.recv(timeout=PATIENCE)
         length = int.from_bytes(window[8:16], "little")
         text = zstandard.ZstdDecompressor().decompress(window[16 : 16 + length])
