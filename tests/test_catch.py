@@ -80,6 +80,12 @@ def test_a_ball_is_caught_after_half_a_second_at_rest() -> None:
     caught = np.asarray(steps(*landing(0.3)).metrics["caught"])
     # The step of the first contact is the 30th; it is at rest from the next one on.
     assert not caught[: 30 + 49].any() and caught[30 + 51 :].all()
+    # A hop starts the rest anew.
+    ball, velocity, paddle = landing(0.3)
+    hop = round(0.7 / DT)
+    velocity[hop:, 2] -= 9.81 * DT
+    caught = np.asarray(steps(ball, velocity, paddle).metrics["caught"])
+    assert not caught[: hop + 48].any() and caught[hop + 52 :].all()
 
 
 def test_a_resting_ball_moves_with_the_paddle() -> None:
@@ -95,14 +101,6 @@ def test_a_resting_ball_moves_with_the_paddle() -> None:
         ball[:, 0] = speed * DT * np.arange(len(ball))
         velocity[:, 0] = speed
         assert steps(ball, velocity, paddle).metrics["caught"][-1] == is_caught
-
-
-def test_a_hop_starts_the_rest_anew() -> None:
-    ball, velocity, paddle = landing(0.3)
-    hop = round(0.7 / DT)
-    velocity[hop:, 2] -= 9.81 * DT
-    caught = np.asarray(steps(ball, velocity, paddle).metrics["caught"])
-    assert not caught[: hop + 48].any() and caught[hop + 52 :].all()
 
 
 @pytest.mark.parametrize(("until", "is_caught"), [(1.4, True), (1.6, False)])

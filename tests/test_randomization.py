@@ -28,22 +28,25 @@ from bounce_mjx.world.randomization import (
 )
 from test_ppo import TwoStates, two_state_config
 
-# Draws
-
-
 HIGH = {name: min(term.bounds[1], 0.9) for name, term in TERMS.items()}
 RANGES = {name: (max(TERMS[name].bounds[0], high - 0.1), high) for name, high in HIGH.items()}
 RANGES |= {"camera_rate": (60.0, 240.0), "ball_start": (-0.2, -0.1)}
 RANGES |= {"restitution_slope": (0.02, 0.05)}
 
 
+draw = functools.partial(sample_world, dtype=jnp.dtype("float32"), num_joints=6)
+
+
+def draws(config: RandomizationConfig, seed: int, **shares) -> dict[str, np.ndarray]:
+    """2,000 worlds."""
+    keys = jax.random.split(jax.random.PRNGKey(seed), 2000)
+    of_key = functools.partial(draw, config.ranges(), **shares)
+    return jax.device_get(jax.jit(jax.vmap(lambda key: of_key(key=key)))(keys))
+
+
 def test_draws_are_uniform_in_their_ranges() -> None:
     config = RandomizationConfig(**RANGES)
-    keys = jax.random.split(jax.random.PRNGKey(0), 2000)
-    draw = functools.partial(
-        sample_world, config.ranges(), dtype=jnp.dtype("float32"), num_joints=6
-    )
-    worlds = jax.jit(jax.vmap(draw))(keys)
+    worlds = draws(config, 0)
     assert tuple(worlds) == tuple(sorted(TERMS)) and set(config.terms) == set(TERMS)
     shares = []
     for name, values in worlds.items():
@@ -64,10 +67,7 @@ OWN = {"paddle_tilt": ((-0.08, 0.01), (-0.07, 0.03)), "servo_gain": GAINS}
 
 
 def test_each_entry_is_drawn_in_its_own_range() -> None:
-    config = RandomizationConfig(**OWN, armature=(0.9, 1.1))
-    keys = jax.random.split(jax.random.PRNGKey(0), 2000)
-    draw = functools.partial(sample_world, dtype=jnp.dtype("float32"), num_joints=6)
-    worlds = jax.jit(jax.vmap(functools.partial(draw, config.ranges())))(keys)
+    worlds = draws(RandomizationConfig(**OWN, armature=(0.9, 1.1)), 0)
     for name, (low, high) in OWN.items():
         shares = (np.asarray(worlds[name], float) - low) / np.subtract(high, low)
         assert shares.min() > -1e-4 and shares.max() < 1 + 1e-4
@@ -75,17 +75,17 @@ def test_each_entry_is_drawn_in_its_own_range() -> None:
     # Ranges that are all the same are one range, drawn from the same numbers.
     same = RandomizationConfig(servo_gain=((0.8,) * 6, (1.2,) * 6)).ranges()
     one = RandomizationConfig(servo_gain=(0.8, 1.2)).ranges()
-    np.testing.assert_array_equal(*(draw(r, keys[0])["servo_gain"] for r in (same, one)))
+    np.testing.assert_array_equal(
+        *(draw(r, key=jax.random.PRNGKey(0))["servo_gain"] for r in (same, one))
+    )
 
 
 def test_draws_do_not_depend_on_the_order_of_the_ranges() -> None:
     """JAX sorts the keys of a traced dictionary."""
     ranges = RandomizationConfig(restitution=(0.7, 0.9), air_drag=(0.0, 0.2)).ranges()
-    draw = functools.partial(
-        sample_world, key=jax.random.PRNGKey(1), dtype=jnp.dtype("float32"), num_joints=6
-    )
-    expected = draw(ranges)
-    for world in (jax.jit(draw)(ranges), draw(dict(reversed(ranges.items())))):
+    of_key = functools.partial(draw, key=jax.random.PRNGKey(1))
+    expected = of_key(ranges)
+    for world in (jax.jit(of_key)(ranges), of_key(dict(reversed(ranges.items())))):
         assert world.keys() == expected.keys()
         for name, value in expected.items():
             np.testing.assert_allclose(world[name], value, rtol=1e-6)
@@ -155,18 +155,8 @@ def test_a_training_draws_from_the_grown_ranges() -> None:
 def test_a_share_of_the_terms_is_drawn() -> None:
     """Each on its own, some with a share of their own; a term without a nominal value is always
     drawn."""
-    config = RandomizationConfig(**RANGES)
-    keys = jax.random.split(jax.random.PRNGKey(2), 2000)
     own = {"action_latency": 0.8, "air_drag": 0.0}
-    draw = functools.partial(
-        sample_world,
-        config.ranges(),
-        dtype=jnp.dtype("float32"),
-        num_joints=6,
-        share=0.3,
-        shares=own,
-    )
-    worlds = jax.jit(jax.vmap(draw))(keys)
+    worlds = draws(RandomizationConfig(**RANGES), 2, share=0.3, shares=own)
     drawn, expected = [], []
     for name, values in worlds.items():
         (low, high), nominal = RANGES[name], TERMS[name].nominal
