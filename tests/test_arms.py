@@ -26,7 +26,7 @@ from random_worlds import random_parameters
 COUNT = 8
 CONTROL_STEPS, STEPS_OF_A_BALL, NUM_SUBSTEPS = 200, 20, 10
 # Number of joints and seed.
-ARMS = ((3, 0), (5, 1), (7, 2))
+ARMS = ((3, 0), pytest.param((5, 1), marks=pytest.mark.slow), (7, 2))
 
 
 class Arm(NamedTuple):

@@ -90,7 +90,7 @@ def test_balls_touch_as_in_mujoco() -> None:
     steps."""
     model = load_model(None, 0.001, num_balls=2)
     data, addresses = mujoco.MjData(model), find_addresses(model)
-    rng, found = np.random.default_rng(0), []
+    rng, found, closest = np.random.default_rng(0), [], jax.jit(task.closest)
     for _ in range(200):
         mujoco.mj_resetData(model, data)
         aside = rng.uniform(0.0, 0.08)
@@ -108,7 +108,7 @@ def test_balls_touch_as_in_mujoco() -> None:
                 np.array([x[list(getattr(b, n)[:3])] for b in addresses.balls])
                 for x, n in ((data.qpos, "qpos"), (data.qvel, "qvel"))
             )
-            seen |= bool(task.closest(position, velocity, 0.01) < 2.0 * 0.019)
+            seen |= bool(closest(position, velocity, 0.01) < 2.0 * 0.019)
         found.append((touched, seen))
     touched, seen = np.array(found).T
     assert 50 < touched.sum() < 150

@@ -298,6 +298,7 @@ def test_an_adopted_arm_moves_as_its_file(style, tmp_path) -> None:
         np.testing.assert_allclose(*accelerations, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_start_pose_lies_inside_the_limits(tmp_path) -> None:
     """By the noise of a reset at least; of an arm in degrees, and of one that turns one way."""
     (tmp_path / "degrees.xml").write_text(styled())

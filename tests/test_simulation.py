@@ -170,9 +170,8 @@ def test_a_slider_reaches_every_value_that_a_reset_samples() -> None:
     assert spans["restitution"] == (0.6, 0.98)
 
 
-@pytest.fixture(scope="module")
-def played() -> Simulation:
-    """The nominal policy in worlds whose ball mass is drawn, under the sliders."""
+def test_a_moved_slider_changes_the_world_at_once(monkeypatch) -> None:
+    """Of the nominal policy, in worlds whose ball mass is drawn."""
     checkpoint = pretrained_checkpoint()
     run = load_run_config(checkpoint.run)
     config = run.env.model_copy(
@@ -181,10 +180,7 @@ def played() -> Simulation:
     env = BounceBall(with_sliders(config))
     networks = make_networks(run.ppo, env.observation_size, env.action_size)
     controller, policy = make_policy_controller(networks), read_policy(checkpoint, run)
-    return Simulation(env, controller, 2, 0, reset_ranges(config), policy)
-
-
-def test_a_moved_slider_changes_the_world_at_once(played: Simulation, monkeypatch) -> None:
+    played = Simulation(env, controller, 2, 0, reset_ranges(config), policy)
     frames, worlds = [], []
     watch(monkeypatch, Simulation, "step", lambda simulation: frames.append(simulation.frame))
     watch(monkeypatch, Simulation, "step", lambda simulation: worlds.append(simulation.world))
