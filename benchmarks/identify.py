@@ -251,9 +251,9 @@ def covered(found: Identified, hidden: Hidden) -> dict[str, bool]:
     """Whether the 95% interval of each shown unknown holds the truth."""
     zero = ("servo_lag", "air_drag", "contact_friction", "joint_frictionloss")
     nominal = dict.fromkeys(zero, 0.0) | hidden.world
-    known = {name: nominal[name] for name in found.layout.terms() if name in nominal}
+    known = {name: nominal[name] for name in found.layout.terms if name in nominal}
     world = found.layout.world(found.layout.vector(known))
-    truth = np.concatenate([np.ravel(world[name]) for name in found.layout.terms()])
+    truth = np.concatenate([np.ravel(world[name]) for name in found.layout.terms])
     listed = estimates(found, [f"Joint{i}" for i in range(1, 7)])
     shown = [(e, x) for e, x in zip(listed, truth, strict=True) if e.seen]
     return {e.label: bool(e.low <= x <= e.high) for e, x in shown}
@@ -262,7 +262,7 @@ def covered(found: Identified, hidden: Hidden) -> dict[str, bool]:
 def widths(found: Identified) -> dict[str, float]:
     """Half the width of the 95% interval of each term that is one number."""
     listed = estimates(found, [f"Joint{i}" for i in range(1, 7)])
-    return {e.label: 0.5 * (e.high - e.low) for e in listed if e.label in found.layout.terms()}
+    return {e.label: 0.5 * (e.high - e.low) for e in listed if e.label in found.layout.terms}
 
 
 def _paddle_normal(model: mujoco.MjModel, world, home) -> np.ndarray:

@@ -22,7 +22,7 @@ from bounce_mjx.adapters.brax import (
     BraxBounceBall,
     device_put_replicated,
     load_brax_policy,
-    pmap_support,
+    ppo,
 )
 from bounce_mjx.errors import UserError
 from bounce_mjx.task import term_names
@@ -205,7 +205,7 @@ def test_brax_apg_learns():
 
 def test_device_put_replicated_exists_only_in_the_context(monkeypatch):
     monkeypatch.delattr(jax, "device_put_replicated", raising=False)
-    with pytest.raises(KeyError), pmap_support.device_put_replicated():
-        assert jax.device_put_replicated is pmap_support.replicate
+    with pytest.raises(KeyError), ppo.device_put_replicated():
+        assert jax.device_put_replicated is ppo.replicate
         raise KeyError
     assert not hasattr(jax, "device_put_replicated")

@@ -13,7 +13,7 @@ from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.reading import read_csv
 from bounce_mjx.identify.simulation import make_targets
 from bounce_mjx.identify.stages import Identified, _check_frame, identify
-from bounce_mjx.identify.unknowns import make_layout
+from bounce_mjx.identify.unknowns import Layout
 from bounce_mjx.identify.windows import Windows, cut
 from bounce_mjx.identify.world import compare, estimates, to_yaml
 from bounce_mjx.reports.identification import identification_page
@@ -95,8 +95,8 @@ def measured_rows(w: Windows, angles: np.ndarray) -> np.ndarray:
 def linear_problem(log: Log, random: np.random.Generator) -> Problem:
     """Windows in which the angles follow the start, and by random shapes two unknowns: that of
     delay in all joints, and of servo_gain each in its own."""
-    w, layout = windows_of(log), make_layout(6, True, 0.001)
-    places, shape = layout.slices(), w.angles.shape
+    w, layout = windows_of(log), Layout(6, True, 0.001)
+    places, shape = layout.slices, w.angles.shape
     late, gain = random.normal(size=(2, *shape))
     ramp = w.angle_times[:, :, None]
 
@@ -116,7 +116,7 @@ def test_intervals_know_that_residuals_of_a_window_are_correlated() -> None:
     problem = linear_problem(flight_log(20.0), random)
     layout, w = problem.layout, problem.windows
     truth, weights = layout.mean, problem.weights(pictures=0.0)
-    free, place = layout.free(["arm"]), layout.slices()["delay"].start
+    free, place = layout.free(["arm"]), layout.slices["delay"].start
     late = truth + 0.02 * (np.arange(len(truth)) == place)
     clean, moved = (w.split(problem.predict(x, w.starts))[0] for x in (truth, late))
     along = moved - clean
@@ -137,8 +137,8 @@ def test_intervals_know_that_residuals_of_a_window_are_correlated() -> None:
 
 def test_a_world_has_the_range_of_each_joint_and_axis(tmp_path: Path) -> None:
     """And a log is compared with that of each, not with the range of all."""
-    log, layout, path = flight_log(), make_layout(6, True, 0.001), tmp_path / "world.yaml"
-    vector, places = layout.mean.copy(), layout.slices()
+    log, layout, path = flight_log(), Layout(6, True, 0.001), tmp_path / "world.yaml"
+    vector, places = layout.mean.copy(), layout.slices
     vector[places["servo_gain"]] = 0.8 + 0.07 * np.arange(6)
     vector[places["paddle_tilt"]] = -0.08, 0.04
     fit = Fit(vector, np.zeros(0))
@@ -193,7 +193,7 @@ def test_a_ball_beside_the_paddle_is_refused(shift) -> None:
 
 def unseen() -> Identified:
     """A log that shows nothing: all deviations are those of the prior."""
-    layout, windows = make_layout(6, False, 0.001), windows_of(flight_log())
+    layout, windows = Layout(6, False, 0.001), windows_of(flight_log())
     spread = np.diag(layout.deviation**2)
     predicted = np.zeros((len(windows.angles), windows.angles[0].size + windows.balls[0].size))
     known = Fit(layout.mean, np.zeros(0), predicted), np.linalg.inv(spread), spread

@@ -78,10 +78,10 @@ def test_runs_that_differ_in_the_seed_are_one_group(runs: list[Path]) -> None:
     groups = group_runs(runs)
     assert [[run.run for run in group.runs] for group in groups] == [runs[:3], runs[3:]]
     assert [group.label for group in groups] == [
-        "num_envs 4096 (3 seeds)",
-        "num_envs 2048 (one seed)",
+        "num_envs 4096 (3 runs)",
+        "num_envs 2048 (one run)",
     ]
-    assert [group.label for group in group_runs(runs[:3])] == ["3 seeds"]
+    assert [group.label for group in group_runs(runs[:3])] == ["3 runs"]
 
 
 def test_a_curve_has_the_values_logged_last(tmp_path: Path) -> None:

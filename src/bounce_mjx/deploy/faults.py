@@ -187,9 +187,3 @@ def faults(bounds: dict[str, Any], facts: dict[str, Any]) -> list[tuple[Rule, An
         for rule, needs in rules
         if facts.keys() >= set(needs)
     ]
-
-
-def first_fault(bounds: dict[str, Any], facts: dict[str, Any]) -> tuple[str, str] | None:
-    """Code and reason of the first rule that a single control step breaks."""
-    broken = (x for x in faults(bounds, facts) if x[1])
-    return next(((rule.fault, rule.reason.format(number)) for rule, _, number in broken), None)

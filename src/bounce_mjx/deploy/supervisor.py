@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from bounce_mjx.deploy.chain import paddle_pose
-from bounce_mjx.deploy.faults import EARLIER, FLYING, first_fault, make_bounds, picture_age
+from bounce_mjx.deploy.faults import EARLIER, FLYING, faults, make_bounds, picture_age
 from bounce_mjx.deploy.network import Measurements
 from bounce_mjx.errors import UserError
 
@@ -134,10 +134,11 @@ class Supervisor:
 
     def _is_fine(self, facts: dict[str, Any]) -> bool:
         """Brakes if the facts break a rule, and says whether they keep all."""
-        fault = first_fault(self._allowed, facts)
-        if fault is not None:
-            self.stop(fault[1], fault[0])
-        return fault is None
+        for rule, is_broken, number in faults(self._allowed, facts):
+            if is_broken:
+                self.stop(rule.reason.format(number), rule.fault)
+                return False
+        return True
 
     def _go_home(self, measurements: Mapping[str, Any]) -> None:
         """A step of the way home."""
@@ -184,15 +185,11 @@ class Supervisor:
 
     def _facts(self, measured: Measurements) -> dict[str, Any]:
         """The facts of a running episode, for the rules."""
-        angles, metadata = measured["joint_angles"], self._policy.metadata
+        angles, dt = measured["joint_angles"], self._policy.metadata.control_dt
         facts: dict[str, Any] = self._window(angles)
-        facts["paddle"] = paddle_pose(metadata, angles)[0]
+        facts["paddle"] = paddle_pose(self._policy.metadata, angles)[0]
         last = self._time
-        self._time = (
-            float(measured["time"][0])
-            if "time" in measured
-            else (last or 0.0) + metadata.control_dt
-        )
+        self._time = float(measured["time"][0]) if "time" in measured else (last or 0.0) + dt
         if last is not None:
             self._time = max(self._time, last)
             facts["elapsed"] = self._time - last

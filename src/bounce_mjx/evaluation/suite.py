@@ -34,8 +34,8 @@ NOMINAL = "nominal"
 """Name of the condition without perturbation, which is always measured."""
 
 _SIGNS = {"strength": 1.0, "-strength": -1.0}
-# Interval of command changes for constant commands, s.
-_NEVER = 1e9
+# For constant commands, and for pushes of speed 0, s.
+_INTERVALS = {"command_interval": 1e9, "push_interval": DEFAULT_PUSH_INTERVAL}
 
 Bounds = tuple[np.ndarray, np.ndarray]
 
@@ -151,12 +151,8 @@ def neutral_range(name: str, env: WorldConfig) -> Bounds | None:
     a command in a world without randomisation (`neutral_commands`)."""
     if name in env.commands:
         low, high = neutral_commands(env)[name]
-    elif name == "push_interval":
-        low = high = DEFAULT_PUSH_INTERVAL
-    elif name == "command_interval":
-        low = high = _NEVER
     else:
-        low = high = TERMS[name].nominal
+        low = high = _INTERVALS.get(name, TERMS[name].nominal)
     return None if low is None else _broadcast(name, env.num_joints, low, high)
 
 

@@ -242,7 +242,7 @@ def _has_no_derivative(informations: np.ndarray, layout: Layout) -> np.ndarray:
     step.
     """
     size = informations.shape[1] // 2
-    others = np.arange(size) != layout.slices()["delay_variance"].start
+    others = np.arange(size) != layout.slices["delay_variance"].start
     cross = np.diagonal(informations[:, :size, size:], axis1=1, axis2=2)
     squares = np.diagonal(informations, axis1=1, axis2=2)
     both = 2.0 * np.sum(cross[:, others], axis=1)
@@ -296,7 +296,7 @@ def _list_differences(
         steps = np.where(turned, -size, size) * step
         found.append(_Difference(np.searchsorted(unknowns, at), steps, rows))
 
-    for name, place in layout.slices().items():
+    for name, place in layout.slices.items():
         if place.start not in unknowns:
             continue
         unknown, places = layout.unknowns[name], range(place.start, place.stop)

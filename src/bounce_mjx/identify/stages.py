@@ -12,7 +12,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.identify.fit import Fit, Noise, Problem, certainty, minimise, picture_weights
 from bounce_mjx.identify.log import Log, least_age
 from bounce_mjx.identify.simulation import make_simulator
-from bounce_mjx.identify.unknowns import Layout, make_layout
+from bounce_mjx.identify.unknowns import Layout
 from bounce_mjx.identify.windows import GRAVITY, Windows, cut
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.world.config import WorldConfig
@@ -150,7 +150,7 @@ def identify(
     progress(f"{len(windows.first)} windows, {bounces} with a bounce")
     if with_ball:
         _check_frame(windows, config, log.source)
-    layout = make_layout(config.num_joints, with_ball, config.physics_dt, camera_rotation)
+    layout = Layout(config.num_joints, with_ball, config.physics_dt, camera_rotation)
     simulate = make_simulator(config, layout, log, windows)
     problem = Problem(simulate, windows, layout, sensor_noise(log), progress)
     progress("arm")
@@ -163,7 +163,7 @@ def identify(
     fit = _search(problem, fit, stages, 3, pictures, states)
     unseen = _fit_held_out(problem, fit, pictures, states)
     fit = _search(problem, unseen, stages, 3, pictures, states, np.ones(1))
-    nominal = {name: TERMS[name].nominal for name in layout.terms() if name in TERMS}
+    nominal = {name: TERMS[name].nominal for name in layout.terms if name in TERMS}
     own = layout.vector({name: value for name, value in nominal.items() if value is not None})
     before = fit._replace(predicted=problem.predict(own, fit.starts))
     counts = np.any(windows.split(fit.weights)[1] > 0.0, axis=(1, 2))
@@ -285,7 +285,7 @@ def _guess_arm(problem: Problem) -> Fit:
 def _shift_flights(problem: Problem, fit: Fit, latency: float, friction: float) -> Fit:
     """The fit with another latency of the ball and friction on the paddle, and flights that explain
     the pictures before the bounces equally well."""
-    places, n = problem.layout.slices(), problem.layout.num_joints
+    places, n = problem.layout.slices, problem.layout.num_joints
     vector, starts = fit.vector.copy(), fit.starts.copy()
     later = latency - vector[places["ball_latency"].start]
     vector[places["ball_latency"]], vector[places["contact_friction"]] = latency, friction

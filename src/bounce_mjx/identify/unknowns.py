@@ -1,7 +1,7 @@
 """The unknown quantities of a robot's world, their prior, and their place in one vector."""
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -60,7 +60,7 @@ CAMERA_ROTATION = "camera_rotation"
 unless its prior deviation is given."""
 
 
-class Layout(NamedTuple):
+class Layout:
     """The unknowns in one vector.
 
     A latency and a short lag delay the angles equally, and differ by the square of the lag. In
@@ -70,49 +70,44 @@ class Layout(NamedTuple):
     variance m (m + dt), as its answer to an impulse is a geometric distribution.
     """
 
-    unknowns: Mapping[str, Unknown]
-    num_joints: int
-    physics_dt: float
-    """Step of the lag's filter, s."""
+    def __init__(
+        self, num_joints: int, with_ball: bool, physics_dt: float, camera_rotation: float = 0.0
+    ):
+        """The unknowns that a log can show.
 
-    def slices(self) -> dict[str, slice]:
+        Args:
+          with_ball: whether it shows bounces.
+          physics_dt: step of the simulation and of the lag's filter, s.
+          camera_rotation: prior standard deviation of the camera's rotation, rad.
+        """
+        self.num_joints, self.physics_dt = num_joints, physics_dt
+        self.unknowns = ARM | BALL if with_ball else dict(ARM)
+        if not with_ball:
+            self.unknowns.pop("encoder_bias")
+        elif camera_rotation > 0.0:
+            rotation = Unknown(0.0, camera_rotation, 3e-3, "rad", "bounce", 3)
+            self.unknowns[CAMERA_ROTATION] = rotation
+        each = self.unknowns.values()
+        sizes = [num_joints if unknown.size is None else max(unknown.size, 1) for unknown in each]
+        ends = np.cumsum(sizes).tolist()
+        self.slices = dict(zip(self.unknowns, map(slice, [0, *ends[:-1]], ends), strict=True))
         """Place of each unknown."""
-        ends = np.cumsum([self._size(unknown) for unknown in self.unknowns.values()]).tolist()
-        return {
-            name: slice(start, end)
-            for name, start, end in zip(self.unknowns, [0, *ends[:-1]], ends, strict=True)
-        }
-
-    def terms(self) -> dict[str, slice]:
+        self.terms = {_TERMS.get(name, name): place for name, place in self.slices.items()}
         """Place of each term of the world; those of `action_latency` and `servo_lag` are where the
         vector has the delay and its variance."""
-        return {_TERMS.get(name, name): place for name, place in self.slices().items()}
 
-    def _size(self, unknown: Unknown) -> int:
-        return self.num_joints if unknown.size is None else max(unknown.size, 1)
+        def column(field: str) -> np.ndarray:
+            return np.repeat([getattr(unknown, field) for unknown in each], sizes, axis=0)
 
-    def _fill(self, value: Callable[[Unknown], Any]) -> np.ndarray:
-        """A value of each unknown in all its entries [P]."""
-        return np.concatenate([np.full(self._size(u), value(u)) for u in self.unknowns.values()])
-
-    @property
-    def mean(self) -> np.ndarray:
-        """Prior mean [P]."""
-        return self._fill(lambda unknown: unknown.mean)
-
-    @property
-    def deviation(self) -> np.ndarray:
-        """Prior standard deviation [P]."""
-        return self._fill(lambda unknown: unknown.deviation)
+        self.mean, self.deviation = column("mean"), column("deviation")
+        """Prior means and standard deviations [P]."""
+        self.limits, self.units = column("limits").T, column("unit").tolist()
+        """Lower and upper limits [2, P], and the unit of each term's entry."""
+        self._stages = column("stage")
 
     def free(self, stages: Sequence[str]) -> np.ndarray:
         """Which entries [P] the stages vary."""
-        return self._fill(lambda unknown: unknown.stage in stages)
-
-    @property
-    def limits(self) -> np.ndarray:
-        """Lower and upper limits [2, P]."""
-        return np.stack([self._fill(lambda unknown, i=i: unknown.limits[i]) for i in (0, 1)])
+        return np.isin(self._stages, stages)
 
     def clip(self, vector: np.ndarray) -> np.ndarray:
         """The vector [..., P] within the limits of each unknown."""
@@ -122,7 +117,7 @@ class Layout(NamedTuple):
         """The vector [P] with a delay from which the differences of derivatives, `steps` times
         each, leave a latency of at least 0: at 0, delay and variance would have one effect."""
         delay, variance = (self.unknowns[name].step for name in ("delay", "delay_variance"))
-        places, moved = self.slices(), vector.copy()
+        places, moved = self.slices, vector.copy()
         mean = self._lag_mean(vector[places["delay_variance"]] + steps * variance)
         moved[places["delay"]] = np.maximum(vector[places["delay"]], mean + steps * delay)
         return moved
@@ -136,7 +131,7 @@ class Layout(NamedTuple):
         """Each term's value [..., size], or [...] of a number."""
         world = {
             name: vector[..., place.start] if self.unknowns[name].size == 0 else vector[..., place]
-            for name, place in self.slices().items()
+            for name, place in self.slices.items()
         }
         delay, variance = world.pop("delay"), world.pop("delay_variance")
         dt, mean = self.physics_dt, self._lag_mean(np.maximum(variance, 1e-14))
@@ -145,7 +140,7 @@ class Layout(NamedTuple):
 
     def vector(self, world: Mapping[str, np.ndarray]) -> np.ndarray:
         """The vector [P] of values by name; a missing one has its prior mean."""
-        vector, places = self.mean, self.slices()
+        vector, places = self.mean.copy(), self.slices
         for name in set(places) & set(world):
             vector[places[name]] = world[name]
         if {"action_latency", "servo_lag"} <= set(world):
@@ -154,34 +149,12 @@ class Layout(NamedTuple):
             vector[places["delay_variance"]] = mean * (mean + self.physics_dt)
         return vector
 
-    def units(self) -> list[str]:
-        """Unit of each term's entry."""
-        return self._fill(lambda unknown: unknown.unit).tolist()
-
     def labels(self, joint_names: Sequence[str]) -> list[str]:
         """Name of each entry, for a reader."""
         labels = []
-        for term, unknown in zip(self.terms(), self.unknowns.values(), strict=True):
+        for term, unknown in zip(self.terms, self.unknowns.values(), strict=True):
             if unknown.size is None:
                 labels += [f"{term} of {joint}" for joint in joint_names]
             else:
                 labels += [f"{term} {axis}" for axis in "xyz"[: unknown.size]] or [term]
         return labels
-
-
-def make_layout(
-    num_joints: int, with_ball: bool, physics_dt: float, camera_rotation: float = 0.0
-) -> Layout:
-    """Layout of the unknowns that a log can show.
-
-    Args:
-      with_ball: whether it shows bounces.
-      physics_dt: step of the simulation, s.
-      camera_rotation: prior standard deviation of the camera's rotation, rad.
-    """
-    unknowns = dict(ARM) | (BALL if with_ball else {})
-    if not with_ball:
-        unknowns.pop("encoder_bias")
-    if with_ball and camera_rotation > 0.0:
-        unknowns[CAMERA_ROTATION] = Unknown(0.0, camera_rotation, 3e-3, "rad", "bounce", 3)
-    return Layout(unknowns, num_joints, physics_dt)

@@ -66,22 +66,22 @@ def estimates(found: Identified, joint_names: Sequence[str]) -> list[Estimate]:
     `ball_latency` is the time from the exposure to the arrival."""
     layout, width = found.layout, _HALF_WIDTH * found.deviation * misfit(found)
     world = layout.world(found.fit.vector)
-    values = np.concatenate([np.ravel(world[name]) for name in layout.terms()])
+    values = np.concatenate([np.ravel(world[name]) for name in layout.terms])
     low, high = (layout.clip(end) for end in (values - width, values + width))
     alone = _HALF_WIDTH * misfit(found) / np.sqrt(np.diag(np.linalg.inv(found.covariance)))
     for name, ends in _estimate_delays(found).items():
-        place = layout.terms()[name]
+        place = layout.terms[name]
         low[place], high[place] = ends
         alone[place] = np.inf
-    late = layout.slices().get("ball_latency", slice(0, 0))
+    late = layout.slices.get("ball_latency", slice(0, 0))
     for array in (values, low, high):
         array[late] += found.stamp_age
-    for name, place in layout.terms().items():
+    for name, place in layout.terms.items():
         if name in TERMS:
             low[place], high[place] = (np.clip(x[place], *TERMS[name].bounds) for x in (low, high))
     seen = found.deviation < _UNSEEN * layout.deviation
     columns = (values, low, high, seen, alone)
-    words = layout.labels(joint_names), layout.units()
+    words = layout.labels(joint_names), layout.units
     return list(map(Estimate, *words, *(column.tolist() for column in columns)))
 
 
@@ -89,7 +89,7 @@ def _estimate_delays(found: Identified) -> dict[str, tuple[float, float]]:
     """Intervals of latency and lag from those of the delay and its variance. The latency is the
     delay less the lag, whose error is not normal near 0: its interval adds the change over the
     variance's interval to the delay's own error at a given variance."""
-    layout, vector, places = found.layout, found.fit.vector, found.layout.slices()
+    layout, vector, places = found.layout, found.fit.vector, found.layout.slices
     delay, variance = (places[name].start for name in ("delay", "delay_variance"))
     width = _HALF_WIDTH * found.deviation[variance] * misfit(found)
     slope = found.covariance[delay, variance] / found.covariance[variance, variance]
@@ -155,7 +155,7 @@ def _describe_unseen(found: Identified, joint_names: Sequence[str]) -> list[str]
     """Combinations of unknowns that the log cannot show: the eigenvectors of its information, in
     units of the prior, with small eigenvalues."""
     layout, labels = found.layout, found.layout.labels(joint_names)
-    owners = [n for n, place in layout.terms().items() for _ in range(place.start, place.stop)]
+    owners = [n for n, place in layout.terms.items() for _ in range(place.start, place.stop)]
     scaled = found.information * np.outer(layout.deviation, layout.deviation)
     values, vectors = np.linalg.eigh(scaled)
     said: dict[frozenset[str], str] = {}
@@ -187,7 +187,7 @@ def to_yaml(found: Identified, log: Log, joint_names: Sequence[str], robot: str 
     ranges: dict[str, list[Any]] = {}
     sources: dict[str, str] = {}
     assumed, listed = [], estimates(found, joint_names)
-    for name, place in found.layout.terms().items():
+    for name, place in found.layout.terms.items():
         if name == CAMERA_ROTATION:
             continue
         entries = listed[place]
@@ -225,7 +225,7 @@ def compare(world: NamedWorld, found: Identified, joint_names: Sequence[str]) ->
     same."""
     given, listed = world.settings.get("randomization", {}), estimates(found, joint_names)
     changed = []
-    for name, place in found.layout.terms().items():
+    for name, place in found.layout.terms.items():
         if name not in given:
             continue
         ends = (np.broadcast_to(end, len(listed[place])) for end in given[name])

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -45,8 +45,7 @@ class Group(NamedTuple):
     """Runs whose configs differ only in `_FREE_KEYS`."""
 
     label: str
-    """The first settings that distinguish this group from the others, and the number of seeds or
-    runs."""
+    """The first settings that distinguish this group from the others, and the number of runs."""
     runs: list[RunCurves]
     task_curves: tuple[Curve, ...] = ()
     """What the runs' task logs."""
@@ -95,18 +94,13 @@ def group_runs(runs: Sequence[Path]) -> list[Group]:
     """
     configs = [load_run_config(run) for run in runs]
     settings = [_settings(run, config) for run, config in zip(runs, configs, strict=True)]
-    differing = [
-        name for name in settings[0] if any(x[name] != settings[0][name] for x in settings)
-    ]
+    shown = [name for name in settings[0] if any(x[name] != settings[0][name] for x in settings)]
     groups: dict[str, list[int]] = {}
     for i, each in enumerate(settings):
         groups.setdefault(json.dumps(each), []).append(i)
     return [
         Group(
-            _label(
-                {name: settings[members[0]][name] for name in differing},
-                [configs[i].seed for i in members],
-            ),
+            _label({name: settings[members[0]][name] for name in shown}, len(members)),
             [read_curves(runs[i]) for i in members],
             configs[members[0]].env.task.curves,
         )
@@ -138,20 +132,9 @@ def mean_and_band(curves: Sequence[LoggedCurve]) -> tuple[np.ndarray, np.ndarray
     return steps, values.mean(axis=0), values.std(axis=0)
 
 
-def _short_name(name: str, others: Iterable[str]) -> str:
-    """The last parts of a dotted name, as many as tell it from the others."""
-    parts = name.split(".")
-    ends = (".".join(parts[i:]) for i in reversed(range(len(parts))))
-    alone = (end for end in ends if sum(f".{x}".endswith(f".{end}") for x in others) == 1)
-    return next(alone, name)
-
-
-def _label(differences: dict[str, Any], seeds: Sequence[int]) -> str:
-    """The label of a group from the seeds of its runs."""
-    named = [f"{_short_name(name, differences)} {value}" for name, value in differences.items()]
+def _label(differences: dict[str, Any], count: int) -> str:
+    """The label of a group of a number of runs."""
+    named = [f"{name.rpartition('.')[2]} {value}" for name, value in differences.items()]
     values = ", ".join(named[:_MAX_NAMED]) + (" …" if len(named) > _MAX_NAMED else "")
-    different = len(set(seeds))
-    members = "one seed" if different == 1 else f"{different} seeds"
-    if len(seeds) > different:
-        members = f"{len(seeds)} runs of {members}"
+    members = "one run" if count == 1 else f"{count} runs"
     return f"{values} ({members})" if values else members

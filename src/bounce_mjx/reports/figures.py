@@ -63,7 +63,7 @@ def curves_figure(groups: Sequence[Group], columns: int = 3) -> Figure:
         _draw_curve(axes, groups, curve)
         axes.set_ylim(bottom=0.0)
         axes.set_xlabel("environment steps")
-    _add_legend(figure)
+    add_legend(figure)
     return figure
 
 
@@ -78,7 +78,7 @@ def rewards_figure(groups: Sequence[Group], columns: int = 5) -> Figure:
         _draw_curve(axes, groups, Curve(name, "", title=title))
     title = "weighted reward terms over environment steps,\nmean of a control step"
     figure.suptitle(title, fontsize=10)
-    _add_legend(figure)
+    add_legend(figure)
     return figure
 
 
@@ -163,7 +163,7 @@ def _draw_curve(axes: Axes, groups: Sequence[Group], shown: Curve) -> None:
     axes.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
 
 
-def _add_legend(figure: Figure) -> None:
+def add_legend(figure: Figure) -> None:
     """A legend of what any panel shows."""
     handles: dict[str, Artist] = {}
     for axes in figure.axes:

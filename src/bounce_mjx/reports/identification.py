@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from bounce_mjx.identify.stages import Identified
 from bounce_mjx.identify.world import estimates, misfit, sentences
-from bounce_mjx.reports.figures import make_panels, style
+from bounce_mjx.reports.figures import add_legend, make_panels, style
 from bounce_mjx.reports.html_page import figures_html, page, table
 
 # Windows of the arm alone, and of a bounce.
@@ -26,16 +26,9 @@ def identification_page(
       world: the file of the identified world.
     """
     listed = estimates(found, joint_names)
-    tables = [
-        table(
-            ["quantity", "estimate", "95% interval"],
-            [
-                [e.label, f"{e.value:.3g}", f"{e.low:.3g} to {e.high:.3g} {e.unit}".rstrip()]
-                for e in listed
-                if e.seen == seen
-            ],
-        )
-        for seen in (True, False)
+    rows = [
+        [e.label, f"{e.value:.3g}", f"{e.low:.3g} to {e.high:.3g} {e.unit}", "" if e.seen else "no"]
+        for e in sorted(listed, key=lambda e: not e.seen)
     ]
     parts = found.before, found.after, found.held_out
     fits = [
@@ -53,9 +46,7 @@ below with the interval that contains it with 95% probability.</p>
 <p><b>How sure:</b> {_describe_fit(found)}</p>
 <p><b>What to do:</b> {_advise(bool(doubts), world)}</p>
 <h2>Estimates</h2>
-{tables[0]}
-<h2>Not shown by the log: the prior stands</h2>
-{tables[1]}
+{table(["quantity", "estimate", "95% interval", "shown by the log, or the prior stands"], rows)}
 <h2>Errors in units of the sensors' noise</h2>
 {table(["sensor", "model's own world", "identified", "windows held out"], fits)}
 {figures_html(figures)}
@@ -123,6 +114,5 @@ def traces_figure(found: Identified, joint_names: Sequence[str]) -> Figure:
         axes.set_title("height of the ball, m")
     for axes in panels:
         axes.set_xlabel("time in the window, s")
-    handles, names = panels[0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside lower center", ncols=4, fontsize=7)
+    add_legend(figure)
     return figure

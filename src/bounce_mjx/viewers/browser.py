@@ -77,17 +77,18 @@ class LivePage:
         side.set_width(300)
         self._add_plots(side, "robot 1" if start.names is None else start.names[0])
 
-    def run(self, seconds: float | None, between: Callable[[], None] = lambda: None) -> None:
+    def run(self, seconds: float | None, is_over: Callable[[], object] = lambda: False) -> None:
         """Steps the simulation and sends pictures and plots.
 
         Args:
           seconds: simulated time; None for no end.
-          between: called between two pictures.
+          is_over: called between two pictures; whether to stop.
         """
         simulation, controls, scene = self._simulation, self._controls, self._scene
         next_plot = 0.0
         for frames in in_real_time(simulation, seconds, controls.pace):
-            between()
+            if is_over():
+                break
             controls.apply()
             if controls.num_shown != scene.num_envs:
                 scene.show(controls.num_shown)

@@ -36,12 +36,12 @@ def check_display() -> None:
         )
 
 
-def show_window(simulation: Simulation, seconds: float | None, between: Callable[[], None]) -> None:
+def show_window(simulation: Simulation, seconds: float | None, is_over: Callable[[], bool]) -> None:
     """Shows the first environment of a simulation in real time until the window is closed.
 
     Args:
       seconds: simulated time; None for no end.
-      between: called between two pictures.
+      is_over: called between two pictures; whether to close the window.
     """
     display, trail = Display(simulation.env), Trail(simulation.env.dt)
     trail.add(simulation.frame)
@@ -52,9 +52,8 @@ def show_window(simulation: Simulation, seconds: float | None, between: Callable
         with viewer.lock():
             mujoco.mjv_defaultFreeCamera(display.model, viewer.cam)
         for frames in in_real_time(simulation, seconds):
-            if not viewer.is_running():
+            if is_over() or not viewer.is_running():
                 return
-            between()
             for frame in frames:
                 trail.add(frame)
             with viewer.lock():

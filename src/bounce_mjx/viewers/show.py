@@ -1,6 +1,5 @@
 """The viewers and recordings that `view` and `play` start."""
 
-import contextlib
 import string
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -9,7 +8,7 @@ from rich.console import Console
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
-from bounce_mjx.interrupt import Interrupted, StopRequest
+from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.robot.model import fingerprint
 from bounce_mjx.runs.files import check_output, write_output
@@ -114,8 +113,8 @@ def _window(options: ViewerOptions, console: Console) -> Present:
     check_display()
 
     def present(simulation: Simulation, start: PageStart) -> None:
-        with contextlib.suppress(Interrupted), StopRequest() as stop:
-            show_window(simulation, options.seconds, stop.check)
+        with StopRequest() as stop:
+            show_window(simulation, options.seconds, lambda: stop.requested)
 
     return present
 
@@ -129,14 +128,10 @@ def _page(options: ViewerOptions, console: Console) -> Present:
     address = Address(options.host, port, options.allow_host)
 
     def present(simulation: Simulation, start: PageStart) -> None:
-        with (
-            contextlib.suppress(Interrupted),
-            StopRequest() as stop,
-            open_server(*address) as server,
-        ):
+        with StopRequest() as stop, open_server(*address) as server:
             page = LivePage(server, simulation, start)
             console.out(f"viewer: {address.url}  (Ctrl-C ends it)", highlight=False)
-            page.run(options.seconds, stop.check)
+            page.run(options.seconds, lambda: stop.requested)
 
     return present
 

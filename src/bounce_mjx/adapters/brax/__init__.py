@@ -12,10 +12,13 @@ with needed("brax", "bounce_mjx[brax]"):
     import_mjx()
     import brax.envs
 
-from bounce_mjx.adapters.brax.checkpoints import load_brax_policy
 from bounce_mjx.adapters.brax.environment import ENV_NAME, BraxBounceBall
-from bounce_mjx.adapters.brax.pmap_support import device_put_replicated
-from bounce_mjx.adapters.brax.ppo import network_settings, ppo_settings
+from bounce_mjx.adapters.brax.ppo import (
+    device_put_replicated,
+    load_brax_policy,
+    network_settings,
+    ppo_settings,
+)
 from bounce_mjx.env.env import Env
 
 __all__ = [

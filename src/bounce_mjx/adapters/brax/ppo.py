@@ -1,9 +1,56 @@
-"""The project's tuned PPO settings for brax's trainer."""
+"""For brax's PPO: the project's tuned settings, the policies that it saved, and a function that its
+trainers miss on a newer JAX."""
 
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+import numpy as np
+from brax.training import checkpoint as training_checkpoint
+from brax.training import networks as brax_networks
+from brax.training.agents.ppo import checkpoint
+from brax.training.agents.ppo import networks as ppo_networks
+
+from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig, load_config
+
+BraxPolicy = Callable[[jax.Array, jax.Array], tuple[jax.Array, dict[str, Any]]]
+"""(observation [..., N], key) -> (action [..., A], extras)."""
+
+
+def load_brax_policy(path: str | Path, deterministic: bool = True) -> BraxPolicy:
+    """The policy of a checkpoint that `ppo.train(save_checkpoint_path=...)` wrote.
+
+    brax 0.14.2 has a function of this name, but it cannot read the checkpoints of networks without
+    an initialiser of the mean, the default, or of an observation that is one array.
+
+    Args:
+      path: a checkpoint, or the folder of all checkpoints, of which the last one is loaded.
+
+    Raises:
+      UserError: there is no checkpoint.
+    """
+    folder = Path(path).resolve()
+    steps = sorted(child for child in folder.glob("*") if child.is_dir() and child.name.isdigit())
+    if steps and not (folder / "ppo_network_config.json").exists():
+        folder = steps[-1]
+    if not (folder / "ppo_network_config.json").exists():
+        raise UserError(
+            f"{path} holds no checkpoint of brax's PPO; give the save_checkpoint_path of ppo.train"
+        )
+    brax_networks.KERNEL_INITIALIZER.setdefault(None, None)
+    config = checkpoint.load_config(folder)
+    if "shape" in config.observation_size:
+        with config.ignore_type():
+            config.observation_size = config.observation_size["shape"][-1]
+    networks = training_checkpoint.get_network(config, ppo_networks.make_ppo_networks)
+    return ppo_networks.make_inference_fn(networks)(
+        checkpoint.load(folder), deterministic=deterministic
+    )
 
 
 def ppo_settings(config: TrainConfig | None = None) -> dict[str, Any]:
@@ -46,4 +93,31 @@ def network_settings(config: TrainConfig | None = None) -> dict[str, Any]:
         distribution_type="normal",
         noise_std_type="log",
         init_noise_std=ppo.init_noise_std,
+    )
+
+
+@contextlib.contextmanager
+def device_put_replicated() -> Iterator[None]:
+    """Provides `jax.device_put_replicated` inside a `with` block: brax 0.14.2 calls it in
+    `ppo.train`, `sac.train` and `apg.train`, but JAX 0.10 removed it.
+
+    Not thread-safe: the function is added to the module `jax` and removed at the end.
+    """
+    jax.device_put_replicated = replicate
+    try:
+        yield
+    finally:
+        del jax.device_put_replicated
+
+
+def replicate(tree: Any, devices: Sequence[jax.Device]) -> Any:
+    """Copies every leaf [...] of a tree (arrays, numbers or random keys) to each of D devices.
+
+    Returns:
+      The tree with leaves [D, ...], slice i on device i.
+    """
+    mesh = jax.sharding.Mesh(np.array(devices), ("device",))
+    sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("device"))
+    return jax.tree.map(
+        lambda leaf: jax.device_put(jnp.stack([jnp.asarray(leaf)] * len(devices)), sharding), tree
     )
