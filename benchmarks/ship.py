@@ -27,6 +27,7 @@ from bounce_mjx.runs.config import (
     read_preset,
     runs_folder,
 )
+from bounce_mjx.runs.copies import ROBOT, copy_robot
 from bounce_mjx.runs.files import MANIFEST_FILE, to_json, write_atomically
 from bounce_mjx.runs.folders import (
     Checkpoint,
@@ -36,7 +37,6 @@ from bounce_mjx.runs.folders import (
 )
 from bounce_mjx.runs.progress import RESULTS_FILE, load_results
 from bounce_mjx.runs.reading import NETWORKS, POLICY, read_networks, read_policy
-from bounce_mjx.runs.robot import ROBOT, copy_robot
 from bounce_mjx.runs.writing import save_checkpoint
 from bounce_mjx.training.setup import set_up_jax
 

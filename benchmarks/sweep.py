@@ -114,16 +114,14 @@ def run_trial(trial: "optuna.Trial", command: Command, base: TrainConfig) -> flo
     chosen["decay_steps"] = round(chosen["decay_steps"])
     config = validate(PPOConfig, dict(base.ppo) | chosen, f"trial {trial.number}")
     env = BounceBall(base.env)
-    trainer = population(PPO(config, env, env.config.episode_steps))
+    init, train = population(PPO(config, env, env.config.episode_steps))
     networks = make_networks(config, env.observation_size, env.action_size)
     evaluate = jax.jit(jax.vmap(make_evaluator(env, networks, command.episodes), in_axes=(0, None)))
     iterations = max(1, round(base.eval_every / config.batch_steps))
-    run = jax.jit(lambda state: trainer.run(state, iterations), donate_argnums=0)
+    run = jax.jit(lambda state: train(state, iterations), donate_argnums=0)
     policies = jax.jit(jax.vmap(lambda state: policy_of(state, env.observation_size)))
 
-    state = jax.jit(trainer.init)(
-        jax.vmap(jax.random.PRNGKey)(base.seed + np.arange(command.seeds))
-    )
+    state = jax.jit(init)(jax.vmap(jax.random.PRNGKey)(base.seed + np.arange(command.seeds)))
     eval_key = jax.random.PRNGKey(base.eval_seed)
     met, steps = [], 0
     while steps < command.steps:

@@ -35,8 +35,7 @@ from bounce_mjx.tasks.bounce import Bounce
 from bounce_mjx.tasks.bounce_rewards import BounceReward, RewardInputs
 from bounce_mjx.tasks.registry import find_task
 from bounce_mjx.training import hosts
-from bounce_mjx.training.command import TrainCommand
-from bounce_mjx.training.start import Start, changed
+from bounce_mjx.training.command import Start, TrainCommand, changed
 from bounce_mjx.world.randomization import TERMS
 
 CHECKOUT = Path(__file__).resolve().parent.parent

@@ -146,9 +146,9 @@ def test_a_training_is_lowered_for_a_gpu(monkeypatch):
         monkeypatch.setattr(module, "has_kernels", lambda: True)
     config = PPOConfig(num_envs=64, num_minibatches=2, hidden_layers=(8,))
     env = BounceBall()
-    trainer = ppo.population(ppo.PPO(config, env, env.config.episode_steps))
-    state = jax.eval_shape(trainer.init, jax.random.split(jax.random.PRNGKey(0), 2))
-    traced = jax.jit(lambda state: trainer.run(state, 1)).trace(state)
+    init, run = ppo.population(ppo.PPO(config, env, env.config.episode_steps))
+    state = jax.eval_shape(init, jax.random.split(jax.random.PRNGKey(0), 2))
+    traced = jax.jit(lambda state: run(state, 1)).trace(state)
     assert "custom_call @mosaic_gpu" in traced.lower(lowering_platforms=("cuda",)).as_text()
     assert jax.tree.structure(traced.out_info[0]) == jax.tree.structure(state)
 

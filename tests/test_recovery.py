@@ -43,9 +43,8 @@ from bounce_mjx.runs.writing import save_checkpoint
 from bounce_mjx.tasks.bounce_ball import BounceBall
 from bounce_mjx.training import job as training_job
 from bounce_mjx.training import ppo_trainer
-from bounce_mjx.training.devices import make_mesh
 from bounce_mjx.training.evaluators import Evaluators
-from bounce_mjx.training.ppo_trainer import PPOTrainer
+from bounce_mjx.training.ppo_trainer import PPOTrainer, make_mesh
 from tiny_runs import STEPS, TIMEOUT, TINY, arrays, job, shared_run
 
 

@@ -19,7 +19,7 @@ from bounce_mjx.learning import ppo
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import latest_checkpoint
-from bounce_mjx.training import devices, hosts
+from bounce_mjx.training import hosts, ppo_trainer
 from bounce_mjx.training.command import read_command
 from tiny_runs import STEPS, TINY, arrays, job
 
@@ -119,7 +119,7 @@ def test_devices_that_cannot_share(monkeypatch, num_devices, num_envs, num_seeds
     monkeypatch.setattr(jax, "devices", lambda: [jax.local_devices()[0]] * 8)
     config = PPOConfig(num_envs=num_envs, num_minibatches=1)
     with pytest.raises(UserError, match=sentence):
-        devices.make_mesh(num_devices, config, num_seeds)
+        ppo_trainer.make_mesh(num_devices, config, num_seeds)
 
 
 def free_port() -> int:

@@ -13,7 +13,6 @@ from scipy import stats
 from scipy.interpolate import CubicHermiteSpline
 
 from bounce_mjx import BounceBall, EnvConfig
-from bounce_mjx.learning.metrics import PRIVILEGED
 from bounce_mjx.physics import PhysicsState
 from bounce_mjx.world import noise
 
@@ -95,7 +94,9 @@ def watching(camera: bool, velocity: str):
                 action, physics = inputs
                 control, actuation = env.control(state.pipeline_state, action)
                 state = env.finish_step(state, action, actuation, physics)
-                metrics = {n: x for n, x in state.metrics.items() if n.startswith(PRIVILEGED)}
+                metrics = {
+                    n: x for n, x in state.metrics.items() if n.startswith(("world/", "true/"))
+                }
                 return state, (state.obs, control.ctrl, metrics)
 
             physics = PhysicsState(jnp.asarray(qpos[1:]), jnp.asarray(qvel[1:]))

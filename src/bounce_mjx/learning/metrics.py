@@ -12,11 +12,8 @@ from bounce_mjx.task import Curve
 
 Metrics = dict[str, jax.Array]
 
-PRIVILEGED = ("world/", "true/")
-"""Prefixes of metrics that only a critic may use."""
-
-SUM = "sum/"
-"""Prefix of the metrics of a step that are sums; a mean of them over steps has no meaning."""
+# Prefix of the sums that a curve is the mean over.
+_OVER = "over/"
 
 
 def matching_metrics(patterns: Sequence[str], known: Iterable[str]) -> tuple[str, ...]:
@@ -39,57 +36,39 @@ def matching_metrics(patterns: Sequence[str], known: Iterable[str]) -> tuple[str
 
 
 def step_metrics(result: vector.VectorStep, groups: int, curves: Sequence[Curve]) -> Metrics:
-    """Metrics of one step over each group of environments [G]: means, and sums under the names
-    `SUM`... for means over episodes and events."""
-    ended = result.terminated | result.truncated
-    logged = {n: v for n, v in result.metrics.items() if not n.startswith(PRIVILEGED)}
-    means = logged | {"reward": result.reward}
-    sums = {
+    """Sums of one step over each group of environments [G], of which `rollout_metrics` makes
+    means: each curve has one by its tag, and one of what it is the mean over."""
+    ended, ones = result.terminated | result.truncated, jnp.ones_like(result.reward)
+    sums = {name: x for name, x in result.metrics.items() if name.startswith("reward")}
+    sums |= {
+        "reward": result.reward,
+        "steps": ones,
         "ended": ended,
         "return": jnp.where(ended, result.episode_return, 0.0),
         "length": jnp.where(ended, result.episode_length, 0),
-        "non_finite": result.metrics["non_finite"],
-        "too_fast": result.metrics["too_fast"],
+        "task/non_finite": result.metrics["non_finite"],
+        "task/too_fast": result.metrics["too_fast"],
     }
     for curve in curves:
-        value = result.metrics[curve.metric]
-        if curve.over == "episodes":
-            sums[f"last/{curve.metric}"] = jnp.where(ended, value, 0.0)
-        elif curve.over != "steps":
-            sums |= {curve.metric: value, curve.over: result.metrics[curve.over]}
-    totals = {SUM + name: value for name, value in sums.items()}
+        value, over = result.metrics[curve.metric], {"steps": ones, "episodes": ended}
+        sums[curve.tag] = jnp.where(ended, value, 0.0) if curve.over == "episodes" else value
+        sums[_OVER + curve.tag] = (over | result.metrics)[curve.over]
     # One array, because on a GPU each small array costs a kernel.
-    rows = jnp.stack([x.astype(result.reward.dtype) for x in (means | totals).values()])
-    row_sums = jnp.sum(rows.reshape(len(rows), groups, -1), axis=-1)
-    count = result.reward.size // groups
-    return {
-        name: total if name in totals else total / count
-        for name, total in zip(means | totals, row_sums, strict=True)
-    }
+    rows = jnp.stack([x.astype(result.reward.dtype) for x in sums.values()])
+    return dict(zip(sums, jnp.sum(rows.reshape(len(rows), groups, -1), axis=-1), strict=True))
 
 
 def rollout_metrics(steps: Metrics, curves: Sequence[Curve]) -> Metrics:
-    """Metrics of a rollout from the metrics of its steps and groups [T, G]: the rewards, the
+    """Metrics of a rollout from the sums of its steps and groups [T, G]: the rewards, the
     episodes and a task's curves. Means over episodes are NaN if none ended, means over events if
     there were none."""
-
-    def total(name: str) -> jax.Array:
-        return jnp.sum(steps[SUM + name])
-
-    ended = total("ended")
-    rewards = {name: jnp.mean(v) for name, v in steps.items() if name.startswith("reward")}
-    metrics = rewards | {
-        "episode/return": total("return") / ended,
-        "episode/length": total("length") / ended,
-        "episode/ended": ended,
-        "task/non_finite": total("non_finite"),
-        "task/too_fast": total("too_fast"),
+    total = {name: jnp.sum(x) for name, x in steps.items()}
+    metrics = {n: x / total["steps"] for n, x in total.items() if n.startswith("reward")}
+    metrics |= {curve.tag: total[curve.tag] / total[_OVER + curve.tag] for curve in curves}
+    return metrics | {
+        "episode/return": total["return"] / total["ended"],
+        "episode/length": total["length"] / total["ended"],
+        "episode/ended": total["ended"],
+        "task/non_finite": total["task/non_finite"],
+        "task/too_fast": total["task/too_fast"],
     }
-    for curve in curves:
-        if curve.over == "steps":
-            metrics[curve.tag] = jnp.mean(steps[curve.metric])
-        elif curve.over == "episodes":
-            metrics[curve.tag] = total(f"last/{curve.metric}") / ended
-        else:
-            metrics[curve.tag] = total(curve.metric) / total(curve.over)
-    return metrics

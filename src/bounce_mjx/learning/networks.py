@@ -89,20 +89,6 @@ class MLP(nn.Module):
         return x
 
 
-class LogParameter(nn.Module):
-    """A positive vector whose logarithm is the parameter `log_value`."""
-
-    size: int
-    initial: float
-
-    @nn.compact
-    def __call__(self) -> jax.Array:
-        """The vector [size]."""
-        log_initial = jnp.log(jnp.float32(self.initial))
-        log_value = self.param("log_value", lambda _: jnp.full(self.size, log_initial))
-        return jnp.exp(log_value)
-
-
 class PolicyNetwork(nn.Module):
     """A Gaussian over actions: its mean depends on the input, its standard deviation does not."""
 
@@ -119,5 +105,6 @@ class PolicyNetwork(nn.Module):
         hidden = MLP(self.hidden_layers, True, self.dtype, self.activation)(observation)
         mean_init = orthogonal(_MEAN_GAIN)
         mean = nn.Dense(self.action_size, kernel_init=mean_init)(hidden)
-        std = LogParameter(self.action_size, self.init_noise_std, name="std_logparam")()
-        return Gaussian(mean, jnp.broadcast_to(std, mean.shape))
+        first = jnp.full(self.action_size, jnp.log(jnp.float32(self.init_noise_std)))
+        log_std = self.param("std_logparam", lambda _: {"log_value": first})["log_value"]
+        return Gaussian(mean, jnp.broadcast_to(jnp.exp(log_std), mean.shape))

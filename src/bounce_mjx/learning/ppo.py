@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
 
@@ -100,16 +99,6 @@ class Samples(NamedTuple):
     """[T, B, 1]."""
 
 
-class TrainingFunctions(NamedTuple):
-    """Training as pure functions; `jax.jit` them (the second argument of `run` is static)."""
-
-    init: Callable[[jax.Array], TrainingState]
-    """key -> state; consumes the key."""
-    run: Callable[[TrainingState, int], tuple[TrainingState, Metrics]]
-    """(state, number of iterations I) -> (state, metrics, each [I]); the metric "fault" is the
-    result of `first_fault`."""
-
-
 class LearnerState(NamedTuple):
     """What a minibatch step changes."""
 
@@ -179,7 +168,8 @@ class PPO:
         )
 
     def run(self, state: TrainingState, num_iterations: int) -> tuple[TrainingState, Metrics]:
-        """Iterations; see `TrainingFunctions`."""
+        """State and a number of iterations I -> state and metrics, each [I]; the metric "fault" is
+        the result of `first_fault`."""
 
         def step(state: TrainingState, _) -> tuple[TrainingState, Metrics]:
             state, metrics = self.iterate(state._replace(env=unpack(state.env)))
@@ -406,18 +396,6 @@ def names_of_critic_metrics(config: PPOConfig, env: AnyEnv) -> tuple[str, ...]:
     return matching_metrics(env.task.critic_metrics if wanted is None else wanted, known_metrics)
 
 
-def warm_started(
-    state: TrainingState, params: Params, statistics: RunningStatistics
-) -> TrainingState:
-    """The first state of a training, or of a population, with other networks and statistics of
-    their inputs; all arrays are NumPy arrays."""
-    networks = state.params, state.statistics
-    params, statistics = jax.tree.map(
-        lambda old, new: np.broadcast_to(new, old.shape), networks, (params, statistics)
-    )
-    return state._replace(params=params, statistics=statistics)
-
-
 def noise_bounds(config: PPOConfig) -> jax.Array:
     """Lower bounds of the action noise of each environment [B, 1]: evenly from 0 to twice
     min_noise_std.
@@ -463,14 +441,10 @@ def generalized_advantages(
     return advantages
 
 
-def population(trainer: PPO) -> TrainingFunctions:
-    """A trainer of S independent runs: keys [S, 2] -> states with S as the first axis of every
-    array; metrics are [S, I]."""
-
-    def run(states: TrainingState, num_iterations: int) -> tuple[TrainingState, Metrics]:
-        return jax.vmap(lambda state: trainer.run(state, num_iterations))(states)
-
-    return TrainingFunctions(jax.vmap(trainer.init), run)
+def population(trainer: PPO) -> tuple[Callable, Callable]:
+    """`init` and `run` of S independent runs: keys [S, 2] -> states with S as the first axis of
+    every array; metrics are [S, I]."""
+    return jax.vmap(trainer.init), jax.vmap(trainer.run, in_axes=(0, None))
 
 
 def num_groups(config: PPOConfig) -> int:

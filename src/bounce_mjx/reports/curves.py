@@ -11,9 +11,8 @@ import numpy as np
 from bounce_mjx.config.files import flat
 from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.copies import identify_robot, identify_task
 from bounce_mjx.runs.progress import load_results
-from bounce_mjx.runs.robot import identify_robot
-from bounce_mjx.runs.task import identify_task
 from bounce_mjx.task.shown import Curve
 
 # Settings that may differ within a group: the seed, the run's location, its length, its devices.

@@ -12,22 +12,15 @@ import pydantic
 from pydantic import Field
 
 from bounce_mjx.config.files import read_mapping
-from bounce_mjx.config.settings import (
-    Count,
-    NonNegativeInt,
-    Steps,
-    StrictModel,
-    merged,
-)
+from bounce_mjx.config.settings import Count, NonNegativeInt, Steps, StrictModel, merged
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.lazy import jax
 from bounce_mjx.learning.config import PPO_NAME, PPOConfig, find_algorithm
 from bounce_mjx.resources import PRETRAINED, resource_path
 from bounce_mjx.robot.config import is_packaged
+from bounce_mjx.runs.copies import ROBOT, task_of_run
 from bounce_mjx.runs.files import check_copy
-from bounce_mjx.runs.robot import ROBOT
-from bounce_mjx.runs.task import task_of_run
 from bounce_mjx.task.task import Task
 from bounce_mjx.tasks.registry import (
     DEFAULT,
@@ -108,14 +101,13 @@ class TrainConfig(StrictModel):
     def _complete(cls, values: Any) -> Any:
         """The task and the settings that belong to it determine each other. Whatever acts with a
         policy needs no settings of its own algorithm, whose code is not run."""
-        if isinstance(values, dict) and isinstance(values.get("ppo"), dict):
-            if (
-                is_file(str(values.get("algorithm")))
-                and cls.model_fields["ppo"].annotation is PPOConfig
-            ):
-                known = {k: v for k, v in values["ppo"].items() if k in PPOConfig.model_fields}
-                values = values | {"ppo": known}
-        if not isinstance(values, dict) or not cls.model_fields["env"].is_required():
+        if not isinstance(values, dict):
+            return values
+        ppo, name = values.get("ppo"), str(values.get("algorithm"))
+        if cls.model_fields["ppo"].annotation is PPOConfig and is_file(name):
+            if isinstance(ppo, dict):
+                values = values | {"ppo": {k: ppo[k] for k in ppo if k in PPOConfig.model_fields}}
+        if not cls.model_fields["env"].is_required():
             return values
         env = values.get("env")
         if "task" not in values and isinstance(env, WorldConfig) and env.task is not None:
@@ -137,22 +129,15 @@ def train_config(
       base: `TrainConfig`, or the command line that trains.
       ppo: settings of the algorithm.
     """
-    kinds = {"task": str, "log_dir": Path}
-    kinds["env"] = Annotated[task.Config, *base.model_fields["env"].metadata]
-    if "ppo" in base.model_fields:
-        kinds["ppo"] = Annotated[ppo, *base.model_fields["ppo"].metadata]
-    defaults = {"task": task_name(task), "env": task.Config(), "log_dir": runs_folder(task)}
-    defaults["ppo"] = ppo()
+    own = {"task": (str, task_name(task)), "log_dir": (Path, runs_folder(task))}
+    own |= {"env": (task.Config, task.Config()), "ppo": (ppo, ppo())}
+    fields = {}
+    for name, (kind, default) in own.items():
+        if (field := base.model_fields.get(name)) is not None:
+            kind = Annotated[kind, *field.metadata] if field.metadata else kind
+            fields[name] = kind, Field(default, description=field.description)
     return pydantic.create_model(
-        base.__name__,
-        __base__=base,
-        __module__=base.__module__,
-        __doc__=base.__doc__,
-        **{
-            name: (kind, Field(defaults[name], description=base.model_fields[name].description))
-            for name, kind in kinds.items()
-            if name in base.model_fields
-        },
+        base.__name__, __base__=base, __module__=base.__module__, __doc__=base.__doc__, **fields
     )
 
 
@@ -210,21 +195,22 @@ def load_config(
         its task or algorithm is a file that the user has not named.
     """
     files = [path] if isinstance(path, Path) else path
-    path = " on ".join(map(shown_file, reversed(files)))
+    source = " on ".join(map(shown_file, reversed(files)))
     values = functools.reduce(merged, map(_read, files), {})
     values.pop(BASE, None)
     defaults = {"task": (task, DEFAULT), "algorithm": (algorithm, PPO_NAME)}
     for key, (given, default) in defaults.items():
-        name = given or values.get(key, default)
+        name = values[key] = given or values.get(key, default)
         if given is None and is_file(name):
             raise UserError(
-                f"{path} has its {key} in the file {name}, which is code; name it yourself to run "
-                f"it: --{key} {name}"
+                f"{source} has its {key} in the file {name}, which is code; name it yourself to "
+                f"run it: --{key} {name}"
             )
-        values[key] = name
-    own = values["algorithm"] != PPO_NAME
-    ppo = find_algorithm(values["algorithm"]).Config if own else PPOConfig
+    algorithm = values["algorithm"]
+    ppo = PPOConfig if algorithm == PPO_NAME else find_algorithm(algorithm).Config
     config_class = train_config(find_task(values["task"]), ppo=ppo)
+    robot = robot and _named(robot, ROBOTS, "robot")
+    world = world and _named(world, WORLDS, "world")
     named = None if world is None else read_world(world)
     if named is not None and named.robot is not None:
         if robot is not None:
@@ -235,7 +221,7 @@ def load_config(
         robot = _robot_of(named, world)
     if robot is not None:
         values = merged(values, _robot_for(config_class().env.task, robot))
-    source = path if robot is None else f"{path} with {robot}"
+        source = f"{source} with {robot}"
     config = validate(config_class, values, source)
     if named is None:
         return config
@@ -320,10 +306,7 @@ def read_preset(
     Raises:
       UserError: a file is missing or invalid.
     """
-    files = preset_files(path, task, machine)
-    robot = robot and _named(robot, ROBOTS, "robot")
-    world = world and _named(world, WORLDS, "world")
-    return load_config(files, robot, task, world, algorithm)
+    return load_config(preset_files(path, task, machine), robot, task, world, algorithm)
 
 
 def preset_files(

@@ -113,20 +113,14 @@ def check_output(path: Path | None, flag: str, suffixes: tuple[str, ...] = ()) -
       suffixes: the ends of the name that it may have; by default, any.
 
     Raises:
-      UserError: it has another suffix, may not be written, is a folder, or is in one that does not
-        exist.
+      UserError: it has another suffix, or is in a folder that does not exist.
     """
     if path is None:
         return
     if suffixes and path.suffix.lower() not in suffixes:
         raise UserError(f"{flag} {path} does not end in {' or '.join(suffixes)}; rename it")
-    folder = path.absolute().parent
-    if not os.path.isdir(folder):
+    if not os.path.isdir(path.absolute().parent):
         raise UserError(f"the folder of {flag} {path} does not exist; make it")
-    if os.path.isdir(path):
-        raise UserError(f"{flag} {path} is a folder; give a file")
-    if not os.access(path if os.path.exists(path) else folder, os.W_OK):
-        raise UserError(f"{flag} {path} may not be written; give another file")
 
 
 def seal(folder: Path) -> None:
@@ -136,13 +130,10 @@ def seal(folder: Path) -> None:
 
 def check_integrity(folder: Path) -> None:
     """Raises OSError or ValueError if a file does not match the manifest."""
-    found = _describe_files(folder)
-    expected = read_json(folder / MANIFEST_FILE, Manifest).files
+    found, expected = _describe_files(folder), read_json(folder / MANIFEST_FILE, Manifest).files
     for name in sorted(found.keys() | expected.keys()):
-        if name not in found:
-            raise ValueError(f"{name} is missing")
-        if found[name] != expected.get(name):
-            raise ValueError(f"{name} is not as it was written")
+        if found.get(name) != expected.get(name):
+            raise ValueError(f"{name} is {'not as it was written' if name in found else 'missing'}")
 
 
 def check_copy(path: Path, folder: Path, flag: str) -> None:

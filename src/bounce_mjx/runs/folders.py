@@ -2,8 +2,8 @@
 
     runs/<task>/<time stamp, UTC>/
         config.yaml                     the resolved config
-        robot/                          a copy of --mjcf and its files (`runs.robot`)
-        task/, algorithm/               copies of the files of own ones (`runs.task`)
+        robot/                          a copy of --mjcf and its files (`runs.copies`)
+        task/, algorithm/               copies of the files of own ones (`runs.copies`)
         events.out.tfevents.*           TensorBoard scalars
         results.json                    all evaluations, and the time of each activity
         checkpoints/<steps>/            of the newest state, and of the one with the best evaluation
@@ -27,8 +27,9 @@ import json
 import os
 import re
 import shutil
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from rich.console import Console
 
@@ -36,12 +37,10 @@ import bounce_mjx
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import POLICIES, PRETRAINED, TASK_POLICIES, resource_path
-from bounce_mjx.runs import old
 from bounce_mjx.runs.config import BASE, CONFIG_FILE, TrainConfig, runs_folder
+from bounce_mjx.runs.copies import ROBOT, copy_code, copy_robot
 from bounce_mjx.runs.files import writable, write_atomically
 from bounce_mjx.runs.progress import load_results
-from bounce_mjx.runs.robot import ROBOT, copy_robot
-from bounce_mjx.runs.task import copy_code
 from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file
 
 POLICY_OF_TASK = {DEFAULT: PRETRAINED} | {task: task for task in TASK_POLICIES}
@@ -49,7 +48,6 @@ POLICY_OF_TASK = {DEFAULT: PRETRAINED} | {task: task for task in TASK_POLICIES}
 LATEST = "latest"
 """Name of the newest run on the command line."""
 CHECKPOINTS = "checkpoints"
-_STAMP = "%Y-%m-%d_%H-%M-%S"
 
 
 class Checkpoint(NamedTuple):
@@ -86,7 +84,7 @@ def create_run(config: TrainConfig) -> Path:
     """
     refuse_brackets(config.log_dir)
     # Not the local time, which is another one on another machine, and in autumn goes back.
-    stamp = datetime.datetime.now(datetime.UTC).strftime(_STAMP)
+    stamp = datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d_%H-%M-%S")
     with writable(config.log_dir, "choose another folder with --log-dir"):
         config.log_dir.mkdir(parents=True, exist_ok=True)
         for copy in itertools.count(1):
@@ -105,11 +103,9 @@ def create_run(config: TrainConfig) -> Path:
 def save_config(run: Path, config: TrainConfig) -> None:
     """Writes the run's resolved config, and copies of its robot and of its task's file unless the
     run has them."""
-    if is_file(config.task):
-        config = config.model_copy(update={"task": copy_code(config.task, run)})
-    if is_file(config.algorithm):
-        copied = copy_code(config.algorithm, run, "algorithm")
-        config = config.model_copy(update={"algorithm": copied})
+    for key in ("task", "algorithm"):
+        if is_file(name := getattr(config, key)):
+            config = config.model_copy(update={key: copy_code(name, run, key)})
     if (mjcf := config.env.mjcf) is not None:
         if not mjcf.is_relative_to((run / ROBOT).absolute()):
             mjcf = copy_robot(mjcf, run).absolute()
@@ -151,6 +147,37 @@ def check_links(run: Path) -> None:
             )
 
 
+@contextlib.contextmanager
+def lock_run(run: Path) -> Iterator[None]:
+    """Holds the lock that gives a run's folder a single writer; the kernel releases it when the
+    process dies.
+
+    On a file system without locks on folders, such as NFS, and on Windows, every process gets it.
+
+    Raises:
+      UserError: another process holds the lock.
+    """
+    try:
+        import fcntl
+    except ImportError:
+        yield
+        return
+    descriptor = os.open(run, os.O_RDONLY)
+    try:
+        # Any other OSError means that the file system has no locks.
+        with contextlib.suppress(OSError):
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise UserError(
+                    f"{run} is in use by another training process; wait until it ends, or stop it "
+                    "with Ctrl-C or SIGTERM, and resume"
+                ) from error
+        yield
+    finally:
+        os.close(descriptor)
+
+
 def find_run(path: Path) -> Path:
     """Folder of the run that contains a path; the path may be the folder itself."""
     # Unlike os.path.isdir, Path.is_dir raises an error for a name that is too long.
@@ -168,11 +195,12 @@ def find_run(path: Path) -> Path:
     )
 
 
-def newest_run(log_dir: Path) -> Path:
-    """Folder of the newest run with a checkpoint, by the time stamps in the runs' names; a run
-    without one counts from the last start of its training."""
-    found = runs_in(log_dir)
-    if not found:
+def named_run(path: Path | None, log_dir: Path) -> Path:
+    """A run's folder or a path in it, as the user named it: None and `LATEST` (unless there is a
+    folder with that name) stand for the newest run with a checkpoint in `log_dir`."""
+    if path is not None and (str(path) != LATEST or os.path.isdir(path)):
+        return path
+    if not (found := runs_in(log_dir)):
         raise UserError(
             f"there is no run with a checkpoint in {log_dir}; train one with bounce-mjx train, or "
             "give a run's folder"
@@ -180,16 +208,13 @@ def newest_run(log_dir: Path) -> Path:
     return found[-1]
 
 
-def named_run(path: Path | None, log_dir: Path) -> Path:
-    """A run's folder or a path in it, as the user named it: None and `LATEST` (unless there is a
-    folder with that name) stand for the newest run in `log_dir`."""
-    is_name = path is None or (str(path) == LATEST and not os.path.isdir(path))
-    return newest_run(log_dir) if is_name else path
-
-
 def runs_in(folder: Path) -> list[Path]:
-    """Runs with a checkpoint in a folder, such as those of several seeds, the oldest first."""
-    return sorted(filter(stored_checkpoints, _runs(folder)), key=_started)
+    """Runs with a checkpoint in a folder, such as those of several seeds, the oldest first by the
+    time stamps of their names; before them, those without one."""
+    runs = [path.parent for path in folder.glob(f"*/{CONFIG_FILE}") if path.is_file()]
+    # The length orders the numbers of runs that began in the same second.
+    runs.sort(key=lambda run: (run.name[0].isdigit(), run.name[:19], len(run.name), run.name))
+    return list(filter(stored_checkpoints, runs))
 
 
 def find_checkpoint(path: Path) -> Checkpoint:
@@ -199,22 +224,26 @@ def find_checkpoint(path: Path) -> Checkpoint:
       path: a run's folder (finds its best checkpoint, or its latest if there is no best), a folder
         of checkpoints in it, or a checkpoint.
     """
-    run, place = find_run(path), Path(os.path.abspath(path))
-    if place == Path(os.path.abspath(run)):
-        run = _best_seed(run)
-        place = Path(os.path.abspath(run))
-    inside = [x for x in stored_checkpoints(run) if x.folder.is_relative_to(place)]
-    return _first_of(_by_quality(inside), path)
+    run = find_run(path)
+    if os.path.samefile(path, run):
+        path = run = _best_seed(run)
+    return best_checkpoint(run, path)
 
 
 def latest_checkpoint(run: Path) -> Checkpoint:
     """Newest checkpoint of a run, from which its training resumes."""
-    return _first_of(sorted(stored_checkpoints(run), key=lambda x: -x.steps), run)
+    return _greatest(stored_checkpoints(run), lambda x: x.steps, run)
 
 
-def best_checkpoint(run: Path) -> Checkpoint:
-    """Checkpoint of a run with the best evaluation; without one, the newest."""
-    return _first_of(_by_quality(stored_checkpoints(run)), run)
+def best_checkpoint(run: Path, place: Path | None = None) -> Checkpoint:
+    """Checkpoint of a run with the best evaluation; among equals and without one, the newest.
+
+    Args:
+      place: folder of the run in which it lies.
+    """
+    place = Path(os.path.abspath(place or run))
+    inside = [x for x in stored_checkpoints(run) if x.folder.is_relative_to(place)]
+    return _greatest(inside, lambda x: (_score(x.folder), x.steps), place)
 
 
 def pretrained_checkpoint(name: str = PRETRAINED) -> Checkpoint:
@@ -258,26 +287,21 @@ def stored_checkpoints(run: Path) -> list[Checkpoint]:
     with contextlib.suppress(OSError), os.scandir(folder) as entries:
         # One look, as a training may remove them meanwhile.
         paths = [folder / entry.name for entry in entries if entry.name.isdecimal()]
-    paths = paths or [path for name in ("best", "latest") for path in old.stored(folder, name)]
+    # Those of version 0.1.
+    old = (path for name in ("best", "latest") for path in folder.glob(f"{name}/*"))
+    paths = paths or [path for path in old if path.name.isdecimal()]
     return [Checkpoint(run, path, int(path.name)) for path in paths if path.is_dir()]
 
 
-def _first_of(checkpoints: list[Checkpoint], named: Path) -> Checkpoint:
-    """
-    Args:
-      named: what the user named, for the error.
-    """
+def _greatest(
+    checkpoints: list[Checkpoint], key: Callable[[Checkpoint], Any], place: Path
+) -> Checkpoint:
     if not checkpoints:
         raise UserError(
-            f"{named} has no checkpoint, because the first one follows the first evaluation; train "
+            f"{place} has no checkpoint, because the first one follows the first evaluation; train "
             "longer or give another run's folder"
         )
-    return checkpoints[0]
-
-
-def _by_quality(checkpoints: list[Checkpoint]) -> list[Checkpoint]:
-    """Checkpoints, the best one first; among equals, the newest."""
-    return sorted(checkpoints, key=lambda x: (_score(x.folder), x.steps), reverse=True)
+    return max(checkpoints, key=key)
 
 
 def _score(folder: Path) -> tuple[float, ...]:
@@ -294,19 +318,3 @@ def _best_seed(run: Path) -> Path:
     results = {seed: load_results(seed) for seed in runs_of_seeds(run) if seed != run}
     scores = {seed: found.best.score for seed, found in results.items() if found}
     return max(scores, key=scores.get, default=run)
-
-
-def _runs(log_dir: Path) -> list[Path]:
-    """Folders of runs, with and without a checkpoint."""
-    return [path.parent for path in log_dir.glob(f"*/{CONFIG_FILE}") if path.is_file()]
-
-
-def _started(run: Path) -> tuple[float, int, str]:
-    """Sort key of the time at which a run was started: by the time stamp in its name, or without
-    one, by the time at which its config was written."""
-    found = re.search(r"(\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d)(?:_(\d+))?", run.name)
-    if found is not None:
-        with contextlib.suppress(ValueError, OverflowError):
-            time = datetime.datetime.strptime(found[1], _STAMP).replace(tzinfo=datetime.UTC)
-            return time.timestamp(), int(found[2] or 1), run.name
-    return os.path.getmtime(run / CONFIG_FILE), 1, run.name

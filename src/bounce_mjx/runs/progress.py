@@ -29,7 +29,12 @@ class Evaluation(pydantic.BaseModel, extra="allow"):
     """Whether the policy failed the screening, so that no full evaluation followed."""
 
 
-class _Evaluations(pydantic.BaseModel):
+class Progress(pydantic.BaseModel):
+    """Evaluations of a run so far."""
+
+    best: Report | None = None
+    fault: str | None = None
+    """First quantity that was not finite, and its step; None unless the training diverged."""
     best_steps: _Steps = 0
     solved_steps: _Steps | None = None
     """Steps at the first evaluation that met all results: the end of the time "to all five
@@ -49,45 +54,9 @@ class _Evaluations(pydantic.BaseModel):
         latest = max((evaluation.steps for evaluation in self.evaluations), default=0)
         return self.margin_steps is not None or latest >= PATIENCE * self.solved_steps
 
-
-class Results(_Evaluations):
-    """results.json: the best evaluation, all evaluations, and the time of each activity. In the
-    file, the keys of the best evaluation are at the top level."""
-
-    best: Report
-    device: str
-    version: str = ""
-    """Version of this package that trained last."""
-    trained_steps: _Steps = 0
-    seconds: dict[str, _Seconds] = {}
-    fresh_resets: bool = False
-    """Whether the results of `best` come from other resets than the selection of the checkpoint."""
-
-    @pydantic.model_validator(mode="before")
-    @classmethod
-    def _nest(cls, plain: Any) -> Any:
-        return plain | {"best": plain} if isinstance(plain, dict) else plain
-
-
-def load_results(run: Path) -> Results | None:
-    """Results of a run; None if there are none yet.
-
-    Raises:
-      UserError: the file is damaged.
-    """
-    return read_stored(run / RESULTS_FILE, Results, "delete it to continue without it")
-
-
-class Progress(_Evaluations):
-    """Evaluations of a run so far."""
-
-    best: Report | None = None
-    fault: str | None = None
-    """First quantity that was not finite, and its step; None unless the training diverged."""
-
-    def results(self, report: Report, **run: Any) -> dict[str, Any]:
-        """Content of results.json: an evaluation, and the other fields of `Results`."""
-        return report.to_dict() | self.model_dump(exclude={"best", "fault"}) | run
+    def results(self, **run: Any) -> dict[str, Any]:
+        """Content of results.json, with the other fields of `Results`."""
+        return self.best.to_dict() | self.model_dump(exclude={"best", "fault"}) | run
 
     def has(self, steps: int) -> bool:
         """Whether the state after this number of steps was evaluated."""
@@ -115,3 +84,31 @@ class Progress(_Evaluations):
             return False
         self.best, self.best_steps = report, steps
         return True
+
+
+class Results(Progress):
+    """results.json: the best evaluation, all evaluations, and the time of each activity. In the
+    file, the keys of the best evaluation are at the top level."""
+
+    best: Report
+    device: str
+    version: str = ""
+    """Version of this package that trained last."""
+    trained_steps: _Steps = 0
+    seconds: dict[str, _Seconds] = {}
+    fresh_resets: bool = False
+    """Whether the results of `best` come from other resets than the selection of the checkpoint."""
+
+    @pydantic.model_validator(mode="before")
+    @classmethod
+    def _nest(cls, plain: Any) -> Any:
+        return plain | {"best": plain} if isinstance(plain, dict) else plain
+
+
+def load_results(run: Path) -> Results | None:
+    """Results of a run; None if there are none yet.
+
+    Raises:
+      UserError: the file is damaged.
+    """
+    return read_stored(run / RESULTS_FILE, Results, "delete it to continue without it")

@@ -7,6 +7,7 @@ from the run's.
 
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -17,20 +18,12 @@ from bounce_mjx.baselines.mirror import MirrorLaw
 from bounce_mjx.config.files import differing_keys
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, reason_of, shorten
-from bounce_mjx.learning.policy import (
-    Actor,
-    Policy,
-    make_networks,
-    networks_of,
-    untrained_policy,
-)
+from bounce_mjx.learning.policy import Actor, Policy, make_networks, networks_of, untrained_policy
 from bounce_mjx.learning.ppo import Params, names_of_critic_metrics
 from bounce_mjx.learning.statistics import RunningStatistics, init_statistics
-from bounce_mjx.runs import old
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
 from bounce_mjx.runs.files import MANIFEST_FILE, check_integrity, first_mistake, read_json
 from bounce_mjx.runs.folders import MIRROR_LAW, Checkpoint, best_checkpoint
-from bounce_mjx.tasks.registry import is_file
 
 POLICY, TRAINING, NETWORKS, RECORD = "policy", "training", "networks", "record"
 """Items of a checkpoint: what acts; what a training continues from; both networks, with which
@@ -42,8 +35,11 @@ RESUMABLE_KEYS = frozenset(
     "total_steps eval_every eval_episodes screening_episodes eval_seed stop_when_solved log_dir "
     "num_devices".split()
 )
-# The checkpoint has the path of the original file, and the run's config the path of its own copy.
-_MJCF_KEY = "env.mjcf"
+# The checkpoint has the paths of the original files, and the run's config those of its own copies.
+_COPIED_KEYS = {"env.mjcf", "task", "algorithm"}
+# Version 0.1 wrote a checkpoint's plain data into this file, and arrays of one chunk in OCDBT and
+# zarr without orbax's own metadata.
+_OLD_RECORD = "run.json"
 
 
 class Record(pydantic.BaseModel):
@@ -97,7 +93,7 @@ def read_training(checkpoint: Checkpoint, template: Any) -> tuple[Any, Record]:
     Args:
       template: shapes and dtypes of the state, as from `jax.eval_shape`.
     """
-    if not (checkpoint.folder / TRAINING).is_dir() or old.is_old(checkpoint.folder):
+    if not (checkpoint.folder / TRAINING).is_dir() or _is_old(checkpoint.folder):
         raise UserError(
             f"the checkpoint {checkpoint.folder} holds no training state of this version to "
             "continue from; start a new run with --warm-start"
@@ -138,17 +134,14 @@ def read_record(checkpoint: Checkpoint) -> Record:
         else:
             # Its training was killed before it wrote the manifest.
             print(f"warning: {folder} has no {MANIFEST_FILE} to find damage by", file=sys.stderr)
-        name = old.RECORD_FILE if old.is_old(folder) else f"{RECORD}/metadata"
+        name = _OLD_RECORD if _is_old(folder) else f"{RECORD}/metadata"
         record = read_json(folder / name, Record)
-        own = {key: getattr(run_config, key) for key in ("task", "algorithm")}
-        copies = {k: v for k, v in own.items() if is_file(v) and is_file(str(record.config.get(k)))}
-        config = type(run_config).model_validate(record.config | copies)
+        config = type(run_config).model_validate(record.config)
     except pydantic.ValidationError as error:
         raise _damaged(checkpoint, ValueError(first_mistake(error))) from error
     except (OSError, ValueError) as error:
         raise _damaged(checkpoint, error) from error
-    differing = differing_keys(run_config, config) - RESUMABLE_KEYS - {_MJCF_KEY}
-    if differing:
+    if differing := differing_keys(run_config, config) - RESUMABLE_KEYS - _COPIED_KEYS:
         raise UserError(
             f"the checkpoint {folder} has a different config from "
             f"{checkpoint.run / CONFIG_FILE}, which differs in {', '.join(sorted(differing))}; "
@@ -161,8 +154,8 @@ def _read_arrays(checkpoint: Checkpoint, item: str, template: Any) -> Any:
     """Reads an item of a checkpoint with exactly the structure, shapes and dtypes of `template`."""
     folder = (checkpoint.folder / item).absolute()
     try:
-        if old.is_old(checkpoint.folder):
-            return old.read_arrays(folder, template)
+        if _is_old(checkpoint.folder):
+            return _read_old(folder, template)
         # Imported here, as the import takes half a second.
         import orbax.checkpoint as ocp
 
@@ -178,6 +171,24 @@ def _read_arrays(checkpoint: Checkpoint, item: str, template: Any) -> Any:
     # Damaged files raise exceptions of many types.
     except Exception as error:
         raise _damaged(checkpoint, error) from error
+
+
+def _is_old(folder: Path) -> bool:
+    return (folder / _OLD_RECORD).is_file()
+
+
+def _read_old(folder: Path, template: Any) -> Any:
+    import tensorstore
+
+    def read(path: tuple, leaf: jax.ShapeDtypeStruct) -> np.ndarray:
+        name = jax.tree_util.keystr(path, simple=True, separator=".")
+        files = {"driver": "file", "path": f"{folder}/"}
+        database = {"driver": "ocdbt", "base": files, "path": f"{name}/"}
+        form = {"shape": leaf.shape, "chunks": leaf.shape, "dtype": leaf.dtype.str}
+        spec = {"driver": "zarr", "kvstore": database, "metadata": form}
+        return tensorstore.open(spec, open=True, read=True).result().read().result()
+
+    return jax.tree_util.tree_map_with_path(read, template)
 
 
 def _forms(tree: Any) -> dict[str, str]:

@@ -1,13 +1,10 @@
 """Writing of checkpoints with orbax."""
 
-import contextlib
 import logging
 import os
 import re
 import shutil
-import sys
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -91,9 +88,12 @@ def save_checkpoint(
     arguments = {name: ocp.args.StandardSave(tree) for name, tree in given.items()}
     record = {"steps": steps, "config": config.model_dump(mode="json"), "progress": progress or {}}
     arguments[RECORD] = ocp.args.JsonSave(to_plain(record))
+    # After an error, orbax would log a traceback.
+    log = logging.getLogger("absl")
+    log.disabled = True
     try:
         # A new manager each time: one that failed would take the checkpoint for written.
-        with _without_tracebacks(), ocp.CheckpointManager(folder, options=options) as manager:
+        with ocp.CheckpointManager(folder, options=options) as manager:
             latest = manager.latest_step()
             number = steps if latest is None else max(steps, latest + 1)
             metrics = {"score": list(score)}
@@ -106,23 +106,8 @@ def save_checkpoint(
             raise
         raise OSError(int(code[1]), os.strerror(int(code[1]))) from error
     finally:
+        log.disabled = False
         shutil.rmtree(folder / _REPLACED, ignore_errors=True)
-
-
-@contextlib.contextmanager
-def _without_tracebacks() -> Iterator[None]:
-    """Around a save: after an error, orbax logs a traceback, and arrays that are still written find
-    its event loop closed."""
-    log, report = logging.getLogger("absl"), sys.unraisablehook
-    log.disabled = True
-    sys.unraisablehook = lambda lost: None if lost.exc_type is RuntimeError else report(lost)
-    try:
-        yield
-    except Exception:
-        time.sleep(0.2)
-        raise
-    finally:
-        log.disabled, sys.unraisablehook = False, report
 
 
 def _score_in(metrics: dict[str, Any]) -> tuple[float, ...]:

@@ -40,15 +40,14 @@ hosts it is called where the run is written. It may have two methods: `start(run
 for each seed before the training, and `close()` after it."""
 
 
-def block_means(metrics: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The points of a block's curves, each [S], from metrics of its iterations, each [S, I]. NaN
-    stands for nothing to measure."""
-    means = {
-        name: np.ma.masked_invalid(values).mean(axis=1).filled(math.nan)
-        for name, values in metrics.items()
-    }
+def block_points(metrics: dict[str, np.ndarray]) -> list[dict[str, float]]:
+    """The finite points of each seed's curves in a block, from metrics of its iterations, each
+    [S, I]. NaN stands for nothing to measure."""
+    means = {n: np.ma.masked_invalid(x).mean(axis=1).filled(math.nan) for n, x in metrics.items()}
     # A sum, because a mean would hide a single event in many iterations.
-    return means | {"task/non_finite": np.nansum(metrics["task/non_finite"], axis=1).astype(float)}
+    means["task/non_finite"] = np.nansum(metrics["task/non_finite"], axis=1)
+    seeds = range(len(means["task/non_finite"]))
+    return [{name: float(x[i]) for name, x in means.items() if np.isfinite(x[i])} for i in seeds]
 
 
 def points_of(report: Report) -> dict[str, float]:

@@ -16,7 +16,7 @@ def say(console: Console, line: str) -> None:
 
 
 def block_line(
-    config: TrainConfig, steps: int, seconds: float, left: float, means: dict[str, np.ndarray]
+    config: TrainConfig, steps: int, seconds: float, left: float, points: list[dict[str, float]]
 ) -> str:
     """A block of iterations.
 
@@ -24,15 +24,15 @@ def block_line(
       steps: environment steps of each seed so far.
       seconds: duration of the block.
       left: estimated time to the last step, s; the training may end earlier.
-      means: see `block_means`.
+      points: those of the curves of each seed.
     """
-    rate = means["speed/steps_per_second"][0]
-    line = f"{count_text(steps)} steps  {count_text(rate)} steps/s"
+    rate = count_text(points[0]["speed/steps_per_second"])
+    line = f"{count_text(steps)} steps  {rate} steps/s"
     for tag in ("episode/return", *(curve.tag for curve in config.env.task.curves[:1])):
-        values = means[tag][np.isfinite(means[tag])]
+        values = [point[tag] for point in points if tag in point]
         form = ".0f" if tag == "episode/return" else ".3g"
         spread = f" +- {np.std(values):{form}}" if len(values) > 1 else ""
-        if len(values):
+        if values:
             line += f"  {tag.rpartition('/')[2]} {np.mean(values):{form}}{spread}"
     return f"{line}  {seconds:.1f} s, {'at most ' * config.stop_when_solved}{left:.0f} s left"
 

@@ -2,7 +2,6 @@
 
 import concurrent.futures
 import dataclasses
-import functools
 import os
 from collections.abc import Sequence
 from typing import TypeVar
@@ -41,11 +40,7 @@ class Evaluators:
     """
 
     def __init__(
-        self,
-        config: TrainConfig,
-        env: Env,
-        mesh: Mesh,
-        pool: concurrent.futures.Executor,
+        self, config: TrainConfig, env: Env, mesh: Mesh, pool: concurrent.futures.Executor
     ):
         """Starts the compilation in a pool."""
         self._config, self._env = config, env
@@ -53,6 +48,11 @@ class Evaluators:
         self._sharding = NamedSharding(mesh, PartitionSpec(*axes))
         self._replicated = NamedSharding(mesh, PartitionSpec())
         self._chunk = min(config.screening_episodes or config.eval_episodes, config.eval_episodes)
+        # On a CPU a chunk uses one core, and XLA runs the programs that one thread starts one after
+        # another. MJX calls LAPACK, and in jaxlib two batched calls of it may wait for each other
+        # for ever.
+        on_cpu = mesh.size == 1 and mesh.devices.flat[0].platform == "cpu"
+        self._threads = os.cpu_count() if on_cpu and env.engine.name == "fused" else 1
         self._program = pool.submit(self._lower().compile)
 
     def wait(self) -> None:
@@ -84,20 +84,16 @@ class Evaluators:
             states = jax.vmap(env.reset, out_axes=-1)(keys)
             return run_episodes(env, networks, policy, states, recorded)
 
-        if config.num_seeds > 1:
-            run = jax.vmap(run, in_axes=(0, None))
+        several = config.num_seeds > 1
+        run_all = jax.vmap(run, in_axes=(0, None)) if several else run
 
         def evaluate(policy: Policy, seed: jax.Array, first: jax.Array):
             # Keys are made inside the program: outside it, each operation would take a tenth of a
             # second. The last chunk may reach beyond the last episode.
-            full, screening = jax.random.split(jax.random.PRNGKey(seed))
-            keys = jnp.concatenate(
-                [
-                    jax.random.split(full, config.eval_episodes),
-                    jax.random.split(screening, config.screening_episodes),
-                ]
-            )
-            return run(policy, jnp.take(keys, first + jnp.arange(self._chunk), 0, mode="clip"))
+            keys = jax.random.split(jax.random.PRNGKey(seed))
+            counts = config.eval_episodes, config.screening_episodes
+            keys = jnp.concatenate([*map(jax.random.split, keys, counts)])
+            return run_all(policy, jnp.take(keys, first + jnp.arange(self._chunk), 0, mode="clip"))
 
         program = jax.jit(
             evaluate,
@@ -105,21 +101,11 @@ class Evaluators:
             out_shardings=self._replicated,
             compiler_options=compiler_options(),
         )
-        seeds = (config.num_seeds,) if config.num_seeds > 1 else ()
+        seeds = (config.num_seeds,) if several else ()
         shapes = jax.tree.map(
             lambda x: jax.ShapeDtypeStruct((*seeds, *x.shape), x.dtype), policy_shapes(config)
         )
         return program.lower(shapes, np.uint32(0), np.int32(0))
-
-    @functools.cached_property
-    def _threads(self) -> int:
-        """Number of chunks that run at the same time. On a CPU a chunk uses one core, and XLA runs
-        the programs that one thread starts one after another."""
-        mesh = self._replicated.mesh
-        if mesh.size > 1 or mesh.devices.flat[0].platform != "cpu":
-            return 1
-        # In jaxlib, two batched calls of LAPACK may wait for each other for ever.
-        return 1 if "lapack" in self._program.result().as_text() else os.cpu_count() or 1
 
     def _measure(
         self, policies: Sequence[Policy], seed: int, screening: bool = False
@@ -127,8 +113,8 @@ class Evaluators:
         config, program = self._config, self._program.result()
         first = config.eval_episodes if screening else 0
         episodes = config.screening_episodes if screening else config.eval_episodes
-        policy = policies[0]
-        if config.num_seeds > 1:
+        policy, several = policies[0], config.num_seeds > 1
+        if several:
             policy = jax.tree.map(lambda *leaves: np.stack(leaves), *policies)
         on_devices = hosts.distribute(policy, jax.tree.map(lambda _: self._sharding, policy))
 
@@ -141,14 +127,12 @@ class Evaluators:
             chunks = pool.map(evaluate, range(0, episodes, self._chunk))
             parts, recordings = zip(*chunks, strict=True)
         statistics = _joined(parts, episodes)
-        if config.num_seeds == 1:
-            recorded = min(RECORDED_EPISODES, episodes)
-            recording = _joined(recordings[: -(-recorded // self._chunk)], recorded)
-            return [judge(self._env, statistics, recording)]
-        return [
-            judge(self._env, jax.tree.map(lambda x, i=i: x[i], statistics))
-            for i in range(config.num_seeds)
-        ]
+        if several:
+            each = [jax.tree.map(lambda x, i=i: x[i], statistics) for i in range(config.num_seeds)]
+            return [judge(self._env, own) for own in each]
+        recorded = min(RECORDED_EPISODES, episodes)
+        recording = _joined(recordings[: -(-recorded // self._chunk)], recorded)
+        return [judge(self._env, statistics, recording)]
 
 
 def _joined(chunks: Sequence[Tree], episodes: int) -> Tree:

@@ -38,13 +38,10 @@ def fault_of(metrics: Metrics, config: TrainConfig) -> str | None:
     seconds = config.env.control_dt * steps / np.maximum(ended, 1e-9)
     if min(limit, config.env.episode_seconds) <= MIN_SECONDS or (seconds >= MIN_SECONDS).any():
         return None
-    cause = f"an end of the task {config.task}"
-    for name, other in (
-        ("task/too_fast", "max_joint_velocity"),
-        ("task/non_finite", "the physics, which is not finite"),
-    ):
-        if metrics.get(name, np.zeros(1)).sum() > 0.5 * ended.sum():
-            cause = other
+    ends = {"max_joint_velocity": "too_fast", "the physics, which is not finite": "non_finite"}
+    half, nothing = 0.5 * ended.sum(), np.zeros(1)
+    often = (end for end, name in ends.items() if metrics.get(f"task/{name}", nothing).sum() > half)
+    cause = next(often, f"an end of the task {config.task}")
     return (
         f"an episode lasts {seconds.max():.2g} s on average, less than {MIN_SECONDS:g} s, and what "
         f"ends it is {cause}; check the unit of the settings"

@@ -27,11 +27,10 @@ from bounce_mjx.learning.policy import Policy
 from bounce_mjx.runs import folders, reading, writing
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.files import to_json, writable, write_atomically
-from bounce_mjx.runs.lock import lock_run
 from bounce_mjx.runs.progress import RESULTS_FILE, Progress
 from bounce_mjx.tasks.registry import is_file
 from bounce_mjx.training import hosts
-from bounce_mjx.training.callbacks import Callback, Event, block_means, call_all, points_of
+from bounce_mjx.training.callbacks import Callback, Event, block_points, call_all, points_of
 from bounce_mjx.training.console import block_line, evaluation_line, say
 from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.first_block import fault_of
@@ -56,24 +55,18 @@ class SeedRun:
     """Seconds by phase, for all seeds together."""
     progress: Progress = dataclasses.field(default_factory=Progress)
     best_policy: Policy | None = None
-    """The policy of the best checkpoint, as NumPy arrays, if this process trained it."""
-    final: Report | None = None
-    """Evaluation of the best checkpoint on fresh resets, after the end of the training."""
-
-    @property
-    def report(self) -> Report | None:
-        """The figures of the best checkpoint; None if the seed diverged before its first
-        evaluation."""
-        return self.final or self.progress.best
+    """The policy of the best checkpoint."""
 
     def recall_best(self) -> None:
         """Takes for the best what the best checkpoint on the disk says: a policy that could not be
         saved is not the best one, and a process may have been killed before it wrote its state."""
         self.best_policy, self.progress.best, self.progress.best_steps = None, None, 0
         with contextlib.suppress(UserError):
-            best = reading.read_record(folders.best_checkpoint(self.run)).progress
-            stored = Progress.model_validate(best)
-            self.progress.best, self.progress.best_steps = stored.best, stored.best_steps
+            best = folders.best_checkpoint(self.run)
+            stored = Progress.model_validate(reading.read_record(best).progress)
+            if stored.best is not None:
+                self.best_policy = reading.read_policy(best, self.config)
+                self.progress.best, self.progress.best_steps = stored.best, stored.best_steps
 
 
 class TrainingStopped(Interrupted):
@@ -144,7 +137,7 @@ class Job:
         self.callbacks = callbacks if hosts.is_leader() else ()
         self.pool = concurrent.futures.ThreadPoolExecutor()
         stack.callback(self.pool.shutdown, wait=False, cancel_futures=True)
-        self.clock = Clock()
+        self.seconds, self.lap_started = {}, time.perf_counter()
         self.block_steps = iterations_per_block(config) * config.ppo.batch_steps
         self.eval_steps = self.block_steps * max(1, round(config.eval_every / self.block_steps))
         self.env = Env(config.env)
@@ -156,7 +149,6 @@ class Job:
         self.ended = False
         self.logs: dict[Path, TensorBoardLog] = {}
         self.opening = self.saving = self.pool.submit(lambda: None)
-        self.could_save = True
 
     def open(self) -> None:
         """Makes the folder of a new run, or reads the resumed one, and says what is trained."""
@@ -170,21 +162,17 @@ class Job:
             self.run = self.resume
         self.stack.push(self._remove_unstarted)
         if hosts.is_leader():
-            self.stack.enter_context(lock_run(self.run))
+            self.stack.enter_context(folders.lock_run(self.run))
         self.stack.callback(lambda: concurrent.futures.wait([self.saving]))
-        alone = {self.run: config}
-        if config.num_seeds > 1:
-            seeds = range(config.seed, config.seed + config.num_seeds)
-            alone = {
-                folders.seed_folder(self.run, seed): config.model_copy(
-                    update={"seed": seed, "num_seeds": 1}
-                )
-                for seed in seeds
-            }
-        self.members = [SeedRun(*each, self.clock.seconds) for each in alone.items()]
+        self.members = []
+        for seed in range(config.seed, config.seed + config.num_seeds):
+            folder = folders.seed_folder(self.run, seed) if config.num_seeds > 1 else self.run
+            alone = config.model_copy(update={"seed": seed, "num_seeds": 1})
+            self.members.append(SeedRun(folder, alone, self.seconds))
         if self.resume is not None:
             self._read_resumed()
-        for folder, own in ({self.run: config} | alone).items() if hosts.is_leader() else ():
+        configs = {self.run: config} | {member.run: member.config for member in self.members}
+        for folder, own in configs.items() if hosts.is_leader() else ():
             # A new run has its own config.
             if self.resume is not None or folder != self.run:
                 with writable(folder, "make room there or make it writable"):
@@ -200,11 +188,17 @@ class Job:
         self.say(f"device: {self.device}  run: {self.run}")
         bound = "at most " if config.stop_when_solved else ""
         self.say(f"steps: {bound}{config.total_steps:,}, in blocks of {self.block_steps:,}")
-        self.clock.lap("setup")
+        self._lap("setup")
 
     def say(self, line: str) -> None:
         """Prints a line."""
         say(self.console, line)
+
+    def _lap(self, name: str) -> None:
+        """Adds the time since the last lap to that of a phase."""
+        now = time.perf_counter()
+        self.seconds[name] = self.seconds.get(name, 0.0) + now - self.lap_started
+        self.lap_started = now
 
     @property
     def _go_on(self) -> str:
@@ -214,8 +208,7 @@ class Job:
         return f"continue with: bounce-mjx train {shlex.join(flags)}"
 
     def failure(self, error: jax.errors.JaxRuntimeError) -> str:
-        """What a device's failure means to the user, once the last state is saved."""
-        concurrent.futures.wait([self.saving])
+        """What a device's failure means to the user."""
         reason = shorten(reason_of(error), 200)
         if reason.startswith("RESOURCE_EXHAUSTED"):
             envs = f"{self.config.ppo.num_envs:,} environments"
@@ -227,10 +220,15 @@ class Job:
 
     def _advice(self) -> str:
         """The advice to the user after the death of a process or a device."""
-        with contextlib.suppress(UserError):
-            latest = folders.latest_checkpoint(self.run)
-            return f"{self._go_on} (the last checkpoint is {latest.folder})"
+        if latest := self._latest():
+            return f"{self._go_on} (the last checkpoint is {latest})"
         return "start again, as no checkpoint had been saved yet"
+
+    def _latest(self) -> Path | None:
+        """The newest checkpoint, once the last save has ended."""
+        concurrent.futures.wait([self.saving])
+        with contextlib.suppress(UserError):
+            return folders.latest_checkpoint(self.run).folder
 
     def _remove_unstarted(self, error: type[BaseException] | None, *_) -> None:
         """Removes the folder of a new run without a checkpoint or a block that can be trained."""
@@ -263,8 +261,8 @@ class Job:
             # The longest program is traced first: Python traces one program at a time while XLA
             # compiles others.
             compiling = self.trainer.compile(threads)
-            mesh = self.trainer.mesh
-            self.evaluators = make_evaluators(self.config, self.env, mesh, threads)
+            parts = self.config, self.env, self.trainer.mesh
+            self.evaluators = make_evaluators(*parts, threads)
             self.opening = self.pool.submit(self._open_logs)
             self.opening.add_done_callback(lambda _: [*map(importlib.import_module, _SLOW_MODULES)])
             compiling.result()
@@ -283,11 +281,9 @@ class Job:
             # them; otherwise the exchange between devices would time out after 30 s.
             self.evaluators.wait()
             hosts.any_of(False)
-        self.trainer.start(self.state)
+        self.trainer.start(self.state, self.first)
         self.state = None
-        if self.first is not None:
-            self.trainer.warm_start(*self.first)
-        self.clock.lap("compile")
+        self._lap("compile")
         self.started, self.first_step = time.monotonic(), self.steps
 
     def _open_logs(self) -> None:
@@ -298,10 +294,17 @@ class Job:
             self.logs[member.run].start(member.config, resumed)
             call_all(self.callbacks, "start", member.run, member.config)
 
-    def _tell(self, events: Sequence[Event]) -> None:
-        """Logs an event of each seed, and tells the callbacks."""
-        for event in events if hosts.is_leader() else ():
-            self.logs[event.run](event)
+    def _tell(
+        self,
+        member: SeedRun,
+        points: dict[str, float],
+        report: Report | None = None,
+        policy: Policy | None = None,
+    ) -> None:
+        """Logs an event of a seed, and tells the callbacks."""
+        if hosts.is_leader():
+            event = Event(member.run, member.config, self.steps, points, report, policy)
+            self.logs[member.run](event)
             answers = [callback(event) for callback in self.callbacks]
             self.ended |= any(answer is False for answer in answers)
 
@@ -324,9 +327,10 @@ class Job:
         stopping = self._stopping()
         is_run = self.resume is not None or self.steps > 0 or self._is_evaluated()
         if is_run and stopping and not self._is_evaluated():
+            self._end_save()
             self._save(self.trainer.snapshot(), {})
         if is_run:
-            self._wait_until_saved()
+            self._end_save(is_last=True)
         evaluated = not stopping and self._evaluate_best()
         jax.distributed.shutdown()
         if not is_run:
@@ -352,11 +356,12 @@ class Job:
 
     def _is_due(self) -> bool:
         done = self._is_done()
+        if done and any(member.progress.best is None for member in self._healthy()):
+            return True
         # The policy of a warm start is the one to beat.
         trained = self.steps > 0 or self.first is not None
-        at_evaluation = trained and (done or self.steps % self.eval_steps == 0)
-        nothing = any(member.progress.best is None for member in self._healthy())
-        return (at_evaluation and not self._is_evaluated()) or (done and nothing)
+        at_evaluation = done or self.steps % self.eval_steps == 0
+        return trained and at_evaluation and not self._is_evaluated()
 
     def _evaluate(self) -> bool:
         """Evaluates and saves; returns False if a stop was requested meanwhile."""
@@ -365,51 +370,39 @@ class Job:
         if reports is None:
             return False
         evaluated = [
-            (i, member, reports[i])
-            for i, member in enumerate(self.members)
-            if member.progress.fault is None
+            each
+            for each in zip(self.members, reports, snapshot.policies, strict=True)
+            if each[0].progress.fault is None
         ]
-        shown = [report for *_, report in evaluated]
-        self.say(evaluation_line(self.config.num_seeds, self.steps, shown))
-        policies = snapshot.policies
-        self._tell(
-            [
-                Event(member.run, member.config, self.steps, points_of(report), report, policies[i])
-                for i, member, report in evaluated
-            ]
-        )
-        if hosts.any_of(self._saving_problem() is not None):
-            for member in self.members:
-                member.recall_best()
-        seconds, scores = sum(self.clock.seconds.values()), {}
-        for i, member, report in evaluated:
+        self.say(evaluation_line(self.config.num_seeds, self.steps, [x[1] for x in evaluated]))
+        for member, report, policy in evaluated:
+            self._tell(member, points_of(report), report, policy)
+        seconds, scores = sum(self.seconds.values()), {}
+        self._end_save()
+        for member, report, policy in evaluated:
             is_best = member.progress.improves(report, self.steps, seconds)
             if is_best:
-                member.best_policy = policies[i]
+                member.best_policy = policy
             if is_best or len(self.members) == 1:
-                scores[i] = report.score
+                scores[member.run] = report.score
         self._save(snapshot, scores)
         return True
 
     def _evaluate_best(self) -> bool:
         """Evaluates the best policies on fresh resets, and writes the results; returns False if a
         stop was requested meanwhile."""
-        evaluated = [member for member in self.members if member.progress.best is not None]
-        for member in evaluated:
-            if member.best_policy is None:
-                best = folders.best_checkpoint(member.run)
-                member.best_policy = reading.read_policy(best, member.config)
         # A seed that diverged before its first evaluation has no best policy; another seed's policy
         # takes its place in the batch.
-        policies = [member.best_policy or evaluated[0].best_policy for member in self.members]
-        reports = self._wait_for_reports(self.evaluators.final, policies)
+        best = [member.best_policy for member in self.members]
+        other = next(policy for policy in best if policy is not None)
+        reports = self._wait_for_reports(self.evaluators.final, [x or other for x in best])
         if reports is None:
             return False
         for member, report in zip(self.members, reports, strict=True):
-            member.final = None if member.progress.best is None else report
+            member.progress.best = report if member.best_policy else None
         if hosts.is_leader():
-            self.saving = self.pool.submit(self._write_results, self._results())
-        self._wait_until_saved()
+            self.saving = self.pool.submit(_write, [], self._results(fresh_resets=True))
+        self._end_save(is_last=True)
         return True
 
     def _wait_for_reports(
@@ -421,7 +414,7 @@ class Job:
         if not self.stop.wait_for(evaluating) and jax.process_count() == 1:
             return None
         reports = evaluating.result()
-        self.clock.lap("evaluate")
+        self._lap("evaluate")
         return reports
 
     def _run_block(self) -> None:
@@ -445,21 +438,17 @@ class Job:
         self.steps += done
         rate = done * self.config.num_seeds / seconds
         metrics["speed/steps_per_second"] = np.full((self.config.num_seeds, 1), rate)
-        means = block_means(metrics)
+        points = block_points(metrics)
         # At the mean speed so far with its evaluations.
         share = (self.config.total_steps - self.steps) / (self.steps - self.first_step)
         left = share * (time.monotonic() - self.started)
-        self.say(block_line(self.config, self.steps, seconds, left, means))
-        if total := int(means["task/non_finite"].sum()):
+        self.say(block_line(self.config, self.steps, seconds, left, points))
+        if total := int(sum(point["task/non_finite"] for point in points)):
             self.say(f"states that were not finite, whose environments were reset: {total:,}")
-        points = [
-            {name: float(x[i]) for name, x in means.items() if np.isfinite(x[i])}
-            for i in range(len(faults))
-        ]
-        members = zip(self.members, points, strict=True)
-        self._tell([Event(member.run, member.config, self.steps, x) for member, x in members])
+        for member, own in zip(self.members, points, strict=True):
+            self._tell(member, own)
         self._check_faults(faults)
-        self.clock.lap("train")
+        self._lap("train")
 
     def _check_faults(self, faults: np.ndarray) -> None:
         """Ends a run that diverged, because its state is useless; with several seeds, the
@@ -480,115 +469,80 @@ class Job:
                 self.say(f"seed {member.config.seed} diverged: {member.progress.fault}")
         if self._healthy():
             return
-        concurrent.futures.wait([self.saving])
-        kept = "no checkpoint had been saved yet"
-        with contextlib.suppress(UserError):
-            kept = f"the last good checkpoint is {folders.latest_checkpoint(self.run).folder}"
+        latest = self._latest()
+        kept = f"the last good checkpoint is {latest}" if latest else "no checkpoint was saved yet"
         raise UserError(
             f"training stopped because it diverged: {self.members[-1].progress.fault}; {kept}; "
             "start a new run with a lower learning rate or other rewards"
         )
 
-    def _saving_problem(self) -> str | None:
-        """Waits for the last save; why it failed, as part of a sentence. What could not be saved is
-        lost: the next save has newer data."""
+    def _end_save(self, is_last: bool = False) -> None:
+        """Waits for the last save. What could not be saved is lost, as the next save has newer
+        data: such a policy is not the best one.
+
+        Raises:
+          UserError: it failed, and no other follows.
+        """
+        problem = None
         try:
             self.saving.result()
         except OSError as error:
-            return f"{self.run} cannot be written ({error.strerror})"
-        return None
+            problem = f"{self.run} cannot be written ({error.strerror})"
+            if is_last:
+                lost = "so the end of the training is lost; make room, and"
+                raise UserError(f"{problem}, {lost} {self._advice()}") from error
+            meanwhile = "training continues, and saves at its next evaluation"
+            self.say(f"the state is not saved, as {problem}; make room: {meanwhile}")
+        if hosts.any_of(problem is not None):
+            for member in self.members:
+                member.recall_best()
+        self._lap("save")
 
-    def _wait_until_saved(self) -> None:
-        """
-        Raises:
-          UserError: the end of the training could not be saved.
-        """
-        if problem := self._saving_problem():
-            raise UserError(
-                f"{problem}, so the end of the training is lost; make room, and {self._advice()}"
-            )
-        self.clock.lap("save")
-
-    def _save(self, snapshot: Snapshot, scores: dict[int, tuple[float, ...]]) -> None:
+    def _save(self, snapshot: Snapshot, scores: dict[Path, tuple[float, ...]]) -> None:
         """Starts to save the state, and with several seeds the policies of some of them.
 
         Args:
-          scores: quality of the policies that were evaluated, by number of the seed; with several
+          scores: quality of the policies that were evaluated, by the seed's folder; with several
             seeds, of those that are the best of their seed.
         """
-        # Each save waits for the one before.
-        problem = self._saving_problem()
-        if problem is not None and self.could_save:
-            meanwhile = "training continues, and saves at its next evaluation"
-            self.say(f"the state is not saved, as {problem}; make room: {meanwhile}")
-        elif problem is None and not self.could_save:
-            self.say("the state is saved again")
-        self.could_save, self.keeps_folder = problem is None, True
+        self.keeps_folder = True
         if hosts.is_leader():
             # A copy, because the training reuses its buffers meanwhile.
-            copied = jax.tree.map(np.array, snapshot)
-            plain = [member.progress.model_dump() for member in self.members]
-            arguments = copied, self.steps, plain, scores, self._results()
-            self.saving = self.pool.submit(self._write, *arguments)
-        self.clock.lap("save")
+            checkpoints = self._checkpoints(jax.tree.map(np.array, snapshot), scores)
+            self.saving = self.pool.submit(_write, checkpoints, self._results())
+        self._lap("save")
 
-    def _write(
-        self,
-        snapshot: Snapshot,
-        steps: int,
-        progress: list[dict[str, Any]],
-        scores: dict[int, tuple[float, ...]],
-        results: dict[Path, str],
-    ) -> None:
-        policies, state, networks = snapshot
-        networks = networks or [None] * len(policies)
-        items = [
-            {reading.POLICY: policy, reading.NETWORKS: network}
-            for policy, network in zip(policies, networks, strict=True)
-        ]
-        if len(items) == 1:
-            everything = items[0] | {reading.TRAINING: state}, progress[0], scores.get(0, ())
-        else:
-            for i, score in scores.items():
-                member = self.members[i]
-                best = items[i], progress[i], score
-                writing.save_checkpoint(member.run, member.config, steps, *best)
-            stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *policies)
-            everything = {reading.POLICY: stacked, reading.TRAINING: state}, {"seeds": progress}
-        # Last, as it refers to the best policies of the seeds.
-        writing.save_checkpoint(self.run, self.config, steps, *everything)
-        self._write_results(results)
+    def _checkpoints(
+        self, snapshot: Snapshot, scores: dict[Path, tuple[float, ...]]
+    ) -> list[tuple[Any, ...]]:
+        """The arguments of `save_checkpoint` for each checkpoint of a save."""
+        saves, records = [], []
+        networks = snapshot.networks or [None] * len(self.members)
+        for member, policy, both in zip(self.members, snapshot.policies, networks, strict=True):
+            items = {reading.POLICY: policy, reading.NETWORKS: both}
+            record, score = member.progress.model_dump(), scores.get(member.run, ())
+            records.append(record)
+            if member.run != self.run and score:
+                saves.append((member.run, member.config, self.steps, items, record, score))
+        if len(self.members) > 1:
+            items, record, score = {}, {"seeds": records}, ()
+        items[reading.TRAINING] = snapshot.state
+        # Last, as with several seeds it refers to the best policies of the seeds.
+        return [*saves, (self.run, self.config, self.steps, items, record, score)]
 
-    def _results(self) -> dict[Path, str]:
+    def _results(self, fresh_resets: bool = False) -> dict[Path, str]:
         """The content of each seed's results.json; none before its first evaluation."""
+        about = {"trained_steps": self.steps, "seconds": self.seconds, "device": self.device}
+        about |= {"fresh_resets": fresh_resets, "version": bounce_mjx.__version__}
         return {
-            member.run / RESULTS_FILE: to_json(
-                member.progress.results(
-                    member.report,
-                    fresh_resets=member.final is not None,
-                    trained_steps=self.steps,
-                    seconds=self.clock.seconds,
-                    device=self.device,
-                    version=bounce_mjx.__version__,
-                )
-            )
+            member.run / RESULTS_FILE: to_json(member.progress.results(**about))
             for member in self.members
-            if member.report is not None
+            if member.progress.best is not None
         }
 
-    def _write_results(self, results: dict[Path, str]) -> None:
-        for path, content in results.items():
-            write_atomically(path, content)
 
-
-class Clock:
-    """Adds up the time between laps by name."""
-
-    def __init__(self):
-        self.seconds: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def lap(self, name: str) -> None:
-        now = time.perf_counter()
-        self.seconds[name] = self.seconds.get(name, 0.0) + now - self._last
-        self._last = now
+def _write(checkpoints: list[tuple[Any, ...]], results: dict[Path, str]) -> None:
+    for arguments in checkpoints:
+        writing.save_checkpoint(*arguments)
+    for path, content in results.items():
+        write_atomically(path, content)

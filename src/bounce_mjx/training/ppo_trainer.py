@@ -1,4 +1,9 @@
-"""The trainer in JAX: the compiled programs of `ppo.py`, on one or several devices."""
+"""The trainer in JAX: the compiled programs of `ppo.py`, on one or several devices.
+
+The program is the same on any number of devices: arrays over the environments are sharded along
+their batch axis, all other arrays are replicated, and XLA adds the reductions of gradients and
+statistics. With several seeds each device holds some of them.
+"""
 
 import concurrent.futures
 import functools
@@ -6,23 +11,26 @@ from collections.abc import Callable
 
 import jax
 import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from bounce_mjx.env.env import Env
-from bounce_mjx.learning.config import find_algorithm
+from bounce_mjx.errors import UserError
+from bounce_mjx.learning.config import PPOConfig, find_algorithm
 from bounce_mjx.learning.ppo import (
     CHECKED,
     Params,
     TrainingState,
+    num_groups,
     policy_of,
     population,
-    warm_started,
 )
 from bounce_mjx.learning.statistics import RunningStatistics
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training import hosts
-from bounce_mjx.training.devices import make_mesh, replicated, state_sharding
 from bounce_mjx.training.setup import compiler_options
 from bounce_mjx.training.trainer import Metrics, Snapshot, iterations_per_block
+
+_AXIS = "devices"
 
 
 class PPOTrainer:
@@ -41,19 +49,20 @@ class PPOTrainer:
         self._compiled_iterations = 1 if on_mjx else iterations_per_block(config)
         self.mesh = make_mesh(config.num_devices, config.ppo, config.num_seeds)
         trainer = find_algorithm(config.algorithm)(config.ppo, env, episode_steps(config))
-        self._trainer = trainer if config.num_seeds == 1 else population(trainer)
+        several = config.num_seeds > 1
+        init, run = population(trainer) if several else (trainer.init, trainer.run)
         seeds = config.seed + np.arange(config.num_seeds, dtype=np.uint32)
-        self._seeds = seeds[0] if config.num_seeds == 1 else seeds
+        self._seeds = seeds if several else seeds[0]
         self.state: TrainingState | None = None
         """The current state, on the devices."""
 
         def initial_state(seeds: jax.Array) -> TrainingState:
             """The first training state of one seed [] or of S seeds [S]."""
             key = jax.random.PRNGKey
-            return self._trainer.init((jax.vmap(key) if seeds.ndim else key)(seeds))
+            return init((jax.vmap(key) if several else key)(seeds))
 
         def train_block(state: TrainingState) -> tuple[TrainingState, Metrics]:
-            return self._trainer.run(state, self._compiled_iterations)
+            return run(state, self._compiled_iterations)
 
         # One object each, not methods, so that JAX traces them only once.
         self._initial_state, self._train_block = initial_state, train_block
@@ -73,7 +82,7 @@ class PPOTrainer:
         run = jax.jit(
             self._train_block,
             in_shardings=(self._sharding,),
-            out_shardings=(self._sharding, replicated(self.mesh)),
+            out_shardings=(self._sharding, NamedSharding(self.mesh, PartitionSpec())),
             donate_argnums=0,
             compiler_options=compiler_options(tunes_products=True),
         )
@@ -86,14 +95,22 @@ class PPOTrainer:
         self._init = pool.submit(init.lower(self._seeds).compile)
         return self._run
 
-    def start(self, state: TrainingState | None = None) -> None:
+    def start(
+        self,
+        state: TrainingState | None = None,
+        networks: tuple[Params, RunningStatistics] | None = None,
+    ) -> None:
         if state is None:
             self.state = jax.block_until_ready(self._init.result()(self._seeds))
-        else:
+        if networks is not None:
+            state = hosts.gather(self.state)
+            own = state.params, state.statistics
+            params, statistics = jax.tree.map(
+                lambda old, new: np.broadcast_to(new, old.shape), own, networks
+            )
+            state = state._replace(params=params, statistics=statistics)
+        if state is not None:
             self.state = hosts.distribute(state, self._sharding)
-
-    def warm_start(self, params: Params, statistics: RunningStatistics) -> None:
-        self.start(warm_started(self.snapshot().state, params, statistics))
 
     def run(self, iterations: int, stopping: Callable[[], bool]) -> Metrics:
         program, parts = self._run.result(), []
@@ -124,3 +141,53 @@ def episode_steps(config: TrainConfig) -> int:
     if limit is None:
         return config.env.episode_steps
     return min(config.env.episode_steps, max(1, round(limit / config.env.control_dt)))
+
+
+def make_mesh(num_devices: int | None, config: PPOConfig, num_seeds: int = 1) -> Mesh:
+    """A mesh of the first `num_devices` devices.
+
+    Args:
+      num_devices: number of devices; None means one, or all devices if there are several hosts.
+
+    Raises:
+      UserError: there are fewer devices, or the environments (one seed) or the seeds (several)
+        cannot be divided among them, or a device of some host would be unused.
+    """
+    devices = jax.devices()
+    if num_devices is None:
+        num_devices = 1 if jax.process_count() == 1 else len(devices)
+    if num_devices > len(devices):
+        raise UserError(
+            f"num_devices is {num_devices}, but there are {len(devices)} "
+            f"({devices[0].device_kind}); choose at most that"
+        )
+    if jax.process_count() > 1 and num_devices < len(devices):
+        raise UserError(
+            f"num_devices is {num_devices}, but the hosts have {len(devices)} and use all; omit it"
+        )
+    if num_seeds > 1:
+        shared, name, advice = num_seeds, f"num_seeds {num_seeds}", f"a multiple of {num_devices}"
+    else:
+        shared, name = num_groups(config), f"num_envs {config.num_envs}"
+        multiple = f"a multiple of {num_devices} * num_minibatches as num_envs"
+        advice = f"a power of two as num_devices, and {multiple}"
+    if shared % num_devices:
+        raise UserError(f"{name} cannot be divided among {num_devices} devices; choose {advice}")
+    return Mesh(devices[:num_devices], (_AXIS,))
+
+
+def state_sharding(mesh: Mesh, state: TrainingState, num_seeds: int = 1) -> TrainingState:
+    """Shardings of a training state. With several seeds each device holds some of them; with one
+    seed each device holds some environments and everything else.
+
+    Args:
+      state: the state or its shapes; with several seeds, the seeds are the first axis.
+    """
+    if num_seeds > 1:
+        return jax.tree.map(lambda _: NamedSharding(mesh, PartitionSpec(_AXIS)), state)
+    shardings = jax.tree.map(lambda _: NamedSharding(mesh, PartitionSpec()), state)
+
+    def batch_last(x: jax.Array) -> NamedSharding:
+        return NamedSharding(mesh, PartitionSpec(*[None] * (x.ndim - 1), _AXIS))
+
+    return shardings._replace(env=jax.tree.map(batch_last, state.env))

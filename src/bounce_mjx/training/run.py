@@ -26,10 +26,10 @@ from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.reading import read_actor
 from bounce_mjx.training import hosts, job
 from bounce_mjx.training.callbacks import Callback
+from bounce_mjx.training.command import Start, changed
 from bounce_mjx.training.console import say
 from bounce_mjx.training.log import TensorBoardLog
 from bounce_mjx.training.setup import set_up_jax
-from bounce_mjx.training.start import Start, changed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -163,14 +163,15 @@ def _start_jax(config: TrainConfig) -> None:
 
 def print_results(seeds: Sequence[job.SeedRun], console: Console) -> job.SeedRun:
     """Prints the results of a training run; returns the best seed."""
-    best = max((s for s in seeds if s.report is not None), key=lambda s: s.report.score)
+    reports = {s.config.seed: s.progress.best for s in seeds}
+    best = max((s for s in seeds if s.progress.best), key=lambda s: s.progress.best.score)
+    report, steps = best.progress.best, best.progress.best_steps
     if len(seeds) > 1:
-        console.print(seeds_table({s.config.seed: s.report for s in seeds}))
+        console.print(seeds_table(reports))
     else:
-        steps = best.progress.best_steps
-        console.print(results_table(best.report, f"best checkpoint, {steps:,} steps"))
-        say(console, details_line(best.report))
-    if unsolved := unsolved_line(best.report):
+        console.print(results_table(report, f"best checkpoint, {steps:,} steps"))
+        say(console, details_line(report))
+    if unsolved := unsolved_line(report):
         say(console, unsolved)
     spent = ", ".join(f"{name} {value:.1f} s" for name, value in best.seconds.items())
     say(console, f"time: {spent}")
@@ -187,7 +188,7 @@ def leave_report(seed: job.SeedRun, console: Console) -> None:
         # Imported during the compilation (`Job.compile`).
         from bounce_mjx.reports import figures, page
 
-        recording = seed.report.recording
+        recording = seed.progress.best.recording
         if recording is None:
             recording = page.record_checkpoint(folders.find_checkpoint(seed.run))
         path, evaluation = page.write_report(seed.run, recording)

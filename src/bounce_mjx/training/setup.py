@@ -39,15 +39,13 @@ def cache_compilations() -> None:
             folder = caches / "bounce_mjx" / "jax"
             folder.mkdir(parents=True, exist_ok=True)
             jax.config.update("jax_compilation_cache_dir", str(folder))
-        except OSError as error:
+        # Without a home, it is a RuntimeError.
+        except (OSError, RuntimeError) as error:
             print(
-                f"warning: compiled programs are not cached, as {error.filename} cannot be used "
-                f"({error.strerror}); set JAX_COMPILATION_CACHE_DIR to your own folder",
+                f"warning: compiled programs are not cached ({error}); set "
+                "JAX_COMPILATION_CACHE_DIR to a folder of yours",
                 file=sys.stderr,
             )
-        except RuntimeError:
-            # No home.
-            pass
 
 
 def set_up_gpu() -> None:
@@ -89,8 +87,8 @@ def compiler_options(
     """
     if jax.default_backend() == "gpu":
         return {"xla_gpu_autotune_level": int(tunes_products)}
-    # XLA may drop these options, and refuses those that it does not know.
-    if jax.default_backend() != "cpu" or jax.__version_info__ >= (0, 12):
+    # XLA refuses options that it does not know.
+    if jax.default_backend() != "cpu":
         return {}
     if runs_once:
         # XLA's older code generator, which jax 0.11 no longer has, is the quicker one.

@@ -54,12 +54,15 @@ class Trainer(Protocol):
     def compile(self, pool: concurrent.futures.Executor) -> concurrent.futures.Future:
         """Starts the compilation in a pool; the future is done when training can start."""
 
-    def start(self, state: Any | None = None) -> None:
-        """Starts from the seeds, or from the state of a `snapshot`."""
+    def start(
+        self, state: Any = None, networks: tuple[Params, RunningStatistics] | None = None
+    ) -> None:
+        """Starts from the seeds, or from the state of a `snapshot`.
 
-    def warm_start(self, params: Params, statistics: RunningStatistics) -> None:
-        """Puts the networks of an earlier training into the first state, after `start`; see
-        `learning.ppo.warm_started`."""
+        Args:
+          networks: those of an earlier training, which each seed starts with, and the statistics of
+            their inputs.
+        """
 
     def run(self, iterations: int, stopping: Callable[[], bool]) -> Metrics:
         """Trains for I iterations, or fewer where a slow trainer sees between two of them that

@@ -17,9 +17,11 @@ from bounce_mjx.errors import reason_of
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.learning.policy import make_networks, untrained_policy
+from bounce_mjx.reports.tables import figure_text
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.task.shown import Curve
 from bounce_mjx.training.callbacks import Event
+from bounce_mjx.training.console import say
 from bounce_mjx.viewers.browser import AXIS, LivePage, free_port
 from bounce_mjx.viewers.guard import open_server
 from bounce_mjx.viewers.options import Address, PageStart
@@ -65,7 +67,7 @@ class TrainingPage:
         """Waits until Ctrl-C ends the page."""
         self._news.put(None)
         if self._thread.is_alive():
-            self._say(f"the page stays at {self._address.url} until Ctrl-C")
+            say(self._console, f"the page stays at {self._address.url} until Ctrl-C")
         with StopRequest(signal.SIGINT) as stop:
             while self._thread.is_alive() and not stop.requested:
                 self._thread.join(0.2)
@@ -74,7 +76,7 @@ class TrainingPage:
         try:
             cpu = jax.default_device(jax.devices("cpu")[0])
             with cpu, open_server(*self._address) as server:
-                self._say(f"watch: {self._address.url}")
+                say(self._console, f"watch: {self._address.url}")
                 side = server.gui.add_panel()
                 panel = _Panel(server.gui, side, self._config)
                 simulation = _simulate(self._config)
@@ -83,7 +85,7 @@ class TrainingPage:
         # The training continues without its page.
         except Exception as error:
             reason = reason_of(error)
-            self._say(f"the page is not served ({reason}); training continues without it")
+            say(self._console, f"the page is not served ({reason}); training continues without it")
 
     def _tell(self, simulation: Simulation, panel: "_Panel") -> None:
         """Shows the news since the last call."""
@@ -92,9 +94,6 @@ class TrainingPage:
             panel.show(event)
             if event is not None and event.policy is not None:
                 simulation.policy = event.policy
-
-    def _say(self, line: str) -> None:
-        self._console.out(line, highlight=False)
 
 
 def _simulate(config: TrainConfig) -> Simulation:
@@ -148,16 +147,20 @@ def _add_plot(gui: viser.GuiApi, title: str) -> viser.GuiUplotHandle:
 
 def results_list(report: Report, steps: int) -> str:
     """The results as HTML, after a number of environment steps."""
-    rows = []
-    for result in report.results:
-        mark = {True: "&#10003;", False: "&#10007;", None: "-"}[result.passed]
-        value = "-" if result.value is None else f"{result.value:.2f}"
-        bound = html.escape(result.bound.partition(" (")[0])
-        cells = mark, html.escape(result.name), value, bound
-        rows.append(f"<tr>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>")
+    marks = {True: "&#10003;", False: "&#10007;", None: "-"}
+    rows = (
+        (
+            marks[x.passed],
+            html.escape(x.name),
+            figure_text(x.value),
+            html.escape(x.bound.partition(" (")[0]),
+        )
+        for x in report.results
+    )
+    table = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
     kind = "screening" if report.screening else "evaluation"
     head = f"{kind} at {steps:,} steps:<br><b>{html.escape(report.summary)}</b>"
-    return _text(f'{head}<table style="width:100%;white-space:nowrap">{"".join(rows)}</table>')
+    return _text(f'{head}<table style="width:100%;white-space:nowrap">{table}</table>')
 
 
 def _text(content: str) -> str:
