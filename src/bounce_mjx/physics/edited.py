@@ -17,7 +17,7 @@ import numpy as np
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics.parameters import Array, PhysicsParameters, check_shapes
-from bounce_mjx.physics.scalars import Scalar, add, mul, scale
+from bounce_mjx.physics.scalars import Scalar, Vec, add, mul
 from bounce_mjx.robot.arm import raise_solver_limits
 from bounce_mjx.robot.model import find_addresses, to_direct_solref
 
@@ -101,7 +101,7 @@ class EditedModel:
         """A number, or a tuple of numbers, without a record."""
         own, values = _field(self.model, field), self._derived | self._edited
         numbers = [values.get(x, own.flat[x[1]].item()) for x in self._keys(field, index)]
-        return tuple(numbers) if np.ndim(own[index]) else numbers[0]
+        return Vec(numbers) if np.ndim(own[index]) else numbers[0]
 
     def put(self, field: str, index: Any, values: Iterable[Scalar]) -> None:
         """Edits entries."""
@@ -208,7 +208,7 @@ def _derive(m: EditedModel) -> None:
             factor = mul(factor, mul(growth, growth))
             m.follow("geom_rbound", ball.geom, [radius])
             m.follow("geom_aabb", (ball.geom, slice(3, 6)), [radius] * 3)
-        m.follow("body_inertia", body, scale(tuple(c.body_inertia[body].tolist()), factor))
+        m.follow("body_inertia", body, Vec(c.body_inertia[body].tolist()) * factor)
         if ball:
             inertia = m.peek("body_inertia", body)
             # Inverses of the mass and of the inertia.

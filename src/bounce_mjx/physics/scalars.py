@@ -7,7 +7,7 @@ has thousands of operations: `jax.lax` traces them in a fraction of the time of 
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jax
@@ -17,12 +17,7 @@ from jax.experimental.xla_metadata import set_xla_metadata
 
 Scalar = float | jax.Array
 Tree = Any
-Vec3 = tuple[Scalar, Scalar, Scalar]
-Mat3 = tuple[Vec3, Vec3, Vec3]
 Quaternion = tuple[Scalar, Scalar, Scalar, Scalar]
-
-ZERO3: Vec3 = (0.0, 0.0, 0.0)
-IDENTITY3: Mat3 = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 def is_constant(a: Scalar) -> bool:
@@ -77,71 +72,86 @@ def maximum(a: Scalar, b: Scalar) -> Scalar:
     return max(a, b) if is_constant(a) and is_constant(b) else jnp.maximum(a, b)
 
 
-def vadd(a: Vec3, b: Vec3) -> Vec3:
-    """a + b."""
-    return (add(a[0], b[0]), add(a[1], b[1]), add(a[2], b[2]))
-
-
-def vsub(a: Vec3, b: Vec3) -> Vec3:
-    """a - b."""
-    return (sub(a[0], b[0]), sub(a[1], b[1]), sub(a[2], b[2]))
-
-
-def scale(a: Vec3, s: Scalar) -> Vec3:
-    """s * a."""
-    return (mul(a[0], s), mul(a[1], s), mul(a[2], s))
-
-
 def dot(a: Sequence[Scalar], b: Sequence[Scalar]) -> Scalar:
     """Inner product of two sequences of one length; 0 if they are empty."""
     return functools.reduce(add, map(mul, a, b), 0.0)
 
 
-def cross(a: Vec3, b: Vec3) -> Vec3:
+@jax.tree_util.register_pytree_node_class
+class Vec(tuple):
+    """A vector of scalars, mostly of three. `a @ b` is the inner product, `a * s` a multiple."""
+
+    def __add__(self, other: "Vec") -> "Vec":
+        return Vec(map(add, self, other))
+
+    def __sub__(self, other: "Vec") -> "Vec":
+        return Vec(map(sub, self, other))
+
+    def __neg__(self) -> "Vec":
+        return Vec(map(neg, self))
+
+    def __mul__(self, factor: Scalar) -> "Vec":
+        return Vec(mul(x, factor) for x in self)
+
+    def __matmul__(self, other: Sequence[Scalar]) -> Scalar:
+        return dot(self, other)
+
+    def tree_flatten(self) -> tuple:
+        return tuple(self), None
+
+    @classmethod
+    def tree_unflatten(cls, _: None, leaves: Sequence) -> Any:
+        return tuple.__new__(cls, leaves)
+
+
+@jax.tree_util.register_pytree_node_class
+class Mat(Vec):
+    """A matrix of scalars, as its rows."""
+
+    def __new__(cls, rows: Iterable[Sequence[Scalar]]) -> "Mat":
+        return super().__new__(cls, map(Vec, rows))
+
+    @property
+    def T(self) -> "Mat":  # noqa: N802
+        """The transposed matrix."""
+        return Mat(zip(*self, strict=True))
+
+    def __matmul__(self, other: Any) -> Any:
+        if isinstance(other, Mat):
+            columns = other.T
+            return Mat([row @ column for column in columns] for row in self)
+        return Vec(row @ other for row in self)
+
+
+ZERO3 = Vec((0.0, 0.0, 0.0))
+IDENTITY3 = Mat(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+
+
+def cross(a: Vec, b: Vec) -> Vec:
     """Cross product."""
-    return (
-        sub(mul(a[1], b[2]), mul(a[2], b[1])),
-        sub(mul(a[2], b[0]), mul(a[0], b[2])),
-        sub(mul(a[0], b[1]), mul(a[1], b[0])),
-    )
+    return Vec(sub(mul(a[i - 2], b[i - 1]), mul(a[i - 1], b[i - 2])) for i in range(3))
 
 
-def transpose(m: Mat3) -> Mat3:
-    """Transposed matrix."""
-    return tuple(zip(*m, strict=True))
-
-
-def matvec(m: Mat3, v: Vec3) -> Vec3:
-    """m @ v."""
-    return (dot(m[0], v), dot(m[1], v), dot(m[2], v))
-
-
-def matmul(a: Mat3, b: Mat3) -> Mat3:
-    """a @ b."""
-    columns = transpose(b)
-    return tuple(tuple(dot(row, column) for column in columns) for row in a)
-
-
-def diagonal(v: Vec3) -> Mat3:
+def diagonal(v: Vec) -> Mat:
     """Diagonal matrix."""
-    return ((v[0], 0.0, 0.0), (0.0, v[1], 0.0), (0.0, 0.0, v[2]))
+    return Mat(((v[0], 0.0, 0.0), (0.0, v[1], 0.0), (0.0, 0.0, v[2])))
 
 
-def symmetric(entry: Callable[[int, int], Scalar]) -> Mat3:
+def symmetric(entry: Callable[[int, int], Scalar]) -> Mat:
     """Symmetric matrix, each entry computed once."""
     xx, xy, xz, yy, yz, zz = (
         entry(i, j) for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
     )
-    return ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+    return Mat(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
 
 
-def congruence(r: Mat3, s: Mat3) -> Mat3:
+def congruence(r: Mat, s: Mat) -> Mat:
     """r @ s @ r.T for a symmetric s."""
-    rs = matmul(r, s)
-    return symmetric(lambda i, j: dot(rs[i], r[j]))
+    rs = r @ s
+    return symmetric(lambda i, j: rs[i] @ r[j])
 
 
-def axis_rotation(axis: tuple[float, float, float], cos: Scalar, sin: Scalar) -> Mat3:
+def axis_rotation(axis: tuple[float, float, float], cos: Scalar, sin: Scalar) -> Mat:
     """Rotation about a constant unit axis by an angle given as its cosine and sine (Rodrigues)."""
     x, y, z = axis
     one_minus_cos = sub(1.0, cos)
@@ -153,11 +163,8 @@ def axis_rotation(axis: tuple[float, float, float], cos: Scalar, sin: Scalar) ->
             return 1.0 if along == 1.0 else symmetric
         return add(mul(one_minus_cos, along), mul(sin, skew))
 
-    return (
-        (entry(0, 0, 0.0), entry(0, 1, -z), entry(0, 2, y)),
-        (entry(1, 0, z), entry(1, 1, 0.0), entry(1, 2, -x)),
-        (entry(2, 0, -y), entry(2, 1, x), entry(2, 2, 0.0)),
-    )
+    rows = ((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))
+    return Mat([entry(i, j, skew) for j, skew in enumerate(row)] for i, row in enumerate(rows))
 
 
 def quaternion_product(p: Quaternion, q: Quaternion) -> Quaternion:
@@ -172,7 +179,7 @@ def quaternion_product(p: Quaternion, q: Quaternion) -> Quaternion:
     )
 
 
-def quaternion_matrix(quaternion: Quaternion) -> Mat3:
+def quaternion_matrix(quaternion: Quaternion) -> Mat:
     """Rotation matrix of a unit quaternion [w, x, y, z]."""
     w, x, y, z = quaternion
 
@@ -184,10 +191,12 @@ def quaternion_matrix(quaternion: Quaternion) -> Mat3:
 
     xy, xz, yz = mul(x, y), mul(x, z), mul(y, z)
     wx, wy, wz = mul(w, x), mul(w, y), mul(w, z)
-    return (
-        (diagonal(y, z), off(xy, neg(wz)), off(xz, wy)),
-        (off(xy, wz), diagonal(x, z), off(yz, neg(wx))),
-        (off(xz, neg(wy)), off(yz, wx), diagonal(x, y)),
+    return Mat(
+        (
+            (diagonal(y, z), off(xy, neg(wz)), off(xz, wy)),
+            (off(xy, wz), diagonal(x, z), off(yz, neg(wx))),
+            (off(xz, neg(wy)), off(yz, wx), diagonal(x, y)),
+        )
     )
 
 

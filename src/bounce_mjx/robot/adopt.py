@@ -18,7 +18,7 @@ from bounce_mjx.robot.arm import (
 )
 from bounce_mjx.robot.config import RobotConfig
 from bounce_mjx.robot.model import find_addresses, name_file
-from bounce_mjx.robot.pose import Mount, PaddlePose, find_pose, mounts
+from bounce_mjx.robot.pose import PaddlePose, find_pose, mounts
 
 # Velocity of a joint that the action 1 commands: rad/s of a hinge, m/s of a slide. The Peitian
 # arm's servos give 0.02 rad x 20000 / 200 = 2 rad/s.
@@ -70,10 +70,10 @@ def adopt(mjcf: Path, config: RobotConfig, control_dt: float, is_mount_given: bo
         arm.spec.compiler.fusestatic = False
         model = compile_spec(arm.spec, path)
         check_as_alone(arm, model)
-        asked = Mount(config.paddle.position, config.paddle.quaternion)
-        pose = find_pose(model, arm.force_limits, (asked,) if is_mount_given else mounts())
+        choices = [config.paddle] if is_mount_given else mounts(config.paddle)
+        pose = find_pose(model, arm.force_limits, choices)
         servos, scale, are_kept = _servos(model, arm, pose, control_dt)
-        update = {"paddle": config.paddle.model_copy(update=pose.mount._asdict())}
+        update = {"paddle": pose.mount}
         if not are_kept:
             columns = zip(ServoSettings._fields, zip(*servos, strict=True), strict=True)
             update |= {f"servo_{name}": column for name, column in columns}

@@ -127,13 +127,8 @@ def build_arm(path: Path, config: RobotConfig) -> Arm:
     """
     arm = read_spec(path)
     model = compile_spec(arm, path)
-    try:
+    with _compiling(path):
         return _Builder(arm, model, config).build()
-    except (ValueError, mujoco.FatalError) as error:
-        reason = reason_of(error)
-        raise UserError(
-            f"the arm of {path} cannot be put into the task's scene ({reason}); simplify the MJCF"
-        ) from error
 
 
 def read_spec(path: Path) -> mujoco.MjSpec:
@@ -142,11 +137,8 @@ def read_spec(path: Path) -> mujoco.MjSpec:
     Raises:
       UserError: the file is no MJCF.
     """
-    try:
-        with _silence():
-            return mujoco.MjSpec.from_file(str(path))
-    except ValueError as error:
-        raise _not_compiled(path, error) from error
+    with _compiling(path):
+        return mujoco.MjSpec.from_file(str(path))
 
 
 def compile_spec(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
@@ -155,11 +147,25 @@ def compile_spec(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
     Raises:
       UserError: the file does not compile.
     """
+    with _compiling(path):
+        return spec.compile()
+
+
+@contextlib.contextmanager
+def _compiling(path: Path) -> Iterator[None]:
+    """Names the file in MuJoCo's errors; without MuJoCo's warnings, which it also writes to a file:
+    of the empty prefix of an attached arm, and of meshes."""
+    earlier = mujoco.get_mju_user_warning()
     try:
-        with _silence():
-            return spec.compile()
-    except ValueError as error:
-        raise _not_compiled(path, error) from error
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            mujoco.set_mju_user_warning(lambda text: None)
+            yield
+    except (ValueError, mujoco.FatalError) as error:
+        reason = reason_of(error)
+        raise UserError(f"the MJCF file {path} does not compile ({reason}); correct it") from error
+    finally:
+        mujoco.set_mju_user_warning(earlier)
 
 
 def find_site(model: mujoco.MjModel, config: RobotConfig) -> tuple[int, np.ndarray, np.ndarray]:
@@ -330,11 +336,6 @@ class _Builder:
             own = model.jnt_range[i] if model.jnt_limited[i] else (-np.inf, np.inf)
             least, greatest = _servo_range(model, a)
             low, high = max(own[0], least), min(own[1], greatest)
-            if not low < high:
-                raise UserError(
-                    f"the range {own[0]:g} to {own[1]:g} of {joint_name(model, i)}, but a servo "
-                    f"that reaches {least:g} to {greatest:g}; correct its ctrlrange"
-                )
             if low - own[0] > _NARROWER or own[1] - high > _NARROWER:
                 narrowed.append(joint_name(model, i))
             joint.limited = mujoco.mjtLimited.mjLIMITED_FALSE
@@ -372,14 +373,13 @@ class _Builder:
                     f"the {noun} {found[0].name} on the arm, so it is not a serial chain; remove "
                     "it, or give a serial arm"
                 )
-        others = [a for a in arm.actuators if a.target not in names]
         floors = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
-        self._remove("removed the keyframes", arm.keys)
-        self._remove("removed the sensors", arm.sensors)
-        self._remove("removed the actuators that do not drive the arm", others)
-        self._remove("removed the contact pairs and exclusions", [*arm.pairs, *arm.excludes])
-        self._remove("removed the lights and cameras", [*arm.lights, *arm.cameras])
-        self._remove("removed the floors", [g for g in arm.geoms if g.type in floors])
+        elements = (
+            *(*arm.keys, *arm.sensors, *arm.pairs, *arm.excludes, *arm.lights, *arm.cameras),
+            *(actuator for actuator in arm.actuators if actuator.target not in names),
+            *(geom for geom in arm.geoms if geom.type in floors),
+        )
+        self._remove("removed what is not the arm", elements)
 
     def _remove(self, words: str, elements: Iterable) -> None:
         elements = list(elements)
@@ -408,20 +408,11 @@ class _Builder:
         """The scene with the arm, and the paddle on the body `holder`."""
         config, arm = self._config, self._arm
         scene = read_spec(resource_path("mjcf/scene.xml"))
-        differing = [
-            name
-            for name in dir(scene.option)
-            if not name.startswith("_")
-            and not np.array_equal(getattr(self._model.opt, name), getattr(scene.option, name))
-        ]
-        if differing:
-            names = ", ".join(differing)
-            self._changes.append(f"replaced the physics options with the task's ({names})")
+        self._changes.append("replaced the physics options with the task's")
         if np.any(self._model.dof_frictionloss):
             raise_solver_limits(scene.option)
         arm.option = scene.option
-        with _silence():
-            scene.attach(arm, frame=scene.worldbody.add_frame(), prefix="")
+        scene.attach(arm, frame=scene.worldbody.add_frame(), prefix="")
         paddle = scene.body(holder).add_body(name=PADDLE_BODY_NAME, pos=position, quat=quaternion)
         _add_paddle(paddle, config, scene.default)
         ball = scene.geom("ball")
@@ -615,22 +606,3 @@ def _list(names: Iterable[str], most: int = 8) -> str:
     names = [name for name in names if name]
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return (", ".join(shorten(name, 40) for name in names[:most]) or "none") + more
-
-
-def _not_compiled(path: Path, error: ValueError) -> UserError:
-    reason = reason_of(error)
-    return UserError(f"the MJCF file {path} does not compile ({reason}); correct it")
-
-
-@contextlib.contextmanager
-def _silence() -> Iterator[None]:
-    """Without MuJoCo's warnings, which it also writes to a file: of the empty prefix of an attached
-    arm, and of meshes."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        earlier = mujoco.get_mju_user_warning()
-        mujoco.set_mju_user_warning(lambda text: None)
-        try:
-            yield
-        finally:
-            mujoco.set_mju_user_warning(earlier)

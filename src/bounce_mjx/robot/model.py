@@ -4,9 +4,9 @@ import hashlib
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
@@ -136,7 +136,8 @@ def load_model(
     try:
         addresses = find_addresses(mj_model)
         _check_servos(mj_model, addresses)
-        _check_balls(len(addresses.balls), num_balls)
+        if (present := len(addresses.balls)) != num_balls:
+            raise UserError(f"{present} balls, but num_balls is {num_balls}; set it to {present}")
         _limit_torques(mj_model, addresses, robot or RobotConfig())
     except UserError as error:
         raise name_file(path, error) from error
@@ -210,32 +211,28 @@ def _check_step(mj_model: mujoco.MjModel) -> None:
             )
 
 
-def to_direct_solref(solref: Any, timestep: float, xp: ModuleType = np) -> tuple[Any, Any]:
+def to_direct_solref(solref: Any, timestep: float) -> tuple[Any, Any]:
     """k and b of a `solref` [2] in MuJoCo's direct format, `solref="-k -b"`.
 
     The standard format, a time constant and a damping ratio, converts to the direct one (MuJoCo's
     documentation, "Modeling", solver parameters).
 
     Args:
+      solref: two floats, or scalars of JAX.
       timestep: of the physics, s.
-      xp: numpy or jax.numpy, for the arrays.
     """
     first, second = solref
-    is_standard = first > 0.0
     # MuJoCo's lower limit for the time constant is two steps.
-    time_constant = xp.maximum(first, 2.0 * timestep)
-    damping_ratio = xp.where(is_standard, second, 1.0)
-    stiffness = xp.where(is_standard, 1.0 / (time_constant * damping_ratio) ** 2, -first)
-    return stiffness, xp.where(is_standard, 2.0 / time_constant, -second)
-
-
-def _check_balls(present: int, num_balls: int) -> None:
-    if present != num_balls:
-        names = ", ".join(map(ball_name, range(present)))
-        raise UserError(
-            f"{present} balls ({names}), but num_balls is {num_balls}; set it to {present}, or "
-            "rename the others' bodies"
-        )
+    least = 2.0 * timestep
+    if isinstance(first, float):
+        if first <= 0.0:
+            return -first, -second
+        time_constant = max(first, least)
+        return 1.0 / (time_constant * second) ** 2, 2.0 / time_constant
+    is_standard, time_constant = first > 0.0, jnp.maximum(first, least)
+    damping_ratio = jnp.where(is_standard, second, 1.0)
+    stiffness = jnp.where(is_standard, 1.0 / (time_constant * damping_ratio) ** 2, -first)
+    return stiffness, jnp.where(is_standard, 2.0 / time_constant, -second)
 
 
 def _check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
@@ -294,9 +291,12 @@ def _find_ball(mj_model: mujoco.MjModel, name: str) -> BallAddresses:
     if mj_model.body_geomnum[body] < 1:
         raise UserError(f"no geom on the body {name}; add the ball's sphere to it")
     qpos, qvel = int(mj_model.jnt_qposadr[joint]), int(mj_model.jnt_dofadr[joint])
+    # The geom in the contact pair; without a pair, the first one.
+    geoms = int(mj_model.body_geomadr[body]) + np.arange(mj_model.body_geomnum[body])
+    touching = np.isin(geoms, [mj_model.pair_geom1, mj_model.pair_geom2])
     return BallAddresses(
         body=body,
-        geom=_ball_geom(mj_model, body),
+        geom=int(geoms[np.argmax(touching)]),
         qpos=tuple(range(qpos, qpos + 7)),
         qvel=tuple(range(qvel, qvel + 6)),
     )
@@ -347,17 +347,6 @@ def check_unedited(mj_model: mujoco.MjModel, built_from: bytes) -> None:
             "env.mj_model was edited after the environment had been built, and the physics would "
             "ignore the edit; edit the MJCF (env.mjcf), or pass randomize=... to Env"
         )
-
-
-def _ball_geom(mj_model: mujoco.MjModel, ball_body: int) -> int:
-    """The ball's geom in the contact pair; without a pair, its first geom."""
-    ball_geoms = {
-        int(geom)
-        for pair in range(mj_model.npair)
-        for geom in (mj_model.pair_geom1[pair], mj_model.pair_geom2[pair])
-        if mj_model.geom_bodyid[geom] == ball_body
-    }
-    return min(ball_geoms, default=int(mj_model.body_geomadr[ball_body]))
 
 
 def _find(mj_model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:

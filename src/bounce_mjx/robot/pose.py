@@ -4,8 +4,9 @@ Inverse kinematics by least squares within the joint limits, from many seeds; th
 has the largest score of conditioning, distance to the joint limits and strength.
 """
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -14,6 +15,7 @@ import scipy.optimize
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.robot.arm import joint_name
+from bounce_mjx.robot.config import PaddleConfig
 from bounce_mjx.robot.model import Addresses, find_addresses
 
 # Length that makes rotations comparable with displacements: about a forearm, m/rad.
@@ -39,13 +41,6 @@ _LOWEST = 0.1
 _HEADROOM = 1.0
 
 
-class Mount(NamedTuple):
-    """A way to hold the paddle, in the frame of the site."""
-
-    position: tuple[float, float, float]
-    quaternion: tuple[float, float, float, float]
-
-
 class PaddlePose(NamedTuple):
     """A start pose, with a level paddle."""
 
@@ -53,7 +48,8 @@ class PaddlePose(NamedTuple):
     """Positions of the acting joints, rad; of a slide, m."""
     paddle: tuple[float, float, float]
     """Centre of the paddle, m."""
-    mount: Mount
+    mount: PaddleConfig
+    """The paddle as it is held in this pose."""
     manipulability: float
     """Smallest singular value of the scaled Jacobian of the task directions."""
     acceleration: float
@@ -67,24 +63,20 @@ class PaddlePose(NamedTuple):
     score: float
 
 
-def mounts() -> tuple[Mount, ...]:
-    """Paddles held by a handle along the site's z, in four turns about it, and one that lies flat
-    on the site."""
+def mounts(paddle: PaddleConfig) -> list[PaddleConfig]:
+    """The paddle held by a handle along the site's z, in four turns about it, and flat on the
+    site."""
+    turns = [(math.cos(i * math.pi / 4.0), math.sin(i * math.pi / 4.0)) for i in range(4)]
     half = math.sqrt(0.5)
-    held = []
-    for turn in range(4):
-        angle = turn * math.pi / 4.0
-        quaternion = np.zeros(4)
-        about_z = np.array([math.cos(angle), 0.0, 0.0, math.sin(angle)])
-        mujoco.mju_mulQuat(quaternion, about_z, np.array([half, 0.0, -half, 0.0]))
-        held.append(Mount((0.0, 0.0, 0.19), tuple(quaternion.tolist())))
-    return (*held, Mount((0.0, 0.0, 0.03), (1.0, 0.0, 0.0, 0.0)))
+    choices = [((0.0, 0.0, 0.19), (half * c, half * s, -half * c, half * s)) for c, s in turns]
+    choices.append(((0.0, 0.0, 0.03), (1.0, 0.0, 0.0, 0.0)))
+    return [paddle.model_copy(update={"position": p, "quaternion": q}) for p, q in choices]
 
 
 def find_pose(
     model: mujoco.MjModel,
     force_limits: Sequence[float | None],
-    choices: Sequence[Mount],
+    choices: Sequence[PaddleConfig],
 ) -> PaddlePose:
     """The best start pose of an arm in the task's scene.
 
@@ -96,13 +88,42 @@ def find_pose(
     Raises:
       UserError: the paddle cannot be level, tilted or lifted, or no servo is strong enough.
     """
-    limits = np.array([np.inf if limit is None else limit for limit in force_limits])
-    return _Search(model, limits).best(choices)
+    search = _Search(model, force_limits)
+    reach = search.reach()
+    poses = [pose for choice in choices for pose in search.level_poses(choice, reach)]
+    names = ", ".join(joint_name(model, j) for j in find_addresses(model).arm_joints)
+    for suits, problem in (
+        (
+            lambda pose: True,
+            f"no reachable pose with a level paddle in front of the robot ({names} inside "
+            "their ranges); check the site, or the paddle's position and quaternion",
+        ),
+        (
+            lambda pose: pose is not None,
+            "no level pose in which the links stay above the floor and out of the ball's way; "
+            f"put the base of the joints {names} higher, or move the paddle",
+        ),
+        (
+            lambda pose: pose.manipulability >= _LEAST_MANIPULABILITY,
+            f"no pose in which the joints {names} can lift the paddle and tilt it about two "
+            "axes; give an arm with joints about more axes, or with wider ranges",
+        ),
+        (
+            lambda pose: pose.acceleration >= _LEAST_ACCELERATION,
+            "no servo strong enough to hold the arm and to accelerate the paddle upward by "
+            f"{_LEAST_ACCELERATION:g} m/s^2; raise the force limits of {names}",
+        ),
+    ):
+        poses = list(filter(suits, poses))
+        if not poses:
+            raise UserError(problem)
+    return max(poses, key=lambda pose: pose.score)
 
 
 class _Search:
-    def __init__(self, model: mujoco.MjModel, limits: np.ndarray):
-        self._model, self._limits, self._rng = model, limits, np.random.default_rng(0)
+    def __init__(self, model: mujoco.MjModel, force_limits: Sequence[float | None]):
+        self._model, self._rng = model, np.random.default_rng(0)
+        self._limits = np.array([np.inf if limit is None else limit for limit in force_limits])
         self._data = mujoco.MjData(model)
         self._at: Addresses = find_addresses(model)
         self._qpos, self._dofs = np.array(self._at.arm_qpos), np.array(self._at.arm_qvel)
@@ -125,52 +146,7 @@ class _Search:
         mujoco.mj_kinematics(model, self._data)
         self._base = self._data.xanchor[self._joints[0]].copy()
 
-    def best(self, choices: Sequence[Mount]) -> PaddlePose:
-        reach = self._reach()
-        poses, level = [], 0
-        for choice in choices:
-            self._mount(choice)
-            for angles in self._level_poses(reach):
-                level += 1
-                pose = self._rate(angles, choice, reach)
-                if pose is not None:
-                    poses.append(pose)
-        if not level:
-            raise UserError(
-                f"no reachable pose with a level paddle in front of the robot ({self._names()} "
-                "inside their ranges); check the site, or the paddle's position and quaternion"
-            )
-        if not poses:
-            raise UserError(
-                "no level pose in which the links stay above the floor and out of the ball's way; "
-                f"put the base of the joints {self._names()} higher, or move the paddle"
-            )
-        able = [p for p in poses if p.manipulability >= _LEAST_MANIPULABILITY]
-        if not able:
-            raise UserError(
-                f"no pose in which the joints {self._names()} can lift the paddle and tilt it "
-                "about two axes; give an arm with joints about more axes, or with wider ranges"
-            )
-        strong = [p for p in able if p.acceleration >= _LEAST_ACCELERATION]
-        if not strong:
-            most = max(0.0, *(p.acceleration for p in able))
-            raise UserError(
-                "no servo strong enough: in addition to holding the arm, the actuators accelerate "
-                f"the paddle upward by {most:.1f} m/s^2 at most, and the task needs "
-                f"{_LEAST_ACCELERATION:g}; raise the force limits of {self._names()}"
-            )
-        return max(strong, key=lambda pose: pose.score)
-
-    def _names(self) -> str:
-        return ", ".join(joint_name(self._model, j) for j in self._at.arm_joints)
-
-    def _mount(self, choice: Mount) -> None:
-        """Moves the paddle, whose body has the frame of the site."""
-        quaternion = np.array(choice.quaternion)
-        self._model.geom_quat[self._at.paddle_geom] = quaternion / np.linalg.norm(quaternion)
-        self._model.geom_pos[self._at.paddle_geom] = choice.position
-
-    def _reach(self) -> float:
+    def reach(self) -> float:
         distances = []
         for _ in range(500):
             paddle, _ = self._forward(self._rng.uniform(*self._seeds))
@@ -191,18 +167,22 @@ class _Search:
         mujoco.mj_jac(self._model, self._data, linear, angular, paddle, self._body)
         return np.vstack([linear, _LENGTH * angular])[:, self._dofs]
 
-    def _level_poses(self, reach: float):
-        """Poses [n] with a level paddle in front of the robot, at many distances and heights."""
+    def level_poses(self, choice: PaddleConfig, reach: float) -> Iterator[PaddlePose | None]:
+        """Poses with a level paddle in front of the robot, at many distances and heights; None for
+        one in the way of the ball or in the floor."""
+        # The paddle's body has the frame of the site.
+        quaternion = np.array(choice.quaternion)
+        self._model.geom_quat[self._at.paddle_geom] = quaternion / np.linalg.norm(quaternion)
+        self._model.geom_pos[self._at.paddle_geom] = choice.position
         distances = reach * np.array([0.45, 0.6, 0.75])
         lowest = max(_LOWEST, self._base[2] - 0.3 * reach)
         heights = lowest + reach * np.array([0.0, 0.15, 0.3])
-        for distance in distances:
-            for height in heights:
-                goal = np.array([self._base[0] + distance, self._base[1], height])
-                for _ in range(_TRIES):
-                    angles = self._solve(self._rng.uniform(*self._seeds), goal)
-                    if angles is not None:
-                        yield angles
+        for distance, height in itertools.product(distances, heights):
+            goal = np.array([self._base[0] + distance, self._base[1], height])
+            for _ in range(_TRIES):
+                angles = self._solve(self._rng.uniform(*self._seeds), goal)
+                if angles is not None:
+                    yield self._rate(angles, choice, reach)
 
     def _solve(self, angles: np.ndarray, goal: np.ndarray) -> np.ndarray | None:
         """The pose near the goal with a level paddle; None if the search finds none."""
@@ -240,7 +220,7 @@ class _Search:
         in_front = paddle[0] - self._base[0] > 0.3 * np.hypot(*(goal - self._base)[:2])
         return angles if in_front and paddle[2] > 0.03 else None
 
-    def _rate(self, angles: np.ndarray, choice: Mount, reach: float) -> PaddlePose | None:
+    def _rate(self, angles: np.ndarray, choice: PaddleConfig, reach: float) -> PaddlePose | None:
         """The pose with its score; None if the arm is in the way of the ball or in the floor."""
         paddle, _ = self._forward(angles)
         if not self._is_clear(paddle):
@@ -256,6 +236,9 @@ class _Search:
         acceleration = -np.inf
         if smallest >= _LEAST_MANIPULABILITY and np.all(np.abs(holding) <= self._limits):
             acceleration = self._acceleration(mass @ np.linalg.pinv(task)[:, -3], holding)
+        low, high = self._range
+        # The distance to the nearest joint limit as a share of half a radian.
+        margin = float(np.clip(np.min(np.minimum(angles - low, high - angles)) / 0.5, 0.0, 1.0))
         strong = min(1.0, max(acceleration, 0.0) / _AMPLE_ACCELERATION)
         return PaddlePose(
             tuple(angles.tolist()),
@@ -266,13 +249,8 @@ class _Search:
             tuple(np.diag(mass).tolist()),
             tuple(holding.tolist()),
             reach,
-            score=smallest * self._margin(angles) * strong,
+            score=smallest * margin * strong,
         )
-
-    def _margin(self, angles: np.ndarray) -> float:
-        """Distance to the nearest joint limit as a share of half a radian, at most 1."""
-        low, high = self._range
-        return float(np.clip(np.min(np.minimum(angles - low, high - angles)) / 0.5, 0.0, 1.0))
 
     def _is_clear(self, paddle: np.ndarray) -> bool:
         """Whether the links, as straight lines between the joints, stay above the floor and out of

@@ -77,9 +77,9 @@ def tilt_frame(own: jax.Array, angles: jax.Array) -> jax.Array:
 
 def tilt_vector(own: jax.Array, angles: jax.Array) -> jax.Array:
     """A vector that turns about the x axis, then about the new y axis."""
-    from bounce_mjx.physics.scalars import matvec, quaternion_matrix
+    from bounce_mjx.physics.scalars import quaternion_matrix
 
-    return jnp.stack(matvec(quaternion_matrix(_rotation_xy(angles)), tuple(own)))
+    return jnp.stack(quaternion_matrix(_rotation_xy(angles)) @ tuple(own))
 
 
 def _rotation_xy(angles: jax.Array) -> Quaternion:

@@ -16,25 +16,18 @@ import jax
 from bounce_mjx.physics.scalars import (
     IDENTITY3,
     ZERO3,
-    Mat3,
+    Mat,
     Scalar,
-    Vec3,
+    Vec,
     add,
     axis_rotation,
     congruence,
     cross,
-    dot,
     is_constant,
-    matmul,
-    matvec,
     mul,
-    scale,
     sine_cosine,
     sub,
     symmetric,
-    transpose,
-    vadd,
-    vsub,
 )
 
 SquareMatrix = list[list[Scalar]]
@@ -44,11 +37,11 @@ SquareMatrix = list[list[Scalar]]
 class Link:
     """One joint and the bodies that move with it."""
 
-    offset: Vec3
+    offset: Vec
     """Origin of the link in the frame of its parent at the joint position `zero_position`, m."""
-    rotation: tuple[tuple[float, float, float], ...]
+    rotation: Mat
     """Orientation of the link in the frame of its parent at the joint position `zero_position`."""
-    axis: tuple[float, float, float]
+    axis: Vec
     """Unit axis of the joint."""
     slides: bool
     """Whether the joint is a slide, not a hinge."""
@@ -56,9 +49,9 @@ class Link:
     """Joint position at which `offset` and `rotation` hold, rad or m."""
     mass: Scalar
     """Mass, kg."""
-    first_moment: Vec3
+    first_moment: Vec
     """Mass times centre of mass, kg m."""
-    inertia: Mat3
+    inertia: Mat
     """Rotational inertia about the origin of the link, kg m^2."""
     armature: Scalar
     """Rotor inertia reflected to the joint, kg m^2 or kg."""
@@ -76,20 +69,20 @@ class Link:
     """b of the dry friction's reference acceleration, 1/s."""
     floating_mass: Scalar = 0.0
     """Mass whose weight `gravcomp` carries, kg."""
-    floating_moment: Vec3 = ZERO3
+    floating_moment: Vec = ZERO3
     """First moment of this mass, kg m."""
 
 
 class Pose(NamedTuple):
     """Poses of all links."""
 
-    rotation: list[Mat3]
+    rotation: list[Mat]
     """Orientation of each link in its parent's frame."""
-    world_rotation: list[Mat3]
+    world_rotation: list[Mat]
     """Orientation of each link in the world."""
-    world_origin: list[Vec3]
+    world_origin: list[Vec]
     """Origin of each link in the world, m."""
-    offset: list[Vec3]
+    offset: list[Vec]
     """Origin of each link in its parent's frame, m."""
 
 
@@ -101,77 +94,70 @@ def forward_kinematics(links: Sequence[Link], q: Sequence[Scalar]) -> Pose:
         moved = sub(position, link.zero_position)
         if link.slides:
             rotation.append(link.rotation)
-            offset.append(vadd(link.offset, scale(matvec(link.rotation, link.axis), moved)))
+            offset.append(link.offset + (link.rotation @ link.axis) * moved)
         else:
             sine, cosine = sine_cosine(moved)
-            joint = axis_rotation(link.axis, cosine, sine)
-            rotation.append(matmul(link.rotation, joint))
+            rotation.append(link.rotation @ axis_rotation(link.axis, cosine, sine))
             offset.append(link.offset)
-        parent_origin = vadd(parent_origin, matvec(parent_rotation, offset[-1]))
-        parent_rotation = matmul(parent_rotation, rotation[-1])
+        parent_origin = parent_origin + parent_rotation @ offset[-1]
+        parent_rotation = parent_rotation @ rotation[-1]
         world_origin.append(parent_origin)
         world_rotation.append(parent_rotation)
     return Pose(rotation, world_rotation, world_origin, offset)
 
 
 def bias_force(
-    links: Sequence[Link], pose: Pose, v: Sequence[Scalar], gravity: Vec3
+    links: Sequence[Link], pose: Pose, v: Sequence[Scalar], gravity: Vec
 ) -> list[Scalar]:
     """Joint forces that balance gravity, Coriolis and centrifugal effects at zero joint
     acceleration: recursive Newton-Euler, with gravity as an acceleration of the base."""
-    omega, alpha, acceleration = ZERO3, ZERO3, scale(gravity, -1.0)
+    omega, alpha, acceleration = ZERO3, ZERO3, -gravity
     forces, moments = [], []
     for link, rotation, offset, speed in zip(links, pose.rotation, pose.offset, v, strict=True):
-        to_link = transpose(rotation)
-        at_origin = vadd(
-            acceleration, vadd(cross(alpha, offset), cross(omega, cross(omega, offset)))
-        )
-        motion = scale(link.axis, speed)
-        omega_of_parent = matvec(to_link, omega)
-        alpha, omega = matvec(to_link, alpha), omega_of_parent
+        to_link = rotation.T
+        at_origin = acceleration + (cross(alpha, offset) + cross(omega, cross(omega, offset)))
+        motion = link.axis * speed
+        omega_of_parent = to_link @ omega
+        alpha, omega = to_link @ alpha, omega_of_parent
         if link.slides:
-            coriolis = scale(cross(omega_of_parent, motion), 2.0)
-            acceleration = vadd(matvec(to_link, at_origin), coriolis)
+            coriolis = cross(omega_of_parent, motion) * 2.0
+            acceleration = to_link @ at_origin + coriolis
         else:
-            alpha = vadd(alpha, cross(omega_of_parent, motion))
-            omega = vadd(omega_of_parent, motion)
-            acceleration = matvec(to_link, at_origin)
-        about_origin = vadd(
-            cross(alpha, link.first_moment), cross(omega, cross(omega, link.first_moment))
-        )
-        forces.append(vadd(scale(acceleration, link.mass), about_origin))
-        turning = vadd(matvec(link.inertia, alpha), cross(omega, matvec(link.inertia, omega)))
-        moments.append(vadd(turning, cross(link.first_moment, acceleration)))
+            alpha = alpha + cross(omega_of_parent, motion)
+            omega = omega_of_parent + motion
+            acceleration = to_link @ at_origin
+        moment = link.first_moment
+        about_origin = cross(alpha, moment) + cross(omega, cross(omega, moment))
+        forces.append(acceleration * link.mass + about_origin)
+        turning = link.inertia @ alpha + cross(omega, link.inertia @ omega)
+        moments.append(turning + cross(moment, acceleration))
 
     along_joints: list[Scalar] = [0.0] * len(links)
     force, moment = ZERO3, ZERO3
     for i in reversed(range(len(links))):
-        force, moment = vadd(forces[i], force), vadd(moments[i], moment)
+        force, moment = forces[i] + force, moments[i] + moment
         along_joints[i] = _along_joint(links[i], force, moment)
         force, moment = _to_parent(pose.rotation[i], pose.offset[i], force, moment)
     return along_joints
 
 
-def floating_force(links: Sequence[Link], pose: Pose, gravity: Vec3) -> list[Scalar]:
+def floating_force(links: Sequence[Link], pose: Pose, gravity: Vec) -> list[Scalar]:
     """Joint forces of MuJoCo's gravity compensation, which carries the weight of each link's
     `floating_mass`."""
-    upward = scale(gravity, -1.0)
-    along_joints = []
+    along_joints, upward = [], -gravity
     mass: Scalar = 0.0
     world_moment = ZERO3
     for link, rotation, origin in reversed(
         list(zip(links, pose.world_rotation, pose.world_origin, strict=True))
     ):
         mass = add(mass, link.floating_mass)
-        about_origin = matvec(rotation, link.floating_moment)
-        about_world = vadd(scale(origin, link.floating_mass), about_origin)
-        world_moment = vadd(world_moment, about_world)
-        axis = matvec(rotation, link.axis)
+        about_world = origin * link.floating_mass + rotation @ link.floating_moment
+        world_moment = world_moment + about_world
+        axis = rotation @ link.axis
         if link.slides:
-            along_joints.append(mul(dot(axis, upward), mass))
+            along_joints.append(mul(axis @ upward, mass))
         else:
-            moment = vsub(world_moment, scale(origin, mass))
-            along_joints.append(dot(axis, cross(moment, upward)))
+            along_joints.append(axis @ cross(world_moment - origin * mass, upward))
     return along_joints[::-1]
 
 
@@ -180,17 +166,17 @@ def mass_matrix(links: Sequence[Link], pose: Pose) -> SquareMatrix:
     n = len(links)
     matrix: SquareMatrix = [[0.0] * n for _ in range(n)]
     mass: Scalar = 0.0
-    first_moment, inertia = ZERO3, ((0.0,) * 3,) * 3
+    first_moment, inertia = ZERO3, Mat((ZERO3,) * 3)
     for i in reversed(range(n)):
         link = links[i]
         mass = add(mass, link.mass)
-        first_moment = vadd(first_moment, link.first_moment)
-        inertia = tuple(vadd(a, b) for a, b in zip(inertia, link.inertia, strict=True))
+        first_moment = first_moment + link.first_moment
+        inertia = Mat(a + b for a, b in zip(inertia, link.inertia, strict=True))
 
         if link.slides:
-            force, moment = scale(link.axis, mass), cross(first_moment, link.axis)
+            force, moment = link.axis * mass, cross(first_moment, link.axis)
         else:
-            force, moment = cross(link.axis, first_moment), matvec(inertia, link.axis)
+            force, moment = cross(link.axis, first_moment), inertia @ link.axis
         matrix[i][i] = add(_along_joint(link, force, moment), link.armature)
         for j in range(i, 0, -1):
             force, moment = _to_parent(pose.rotation[j], pose.offset[j], force, moment)
@@ -202,12 +188,12 @@ def mass_matrix(links: Sequence[Link], pose: Pose) -> SquareMatrix:
     return matrix
 
 
-def point_velocities(links: Sequence[Link], pose: Pose, point: Vec3) -> Iterator[Vec3]:
+def point_velocities(links: Sequence[Link], pose: Pose, point: Vec) -> Iterator[Vec]:
     """Velocity of a point fixed to the last link, per unit velocity of each joint; all in the
     world."""
     for link, rotation, origin in zip(links, pose.world_rotation, pose.world_origin, strict=True):
-        axis = matvec(rotation, link.axis)
-        yield axis if link.slides else cross(axis, vsub(point, origin))
+        axis = rotation @ link.axis
+        yield axis if link.slides else cross(axis, point - origin)
 
 
 def cholesky(matrix: SquareMatrix) -> tuple[SquareMatrix, list[Scalar]]:
@@ -254,30 +240,30 @@ def solve_upper(factor: tuple[SquareMatrix, list[Scalar]], b: Sequence[Scalar]) 
     return x
 
 
-def _along_joint(link: Link, force: Vec3, moment: Vec3) -> Scalar:
+def _along_joint(link: Link, force: Vec, moment: Vec) -> Scalar:
     """Joint force that a force and its moment about the link's origin exert."""
-    return dot(link.axis, force if link.slides else moment)
+    return link.axis @ (force if link.slides else moment)
 
 
-def _to_parent(rotation: Mat3, offset: Vec3, force: Vec3, moment: Vec3) -> tuple[Vec3, Vec3]:
+def _to_parent(rotation: Mat, offset: Vec, force: Vec, moment: Vec) -> tuple[Vec, Vec]:
     """A force and its moment about the link's origin, transformed to the parent's frame and
     origin."""
-    force = matvec(rotation, force)
-    return force, vadd(matvec(rotation, moment), cross(offset, force))
+    force = rotation @ force
+    return force, rotation @ moment + cross(offset, force)
 
 
 def _inertia_to_parent(
-    rotation: Mat3, offset: Vec3, mass: Scalar, first_moment: Vec3, inertia: Mat3
-) -> tuple[Vec3, Mat3]:
+    rotation: Mat, offset: Vec, mass: Scalar, first_moment: Vec, inertia: Mat
+) -> tuple[Vec, Mat]:
     """First moment and inertia of the composite body in the parent's frame, about the parent's
     origin (parallel-axis theorem with the offset p of the link's origin)."""
     p = offset
-    h = matvec(rotation, first_moment)
+    h = rotation @ first_moment
     rotated = congruence(rotation, inertia)
-    diagonal = add(mul(2.0, dot(p, h)), mul(mass, dot(p, p)))
+    diagonal = add(mul(2.0, p @ h), mul(mass, p @ p))
 
     def entry(i: int, j: int) -> Scalar:
         off = add(add(mul(p[i], h[j]), mul(p[j], h[i])), mul(mul(mass, p[i]), p[j]))
         return sub(add(rotated[i][j], diagonal if i == j else 0.0), off)
 
-    return vadd(h, scale(p, mass)), symmetric(entry)
+    return h + p * mass, symmetric(entry)

@@ -11,17 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from bounce_mjx.physics.scalars import (
-    Mat3,
-    Scalar,
-    Vec3,
-    cross,
-    dot,
-    matvec,
-    scale,
-    transpose,
-    vsub,
-)
+from bounce_mjx.physics.scalars import Mat, Scalar, Vec, cross, dot
 
 # MuJoCo's mjMINVAL: a centre closer to the box counts as inside it.
 _MIN_DISTANCE = 1e-15
@@ -53,7 +43,7 @@ class Contact(NamedTuple):
 
     distance: jax.Array
     """Gap between the surfaces, negative when they overlap, m."""
-    normal: Vec3
+    normal: Vec
     """Unit vector in the world from the paddle or the first ball to the last ball."""
 
 
@@ -62,14 +52,14 @@ def side(model: ContactModel, ball: int) -> float:
     return 1.0 if ball == model.balls[-1] else -1.0
 
 
-def relative(model: ContactModel, vectors: Sequence[Vec3]) -> Vec3:
+def relative(model: ContactModel, vectors: Sequence[Vec]) -> Vec:
     """A vector of the last ball less that of the first one, or less nothing, at a contact.
 
     Args:
       vectors: one of each ball.
     """
     first, *last = (vectors[i] for i in model.balls)
-    return vsub(*last, first) if last else first
+    return last[0] - first if last else first
 
 
 def shared_balls(a: ContactModel, b: ContactModel) -> list[tuple[int, float]]:
@@ -79,17 +69,17 @@ def shared_balls(a: ContactModel, b: ContactModel) -> list[tuple[int, float]]:
 
 def sphere_box(
     radius: Scalar,
-    centre: Vec3,
+    centre: Vec,
     half: tuple[float, float, float],
-    box_origin: Vec3,
-    box_rotation: Mat3,
+    box_origin: Vec,
+    box_rotation: Mat,
 ) -> Contact:
     """Contact at the box's nearest point; for a centre inside the box, at its nearest face.
 
     Args:
       half: half sizes of the box, m.
     """
-    local = matvec(transpose(box_rotation), vsub(centre, box_origin))
+    local = box_rotation.T @ (centre - box_origin)
     offset = tuple(x - jnp.clip(x, -s, s) for x, s in zip(local, half, strict=True))
     squared = dot(offset, offset)
     outside = squared > _MIN_DISTANCE**2
@@ -108,18 +98,16 @@ def sphere_box(
 
     normal = tuple(jnp.where(outside, x * inverse, f) for x, f in zip(offset, face, strict=True))
     distance = jnp.where(outside, squared * inverse, -face_depth) - radius
-    return Contact(distance, matvec(box_rotation, normal))
+    return Contact(distance, box_rotation @ normal)
 
 
-def sphere_sphere(
-    first_radius: Scalar, second_radius: Scalar, first: Vec3, second: Vec3
-) -> Contact:
+def sphere_sphere(first_radius: Scalar, second_radius: Scalar, first: Vec, second: Vec) -> Contact:
     """Contact of two spheres with these centres."""
-    offset = vsub(second, first)
-    squared = dot(offset, offset)
+    offset = second - first
+    squared = offset @ offset
     apart = squared > _MIN_DISTANCE**2
     inverse = jax.lax.rsqrt(jnp.where(apart, squared, 1.0))
-    normal = tuple(
+    normal = Vec(
         jnp.where(apart, x * inverse, axis) for x, axis in zip(offset, (1.0, 0.0, 0.0), strict=True)
     )
     distance = jnp.where(apart, squared * inverse, 0.0) - (first_radius + second_radius)
@@ -144,19 +132,13 @@ def softness(model: ContactModel, d: jax.Array) -> jax.Array:
     return (1.0 - d) / d * (model.inverse_weights[0] + model.inverse_weights[1])
 
 
-def tangents(normal: Vec3) -> tuple[Vec3, Vec3]:
+def tangents(normal: Vec) -> tuple[Vec, Vec]:
     """Tangents of MuJoCo's contact frame (mju_makeFrame), the second up to its sign. The first
     tangent is y, or z if the normal is close to y, made orthogonal to the normal."""
     x, y, z = normal
     from_y = jnp.abs(y) < 0.5
     along = jnp.where(from_y, y, z)
     inverse = jax.lax.rsqrt(1.0 - along * along)
-    first = scale(
-        (
-            -x * along,
-            jnp.where(from_y, 1.0, 0.0) - y * along,
-            jnp.where(from_y, 0.0, 1.0) - z * along,
-        ),
-        inverse,
-    )
+    ends = (jnp.where(from_y, 1.0, 0.0), jnp.where(from_y, 0.0, 1.0))
+    first = Vec((-x * along, ends[0] - y * along, ends[1] - z * along)) * inverse
     return first, cross(normal, first)

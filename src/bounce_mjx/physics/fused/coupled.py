@@ -25,7 +25,6 @@ from bounce_mjx.physics.fused.contact import ContactModel
 from bounce_mjx.physics.fused.pyramid import edge_regulariser
 from bounce_mjx.physics.scalars import (
     Scalar,
-    Vec3,
     add,
     dot,
     is_constant,
@@ -42,6 +41,7 @@ from bounce_mjx.physics.scalars import (
 _NEWTON_STEPS = 24
 _SEARCH_STEPS = 10
 _ROOT = math.sqrt(2.0)
+Scalars = tuple[Scalar, ...]
 
 
 class Cone(NamedTuple):
@@ -161,7 +161,7 @@ def _ahead(start: list[Scalar], length: Scalar, step: list[Scalar]) -> list[Scal
 
 def _response(
     cones: Sequence[Cone], y: Sequence[Scalar]
-) -> tuple[list[Scalar], list[tuple[Vec3, Vec3, Vec3]]]:
+) -> tuple[list[Scalar], list[tuple[Scalars, ...]]]:
     """f(y) [3 k], and for each contact the three columns of L."""
     forces, factors = [], []
     for k, cone in enumerate(cones):
@@ -176,7 +176,7 @@ def _response(
     return forces, factors
 
 
-def _pyramid_response(cone: Cone, y: Vec3) -> tuple[Vec3, tuple[Vec3, Vec3, Vec3]]:
+def _pyramid_response(cone: Cone, y: Scalars) -> tuple[Scalars, tuple[Scalars, ...]]:
     pull, *tangential = y
     root = lax.rsqrt(cone.regulariser)
     normal, forces, columns, both = 0.0, [], [], []

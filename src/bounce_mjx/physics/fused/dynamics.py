@@ -22,7 +22,7 @@ from bounce_mjx.physics.parameters import PhysicsParameters, PhysicsState, gives
 from bounce_mjx.physics.scalars import (
     ZERO3,
     Scalar,
-    Vec3,
+    Vec,
     add,
     cross,
     is_constant,
@@ -30,17 +30,15 @@ from bounce_mjx.physics.scalars import (
     mul,
     not_inlined,
     scalars_of,
-    scale,
     sub,
-    vadd,
 )
 
 
 class Ball(NamedTuple):
     """Coordinates of one ball."""
 
-    position: Vec3
-    velocity: Vec3
+    position: Vec
+    velocity: Vec
     turning: Turning | None
     """Spin and orientation; None if the spin is constant and has no effect."""
 
@@ -77,7 +75,7 @@ def step(
     velocities = [_entries(qvel, x.qvel[:3]) for x in at.balls]
     if control.ball_push is not None:
         pushes = jnp.reshape(control.ball_push, (-1, 3))
-        velocities = [vadd(v, _entries(pushes[k], range(3))) for k, v in enumerate(velocities)]
+        velocities = [v + _entries(pushes[k], range(3)) for k, v in enumerate(velocities)]
     balls = [
         Ball(_entries(qpos, x.qpos[:3]), velocity, turning if turns else None)
         for x, velocity, turning in zip(at.balls, velocities, turnings, strict=True)
@@ -101,10 +99,8 @@ def step(
     return PhysicsState(jnp.stack(qpos), jnp.stack(qvel))
 
 
-def _entries(
-    coordinates: jax.Array | Sequence[Scalar], indices: Sequence[int]
-) -> tuple[Scalar, ...]:
-    return tuple(coordinates[i] for i in indices)
+def _entries(coordinates: jax.Array | Sequence[Scalar], indices: Sequence[int]) -> Vec:
+    return Vec(coordinates[i] for i in indices)
 
 
 def _put(coordinates: list[Scalar], indices: Sequence[int], values: Sequence[Scalar]) -> None:
@@ -181,12 +177,12 @@ def _targets(control: Control, step: jax.Array) -> tuple[Scalar, ...]:
 
 
 @functools.lru_cache(maxsize=16)
-def _paddle_position(model: FusedModel, given: jax.tree_util.PyTreeDef) -> Callable[..., Vec3]:
+def _paddle_position(model: FusedModel, given: jax.tree_util.PyTreeDef) -> Callable[..., Vec]:
     """`paddle_position` as a function of the joint angles and the given parameters; cached
     like `_substeps`."""
     n = len(model.links)
 
-    def position(*scalars: Scalar) -> Vec3:
+    def position(*scalars: Scalar) -> Vec:
         world = read_model(model.mj_model, given.unflatten(scalars[n:]))
         return paddle_origin(world, chain.forward_kinematics(world.links, scalars[:n]))
 
@@ -197,8 +193,7 @@ def substep(model: FusedModel, motion: Motion, targets: tuple[Scalar, ...]) -> M
     """One physics step: the equivalent of `mj_step`."""
     keep = _keep(model, motion)
     pose = keep(chain.forward_kinematics(model.links, motion.q))
-    arm_gravity = scale(model.gravity, model.weight)
-    bias = keep(chain.bias_force(model.links, pose, motion.v, arm_gravity))
+    bias = keep(chain.bias_force(model.links, pose, motion.v, model.gravity))
     inertia = keep(chain.mass_matrix(model.links, pose))
     floating = chain.floating_force(model.links, pose, model.gravity)
     applied, servo_damping = [], []
@@ -223,7 +218,7 @@ def substep(model: FusedModel, motion: Motion, targets: tuple[Scalar, ...]) -> M
         inertia,
         servo_damping,
         list(map(add, applied, response.joint_torque)),
-        list(map(vadd, free, response.ball_accelerations)),
+        [a + b for a, b in zip(free, response.ball_accelerations, strict=True)],
         response.spin_accelerations,
     )
 
@@ -255,13 +250,13 @@ def joint_force(servo: Servo, force: Scalar, carried: Scalar) -> Scalar:
     return add(jnp.clip(force, *servo.joint_range), carried)
 
 
-def _free_acceleration(model: FusedModel, index: int, ball: Ball) -> Vec3:
+def _free_acceleration(model: FusedModel, index: int, ball: Ball) -> Vec:
     """Acceleration of a ball without contacts, m/s^2."""
-    free = scale(model.gravity, model.balls[index].weight)
+    free = model.gravity * model.balls[index].weight
     if not is_constant(model.air_drag):
-        free = vadd(free, drag(model.air_drag, ball.velocity))
+        free = free + drag(model.air_drag, ball.velocity)
     if not is_constant(model.air_lift):
-        free = vadd(free, scale(cross(ball.turning.spin, ball.velocity), model.air_lift))
+        free = free + cross(ball.turning.spin, ball.velocity) * model.air_lift
     return free
 
 
@@ -271,8 +266,8 @@ def integrate(
     inertia: chain.SquareMatrix,
     servo_damping: Sequence[Scalar],
     torque: list[Scalar],
-    ball_accelerations: Sequence[Vec3],
-    spin_accelerations: Sequence[Vec3],
+    ball_accelerations: Sequence[Vec],
+    spin_accelerations: Sequence[Vec],
 ) -> Motion:
     """MuJoCo's integrators implicitfast and Euler: semi-implicit Euler, implicit in the
     velocity-dependent forces of joint damping and, with implicitfast, of servos (documentation,
@@ -286,16 +281,16 @@ def integrate(
         implicit[i][i] = add(implicit[i][i], dt * damping)
     factor = _keep(model, motion)(chain.cholesky(implicit))
     acceleration = chain.solve_upper(factor, chain.solve_lower(factor, torque))
-    v = tuple(a + dt * b for a, b in zip(motion.v, acceleration, strict=True))
-    q = tuple(a + dt * b for a, b in zip(motion.q, v, strict=True))
+    v = Vec(a + dt * b for a, b in zip(motion.v, acceleration, strict=True))
+    q = Vec(a + dt * b for a, b in zip(motion.q, v, strict=True))
     accelerations = zip(motion.balls, ball_accelerations, spin_accelerations, strict=True)
     return Motion(q, v, tuple(_move_ball(*ball, dt) for ball in accelerations))
 
 
-def _move_ball(ball: Ball, acceleration: Vec3, spin_acceleration: Vec3, dt: float) -> Ball:
+def _move_ball(ball: Ball, acceleration: Vec, spin_acceleration: Vec, dt: float) -> Ball:
     """The ball one step later."""
-    velocity = vadd(ball.velocity, scale(acceleration, dt))
-    position = vadd(ball.position, scale(velocity, dt))
+    velocity = ball.velocity + acceleration * dt
+    position = ball.position + velocity * dt
     turning = ball.turning
     if turning is not None:
         turning = advance_turning(turning, spin_acceleration, dt)

@@ -2,9 +2,9 @@
 
 import dataclasses
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 
@@ -12,31 +12,32 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.physics.edited import MIN_FRICTION, EditedModel, edited
 from bounce_mjx.physics.fused import chain
 from bounce_mjx.physics.fused.contact import ContactModel
-from bounce_mjx.physics.fused.frames import Frame, cheapest, exact, floats
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS, PhysicsParameters
 from bounce_mjx.physics.scalars import (
+    IDENTITY3,
     ZERO3,
-    Mat3,
+    Mat,
     Scalar,
-    Vec3,
+    Vec,
     add,
     congruence,
     diagonal,
-    dot,
     is_constant,
-    matmul,
-    matvec,
     maximum,
     mul,
-    neg,
     quaternion_matrix,
-    scale,
     sub,
     symmetric,
-    vadd,
 )
 from bounce_mjx.physics.support import unsupported_friction
 from bounce_mjx.robot.model import Addresses, BallAddresses, fingerprint, to_direct_solref
+
+
+class Frame(NamedTuple):
+    """Position (m) and orientation of a body in the frame of its link."""
+
+    origin: Vec = ZERO3
+    rotation: Mat = IDENTITY3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,15 +83,15 @@ class FusedModel:
     place of those that the parameters of an environment change."""
 
     dt: float
-    gravity: Vec3
+    gravity: Vec
     links: tuple[chain.Link, ...]
     servos: tuple[Servo, ...]
     """In the order of the joints."""
-    paddle_origin: Vec3
+    paddle_origin: Vec
     """Centre of the paddle in the frame of the last link."""
-    paddle_rotation: Mat3
+    paddle_rotation: Mat
     """Orientation of the paddle in the frame of the last link."""
-    paddle_half_size: Vec3
+    paddle_half_size: Vec
     """Half sizes of the paddle, m."""
     balls: tuple[BallModel, ...]
     contacts: tuple[ContactModel, ...]
@@ -100,8 +101,6 @@ class FusedModel:
     """Source of the model, to be read again in each world."""
     fingerprint: bytes = b""
     """Hash of the source, so that models of equal sources are equal; empty in a world."""
-    weight: float = 1.0
-    """Share of the links' weight that acts on the arm."""
     implicit_servos: bool = True
     """Whether the integrator is implicit in the servos' damping (implicitfast), or not (Euler)."""
     implicit_damping: bool = True
@@ -129,10 +128,7 @@ def read_model(
     m = edited(mj_model, parameters)
     c, addresses = m.model, m.addresses
     links, frames = _read_links(m)
-    compensated = _compensated_share(c, addresses)
-    if compensated is not None:
-        links = [dataclasses.replace(x, floating_mass=0.0, floating_moment=ZERO3) for x in links]
-    links, body = cheapest(links, frames[int(c.geom_bodyid[addresses.paddle_geom])])
+    body = frames[int(c.geom_bodyid[addresses.paddle_geom])]
     paddle = _geom_frame(m, addresses.paddle_geom)
     implicit = c.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     explicit_damping = c.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
@@ -144,15 +140,14 @@ def read_model(
             _read_servo(m, actuator, joint)
             for actuator, joint in zip(addresses.actuators, addresses.arm_joints, strict=True)
         ),
-        paddle_origin=vadd(body.origin, matvec(body.rotation, paddle.origin)),
-        paddle_rotation=exact(matmul(body.rotation, paddle.rotation)),
+        paddle_origin=body.origin + body.rotation @ paddle.origin,
+        paddle_rotation=exact(body.rotation @ paddle.rotation),
         paddle_half_size=m["geom_size", addresses.paddle_geom],
         balls=tuple(_read_ball(m, ball) for ball in addresses.balls),
         contacts=_read_contacts(m),
         addresses=addresses,
         mj_model=c,
         fingerprint=b"" if jax.tree.leaves(parameters) else fingerprint(c),
-        weight=1.0 - (compensated or 0.0),
         implicit_servos=implicit,
         implicit_damping=implicit or not explicit_damping,
     )
@@ -167,7 +162,21 @@ def read_model(
     return model
 
 
-def _rotation(quaternion: Sequence[Scalar]) -> Mat3:
+def floats(values: np.ndarray) -> Vec:
+    """An array as Python floats, which fold."""
+    return Vec(map(float, values))
+
+
+def exact(rotation: Sequence[Sequence[Scalar]]) -> Mat:
+    """Rotation matrix; entries within rounding error of -1, 0 and 1 become exact and fold."""
+
+    def entry(x: Scalar) -> Scalar:
+        return float(round(x)) if is_constant(x) and abs(x - round(x)) < 1e-12 else x
+
+    return Mat(map(entry, row) for row in rotation)
+
+
+def _rotation(quaternion: Sequence[Scalar]) -> Mat:
     """Rotation matrix of a unit quaternion [w, x, y, z]."""
     if not all(map(is_constant, quaternion)):
         return quaternion_matrix(quaternion)
@@ -186,16 +195,16 @@ def _read_links(m: EditedModel) -> tuple[list[chain.Link], dict[int, Frame]]:
         if c.body_weldid[body] in [ball.body for ball in m.addresses.balls]:
             continue
         parent, link_of[body] = (x[int(c.body_parentid[body])] for x in (frames, link_of))
-        origin = vadd(parent.origin, matvec(parent.rotation, m["body_pos", body]))
-        rotation = exact(matmul(parent.rotation, _rotation(c.body_quat[body])))
+        origin = parent.origin + parent.rotation @ m["body_pos", body]
+        rotation = exact(parent.rotation @ _rotation(c.body_quat[body]))
         frame = Frame(origin, rotation)
         for joint in range(c.body_jntadr[body], c.body_jntadr[body] + c.body_jntnum[body]):
             slides = c.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
             anchor = ZERO3 if slides else floats(c.jnt_pos[joint])
-            origin = vadd(frame.origin, matvec(frame.rotation, anchor))
+            origin = frame.origin + frame.rotation @ anchor
             link_of[body] = len(links)
             links.append(_read_joint(m, joint, Frame(origin, frame.rotation)))
-            frame = Frame(scale(anchor, -1.0))
+            frame = Frame(-anchor)
         frames[body] = frame
         if link_of[body] >= 0:
             links[link_of[body]] = _with_body(m, links[link_of[body]], body, frame)
@@ -218,7 +227,7 @@ def _read_joint(m: EditedModel, joint: int, frame: Frame) -> chain.Link:
         zero_position=m["qpos0", at],
         mass=0.0,
         first_moment=ZERO3,
-        inertia=(ZERO3,) * 3,
+        inertia=Mat((ZERO3,) * 3),
         armature=m["dof_armature", dof],
         damping=m["dof_damping", dof],
         stiffness=m["jnt_stiffness", joint] if springs else 0.0,
@@ -232,23 +241,23 @@ def _read_joint(m: EditedModel, joint: int, frame: Frame) -> chain.Link:
 def _with_body(m: EditedModel, link: chain.Link, body: int, frame: Frame) -> chain.Link:
     """Link with the mass of one more body, whose frame is given in the link."""
     mass, inertial = m["body_mass", body], _inertial_frame(m.model, body)
-    centre = vadd(frame.origin, matvec(frame.rotation, inertial.origin))
-    principal = matmul(frame.rotation, inertial.rotation)
-    lever = dot(centre, centre)
-    shift = tuple(
-        tuple(sub(lever if i == j else 0.0, mul(centre[i], centre[j])) for j in range(3))
-        for i in range(3)
-    )
+    centre = frame.origin + frame.rotation @ inertial.origin
+    principal = frame.rotation @ inertial.rotation
+    lever = centre @ centre
     about_centre = congruence(principal, diagonal(m["body_inertia", body]))
-    inertia = symmetric(lambda i, j: add(about_centre[i][j], mul(shift[i][j], mass)))
-    moment, floating = scale(centre, mass), _gravity_compensation(m.model)[body].item()
+
+    def entry(i: int, j: int) -> Scalar:
+        shift = sub(lever if i == j else 0.0, mul(centre[i], centre[j]))
+        return add(link.inertia[i][j], add(about_centre[i][j], mul(shift, mass)))
+
+    moment, floating = centre * mass, _gravity_compensation(m.model)[body].item()
     return dataclasses.replace(
         link,
         mass=add(link.mass, mass),
-        first_moment=vadd(link.first_moment, moment),
-        inertia=symmetric(lambda i, j: add(link.inertia[i][j], inertia[i][j])),
+        first_moment=link.first_moment + moment,
+        inertia=symmetric(entry),
         floating_mass=add(link.floating_mass, mul(mass, floating)),
-        floating_moment=vadd(link.floating_moment, scale(moment, floating)),
+        floating_moment=link.floating_moment + moment * floating,
     )
 
 
@@ -282,17 +291,6 @@ def _gravity_compensation(mj_model: mujoco.MjModel) -> np.ndarray:
     """Compensated share [nbody] of each body's weight. MuJoCo ignores negative shares if none is
     positive, which `ngravcomp` counts."""
     return mj_model.body_gravcomp if mj_model.ngravcomp else np.zeros(mj_model.nbody)
-
-
-def _compensated_share(mj_model: mujoco.MjModel, addresses: Addresses) -> float | None:
-    """Share of the arm's weight that gravity compensation carries; None if it differs between
-    bodies or counts for a joint's `actuatorfrcrange`. A common share costs no operation."""
-    m = mj_model
-    joints = list(addresses.arm_joints)
-    counts = m.jnt_actgravcomp[joints].astype(bool) & m.jnt_actfrclimited[joints].astype(bool)
-    moving = np.isin(m.body_weldid, m.jnt_bodyid[joints])
-    shares = np.unique(_gravity_compensation(m)[moving & (m.body_mass > 0.0)])
-    return float(shares[0]) if len(shares) == 1 and not (np.any(counts) and shares[0]) else None
 
 
 def _read_servo(m: EditedModel, actuator: int, joint: int) -> Servo:
@@ -343,7 +341,7 @@ def _read_contacts(m: EditedModel) -> tuple[ContactModel, ...]:
 def _read_contact(m: EditedModel, pair: int, balls: tuple[int, ...]) -> ContactModel:
     c, addresses, solimp = m.model, m.addresses, m.model.pair_solimp[pair]
     dmin, dmax, midpoint = _impedance_limits(solimp[[0, 1, 3]]).tolist()
-    stiffness, damping = _direct_solref(c, m["pair_solref", pair])
+    stiffness, damping = to_direct_solref(m["pair_solref", pair], c.opt.timestep)
     power = max(1.0, float(solimp[4]))
     bodies = [addresses.balls[i].body for i in balls]
     bodies = [c.geom_bodyid[addresses.paddle_geom], *bodies][-2:]
@@ -366,18 +364,6 @@ def _read_contact(m: EditedModel, pair: int, balls: tuple[int, ...]) -> ContactM
         else None,
         impratio=max(mujoco.mjMINVAL, float(c.opt.impratio)),
     )
-
-
-def _direct_solref(
-    mj_model: mujoco.MjModel, solref: tuple[Scalar, Scalar]
-) -> tuple[Scalar, Scalar]:
-    """k and b of a `solref` in MuJoCo's direct format."""
-    first, second = solref
-    if is_constant(first) and first <= 0.0:
-        return neg(first), neg(second)
-    constant = is_constant(first) and is_constant(second)
-    direct = to_direct_solref(solref, mj_model.opt.timestep, np if constant else jnp)
-    return tuple(map(float, direct)) if constant else direct
 
 
 def _impedance_limits(solimp: np.ndarray) -> np.ndarray:

@@ -18,7 +18,9 @@ import jax.numpy as jnp
 from jax import lax
 
 from bounce_mjx.physics.fused.contact import ContactModel
-from bounce_mjx.physics.scalars import Scalar, Vec3, add, mul
+from bounce_mjx.physics.scalars import Scalar, add, mul
+
+Scalars = tuple[Scalar, ...]
 
 
 def edge_regulariser(model: ContactModel, softness: Scalar) -> Scalar:
@@ -33,7 +35,7 @@ def edge_regulariser(model: ContactModel, softness: Scalar) -> Scalar:
 
 def pyramid_force(
     model: ContactModel, matrix: Sequence[Scalar], offsets: Sequence[Scalar], softness: Scalar
-) -> Vec3:
+) -> Scalars:
     """Force [normal, first and second tangent] of a contact, N.
 
     Args:
@@ -48,7 +50,7 @@ def pyramid_force(
     return tuple(map(mul, x, units))
 
 
-def in_pyramidal_cone(q: Sequence[Scalar], c: Sequence[Scalar], regulariser: Scalar) -> Vec3:
+def in_pyramidal_cone(q: Sequence[Scalar], c: Sequence[Scalar], regulariser: Scalar) -> Scalars:
     """Minimum x of 1/2 x.Q x + c.x over nonnegative combinations of the four edges, each with a
     regulariser; q is the upper triangle of Q, row by row.
 
@@ -105,7 +107,9 @@ def in_pyramidal_cone(q: Sequence[Scalar], c: Sequence[Scalar], regulariser: Sca
     return lax.fori_loop(0, 2, one, _better(none, both))[0]
 
 
-def _better(a: tuple[Vec3, jax.Array], b: tuple[Vec3, jax.Array]) -> tuple[Vec3, jax.Array]:
+def _better(
+    a: tuple[Scalars, jax.Array], b: tuple[Scalars, jax.Array]
+) -> tuple[Scalars, jax.Array]:
     """The candidate with the higher score."""
     (x, x_score), (y, y_score) = a, b
     chosen = tuple(jnp.where(y_score > x_score, j, i) for i, j in zip(x, y, strict=True))

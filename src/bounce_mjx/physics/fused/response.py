@@ -5,6 +5,7 @@ sliding friction. Source: MuJoCo's documentation, "Computation" (constraint mode
 acceleration).
 """
 
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -28,19 +29,7 @@ from bounce_mjx.physics.fused.coupled import coupled_forces
 from bounce_mjx.physics.fused.model import FusedModel
 from bounce_mjx.physics.fused.normals import normal_forces
 from bounce_mjx.physics.fused.pyramid import pyramid_force
-from bounce_mjx.physics.scalars import (
-    ZERO3,
-    Scalar,
-    Vec3,
-    add,
-    dot,
-    matmul,
-    matvec,
-    mul,
-    scale,
-    vadd,
-    vsub,
-)
+from bounce_mjx.physics.scalars import ZERO3, Scalar, Vec, add, dot, mul
 
 Keep = Callable[[Any], Any]
 """`not_inlined`, or the identity."""
@@ -51,9 +40,9 @@ class Response(NamedTuple):
 
     joint_torque: list[Scalar]
     """Joint torques of both, N m."""
-    ball_accelerations: list[Vec3]
+    ball_accelerations: list[Vec]
     """Acceleration of each ball by the contacts alone, m/s^2."""
-    spin_accelerations: list[Vec3]
+    spin_accelerations: list[Vec]
     """Angular acceleration of each ball in the world, rad/s^2."""
 
 
@@ -63,12 +52,12 @@ class Touch(NamedTuple):
     model: ContactModel
     distance: jax.Array
     """Gap between the surfaces, m."""
-    axes: tuple[Vec3, ...]
+    axes: tuple[Vec, ...]
     """The rows' unit vectors [r] in the world."""
     levers: dict[int, Scalar]
     """Distance from the contact point, midway between the surfaces, to each ball's centre, m; only
     with friction."""
-    torques: dict[int, tuple[Vec3, ...]]
+    torques: dict[int, tuple[Vec, ...]]
     """Torques on each ball from unit forces along the tangents, m."""
     rows: list[list[Scalar]]
     """Jacobian [r, n] of the joints."""
@@ -80,8 +69,8 @@ def contact_response(
     factor: tuple[chain.SquareMatrix, list[jax.Array]],
     joint_velocity: Sequence[Scalar],
     half_applied: Sequence[Scalar],
-    balls: Sequence[tuple[Vec3, Vec3, Vec3 | None]],
-    free_accelerations: Sequence[Vec3],
+    balls: Sequence[tuple[Vec, Vec, Vec | None]],
+    free_accelerations: Sequence[Vec],
     keep: Keep,
 ) -> Response:
     """Effect of the contacts' forces and of dry friction on the joints and the balls.
@@ -137,15 +126,15 @@ def contact_response(
     return Response(torque, *_ball_accelerations(model, touches, forces))
 
 
-def paddle_origin(model: FusedModel, pose: chain.Pose) -> Vec3:
+def paddle_origin(model: FusedModel, pose: chain.Pose) -> Vec:
     """Centre of the paddle in the world, m."""
-    return vadd(pose.world_origin[-1], matvec(pose.world_rotation[-1], model.paddle_origin))
+    return pose.world_origin[-1] + pose.world_rotation[-1] @ model.paddle_origin
 
 
-def _contacts(model: FusedModel, pose: chain.Pose, positions: Sequence[Vec3]) -> list[Contact]:
+def _contacts(model: FusedModel, pose: chain.Pose, positions: Sequence[Vec]) -> list[Contact]:
     """Geometry of each of `FusedModel.contacts`; `positions` are the balls'."""
     origin = paddle_origin(model, pose)
-    rotation = matmul(pose.world_rotation[-1], model.paddle_rotation)
+    rotation = pose.world_rotation[-1] @ model.paddle_rotation
     contacts = []
     for pair in model.contacts:
         centres = [positions[i] for i in pair.balls]
@@ -163,7 +152,7 @@ def _touch(
     pose: chain.Pose,
     pair: ContactModel,
     contact: Contact,
-    positions: Sequence[Vec3],
+    positions: Sequence[Vec],
     keep: Keep,
 ) -> Touch:
     """A contact with its rows; `positions` are the balls'."""
@@ -173,16 +162,15 @@ def _touch(
         first, second = keep(tangents(normal))
         axes = normal, first, second
         levers = {i: model.balls[i].radius + 0.5 * contact.distance for i in pair.balls}
-        torques = {i: (scale(second, -lever), scale(first, lever)) for i, lever in levers.items()}
+        torques = {i: (second * -lever, first * lever) for i, lever in levers.items()}
     rows = [[0.0] * len(model.links)] * len(axes)
     if len(pair.balls) == 1:
         # A force along the normal has the same torque at the ball's centre.
         point = positions[pair.balls[0]]
         for lever in levers.values():
-            point = vsub(point, scale(normal, lever))
+            point = point - normal * lever
         columns = list(chain.point_velocities(model.links, pose, point))
-        backward = [scale(axis, -1.0) for axis in axes]
-        rows = keep([[dot(axis, column) for column in columns] for axis in backward])
+        rows = keep([[axis @ column for column in columns] for axis in map(operator.neg, axes)])
     return Touch(pair, contact.distance, axes, levers, torques, rows)
 
 
@@ -210,9 +198,9 @@ def _by_balls(model: FusedModel, one: tuple[Touch, int], other: tuple[Touch, int
     for i, sign in shared_balls(first.model, second.model):
         ball = model.balls[i]
         if first is not second:
-            share = add(share, mul(dot(first.axes[a], second.axes[b]), sign / ball.mass))
+            share = add(share, mul(first.axes[a] @ second.axes[b], sign / ball.mass))
             if a > 0 and b > 0:
-                turning = dot(first.torques[i][a - 1], second.torques[i][b - 1])
+                turning = first.torques[i][a - 1] @ second.torques[i][b - 1]
                 share = add(share, turning / ball.inertia)
         elif a == b:
             share = add(share, 1.0 / ball.mass)
@@ -225,8 +213,8 @@ def _offsets(
     touch: Touch,
     half: Sequence[Sequence[Scalar]],
     d: Scalar,
-    velocity: tuple[Vec3, Sequence[Vec3 | None], Sequence[Scalar]],
-    free: tuple[Vec3, Sequence[Scalar]],
+    velocity: tuple[Vec, Sequence[Vec | None], Sequence[Scalar]],
+    free: tuple[Vec, Sequence[Scalar]],
 ) -> list[Scalar]:
     """J a0 - aref [r] of a contact, m/s^2.
 
@@ -239,10 +227,10 @@ def _offsets(
     model, (along, spins, joint_velocity) = touch.model, velocity
     offsets = []
     for a, axis in enumerate(touch.axes):
-        speed, acceleration = dot(axis, along), dot(axis, free[0])
+        speed, acceleration = axis @ along, axis @ free[0]
         if a > 0:
             for i, torques in touch.torques.items():
-                speed = add(speed, dot(torques[a - 1], spins[i]))
+                speed = add(speed, torques[a - 1] @ spins[i])
         speed = add(speed, dot(touch.rows[a], joint_velocity))
         acceleration = add(acceleration, dot(half[a], free[1]))
         offsets.append(add(acceleration, mul(model.damping, speed)))
@@ -252,7 +240,7 @@ def _offsets(
 
 def _ball_accelerations(
     model: FusedModel, touches: Sequence[Touch], forces: Sequence[Scalar]
-) -> tuple[list[Vec3], list[Vec3]]:
+) -> tuple[list[Vec], list[Vec]]:
     """Accelerations and angular accelerations of the balls by the contacts' forces."""
     along, turning = [ZERO3] * len(model.balls), [ZERO3] * len(model.balls)
     remaining = iter(forces)
@@ -262,7 +250,7 @@ def _ball_accelerations(
             ball = model.balls[i]
             for axis, force in zip(touch.axes, own, strict=True):
                 push = mul(force, side(touch.model, i) / ball.mass)
-                along[i] = vadd(along[i], scale(axis, push))
+                along[i] = along[i] + axis * push
             for torque, force in zip(touch.torques.get(i, ()), own[1:], strict=True):
-                turning[i] = vadd(turning[i], scale(torque, mul(force, 1.0 / ball.inertia)))
+                turning[i] = turning[i] + torque * mul(force, 1.0 / ball.inertia)
     return along, turning
