@@ -334,7 +334,7 @@ def test_settings_of_an_own_algorithm_are_keys(tmp_path):
     assert not hasattr(load_run_config(run).ppo, "own_cost")
     with pytest.raises(UserError, match=r"which is code; name it to run it: --algorithm /.+:Own"):
         read_command(["--resume", str(run)])
-    with pytest.raises(UserError, match="has no algorithm 'Other'"):
+    with pytest.raises(UserError, match="has no subclass 'Other' of PPO"):
         read_command(["--algorithm", name.replace("Own", "Other")])
     with pytest.raises(UserError, match="there is no algorithm 'sac'; give ppo or FILE.py:CLASS"):
         read_command(["--algorithm", "sac"])

@@ -190,9 +190,9 @@ def test_a_config_file_cannot_name_code(mine: Path, tmp_path: Path) -> None:
     ("name", "words"),
     [
         ("bonce", "there is no task 'bonce' .*; did you mean bounce?"),
-        ("missing.py:Task", r"the task's file .*missing\.py cannot be read .*; give FILE.py:CLASS"),
-        (DRIBBLE.replace("Dribble", "Dribbl"), "has no task 'Dribbl' .*Dribble"),
-        (DRIBBLE.replace("Dribble", "Config"), "has no task 'Config'"),
+        ("missing.py:Task", r"missing\.py cannot be read .*; give FILE.py:CLASS"),
+        (DRIBBLE.replace("Dribble", "Dribbl"), "has no subclass 'Dribbl' of Task .*Dribble"),
+        (DRIBBLE.replace("Dribble", "Config"), "has no subclass 'Config' of Task"),
     ],
 )
 def test_a_wrong_task_is_one_sentence(name: str, words: str) -> None:

@@ -11,6 +11,7 @@ import os
 import shlex
 import shutil
 import sys
+import zlib
 from pathlib import Path
 
 from bounce_mjx.errors import UserError
@@ -97,7 +98,7 @@ def task_of_run(name: str, run: Path, given: str | None) -> type[Task]:
     Raises:
       UserError: the user has not named the file; or the run has another task.
     """
-    differs = given is not None and not is_same_task(name, given)
+    differs = given is not None and not registry.is_same_code(name, given)
     if not registry.is_file(name):
         if differs:
             raise UserError(
@@ -122,14 +123,8 @@ def task_of_run(name: str, run: Path, given: str | None) -> type[Task]:
     return task
 
 
-def is_same_task(name: str, given: str) -> bool:
-    """Whether two names stand for equal code."""
-    return registry.code_of(name) == registry.code_of(given)
-
-
 def identify_task(name: str) -> str:
-    """A task's name; for FILE.py:CLASS without the folder, and with eight digits of the hash."""
+    """A task's name; for FILE.py:CLASS without the folder, and with the file's checksum."""
     if not registry.is_file(name):
         return name
-    digest, attribute = registry.code_of(name)
-    return f"{registry.source_file(name).name}:{attribute} {digest[:8]}"
+    return f"{Path(name).name} {zlib.crc32(registry.read_source(name)):08x}"

@@ -23,8 +23,7 @@ from bounce_mjx.runs.config import (
     runs_folder,
     train_config,
 )
-from bounce_mjx.runs.copies import is_same_task
-from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file
+from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file, is_same_code
 from bounce_mjx.world.config import WorldConfig
 
 PROG = "bounce-mjx train"
@@ -104,7 +103,7 @@ class Start(StrictModel):
         base = load_run_config(run, self.task, self.algorithm)
         for key in ("task", "algorithm"):
             given, own = getattr(self, key), getattr(base, key)
-            if given is not None and not is_same_task(own, given):
+            if given is not None and not is_same_code(own, given):
                 raise UserError(
                     f"--resume cannot change the {key}, and {given} differs from {own}; restore "
                     "it, name the run's copy, or start a new run"
