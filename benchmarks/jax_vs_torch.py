@@ -35,7 +35,7 @@ from pydantic import Field
 from tables import device_name, markdown_table
 from trainers import TRAINERS, Method
 
-from bounce_mjx.config.command_line import Flag, parse, parse_first
+from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.episodes import make_evaluator
@@ -67,8 +67,8 @@ Record = dict[str, Any]
 class Command(TrainConfig):
     """The command line: the config's keys as flags, and what to train."""
 
-    env: Annotated[EnvConfig, Flag(name="")] = EnvConfig()
-    ppo: Annotated[PPOConfig, Flag(name="")] = PPOConfig()
+    env: EnvConfig = EnvConfig()
+    ppo: PPOConfig = PPOConfig()
     total_steps: Annotated[int, Field(ge=1)] = 20_000_000
     """Environment steps of each run."""
     eval_every: Annotated[int, Field(ge=1)] = 1_000_000
@@ -117,7 +117,7 @@ def main() -> None:
 
 def read_command(args: list[str]) -> Command:
     """Reads the command line on top of the preset."""
-    first = parse_first(_FirstFlag, args, prog="benchmarks/jax_vs_torch.py")
+    first = parse(_FirstFlag, args, prog="benchmarks/jax_vs_torch.py", is_first=True)
     base = dict(read_preset(first.config))
     for key in ("total_steps", "eval_every"):
         del base[key]

@@ -70,7 +70,7 @@ def exit_on_user_error() -> Iterator[None]:
     try:
         yield
     except UserError as error:
-        print(f"error: {on_one_line(str(error))}", file=sys.stderr)
+        print(f"error: {shorten(reason_of(error), 3000)}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         leave()
@@ -87,12 +87,6 @@ class _Output(io.FileIO):
             # Also for the output of C++.
             os.dup2(os.open(os.devnull, os.O_WRONLY), self.fileno())
             return len(data)
-
-
-def on_one_line(text: str) -> str:
-    """A text without the line breaks and terminal codes that a file or a flag may hold."""
-    line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
-    return shorten(line, 3000)
 
 
 def reason_of(error: Exception) -> str:

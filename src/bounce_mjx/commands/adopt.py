@@ -12,7 +12,7 @@ from rich.console import Console
 from bounce_mjx.config.command_line import Flag, parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.config.validation import validate
-from bounce_mjx.errors import exit_on_user_error, on_one_line
+from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.robot.config import PaddleConfig, RobotConfig
 from bounce_mjx.runs.config import train_config
 from bounce_mjx.tasks.registry import DEFAULT, find_task
@@ -69,7 +69,7 @@ def main(args: Sequence[str]) -> None:
     out = command.out or Path(f"{command.mjcf.stem}.yaml")
     head = f"An arm with a paddle: bounce-mjx adopt {command.mjcf} --site {adoption.config.site}"
     text = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)
-    write_output(out, f"# {on_one_line(head)}\n{text}")
+    write_output(out, f"# {head}\n{text}")
     console.print(f"config: {out}", markup=False)
     named = [] if command.task == DEFAULT else ["--task", command.task]
     flags = [*named, "--robot", str(out)]

@@ -32,7 +32,7 @@ class PlayCommand(WorldCommand):
     the package if there is no run. mirror stands for the mirror law, a model-based baseline."""
     randomization: RandomizationConfig = RandomizationConfig()
     """World of the episodes, if a term is given, in place of the world of the training."""
-    viewing: Annotated[ViewerOptions, Flag(name="")] = ViewerOptions()
+    viewing: ViewerOptions = ViewerOptions()
 
 
 @exit_on_user_error()

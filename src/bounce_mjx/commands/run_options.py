@@ -9,7 +9,7 @@ import pydantic
 from pydantic import Field
 from rich.console import Console
 
-from bounce_mjx.config.command_line import Flag, flag_of, flags_of, parse, parse_first
+from bounce_mjx.config.command_line import Flag, flag_of, flags_of, parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError
 from bounce_mjx.runs.config import (
@@ -148,7 +148,7 @@ def parse_with_commands(
     Raises:
       UserError: a flag has a bad value, or no task has it.
     """
-    task, known = parse_first(_FirstFlags, args, prog=prog).task, flags_of(command_class)
+    task, known = parse(_FirstFlags, args, prog=prog, is_first=True).task, flags_of(command_class)
     words = {word.partition("=")[0].replace("_", "-") for word in args if word.startswith("--")}
     # Without --task, the run may be of any task.
     names = [task or DEFAULT] if task or words <= {*known, "--help"} else registered_tasks()

@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import pydantic
 
-from bounce_mjx.config.command_line import Flag, parse, parse_first, stdout
+from bounce_mjx.config.command_line import parse, stdout
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.runs.config import read_preset, train_config
@@ -33,14 +33,14 @@ class ViewCommand(StrictModel):
     robot: Path | None = None
     """Config of a robot: the file that bounce-mjx adopt wrote, or the name of one in
     configs/robots/ (ur5e, panda or iiwa)."""
-    viewing: Annotated[ViewerOptions, Flag(name="")] = ViewerOptions()
-    env: Annotated[pydantic.SerializeAsAny[WorldConfig], Flag(name="")]
+    viewing: ViewerOptions = ViewerOptions()
+    env: pydantic.SerializeAsAny[WorldConfig]
 
 
 @exit_on_user_error()
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 2 on a mistake."""
-    first = parse_first(_FirstFlags, args, prog="bounce-mjx view")
+    first = parse(_FirstFlags, args, prog="bounce-mjx view", is_first=True)
     env = read_preset(Path("default"), first.robot, first.task).env
     own_class = train_config(env.task, ViewCommand)
     command = parse(own_class, args, prog="bounce-mjx view", default=own_class(env=env))

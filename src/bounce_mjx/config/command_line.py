@@ -1,19 +1,18 @@
 """Command lines from the types of settings: argparse reads words, and pydantic their values."""
 
 import argparse
-import functools
 import re
 import types
-import typing
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, NoReturn, TypeVar
+from typing import Annotated, Any, NamedTuple, NoReturn, TypeVar
 
 import pydantic
 from pydantic.fields import FieldInfo
 from rich.console import Console
 
-from bounce_mjx.config.settings import leaves, types_in
+from bounce_mjx.config.files import flat
+from bounce_mjx.config.settings import fields_in, merged, nested, types_in
 from bounce_mjx.config.validation import describe
 from bounce_mjx.errors import UserError, suggest
 
@@ -27,7 +26,7 @@ class Flag(NamedTuple):
     """A mark of a setting: how its flag differs from its name and type."""
 
     name: str | None = None
-    """Name in place of the setting's; empty for a group whose flags have no prefix."""
+    """Name in place of the setting's."""
     metavar: str | None = None
     """Form of the value in the help."""
     is_positional: bool = False
@@ -64,6 +63,7 @@ def parse(
     default: CommandT | None = None,
     shown: Sequence[str] | None = None,
     epilog: str | None = None,
+    is_first: bool = False,
 ) -> CommandT:
     """Reads a command line into a config.
 
@@ -72,41 +72,38 @@ def parse(
       default: values for the flags that are not given; by default, the type's own default values.
       shown: dotted keys of the flags that --help lists; by default, all.
       epilog: the end of the help.
+      is_first: reads the flags that must be known before the others, which it leaves alone.
 
     Raises:
       UserError: a flag is unknown or has a bad value.
     """
-    # Python's option -OO leaves out docstrings.
-    options = {"description": description or command_class.__doc__ or "", "epilog": epilog}
-    values, unknown = _read(command_class, args, prog, default, shown, **options)
-    if unknown:
-        word = unknown[0].partition("=")[0]
-        advice = "; ".join(filter(None, [unknown[0], suggest(word, flags_of(command_class))]))
-        raise UserError(f"unknown argument {advice} (see {prog} --help)")
-    return _validate(command_class, values, prog)
-
-
-def parse_first(command_class: type[CommandT], args: Sequence[str], *, prog: str) -> CommandT:
-    """Reads the flags that must be known before the others, which it leaves alone.
-
-    Raises:
-      UserError: one of these flags has a bad value.
-    """
-    return _validate(command_class, _read(command_class, args, prog, add_help=False)[0], prog)
-
-
-def _validate(command_class: type[CommandT], values: dict[str, Any], prog: str) -> CommandT:
+    values = (default or command_class.model_construct()).model_dump()
+    fields = fields_in(command_class)
+    parser = _Parser(
+        prog=prog,
+        # Python's option -OO leaves out docstrings.
+        description=description or command_class.__doc__ or "",
+        epilog=epilog,
+        allow_abbrev=False,
+        add_help=not is_first,
+        argument_default=argparse.SUPPRESS,
+        formatter_class=lambda prog: argparse.HelpFormatter(prog, max_help_position=26, width=100),
+    )
+    _add_arguments(parser, fields, flat(values), shown)
+    words = [re.sub(r"^--[^=]+", lambda flag: flag[0].replace("_", "-"), word) for word in args]
+    words = [re.sub(r"^--(.+)=false$", r"--no-\1", word, flags=re.I) for word in words]
+    words = [re.sub(r"^(--.+)=true$", r"\1", word, flags=re.I) for word in words]
+    given, unknown = parser.parse_known_intermixed_args(words)
+    if unknown and not is_first:
+        flag = unknown[0].partition("=")[0]
+        advice = "; ".join(filter(None, [unknown[0], suggest(flag, flags_of(command_class))]))
+        parser.error(f"unknown argument {advice}")
+    for key, value in vars(given).items():
+        values = merged(values, nested(key, _plain(fields[key].annotation, value)))
     try:
         return command_class.model_validate(values)
     except pydantic.ValidationError as error:
-        flags = {".".join(name for name, _ in path): _flag(path) for path in leaves(command_class)}
-        sentence = describe(error, command_class, lambda key: flags.get(key, key), _on_one_line)
-        raise UserError(f"{sentence} (see {prog} --help)") from error
-
-
-def _on_one_line(value: Any) -> str:
-    """The words of a value."""
-    return " ".join(map(str, value)) or "empty" if isinstance(value, list | tuple) else str(value)
+        parser.error(describe(error, fields, {key: _flag(key, x) for key, x in fields.items()}))
 
 
 class _Parser(argparse.ArgumentParser):
@@ -114,79 +111,64 @@ class _Parser(argparse.ArgumentParser):
         raise UserError(f"{message} (see {self.prog} --help)")
 
 
-def _read(
-    command_class: type[pydantic.BaseModel],
-    args: Sequence[str],
-    prog: str,
-    default: pydantic.BaseModel | None = None,
-    shown: Sequence[str] | None = None,
-    **options: Any,
-) -> tuple[dict[str, Any], list[str]]:
-    """The values of a command's arguments, nested, on top of the defaults, and the words that are
-    none of its arguments."""
-    parser = _Parser(
-        prog=prog,
-        usage=f"{prog} [FLAGS]",
-        allow_abbrev=False,
-        argument_default=argparse.SUPPRESS,
-        formatter_class=lambda prog: argparse.HelpFormatter(prog, max_help_position=26, width=100),
-        **options,
-    )
-    start, groups = default or command_class.model_construct(), {}
-    fields = {}
-    for path in leaves(command_class):
-        key, field = ".".join(name for name, _ in path), path[-1][1]
-        fields[key] = field
-        value = functools.reduce(lambda at, name: getattr(at, name, None), key.split("."), start)
+def _mark(field: FieldInfo) -> Flag:
+    return next((mark for mark in field.metadata if isinstance(mark, Flag)), Flag())
+
+
+def _flag(key: str, field: FieldInfo) -> str:
+    """The flag of a setting: --reset.joint-angles of env.reset.joint_angles."""
+    return flag_of(_mark(field).name or re.sub(r"^(env|ppo|viewing)\.", "", key))
+
+
+def _add_arguments(
+    parser: argparse.ArgumentParser,
+    fields: dict[str, FieldInfo],
+    defaults: dict[str, Any],
+    shown: Sequence[str] | None,
+) -> None:
+    """Adds the arguments, in groups; `defaults` are by dotted name."""
+    parser.usage, groups = f"{parser.prog} [FLAGS]", {}
+    for key, field in fields.items():
+        mark = _mark(field)
         text = " ".join((field.description or "").split()).replace("%", "%%")
         text = text if shown is None else re.split(r"(?<=[\w)])[.;] ", text)[0].rstrip(".")
-        if value is not False and value not in (None, (), {}):
-            text += f" (default: {_on_one_line(value)})"
-        group = key.rpartition(".")[0] or "arguments"
-        if group not in groups:
-            groups[group] = parser.add_argument_group(group)
+        if (value := defaults.get(key)) is not False and value not in (None, ()):
+            words = " ".join(map(str, value)) if isinstance(value, tuple) else value
+            text += f" (default: {words})"
         own = {"help": text if shown is None or key in shown else argparse.SUPPRESS}
         if field.annotation is bool:
             own["action"] = argparse.BooleanOptionalAction
-        elif _mark(field).is_repeated:
-            own["action"] = "append"
-        elif _is_list(field.annotation):
-            own["nargs"] = "*"
-        if field.annotation is not bool:
-            own["metavar"] = _mark(field).metavar or _form(field.annotation)
-        if _mark(field).is_positional:
-            own.setdefault("nargs", None if field.is_required() else "?")
-            parser.usage += f" {own['metavar']}"
-            groups[group].add_argument(key, **own)
         else:
-            groups[group].add_argument(_flag(path), dest=key, **own)
-    words = [re.sub(r"^--[^=]+", lambda flag: flag[0].replace("_", "-"), word) for word in args]
-    words = [re.sub(r"^--(.+)=false$", r"--no-\1", word, flags=re.I) for word in words]
-    words = [re.sub(r"^(--.+)=true$", r"\1", word, flags=re.I) for word in words]
-    given, unknown = parser.parse_known_intermixed_args(words)
-    values = {} if default is None else default.model_dump()
-    for key, value in vars(given).items():
-        *outer, name = key.split(".")
-        group = functools.reduce(lambda at, name: at.setdefault(name, {}), outer, values)
-        group[name] = value if isinstance(value, bool) else _plain(fields[key].annotation, value)
-    return values, unknown
-
-
-def _mark(field: FieldInfo) -> Flag:
-    return next((mark for mark in field.metadata if isinstance(mark, Flag)), Flag())
+            own["metavar"] = mark.metavar or _form(field.annotation)
+            if mark.is_repeated:
+                own["action"] = "append"
+            elif _is_list(field.annotation):
+                own["nargs"] = "*"
+            elif mark.is_positional and not field.is_required():
+                own["nargs"] = "?"
+        name = key.rpartition(".")[0] or "arguments"
+        if name not in groups:
+            groups[name] = parser.add_argument_group(name)
+        if mark.is_positional:
+            parser.usage += f" {own['metavar']}"
+            groups[name].add_argument(key, **own)
+        else:
+            groups[name].add_argument(_flag(key, field), dest=key, **own)
 
 
 def _is_list(kind: Any) -> bool:
     return not {tuple, dict}.isdisjoint(types_in(kind))
 
 
-def _plain(kind: Any, words: str | list[str]) -> Any:
+def _plain(kind: Any, given: bool | str | list[str]) -> Any:
     """The words of a setting as pydantic reads them. A list may also have commas, except where a
     file's name may."""
+    if isinstance(given, bool):
+        return given
     kinds = set(types_in(kind))
     parts = [
         None if part == "None" and type(None) in kinds else part
-        for word in ([words] if isinstance(words, str) else words)
+        for word in ([given] if isinstance(given, str) else given)
         for part in (word.split(",") if _is_list(kind) and Path not in kinds else [word])
     ]
     if dict in kinds:
@@ -196,33 +178,22 @@ def _plain(kind: Any, words: str | list[str]) -> Any:
 
 def _form(kind: Any) -> str:
     """The form of a setting's value, such as INT of tuple[int, ...]."""
-    origin, inner = typing.get_origin(kind), typing.get_args(kind)
-    if origin is Annotated:
-        return _form(inner[0])
-    if origin is Literal:
-        return f"{{{','.join(inner)}}}"
-    if origin in (tuple, dict):
-        return " ".join(_form(kind) for kind in inner if kind is not ...)
-    if origin in (typing.Union, types.UnionType):
-        return "|".join(_form(kind) for kind in inner if kind is not type(None))
-    return kind.__name__.upper()
+    kinds = [*types_in(kind)]
+    if choices := [kind for kind in kinds if isinstance(kind, str)]:
+        return f"{{{','.join(choices)}}}"
+    hidden = {tuple, dict, type(None), types.UnionType, Annotated}
+    return " ".join(k.__name__.upper() for k in kinds if isinstance(k, type) and k not in hidden)
 
 
 def flags_of(command_class: type[pydantic.BaseModel]) -> list[str]:
     """The flags of a command."""
     flags = []
-    for path in leaves(command_class):
-        if not _mark(path[-1][1]).is_positional:
-            flags.append(_flag(path))
-            if path[-1][1].annotation is bool:
+    for key, field in fields_in(command_class).items():
+        if not _mark(field).is_positional:
+            flags.append(_flag(key, field))
+            if field.annotation is bool:
                 flags.append(flags[-1].replace("--", "--no-", 1))
     return flags
-
-
-def _flag(path: Sequence[tuple[str, FieldInfo]]) -> str:
-    """The flag of a setting: --reset.joint-angles of env.reset.joint_angles."""
-    marks = [(name, _mark(field).name) for name, field in path]
-    return flag_of(".".join(filter(None, (name if own is None else own for name, own in marks))))
 
 
 def flag_of(name: str) -> str:

@@ -56,12 +56,10 @@ Ascending = pydantic.AfterValidator(_check_order)
 
 
 def whole_number(value: Any) -> Any:
-    """A whole number in scientific notation, such as "1e6", as an integer; any other value but a
-    switch is returned unchanged. YAML reads 1e6 as a string, because its numbers with an exponent
+    """A whole number in scientific notation, such as "1e6", as an integer; any other value is
+    returned unchanged. YAML reads 1e6 as a string, because its numbers with an exponent
     need a decimal point.
     """
-    if isinstance(value, bool):
-        raise PydanticKnownError("int_type")
     if isinstance(value, str) and re.fullmatch(r"[+-]?[\d_]*\d(\.\d*)?[eE][+-]?\d+", value):
         number = float(value)
         return int(number) if number.is_integer() else value
@@ -90,8 +88,8 @@ class StrictModel(pydantic.BaseModel):
         # pydantic would read true as 1.
         kinds = {*types_in(cls.model_fields[info.field_name].annotation)}
         parts = value if isinstance(value, list | tuple) else [value]
-        if float in kinds and bool not in kinds and any(isinstance(x, bool) for x in parts):
-            raise PydanticKnownError("float_type")
+        if kinds & {int, float} and bool not in kinds and any(isinstance(x, bool) for x in parts):
+            raise PydanticKnownError("int_type" if int in kinds else "float_type")
         return value
 
     @pydantic.model_validator(mode="before")
@@ -117,16 +115,25 @@ def types_in(kind: Any) -> Iterator[Any]:
         yield from types_in(inner)
 
 
-def is_group(kind: Any) -> bool:
+def _is_group(kind: Any) -> bool:
     """Whether a type is a group of settings."""
     return isinstance(kind, type) and issubclass(kind, pydantic.BaseModel)
 
 
-def leaves(group: type[pydantic.BaseModel]) -> Iterator[tuple[tuple[str, FieldInfo], ...]]:
-    """The settings of a group and of the groups in it: the names and fields that lead to each."""
-    for step in group.model_fields.items():
-        inner = step[1].annotation
-        yield from ((step, *rest) for rest in (leaves(inner) if is_group(inner) else [()]))
+def fields_in(group: type[pydantic.BaseModel], prefix: str = "") -> dict[str, FieldInfo]:
+    """The settings of a group and of the groups in it, by dotted name."""
+    fields = {}
+    for name, field in group.model_fields.items():
+        inner, key = field.annotation, prefix + name
+        fields |= fields_in(inner, f"{key}.") if _is_group(inner) else {key: field}
+    return fields
+
+
+def nested(key: str, value: Any) -> dict[str, Any]:
+    """Nested mappings with one value, by its dotted key."""
+    for name in reversed(key.split(".")):
+        value = {name: value}
+    return value
 
 
 def merged(values: dict[str, Any], others: dict[str, Any]) -> dict[str, Any]:

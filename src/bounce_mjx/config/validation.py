@@ -2,12 +2,14 @@
 
 import difflib
 import re
-from collections.abc import Callable
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import pydantic
+from pydantic.fields import FieldInfo
 
-from bounce_mjx.config.settings import StrictModel, leaves
+from bounce_mjx.config.settings import StrictModel, fields_in
 from bounce_mjx.errors import UserError, shorten
 
 ConfigT = TypeVar("ConfigT", bound=StrictModel)
@@ -27,27 +29,24 @@ def validate(config_class: type[ConfigT], values: dict[str, Any], source: str) -
     try:
         return config_class.model_validate(values)
     except pydantic.ValidationError as error:
-        raise UserError(f"{shorten(source)}: {describe(error, config_class)}") from error
+        raise UserError(f"{shorten(source)}: {describe(error, fields_in(config_class))}") from error
 
 
 def describe(
     error: pydantic.ValidationError,
-    config_class: type[pydantic.BaseModel],
-    spell: Callable[[str], str] = str,
-    show: Callable[[Any], str] = repr,
+    fields: Mapping[str, FieldInfo],
+    flags: Mapping[str, str] = MappingProxyType({}),
 ) -> str:
     """The first mistake of a validation error as part of a sentence, in pydantic's words.
 
     Args:
-      spell: turns the dotted name of a setting into the form for the message, such as a flag.
-      show: the same for its value.
+      fields: the settings by dotted name.
+      flags: of a command line, the flag of each setting by its dotted name.
     """
     first = error.errors()[0]
-    fields = {".".join(name for name, _ in path): path[-1][1] for path in leaves(config_class)}
-    if first["type"] in ("extra_forbidden", "invalid_key"):
-        *groups, name = (shorten(str(part)) for part in first["loc"])
-        return f"unknown key {'.'.join([*groups, name])}; {_advice(fields, groups, name)}"
     key = ".".join(part for part in first["loc"] if isinstance(part, str))
+    if first["type"] in ("extra_forbidden", "invalid_key"):
+        return f"unknown key {shorten(key)}; {_advice(fields, key)}"
     if first["type"] == "value_error":
         reason = shorten(first["msg"].removeprefix("Value error, "), 500)
         return ": ".join(filter(None, [key.rpartition(".")[2], reason]))
@@ -56,8 +55,8 @@ def describe(
         reason = "an item is missing"
     if first["type"].startswith(("greater_than", "less_than")) and key in fields:
         reason += f" {unit_of(fields[key].description or '')}".rstrip()
-    given = shorten(show(first["input"]))
-    return f"{spell(key)} is {given}, but {reason.replace('input should', 'must', 1)}"
+    given = shorten(str(first["input"]))
+    return f"{flags.get(key, key)} is {given}, but {reason.replace('input should', 'must', 1)}"
 
 
 def unit_of(text: str) -> str:
@@ -67,17 +66,13 @@ def unit_of(text: str) -> str:
     return units[-1] if units else ""
 
 
-def _advice(known: dict[str, Any], groups: list[str], name: str) -> str:
-    """Advice on an unknown key.
-
-    Args:
-      known: the settings by dotted name.
-      groups: the groups that the key is in.
-    """
-    prefix = "".join(f"{group}." for group in groups)
-    here = {key.removeprefix(prefix).split(".")[0] for key in known if key.startswith(prefix)}
-    same_name = [key for key in known if key.rpartition(".")[2] == name]
-    near = [prefix + key for key in difflib.get_close_matches(name, here, n=1)]
-    if near or same_name:
-        return f"did you mean {(same_name or near)[0]}?"
+def _advice(known: Iterable[str], key: str) -> str:
+    """Advice on an unknown dotted name."""
+    group, _, name = key.rpartition(".")
+    near = [other for other in known if other.rpartition(".")[2] == name]
+    near += difflib.get_close_matches(key, known, n=1, cutoff=0.8)
+    if near:
+        return f"did you mean {near[0]}?"
+    prefix = f"{group}." if group else ""
+    here = {other.removeprefix(prefix).split(".")[0] for other in known if other.startswith(prefix)}
     return f"known keys here are {', '.join(sorted(here))}"

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import pydantic
 from pydantic import Field
 
-from bounce_mjx.config.command_line import Flag, parse, parse_first
+from bounce_mjx.config.command_line import Flag, parse
 from bounce_mjx.config.files import differing_keys
 from bounce_mjx.config.settings import Count, NonNegativeInt, Steps, StrictModel, merged
 from bounce_mjx.config.validation import validate
@@ -177,8 +177,8 @@ def changed(base: TrainConfig, settings: dict[str, Any]) -> TrainConfig:
 class TrainCommand(TrainConfig, Start):
     """Trains a policy; by default, one that keeps the ball bouncing."""
 
-    env: Annotated[pydantic.SerializeAsAny[WorldConfig], Flag(name="")]
-    ppo: Annotated[pydantic.SerializeAsAny[PPOConfig], Flag(name="")] = PPOConfig()
+    env: pydantic.SerializeAsAny[WorldConfig]
+    ppo: pydantic.SerializeAsAny[PPOConfig] = PPOConfig()
     report: bool = True
     """Write report.html into the run's folder after the results are printed."""
     wandb: str | None = None
@@ -229,7 +229,7 @@ def read_command(args: Sequence[str], machine: Path | None = None) -> TrainComma
       SystemExit: the flags include --help or --help-all, which it has printed.
     """
     helps = {"-h", "--help", "--help-all"}.intersection(args)
-    start = parse_first(Start, [word for word in args if word not in helps], prog=PROG)
+    start = parse(Start, [word for word in args if word not in helps], prog=PROG, is_first=True)
     base = start.base(machine)
     own_class = train_config(base.env.task, TrainCommand, type(base.ppo))
     default = own_class(**dict(base))
