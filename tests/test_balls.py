@@ -287,7 +287,7 @@ def test_a_world_of_two_balls_sees_each_late():
     np.testing.assert_allclose(seen[4:, 0], at[2:-2], atol=1e-5)
     np.testing.assert_array_equal(seen[1:, 1], seen[:-1, 0])
     assert {"true/ball_position_5", "true/ball_velocity_5"} <= state.metrics.keys()
-    assert env.layout.parts[env.layout.parts.index(("ball_velocity", 6, "m/s"))]
+    assert env.layout.parts[env.layout.parts.index(("ball_velocity", 6, "m/s", 1))]
 
 
 @pytest.mark.slow

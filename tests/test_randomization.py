@@ -183,20 +183,20 @@ def test_a_share_of_the_terms_is_drawn() -> None:
     ("values", "words"),
     [
         ({"restitution_slope": (0, 0.02)}, "restitution_slope is given without restitution; give"),
-        ({"air_drag": (0.2, 0.1)}, "air_drag (0.2, 0.1) is not a range; give the lower end first"),
-        ({"restitution": (0.5, 0.9)}, "restitution (0.5, 0.9) leaves 0.6 to 0.98"),
+        ({"air_drag": (0.2, 0.1)}, "air_drag (0.2, 0.1) is not a range within 0 to 10"),
+        ({"restitution": (0.5, 0.9)}, "restitution (0.5, 0.9) is not a range within 0.6 to 0.98"),
         (
             {"restitution": (0.6, 0.9), "restitution_slope": (0, 0.1)},
             "falls below 0.4 in an impact at 4.5 m/s; start restitution at 0.605, or narrow",
         ),
-        ({"frame_drop": (0.0, 1.0)}, "leaves 0 to 0.99"),
+        ({"frame_drop": (0.0, 1.0)}, "within 0 to 0.99; give the lower end"),
         ({"drag": (0.0, 0.1)}, "drag; did you mean randomization.air_drag?"),
         ({"shares": {"drag": 0.1}}, "shares has a probability for drag, which is not a term"),
         ({"restitution": [[0.7], [0.8]]}, "is not a range; give two numbers"),
         ({"paddle_tilt": [[0.0] * 3, [0.1] * 3]}, "two lists with one for each of 2 axes"),
         ({"paddle_tilt": [[0.0, 0.2], [0.1, 0.1]]}, "paddle_tilt (0.2, 0.1) is not a range"),
         ({"servo_gain": [[0.9] * 6, [1.1] * 5]}, "two numbers, or two lists with one for each"),
-        ({"servo_gain": [[0.9] * 5, [1.1] * 5]}, "ranges for 5 joints, but default_joint_angles"),
+        ({"servo_gain": [[0.9] * 5, [1.1] * 5]}, "is for 5 joints, but default_joint_angles"),
         ({"servo_gain": [[0.9] * 6, [math.inf] * 6]}, "servo_gain is inf, but must be a finite"),
     ],
 )
@@ -329,7 +329,7 @@ def test_late_and_lagging_targets_are_those_of_a_simulation(lag: float | None) -
             control, memory = add_delay(world, memory, Control(target[None]), dt, n)
             return memory, servo_targets(control, n)[:, 0]
 
-        memory = start_actuation(config, dt, jnp.asarray(asked[:1]))
+        memory = start_actuation(config, dt, Control(jnp.asarray(asked[:1])))
         return jax.lax.scan(step, memory, jnp.asarray(asked[1:]))[1].ravel()
 
     delays = np.arange(32)

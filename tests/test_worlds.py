@@ -49,9 +49,9 @@ def test_each_number_of_a_shipped_world_is_sourced_or_assumed(name: str) -> None
         ({"env": {"observation": {"action": 3}}}, "unknown key env.observation"),
         ({"env": {"randomization": {"latency": [0, 1]}}}, "unknown key env.randomization.latency"),
         ({"env": {"randomization": {"frame_drop": [0.5, 0.1]}}}, "frame_drop"),
-        ({"sources": {"randomization": "x", "robot": "y"}}, "sources has robot, but env has no"),
+        ({"sources": {"randomization": "x", "robot": "y"}}, "has robot, but env has no"),
         ({"sources": {}, "assumed": []}, "randomization.action_latency has no source"),
-        ({"assumed": ["frame_drop"]}, "assumed has frame_drop, but env has no such key"),
+        ({"assumed": ["frame_drop"]}, "has frame_drop, but env has no such key"),
     ],
 )
 def test_a_mistake_is_one_sentence(tmp_path: Path, changes: dict, wrong: str) -> None:

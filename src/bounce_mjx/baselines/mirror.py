@@ -101,9 +101,9 @@ class MirrorLaw:
 
     def _action(self, observation: jax.Array) -> jax.Array:
         config = self._env.config
-        sizes = {p.name: p.size for p in config.observation.parts(config.num_joints)}
+        layout = self._env.layout
         # The newest value of each quantity comes first.
-        seen = {name: observation[self._env.layout[name]][:size] for name, size in sizes.items()}
+        seen = {part.name: observation[layout[part.name]][: part.size] for part in layout.parts}
         ball, velocity = seen["ball_position"], seen["ball_velocity"]
         place = jnp.asarray(self._place)
         if "target_x" in seen:

@@ -163,10 +163,9 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
 
 
 def _inputs(env: WorldConfig) -> tuple[Input, ...]:
-    histories = env.observation.lengths()
     return tuple(
-        Input(_INPUT_NAMES.get(part.name, part.name), histories[part.name], part.size, part.unit)
-        for part in env.observation.parts(env.num_joints, env.num_balls)
+        Input(_INPUT_NAMES.get(part.name, part.name), part.count, part.size, part.unit)
+        for part in env.layout.parts
     )
 
 

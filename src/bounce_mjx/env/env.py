@@ -37,7 +37,7 @@ from bounce_mjx.world.impact import Impact, damping, first_impact, next_impact
 from bounce_mjx.world.noise import Clock
 from bounce_mjx.world.observation import Kinematics
 from bounce_mjx.world.randomization import TERMS, Ranges, World, physics_parameters, sample_world
-from bounce_mjx.world.sensing import Sensing, Sensors
+from bounce_mjx.world.sensing import Sensed, Sensing, Sensors
 
 # MuJoCo's mjMAXVAL: a coordinate beyond it has diverged and counts as non-finite.
 _MAX_COORDINATE = 1e10
@@ -270,7 +270,7 @@ class Env:
             impact = first_impact(world, self.mj_model)
             state = self._with_impact(state._replace(impact=impact), truth)
         if self._sensors.are_needed:
-            state = state._replace(sensing=self._sensors.first(truth, *self._sensor_inputs(state)))
+            state = state._replace(sensing=self._sensors.first(self._sensed(state, truth)))
         return State(
             pipeline_state=state,
             obs=self.observe(state, truth),
@@ -326,8 +326,7 @@ class Env:
 
         now = self._with_impact(now, truth)
         if now.sensing is not None:
-            sensing = self._sensors.next(now.sensing, truth, *self._sensor_inputs(now))
-            now = now._replace(sensing=sensing)
+            now = now._replace(sensing=self._sensors.next(now.sensing, self._sensed(now, truth)))
         dtype = truth.ball_position.dtype
         metrics = _metrics(done, dtype) | {name: end.astype(dtype) for name, end in ends.items()}
         return state.replace(
@@ -410,7 +409,7 @@ class Env:
         (age, ranges), command = state.redraw, {}
         interval, phase = state.world["command_interval"], clock.phases[2]
         now = recurs(interval, phase, state.clock.step, self.dt)
-        shares = noise.uniform(clock.counter, noise.Stream.COMMAND, (len(ranges),), age.dtype)
+        shares = noise.uniform(clock.counter, noise.COMMAND, (len(ranges),), age.dtype)
         for i, name in enumerate(self.config.commands):
             low, high = ranges[name]
             command[name] = jnp.where(now, low + (high - low) * shares[i], state.command[name])
@@ -435,10 +434,9 @@ class Env:
         parameters = parameters._replace(contact_damping=damping(impact))
         return state._replace(impact=impact, parameters=parameters)
 
-    def _sensor_inputs(self, state: EnvState) -> tuple:
-        """What the sensors need beside the truth."""
+    def _sensed(self, state: EnvState, truth: Kinematics) -> Sensed:
         known = _entries(state.command) | {"action": state.last_action}
-        return state.world, state.clock, known, state.actuation.setpoint
+        return Sensed(truth, state.world, state.clock, known, state.actuation.setpoint)
 
     def servo_targets(
         self, physics: PhysicsState, action: jax.Array, last: Setpoint | None = None

@@ -29,9 +29,8 @@ class Actuation(NamedTuple):
     setpoint: Setpoint | None = None
     """The joints' commands at the end of the last step, each entry [n], to which an action adds;
     the position alone if the commands jump."""
-    queue: jax.Array | Setpoint | None = None
-    """Servo targets of the last control steps [K, nu], the newest first; of targets that move,
-    position and velocity at the start of each step and the acceleration in it."""
+    queue: Control | None = None
+    """Controls of the last control steps, each entry [K, nu], the newest first."""
     filtered: jax.Array | None = None
     """Outputs of the servos' lags [nu]."""
 
@@ -47,16 +46,13 @@ class Actuators:
 
     def first(self, qpos: jax.Array) -> Actuation:
         """Memory at a reset, with the servos at rest at qpos [nq]."""
-        config = self._config
-        joints = self._joint_targets(qpos, jnp.zeros(config.num_joints, qpos.dtype))
-        moving, position = self._motion is not None, jnp.stack(joints)
-        memory = start_actuation(
-            config.randomization, config.control_dt, self._ctrl(joints), moving
-        )
-        if config.action.base == "measured":
-            return memory
-        still = jnp.zeros_like(position) if moving else None
-        return memory._replace(setpoint=Setpoint(position, still, still))
+        config, still = self._config, jnp.zeros(self._config.num_joints, qpos.dtype)
+        joints, last = self._joint_targets(qpos, still), None
+        if config.action.base == "target":
+            last = Setpoint(jnp.stack(joints), still, still)
+        control, setpoint = self._command(joints, last)
+        memory = start_actuation(config.randomization, config.control_dt, control)
+        return memory._replace(setpoint=setpoint)
 
     def next(
         self,
@@ -149,9 +145,8 @@ class Actuators:
         if self._motion[0].smoothing is None:
             return None
         # An actuator of no joint has a target of zero, whatever the time.
-        times = np.ones(self._model.nu)
-        for actuator, limits in zip(self._addresses.actuators, self._motion, strict=True):
-            times[actuator] = limits.smoothing / self._config.physics_dt
+        times, dt = np.ones(self._model.nu), self._config.physics_dt
+        times[[*self._addresses.actuators]] = [limits.smoothing / dt for limits in self._motion]
         return jnp.asarray(times, dtype)
 
     def _ctrl(self, values: Sequence[jax.Array]) -> jax.Array:
@@ -171,29 +166,30 @@ class Actuators:
         now = recurs(interval, phase, clock.step, config.control_dt)
         each = () if config.num_balls == 1 else (config.num_balls,)
         counter = noise.next_counter(clock.counter)
-        angle = 2.0 * math.pi * noise.uniform(counter, noise.Stream.PUSH, each, phase.dtype)
+        angle = 2.0 * math.pi * noise.uniform(counter, noise.PUSH, each, phase.dtype)
         speed = jnp.where(now, world["push_speed"], 0.0)
         x, y = speed * jnp.cos(angle), speed * jnp.sin(angle)
         return jnp.stack([x, y, jnp.zeros_like(x)], axis=-1)
 
 
-def start_actuation(
-    config: RandomizationConfig, control_dt: float, targets: jax.Array, moving: bool = False
-) -> Actuation:
-    """Memory of latency and lag at a reset, with the servos at rest at the targets [nu].
-
-    Args:
-      moving: whether the targets move within an arm's limits.
-    """
+def start_actuation(config: RandomizationConfig, control_dt: float, rest: Control) -> Actuation:
+    """Memory of latency and lag at a reset, with the servos at rest under a control."""
     queue = None
     if config.action_latency is not None:
         length = math.floor(config.action_latency[1] / control_dt) + 2
-        queue = jnp.broadcast_to(targets, (length, *targets.shape))
-        if moving:
-            # Smoothing needs the acceleration one step further back.
-            still = jnp.zeros((length + 1, *targets.shape), targets.dtype)
-            queue = Setpoint(queue, still[1:], still)
-    return Actuation(queue=queue, filtered=None if config.servo_lag is None else targets)
+        queue = jax.tree.map(
+            lambda x: jnp.broadcast_to(x, (length, *x.shape)), _with_past(rest, rest)
+        )
+    return Actuation(queue=queue, filtered=None if config.servo_lag is None else rest.ctrl)
+
+
+def _with_past(control: Control, before: Control) -> Control:
+    """A control for the queue, with what its targets did in the step before the one before."""
+    moving = control.moving
+    if moving is None:
+        return control
+    earlier = None if moving.smoothing is None else before.moving.before
+    return control._replace(moving=moving._replace(smoothing=None, earlier=earlier))
 
 
 def add_delay(
@@ -206,39 +202,25 @@ def add_delay(
     """
     queue, filtered, moving = memory.queue, memory.filtered, control.moving
     if queue is not None:
-        newest = control.ctrl
-        if moving is not None:
-            newest = Setpoint(newest, moving.velocity, moving.acceleration)
+        newest = _with_past(control, jax.tree.map(lambda q: q[0], queue))
         queue = jax.tree.map(lambda new, q: jnp.concatenate([new[None], q[:-1]]), newest, queue)
         latency = world["action_latency"] / control_dt
         # Without the 1e-4, rounding could turn a latency of one 10 ms step into zero whole steps
         # and a switch at the end of the step.
         whole = jnp.floor(latency + 1e-4)
+        control = jax.tree.map(lambda q: entry_at(q, whole), queue)
         if moving is None:
-            control = Control(entry_at(queue, whole), previous=entry_at(queue[1:], whole))
-        else:
-            control = _delay_moving(queue, whole, moving, num_substeps)
+            control = control._replace(previous=entry_at(queue.ctrl[1:], whole))
+        elif moving.smoothing is not None:
+            duration = jnp.asarray(num_substeps, control.ctrl.dtype)
+            late = control.moving._replace(smoothing=moving.smoothing, duration=duration)
+            control = control._replace(moving=late)
         control = control._replace(switch=jnp.round((latency - whole) * num_substeps))
     if filtered is not None:
         steps = world["servo_lag"] / (control_dt / num_substeps)
         control = control._replace(filtered=filtered, lag=steps)
         filtered = servo_target(control, jnp.asarray(num_substeps - 1, filtered.dtype))
     return control, memory._replace(queue=queue, filtered=filtered)
-
-
-def _delay_moving(queue: Setpoint, whole: jax.Array, moving: Moving, num_substeps: int) -> Control:
-    """Control of moving targets that are late by a whole number of control steps []."""
-    accelerations = queue.acceleration
-    smoothed = moving.smoothing is not None
-    late = Moving(
-        velocity=entry_at(queue.velocity, whole),
-        acceleration=entry_at(accelerations[:-1], whole),
-        before=entry_at(accelerations[1:], whole),
-        smoothing=moving.smoothing,
-        earlier=entry_at(accelerations[2:], whole) if smoothed else None,
-        duration=jnp.asarray(num_substeps, accelerations.dtype) if smoothed else None,
-    )
-    return Control(entry_at(queue.position, whole), late)
 
 
 def entry_at(queue: jax.Array, index: jax.Array) -> jax.Array:

@@ -1,6 +1,7 @@
 """Settings of the world, which each task extends with its own."""
 
 import math
+import os
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
@@ -21,7 +22,7 @@ from bounce_mjx.config.settings import (
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.robot.config import OF_SITE, RobotConfig, is_packaged
 from bounce_mjx.world.observation import ObservationConfig, ObservationLayout
-from bounce_mjx.world.randomization import TERMS, RandomizationConfig, entries
+from bounce_mjx.world.randomization import TERMS, RandomizationConfig
 
 PADDLE_HOME = (0.59356, 0.0, 0.0498)
 """Centre of the paddle of the project's own arm at a reset, m."""
@@ -69,10 +70,9 @@ class Command(NamedTuple):
             number = math.nan
         if math.isfinite(number) and self.least <= number <= self.greatest:
             return number
-        limits = [f">= {self.least:g}"] * math.isfinite(self.least)
-        limits += [f"<= {self.greatest:g}"] * math.isfinite(self.greatest)
-        number_words = " ".join(["a finite number", " and ".join(limits)]).rstrip()
-        wanted = ", ".join([*self.names, f"or {number_words}"]) if self.names else number_words
+        ends = (">=", self.least), ("<=", self.greatest)
+        limits = " and ".join(f"{sign} {end:g}" for sign, end in ends if math.isfinite(end))
+        wanted = " or ".join([*self.names, f"a finite number {limits}".rstrip()])
         unit = f" ({self.unit})" if self.unit else ""
         raise UserError(f"{label} is {shorten(repr(value))}, but must be {wanted}{unit}")
 
@@ -180,13 +180,16 @@ class WorldConfig(StrictModel):
 
     @pydantic.model_validator(mode="after")
     def _check_limits(self):
-        limits = self.robot.limits
-        for name in type(limits).model_fields:
-            values = getattr(limits, name)
-            if values is not None and len(values) != self.num_joints:
+        limits, terms = self.robot.limits, self.randomization
+        counts = {f"robot.limits.{name}": len(x) for name, x in limits if x is not None}
+        for name in terms.terms:
+            if TERMS[name].size is None and isinstance(getattr(terms, name)[0], tuple):
+                counts[f"randomization.{name}"] = len(getattr(terms, name)[0])
+        for key, count in counts.items():
+            if count != self.num_joints:
                 raise ValueError(
-                    f"robot.limits.{name} has {len(values)} numbers, but default_joint_angles has "
-                    f"{self.num_joints}; give one for each acting joint"
+                    f"{key} is for {count} joints, but default_joint_angles has "
+                    f"{self.num_joints}; give a number for each acting joint"
                 )
         if limits.velocity is not None and self.action.base == "measured":
             # A command that follows the measured angle, which follows the command, oscillates.
@@ -194,24 +197,12 @@ class WorldConfig(StrictModel):
                 "robot.limits are of commands that move, to which an action adds, but action.base "
                 "is measured; set action.base to target"
             )
-        if limits.jerk is not None:
-            for acceleration, jerk in zip(limits.acceleration, limits.jerk, strict=True):
-                if 2.0 * acceleration / jerk > self.control_dt:
-                    raise ValueError(
-                        f"robot.limits.jerk {jerk:g} is too low: the acceleration cannot turn from "
-                        f"{acceleration:g} to the opposite within control_dt {self.control_dt:g}; "
-                        f"give at least {2.0 * acceleration / self.control_dt:g}"
-                    )
-        return self
-
-    @pydantic.model_validator(mode="after")
-    def _check_entries(self):
-        for name in self.randomization.terms:
-            count = len(entries(getattr(self.randomization, name)))
-            if TERMS[name].size is None and count not in (1, self.num_joints):
+        for acceleration, jerk in zip(limits.acceleration or (), limits.jerk or (), strict=False):
+            if 2.0 * acceleration / jerk > self.control_dt:
                 raise ValueError(
-                    f"randomization.{name} has ranges for {count} joints, but default_joint_angles "
-                    f"has {self.num_joints}; give one for each acting joint, or one for all"
+                    f"robot.limits.jerk {jerk:g} is too low: the acceleration cannot turn from "
+                    f"{acceleration:g} to the opposite within control_dt {self.control_dt:g}; "
+                    f"give at least {2.0 * acceleration / self.control_dt:g}"
                 )
         return self
 
@@ -233,12 +224,9 @@ class WorldConfig(StrictModel):
     @classmethod
     def _make_absolute(cls, path: Path | None) -> Path | None:
         """A run's config is read from other folders too."""
-        try:
-            if path is None or is_packaged(path):
-                return path
-            return path.expanduser().absolute()
-        except RuntimeError as error:
-            raise ValueError(f"{path} is in the home of an unknown user; give a path") from error
+        if path is None or is_packaged(path):
+            return path
+        return Path(os.path.expanduser(path)).absolute()
 
     @classmethod
     def settings_at(cls, paddle: tuple[float, float, float]) -> dict[str, Any]:
@@ -269,20 +257,6 @@ class WorldConfig(StrictModel):
     def commands(self) -> dict[str, Command]:
         """The commands of the policy, by name; a task's config has its own."""
         return {}
-
-    @property
-    def unseen_noise(self) -> tuple[str, ...]:
-        """Terms of the randomisation that change measurements which the policy does not see."""
-        seen, terms = self.observation, self.randomization.terms
-        if seen.lengths("task"):
-            return ()
-        velocity = seen.ball_velocity and seen.velocity == "measured"
-        unseen = {
-            "joint_velocity_": seen.joint_velocities,
-            "ball_velocity_": velocity,
-            "ball_position_": seen.ball_position or (seen.ball_velocity and not velocity),
-        }
-        return tuple(t for t in terms if any(t.startswith(p) and not s for p, s in unseen.items()))
 
     @property
     def heights(self) -> dict[str, float]:

@@ -1,16 +1,16 @@
 """Named worlds: the numbers of a real robot and its camera in a YAML file, each with its source."""
 
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pydantic
 
-from bounce_mjx.config.files import read_mapping
-from bounce_mjx.config.settings import StrictModel, merged
+from bounce_mjx.config.files import flat, read_mapping
+from bounce_mjx.config.settings import StrictModel, merged, nested
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import shorten
+from bounce_mjx.lazy import np
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import TERMS, RandomizationConfig
 
@@ -58,18 +58,14 @@ class NamedWorld(StrictModel):
 
     @pydantic.model_validator(mode="after")
     def _check_sources(self):
-        given = dict(_leaves(self.settings))
+        given = flat(self.settings)
         groups = {key[:i] for key in given for i, char in enumerate(key) if char == "."}
-        for name, keys, known in (
-            ("sources", self.sources, {*given, *groups}),
-            ("assumed", self.assumed, given),
-        ):
-            for key in keys:
-                if key not in known:
-                    raise ValueError(
-                        f"{name} has {shorten(key)}, but env has no such key; give env that key, "
-                        f"or remove it from {name}"
-                    )
+        for key in (*self.sources, *self.assumed):
+            if key not in given and (key in self.assumed or key not in groups):
+                raise ValueError(
+                    f"sources or assumed has {shorten(key)}, but env has no such key; give env "
+                    "that key, or remove it from them"
+                )
         for key in given:
             if key.startswith("randomization.") and key.split(".")[1] in CURRICULUM:
                 continue
@@ -102,8 +98,8 @@ class NamedWorld(StrictModel):
         A term of the randomisation goes twice as far from the model's value, within its limits; a
         rate, an interval, or a limit, of which less is harder, is halved.
         """
-        given = dict(_leaves(self.settings))
-        return {key: _nest(key, _double(key, given[key])) for key in self.assumed}
+        given = flat(self.settings)
+        return {key: nested(key, _double(key, given[key])) for key in self.assumed}
 
 
 def read_world(path: Path) -> NamedWorld:
@@ -116,22 +112,6 @@ def read_world(path: Path) -> NamedWorld:
     return validate(NamedWorld, values, str(path))
 
 
-def _leaves(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """The dotted keys of nested settings, and their values."""
-    for name, value in values.items():
-        if isinstance(value, dict):
-            yield from _leaves(value, f"{prefix}{name}.")
-        else:
-            yield prefix + name, value
-
-
-def _nest(key: str, value: Any) -> dict[str, Any]:
-    """Nested settings with one value, by its dotted key."""
-    for name in reversed(key.split(".")):
-        value = {name: value}
-    return value
-
-
 def _double(key: str, value: Any) -> Any:
     group, _, name = key.rpartition(".")
     factor, centre, (least, most) = 2.0, 0.0, (-math.inf, math.inf)
@@ -141,9 +121,4 @@ def _double(key: str, value: Any) -> Any:
     elif group == "robot.limits":
         factor = 0.5
 
-    def changed(value: Any) -> Any:
-        if isinstance(value, tuple):
-            return tuple(map(changed, value))
-        return min(max(centre + factor * (value - centre), least), most)
-
-    return changed(value)
+    return np.clip(centre + factor * (np.array(value) - centre), least, most).tolist()

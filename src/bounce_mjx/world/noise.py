@@ -4,7 +4,6 @@ An environment's `step` takes no key. A few integer operations on a counter in i
 numbers that are random enough for the noise of sensors.
 """
 
-import enum
 import math
 from typing import NamedTuple
 
@@ -13,15 +12,8 @@ import jax.numpy as jnp
 
 from bounce_mjx.physics.scalars import sine_cosine
 
-
-class Stream(enum.IntEnum):
-    """Independent random numbers of one counter, by their use."""
-
-    BALL = 0
-    JOINTS = 1
-    FRAME_DROP = 2
-    PUSH = 3
-    COMMAND = 4
+BALL, JOINTS, FRAME_DROP, PUSH, COMMAND = range(5)
+"""Streams: independent random numbers of one counter, by their use."""
 
 
 class Clock(NamedTuple):
@@ -38,7 +30,7 @@ class Clock(NamedTuple):
 def first_clock(key: jax.Array, dtype: jnp.dtype) -> Clock:
     """The clock at a reset; consumes the key."""
     counter = jax.lax.bitcast_convert_type(jax.random.bits(key, dtype=jnp.uint32), jnp.int32)
-    phases = uniform(counter, Stream.COMMAND, (3,), dtype)
+    phases = uniform(counter, COMMAND, (3,), dtype)
     return Clock(counter, jnp.zeros((), jnp.int32), phases)
 
 
@@ -76,7 +68,7 @@ def normal(counter: jax.Array, stream: int, shape: tuple[int, ...], dtype: jnp.d
 
 def joints(counter: jax.Array, num_joints: int, dtype: jnp.dtype) -> tuple[jax.Array, jax.Array]:
     """Normally distributed numbers for the measured angle and velocity of each joint, both [n]."""
-    numbers = normal(counter, Stream.JOINTS, (2 * num_joints,), dtype)
+    numbers = normal(counter, JOINTS, (2 * num_joints,), dtype)
     return numbers[:num_joints], numbers[num_joints:]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
+import itertools
 from typing import Annotated, Any, Literal, NamedTuple
 
 import pydantic
@@ -42,9 +42,16 @@ class Part(NamedTuple):
 
     name: str
     size: int
-    """Number of entries."""
+    """Number of entries of one value."""
     unit: str
     """Unit of the entries; empty for a pure number."""
+    count: int
+    """Number of values, the newest first."""
+
+    @property
+    def length(self) -> int:
+        """Number of entries of all values."""
+        return self.count * self.size
 
 
 class ObservationConfig(StrictModel):
@@ -107,24 +114,15 @@ class ObservationConfig(StrictModel):
             if (count := getattr(self, name)) and group in (None, quantity.group)
         }
 
-    def parts(self, num_joints: int, num_balls: int = 1) -> tuple[Part, ...]:
-        """One value of each quantity that the policy sees, for an arm with this number of acting
-        joints and for this number of balls, in order."""
-        known = self.quantities()
-        return tuple(
-            Part(name, known[name].entries(num_joints, num_balls), known[name].unit)
-            for name in self.lengths()
-        )
-
     def layout(self, num_joints: int, num_balls: int = 1) -> ObservationLayout:
-        """The order of the entries of `parts`, with past values."""
-        counts = self.lengths()
-        return ObservationLayout(
-            tuple(
-                part._replace(size=part.size * counts[part.name])
-                for part in self.parts(num_joints, num_balls)
-            )
+        """The order of the entries, for an arm with this number of acting joints and for this
+        number of balls."""
+        known = self.quantities()
+        parts = (
+            Part(name, known[name].entries(num_joints, num_balls), known[name].unit, count)
+            for name, count in self.lengths().items()
         )
+        return ObservationLayout(tuple(parts))
 
     @property
     def is_momentary(self) -> bool:
@@ -141,27 +139,22 @@ class ObservationLayout:
 
     parts: tuple[Part, ...]
 
-    @functools.cached_property
+    @property
     def size(self) -> int:
         """Length of the observation vector."""
-        return sum(part.size for part in self.parts)
-
-    @functools.cached_property
-    def _slices(self) -> dict[str, slice]:
-        slices, start = {}, 0
-        for part in self.parts:
-            slices[part.name] = slice(start, start + part.size)
-            start += part.size
-        return slices
+        return sum(part.length for part in self.parts)
 
     def __getitem__(self, name: str) -> slice:
         """Entries of the part `name`, such as `obs[layout["ball_position"]]`."""
-        return self._slices[name]
+        ends = itertools.accumulate(part.length for part in self.parts)
+        pairs = zip(self.parts, ends, strict=True)
+        return {part.name: slice(end - part.length, end) for part, end in pairs}[name]
 
     def pack(self, values: dict[str, jax.Array]) -> jax.Array:
-        """The observation [size] from the value of every part, [part.size]."""
+        """The observation [size] from the values of every part, [part.length]."""
         # One scalar per entry, which XLA fuses with the physics; whole arrays would be copied.
-        return jnp.stack([values[part.name][i] for part in self.parts for i in range(part.size)])
+        entries = [(p.name, i) for p in self.parts for i in range(p.length)]
+        return jnp.stack([values[name][i] for name, i in entries])
 
 
 class Kinematics(NamedTuple):

@@ -8,6 +8,7 @@ entry. A term that is null is off and costs nothing.
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -48,26 +49,6 @@ Ranges = dict[str, tuple["jax.Array", "jax.Array"]]
 shape."""
 
 
-def scale(own: jax.Array, factor: jax.Array) -> jax.Array:
-    """The operation of a term that is a factor."""
-    return own * factor
-
-
-def shift(own: jax.Array, added: jax.Array) -> jax.Array:
-    """The operation of a term that is a difference."""
-    return own + added
-
-
-def replace(_: jax.Array | None, value: jax.Array) -> jax.Array:
-    """The operation of a term that is the value itself."""
-    return value
-
-
-def limit(own: jax.Array, most: jax.Array) -> jax.Array:
-    """The operation of a term that is an upper bound."""
-    return jnp.minimum(own, most)
-
-
 def tilt_frame(own: jax.Array, angles: jax.Array) -> jax.Array:
     """The quaternion of a frame that turns about its own x axis, then about its new y axis."""
     from bounce_mjx.physics.scalars import quaternion_product
@@ -90,6 +71,18 @@ def _rotation_xy(angles: jax.Array) -> Quaternion:
     about_x = (jnp.cos(a), jnp.sin(a), 0.0, 0.0)
     about_y = (jnp.cos(b), 0.0, jnp.sin(b), 0.0)
     return quaternion_product(about_x, about_y)
+
+
+# The operations of terms, on the model's own value and the sampled one.
+scale, shift = operator.mul, operator.add
+
+
+def limit(own: jax.Array, most: jax.Array) -> jax.Array:
+    return jnp.minimum(own, most)
+
+
+def replace(_: Any, value: jax.Array) -> jax.Array:
+    return value
 
 
 class Term(NamedTuple):
@@ -226,12 +219,11 @@ class RandomizationConfig(StrictModel):
             raise ValueError(
                 f"shares has a probability for {shorten(name)}, which is not a term; remove it"
             )
-        if self.restitution_slope is not None and self.restitution is None:
-            raise ValueError("restitution_slope is given without restitution; give both")
-        if self.first_command_range < 1.0 and not self.warmup_steps:
-            raise ValueError("first_command_range is given without warmup_steps; give both")
-        if self.push_interval is not None and self.push_speed is None:
-            raise ValueError("push_interval is given without push_speed; give both, or neither")
+        needed = {"restitution_slope": "restitution", "push_interval": "push_speed"}
+        for name, other in (needed | {"first_command_range": "warmup_steps"}).items():
+            default = type(self).model_fields[name].default
+            if getattr(self, name) != default and not getattr(self, other):
+                raise ValueError(f"{name} is given without {other}; give both")
         for name in self.terms:
             ends, (size, _, (least, greatest), *_) = getattr(self, name), TERMS[name]
             unit = f" {unit_of(type(self).model_fields[name].description)}".rstrip()
@@ -243,14 +235,10 @@ class RandomizationConfig(StrictModel):
                     f"{name} {shorten(str(ends))} is not a range; give two numbers{lists}"
                 )
             for low, high in entries(ends):
-                if not low <= high:
+                if not least <= low <= high <= greatest:
                     raise ValueError(
-                        f"{name} ({low}, {high}) is not a range; give the lower end first"
-                    )
-                if low < least or high > greatest:
-                    raise ValueError(
-                        f"{name} ({low}, {high}) leaves {least:g} to {greatest:g}{unit}; narrow "
-                        "the range"
+                        f"{name} ({low}, {high}) is not a range within {least:g} to "
+                        f"{greatest:g}{unit}; give the lower end first"
                     )
         return self
 
@@ -279,14 +267,12 @@ class RandomizationConfig(StrictModel):
           progress: share of the warm-up that has passed [], from 0 to 1.
         """
 
-        def grown(name: str, end: float | tuple[float, ...]) -> jax.Array:
-            if isinstance(end, tuple):
-                return jnp.stack([grown(name, entry) for entry in end])
-            nominal = TERMS[name].nominal
-            start = end if nominal is None else nominal
-            return jnp.asarray(start + (end - start) * progress, jnp.float32)
-
-        return {name: tuple(grown(name, end) for end in getattr(self, name)) for name in self.terms}
+        ranges = {}
+        for name in self.terms:
+            ends, nominal = np.array(getattr(self, name)), TERMS[name].nominal
+            start = ends if nominal is None else nominal
+            ranges[name] = tuple(jnp.asarray(start + (ends - start) * progress, jnp.float32))
+        return ranges
 
 
 def entries(ends: Range) -> list[tuple[float, float]]:

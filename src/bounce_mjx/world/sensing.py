@@ -16,8 +16,8 @@ from bounce_mjx.world import noise
 from bounce_mjx.world.actuation import entry_at
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.noise import Clock
-from bounce_mjx.world.observation import Kinematics, ObservationConfig
-from bounce_mjx.world.randomization import RandomizationConfig, World
+from bounce_mjx.world.observation import Kinematics
+from bounce_mjx.world.randomization import World
 
 _TERMS = frozenset(
     "ball_latency camera_rate frame_drop ball_position_noise ball_position_bias "
@@ -59,6 +59,20 @@ class Sensing(NamedTuple):
     """What the task remembers of the measurements."""
 
 
+class Sensed(NamedTuple):
+    """What the sensors see of a control step."""
+
+    truth: Kinematics
+    """After the step."""
+    world: World
+    clock: Clock
+    """After the step."""
+    known: dict[str, jax.Array]
+    """Values [size] of the quantities that need no sensor: the commands and the action."""
+    setpoint: Setpoint | None
+    """The joints' commands at the end of the step, if an action adds to them."""
+
+
 class Sensors:
     """The sensors of a world."""
 
@@ -76,26 +90,21 @@ class Sensors:
         sees_paddle = observation.paddle_position or observation.lengths("task")
         self._misjudges_paddle = bool(sees_paddle and _PADDLE_TERMS & terms)
 
-    def first(
-        self,
-        truth: Kinematics,
-        world: World,
-        clock: Clock,
-        known: dict[str, jax.Array],
-        setpoint: Setpoint | None,
-    ) -> Sensing:
+    def first(self, now: Sensed) -> Sensing:
         """Memory at a reset: the histories repeat the first measurements, and the ball has rested
-        until then. The arguments are those of `next`."""
-        config, zero = self._config, jnp.zeros((), truth.ball_position.dtype)
-        length = math.ceil(_oldest_picture(config.randomization) / config.control_dt - 1e-6) + 1
-        ball = _position_and_velocity(truth)
-        balls = jnp.broadcast_to(ball, (length, *ball.shape))
+        until then."""
+        config, truth, ball = self._config, now.truth, _position_and_velocity(now.truth)
+        latency = (config.randomization.ball_latency or (0.0, 0.0))[1]
+        rate = config.randomization.camera_rate
+        # The greatest age of the last picture if none is lost.
+        oldest = latency if rate is None else latency + 1.0 / rate[0]
+        length = math.ceil(oldest / config.control_dt - 1e-6) + 1
+        balls, zero = jnp.broadcast_to(ball, (length, *ball.shape)), jnp.zeros((), ball.dtype)
         # Too long ago for a velocity from the difference to it.
         before = Picture(
             truth.ball_position, truth.ball_velocity, zero + _LONG_AGO, zero - _LONG_AGO
         )
-        picture = take_picture(config, world, balls, before, clock)
-        measured = self._measure(truth, world, clock, known, setpoint, picture)
+        picture, measured = self._measure(now, balls, before)
         task, own = self._task.first_quantities(measured)
         values = measured | own
         histories = {
@@ -104,44 +113,27 @@ class Sensors:
         }
         return Sensing(balls, picture, histories, task)
 
-    def next(
-        self,
-        before: Sensing,
-        truth: Kinematics,
-        world: World,
-        clock: Clock,
-        known: dict[str, jax.Array],
-        setpoint: Setpoint | None,
-    ) -> Sensing:
-        """Memory after a control step.
-
-        Args:
-          truth: after the step.
-          clock: after the step.
-          known: values [size] of the quantities that need no sensor: the commands and the action.
-          setpoint: the joints' commands at the end of the step, if an action adds to them.
-        """
-        config, ball = self._config, _position_and_velocity(truth)
-        balls = jnp.concatenate([ball[None], before.balls[:-1]])
-        picture = take_picture(config, world, balls, before.picture, clock)
-        measured = self._measure(truth, world, clock, known, setpoint, picture)
-        histories = remember(config.observation, before.histories, measured)
-        own = {name: histories[name] for name in config.observation.lengths("task")}
+    def next(self, before: Sensing, now: Sensed) -> Sensing:
+        """Memory after a control step."""
+        balls = jnp.concatenate([_position_and_velocity(now.truth)[None], before.balls[:-1]])
+        picture, measured = self._measure(now, balls, before.picture)
+        own, histories = {}, {}
+        for name, past in before.histories.items():
+            if name in measured:
+                histories[name] = jnp.concatenate([measured[name][None], past[:-1]])
+            else:
+                own[name] = past
         task, own = self._task.next_quantities(before.task, own, measured)
         return Sensing(balls, picture, histories | own, task)
 
     def _measure(
-        self,
-        truth: Kinematics,
-        world: World,
-        clock: Clock,
-        known: dict[str, jax.Array],
-        setpoint: Setpoint | None,
-        picture: Picture,
-    ) -> dict[str, jax.Array]:
-        """The measured value [size] of each quantity of the world and of each command."""
-        angles, velocities = measured_joints(world, clock.counter, truth)
-        measured = truth._asdict() | known
+        self, now: Sensed, balls: jax.Array, last: Picture
+    ) -> tuple[Picture, dict[str, jax.Array]]:
+        """The last picture that has arrived, and the measured value [size] of each quantity of the
+        world and of each command."""
+        world, picture = now.world, take_picture(self._config, now, balls, last)
+        angles, velocities = measured_joints(world, now.clock.counter, now.truth)
+        measured = now.truth._asdict() | now.known
         measured |= {
             "joint_angles": angles,
             "joint_velocities": velocities,
@@ -150,17 +142,17 @@ class Sensors:
             "ball_age": picture.age[None],
             "ball_picture": picture.position,
         }
-        if setpoint is not None:
+        if now.setpoint is not None:
             # The servo shares the offset of the encoder's zero.
-            measured["servo_lead"] = setpoint.position - (angles - world.get("encoder_bias", 0.0))
+            lead = now.setpoint.position - (angles - world.get("encoder_bias", 0.0))
+            measured["servo_lead"] = lead
         if self._misjudges_paddle:
             qpos = [jnp.asarray(coordinate, angles.dtype) for coordinate in self._qpos]
             for i, address in enumerate(self._arm):
                 qpos[address] = angles[i]
-            measured["paddle_position"] = self._engine.paddle_position(
-                MODEL_PARAMETERS, jnp.stack(qpos)
-            )
-        return measured
+            position = self._engine.paddle_position(MODEL_PARAMETERS, jnp.stack(qpos))
+            measured["paddle_position"] = position
+        return picture, measured
 
 
 def _position_and_velocity(truth: Kinematics) -> jax.Array:
@@ -168,16 +160,7 @@ def _position_and_velocity(truth: Kinematics) -> jax.Array:
     return jnp.concatenate([truth.ball_position, truth.ball_velocity], axis=-1)
 
 
-def _oldest_picture(randomization: RandomizationConfig) -> float:
-    """Greatest age of the last picture if none is lost, s."""
-    latency = (randomization.ball_latency or (0.0, 0.0))[1]
-    rate = randomization.camera_rate
-    return latency if rate is None else latency + 1.0 / rate[0]
-
-
-def take_picture(
-    config: WorldConfig, world: World, balls: jax.Array, last: Picture, clock: Clock
-) -> Picture:
+def take_picture(config: WorldConfig, now: Sensed, balls: jax.Array, last: Picture) -> Picture:
     """Last picture that has arrived at a control step.
 
     A camera takes pictures at its own rate, independent of the control steps. Between two control
@@ -189,7 +172,7 @@ def take_picture(
       balls: `Sensing.balls`, including the ball of this control step.
       last: the last picture at the control step before.
     """
-    dtype, control_dt = balls.dtype, config.control_dt
+    world, clock, dtype, control_dt = now.world, now.clock, balls.dtype, config.control_dt
     steps = clock.step.astype(dtype)
     latency = world.get("ball_latency", jnp.zeros((), dtype)) / control_dt
     if "camera_rate" in world:
@@ -204,12 +187,12 @@ def take_picture(
     newer, older = entry_at(balls, whole), entry_at(balls, whole + 1.0)
     position, velocity = _between(newer, older, age - whole, control_dt)
 
-    noises = noise.normal(clock.counter, noise.Stream.BALL, balls.shape[1:], dtype)
+    noises = noise.normal(clock.counter, noise.BALL, balls.shape[1:], dtype)
     position = _add_errors(world, "ball_position", position, noises[..., :3])
     due = number > last.number
     arrived = due
     if "frame_drop" in world:
-        chance = noise.uniform(clock.counter, noise.Stream.FRAME_DROP, (), dtype)
+        chance = noise.uniform(clock.counter, noise.FRAME_DROP, (), dtype)
         arrived = due & ((chance >= world["frame_drop"]) | (clock.step == 0))
     held_age = last.age + control_dt
     if config.observation.velocity == "differences":
@@ -261,21 +244,3 @@ def measured_joints(
     if "encoder_bias" in world:
         angles = angles + world["encoder_bias"]
     return angles, _add_errors(world, "joint_velocity", truth.joint_velocities, velocity_noise)
-
-
-def remember(
-    observation: ObservationConfig,
-    histories: dict[str, jax.Array],
-    measured: dict[str, jax.Array],
-) -> dict[str, jax.Array]:
-    """Histories after the measurements of a control step; those of the task's own quantities stay.
-
-    Args:
-      histories: last values of each observed quantity [H, size].
-      measured: value [size] of each quantity except the task's own.
-    """
-    own = observation.lengths("task")
-    return {
-        name: past if name in own else jnp.concatenate([measured[name][None], past[:-1]])
-        for name, past in histories.items()
-    }
