@@ -6,6 +6,7 @@ A row is a policy, or the seeds of one training run: the mean over the seeds and
 """
 
 import functools
+import math
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -35,7 +36,9 @@ from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.folders import Checkpoint, runs_in, runs_of_seeds
 from bounce_mjx.runs.reading import read_actor
-from bounce_mjx.task.results import Episodes
+from bounce_mjx.task import Episodes, Task, mean_and_margin
+from bounce_mjx.tasks.bounce import Bounce
+from bounce_mjx.tasks.track import Track
 from bounce_mjx.training.setup import set_up_jax
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import RandomizationConfig
@@ -137,11 +140,10 @@ def largest_stable(outcomes: Sequence[ConditionOutcome], perturbation: str) -> f
 def measure_nominal(
     policy: Policy | None, actor: Callable[[Env], Actor], trained: WorldConfig, seed: int
 ) -> Figures:
-    """The task's own figures (`Task.ranking`) in the nominal world, and the median of the hits of a
-    task that counts them: in episodes without a time limit, else in episodes of the usual length.
-    """
+    """The task's own figures in the nominal world, and the median of the hits of bouncing: in
+    episodes without a time limit, else in episodes of the usual length."""
     env = Env(trained.model_copy(update={"randomization": RandomizationConfig()}))
-    acting, commands, hits = actor(env), neutral_commands(trained), env.task.hits
+    acting, commands, hits = actor(env), neutral_commands(trained), isinstance(env.task, Bounce)
     ranges = {name: (jnp.array([low]), jnp.array([high])) for name, (low, high) in commands.items()}
     episodes = HIT_EPISODES if hits else TIMED_EPISODES
     limit = round(MOST_SECONDS / env.dt) if hits else env.config.episode_steps
@@ -151,13 +153,29 @@ def measure_nominal(
     for step in range(0, limit, env.config.episode_steps):
         now = advance(policy, now, min(step + env.config.episode_steps, limit))
         statistics = jax.tree.map(lambda x: jax.device_get(x).astype(float), now.statistics)
-        counted = np.minimum(statistics.tally.sums[hits], MOST_HITS) if hits else np.inf
+        counted = np.minimum(statistics.tally.sums["hits"], MOST_HITS) if hits else np.inf
         if not np.any(now.statistics.running & (counted < MOST_HITS)):
             break
     figures = {"hits": float(np.median(counted))} if hits else {}
     tally, spans = statistics.tally, {n: (c.low, c.high) for n, c in env.config.commands.items()}
     episodes = Episodes(tally.sums, tally.maxima, statistics.running, spans | commands)
-    return figures | env.task.ranking(episodes)
+    return figures | own_figures(env.task, episodes)
+
+
+def own_figures(task: Task, episodes: Episodes) -> Figures:
+    """The root mean square and the mean of apex minus target height, or the error of a fast
+    point."""
+    if isinstance(task, Track):
+        (fast,) = (r.value for r in task.results(episodes) if r.name == "fast error")
+        return {"moving point, cm": fast}
+    if not isinstance(task, Bounce):
+        return {}
+    sums, bounces = episodes.sums, episodes.sums["settled_bounces"]
+    square, _ = mean_and_margin(sums["apex_error^2"], bounces)
+    bias, _ = mean_and_margin(sums["apex_offset"], bounces)
+    if square is None:
+        return {"apex RMS, cm": None, "apex bias, cm": None}
+    return {"apex RMS, cm": 100.0 * math.sqrt(square), "apex bias, cm": 100.0 * bias}
 
 
 def table(rows: dict[str, list[Figures]]) -> str:

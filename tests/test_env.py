@@ -13,6 +13,7 @@ from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
+from bounce_mjx.task import Kinematics, Step
 from bounce_mjx.tasks.bounce import Bounce, BounceState
 from bounce_mjx.world.config import PADDLE_HOME
 from reward_reference import REFERENCE_WEIGHTS, reference_terms
@@ -333,13 +334,13 @@ def drive(steps, start_height=0.45, target=0.5, config=None):
     )
     bounced, counts = [], []
     for z, vz in steps:
-        state, is_bounce = detect(
-            state,
-            target,
-            jnp.array([0.5, 0.0, z]),
-            jnp.array([0.0, 0.0, vz]),
-            jnp.array([0.55, 0.0, PADDLE_Z]),
-        )
+        truth = dict.fromkeys(Kinematics._fields) | {
+            "ball_position": jnp.array([0.5, 0.0, z]),
+            "ball_velocity": jnp.array([0.0, 0.0, vz]),
+            "paddle_position": jnp.array([0.55, 0.0, PADDLE_Z]),
+        }
+        step = Step(Kinematics(**truth), {"target_height": target}, None, None)
+        state, is_bounce = detect(state, step)
         bounced.append(bool(is_bounce))
         counts.append(float(state.n_bounces))
     return bounced, counts, state

@@ -55,7 +55,6 @@ def _row(env: Env, states: State, running: jax.Array, step: jax.Array) -> Record
             ball=now.truth.ball_position,
             paddle=now.truth.paddle_position,
             command=now.command,
-            task=env.task.recorded(now),
             running=running,
             command_velocity=None if setpoint is None else setpoint.velocity,
             qpos=state.pipeline_state.physics.qpos,

@@ -67,8 +67,9 @@ class Result:
 
 def share_of_episodes(name: str, measured: str, met: np.ndarray, least: float) -> Result:
     """The result for the share of the episodes [E] that meet a condition, at least `least`."""
-    share, margin = float(met.mean()), MARGIN_FAILURES * (1.0 - least)
-    return _at_least(name, measured, share, margin, least)
+    share, bound = float(met.mean()), f">= {100 * least:g}"
+    margin = _clearness(share - least, MARGIN_FAILURES * (1.0 - least))
+    return Result(name, f"{measured}, %", 100.0 * share, bound, share >= least, margin)
 
 
 def share_of_events(
@@ -81,7 +82,9 @@ def share_of_events(
       met: number that meet the condition in each episode [E].
       events: number of all in each episode [E].
     """
-    return _at_least(name, measured, *mean_and_margin(met, events), least)
+    found = mean_of_events(name, f"{measured}, %", met, events, (least, math.inf))
+    share = None if found.value is None else 100.0 * found.value
+    return dataclasses.replace(found, value=share, bound=f">= {100 * least:g}")
 
 
 def mean_of_events(
@@ -120,12 +123,9 @@ def root_mean_square(
       squares: sum of the squared quantity in each episode [E].
       events: number of steps or events in each episode [E].
     """
-    mean, margin = mean_and_margin(squares, events)
-    distance = -1.0 if mean is None else most**2 - mean
-    root = None if mean is None else math.sqrt(mean)
-    return Result(
-        name, measured, root, f"<= {most:g}", distance >= 0.0, _clearness(distance, margin)
-    )
+    found = mean_of_events(name, measured, squares, events, (-math.inf, most**2))
+    root = None if found.value is None else math.sqrt(found.value)
+    return dataclasses.replace(found, value=root, bound=f"<= {most:g}")
 
 
 def mean_and_margin(totals: np.ndarray, events: np.ndarray) -> tuple[float | None, float]:
@@ -140,17 +140,6 @@ def mean_and_margin(totals: np.ndarray, events: np.ndarray) -> tuple[float | Non
     mean = float(totals.sum() / count)
     spread = float((totals - mean * events).std() / events.mean())
     return mean, MARGIN_ERRORS * spread / math.sqrt(MARGIN_EPISODES)
-
-
-def _at_least(name: str, measured: str, share: float | None, margin: float, least: float) -> Result:
-    return Result(
-        name,
-        f"{measured}, %",
-        None if share is None else 100.0 * share,
-        f">= {100 * least:g}",
-        share is not None and share >= least,
-        0.0 if share is None else _clearness(share - least, margin),
-    )
 
 
 def _clearness(distance: float, margin: float) -> float:

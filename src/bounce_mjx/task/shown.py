@@ -33,8 +33,6 @@ class Recording(NamedTuple):
     """Positions of the paddle's centre after the step [T, 3, K], m."""
     command: dict[str, jax.Array]
     """Commands [T, K]."""
-    task: dict[str, jax.Array]
-    """What `Task.recorded` gave [T, K]."""
     running: jax.Array
     """Whether the episode had not ended before the step [T, K], bool."""
     command_velocity: jax.Array | None = None

@@ -99,9 +99,6 @@ class Task:
     """Numbers of balls (`WorldConfig.num_balls`) that it takes."""
     num_draws: ClassVar[int] = 0
     """Random numbers that a reset samples for the task."""
-    hits: ClassVar[str] = ""
-    """The sum of `tally` that counts hits; `benchmarks/rank.py` then measures episodes without a
-    time limit, up to a number of hits."""
     critic_metrics: ClassVar[tuple[str, ...]] = ()
     """Metrics that the value network sees by default, because the reward depends on them and the
     observation does not contain them."""
@@ -184,15 +181,6 @@ class Task:
         """Further figures by name; a unit is the end of the name, such as `mean_error_m`."""
         return {}
 
-    def ranking(self, episodes: Episodes) -> dict[str, Figure]:
-        """Further figures for `benchmarks/rank.py`, which rank policies that meet all results; a
-        unit follows a comma."""
-        return {}
-
-    def recorded(self, moment: Moment) -> Values:
-        """Numbers [] of a control step that `plots` needs in addition to the coordinates."""
-        return {}
-
     def plots(self, recording: Recording) -> tuple[Histogram | Hits, ...]:
         """What a report draws of the first episodes of an evaluation, as NumPy arrays."""
         return ()
@@ -208,8 +196,9 @@ class Task:
         return ()
 
     def levels(self, command: dict[str, float]) -> dict[str, float]:
-        """Heights that a plot shows in addition to those of ball and paddle, m."""
-        return {}
+        """Heights that a plot shows in addition to those of ball and paddle, m: a `target_height`
+        by default."""
+        return {"target": command["target_height"]} if "target_height" in command else {}
 
     def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
         """What a viewer writes over an environment, by name; the first stands for all where there

@@ -20,7 +20,7 @@ from bounce_mjx.config.settings import (
     NonNegative,
     Positive,
 )
-from bounce_mjx.lazy import jax, jnp, np
+from bounce_mjx.lazy import jax, jnp
 from bounce_mjx.tasks.bounce_rewards import BounceReward, RewardInputs
 
 SETTLING_SECONDS = 2.0
@@ -190,7 +190,6 @@ class Bounce(task.Task):
         task.Curve("task/n_bounces", "n_bounces"),
     )
     critic_metrics = ("n_bounces",)
-    hits = "hits"
 
     def reset(self, start: task.Start) -> BounceState:
         """No bounce yet; the first apex is the height at which the ball starts."""
@@ -198,13 +197,13 @@ class Bounce(task.Task):
         return BounceState(jnp.zeros((), bool), jnp.zeros_like(height), apex=height)
 
     def step(self, state: BounceState, step: task.Step) -> task.TaskStep:
-        """A bounce or none, the specification's reward, and whether the ball is lost."""
-        target, truth, reward = step.command["target_height"], step.truth, self.config.reward
-        after, bounced = self.detect(
-            state, target, truth.ball_position, truth.ball_velocity, truth.paddle_position
-        )
+        """A bounce or none, the specification's reward, and whether the ball fell, flew too high or
+        too far."""
+        target, truth, config = step.command["target_height"], step.truth, self.config
+        after, bounced = self.detect(state, step)
+        ball, apex_offset = truth.ball_position, state.apex - target
         inputs = RewardInputs(
-            ball_position=truth.ball_position,
+            ball_position=ball,
             ball_velocity=truth.ball_velocity,
             paddle_position=truth.paddle_position,
             target_height=target,
@@ -213,61 +212,46 @@ class Bounce(task.Task):
             action=step.action,
             last_action=step.last_action,
             joint_velocity=truth.joint_velocities,
-            home=reward,
+            home=config.reward,
         )
+        fell = ball[2] < config.min_ball_height
+        too_high = ball[2] > target + config.max_height_above_target
+        too_far = jnp.any(jnp.abs(ball[:2]) > config.max_horizontal_distance)
         return task.TaskStep(
             state=after,
-            reward=task.weighted_terms(reward, inputs),
-            ended=self.is_lost(truth.ball_position, target),
+            reward=task.weighted_terms(config.reward, inputs),
+            ended=fell | too_high | too_far,
             metrics={
                 "bounced": bounced,
                 "n_bounces": after.n_bounces,
                 "ball_xy_error": inputs.err_xy,
-                "apex_error": jnp.where(bounced, jnp.abs(state.apex - target), 0.0),
-                "apex_offset": jnp.where(bounced, state.apex - target, 0.0),
+                "apex_error": jnp.where(bounced, jnp.abs(apex_offset), 0.0),
+                "apex_offset": jnp.where(bounced, apex_offset, 0.0),
             },
         )
 
-    def detect(
-        self,
-        state: BounceState,
-        target_height: jax.Array,
-        ball: jax.Array,
-        ball_velocity: jax.Array,
-        paddle: jax.Array,
-    ) -> tuple[BounceState, jax.Array]:
+    def detect(self, state: BounceState, step: task.Step) -> tuple[BounceState, jax.Array]:
         """Detects a bounce and counts it.
 
         A bounce is the first step on which the ball rises, near the paddle. It adds to the count if
         the apex before it was above the target height minus the tolerance; otherwise the count
         restarts at 1, which is also the count after the first bounce of an episode.
 
-        Args:
-          ball, ball_velocity, paddle: positions [3] (m) and velocity [3] (m/s) after the step.
-
         Returns:
           The new state, and whether this step is a bounce [] (bool).
         """
-        config = self.config
-        rising = ball_velocity[2] > config.bounce_min_velocity
-        near = jnp.abs(ball[2] - paddle[2]) < config.bounce_max_distance
+        config, truth, height = self.config, step.truth, step.truth.ball_position[2]
+        rising = truth.ball_velocity[2] > config.bounce_min_velocity
+        near = jnp.abs(height - truth.paddle_position[2]) < config.bounce_max_distance
         bounced = rising & ~state.rising & near
-        continues = state.apex > target_height - config.apex_tolerance
+        continues = state.apex > step.command["target_height"] - config.apex_tolerance
         counted = jnp.where(continues, state.n_bounces + 1.0, 1.0)
         after = BounceState(
             rising=rising,
             n_bounces=jnp.where(bounced, counted, state.n_bounces),
-            apex=jnp.where(bounced, ball[2], jnp.maximum(state.apex, ball[2])),
+            apex=jnp.where(bounced, height, jnp.maximum(state.apex, height)),
         )
         return after, bounced
-
-    def is_lost(self, ball: jax.Array, target_height: jax.Array) -> jax.Array:
-        """Whether the ball [3] fell, flew too high or too far [], bool."""
-        config = self.config
-        fell = ball[2] < config.min_ball_height
-        too_high = ball[2] > target_height + config.max_height_above_target
-        too_far = jnp.any(jnp.abs(ball[:2]) > config.max_horizontal_distance)
-        return fell | too_high | too_far
 
     def first_quantities(
         self, measured: dict[str, jax.Array]
@@ -349,41 +333,25 @@ class Bounce(task.Task):
         rise = self.config.reward.paddle_home_height - HOME_HEIGHT
         lowest, highest = (round(height + rise, 4) for height in UPWARD_SPEED_TARGETS)
         is_judged = lowest <= heights[0] and heights[1] <= highest
+        condition = "" if is_judged else f"targets {lowest} to {highest} only"
+        in_row = episodes.maxima["n_bounces"] >= MIN_CONSECUTIVE_BOUNCES
+        texts = {
+            "consecutive bounces": f"episodes with at least {MIN_CONSECUTIVE_BOUNCES} in a row",
+            "horizontal position": f"steps with |x error| <= {MAX_X_ERROR} m",
+            "height": f"bounces with |apex error| <= {MAX_APEX_ERROR} m",
+            "upward speed": "mean velocity of the rising ball, m/s",
+            "stable": f"episodes that last the full {self.config.episode_seconds:g} s",
+        }
+        row, place, height, speed, stable = texts.items()
+        centred, settled = sums["centred_steps"], sums["settled_steps"]
+        accurate, bounces = sums["accurate_bounces"], sums["settled_bounces"]
+        rising = sums["rising_speed"], sums["rising_steps"]
         return (
-            task.share_of_episodes(
-                "consecutive bounces",
-                f"episodes with at least {MIN_CONSECUTIVE_BOUNCES} in a row",
-                episodes.maxima["n_bounces"] >= MIN_CONSECUTIVE_BOUNCES,
-                MIN_EPISODE_SHARE,
-            ),
-            task.share_of_events(
-                "horizontal position",
-                f"steps with |x error| <= {MAX_X_ERROR} m",
-                sums["centred_steps"],
-                sums["settled_steps"],
-                MIN_STEP_SHARE,
-            ),
-            task.share_of_events(
-                "height",
-                f"bounces with |apex error| <= {MAX_APEX_ERROR} m",
-                sums["accurate_bounces"],
-                sums["settled_bounces"],
-                MIN_STEP_SHARE,
-            ),
-            task.mean_of_events(
-                "upward speed",
-                "mean velocity of the rising ball, m/s",
-                sums["rising_speed"],
-                sums["rising_steps"],
-                UPWARD_SPEED_RANGE,
-                "" if is_judged else f"targets {lowest} to {highest} only",
-            ),
-            task.share_of_episodes(
-                "stable",
-                f"episodes that last the full {self.config.episode_seconds:g} s",
-                episodes.lasted,
-                MIN_EPISODE_SHARE,
-            ),
+            task.share_of_episodes(*row, in_row, MIN_EPISODE_SHARE),
+            task.share_of_events(*place, centred, settled, MIN_STEP_SHARE),
+            task.share_of_events(*height, accurate, bounces, MIN_STEP_SHARE),
+            task.mean_of_events(*speed, *rising, UPWARD_SPEED_RANGE, condition),
+            task.share_of_episodes(*stable, episodes.lasted, MIN_EPISODE_SHARE),
         )
 
     def details(self, episodes: task.Episodes) -> dict[str, task.Figure]:
@@ -396,29 +364,14 @@ class Bounce(task.Task):
             "mean_apex_error_m": error,
         }
 
-    def ranking(self, episodes: task.Episodes) -> dict[str, task.Figure]:
-        """The root mean square and the mean of apex minus target height."""
-        sums, bounces = episodes.sums, episodes.sums["settled_bounces"]
-        square, _ = task.mean_and_margin(sums["apex_error^2"], bounces)
-        bias, _ = task.mean_and_margin(sums["apex_offset"], bounces)
-        if square is None:
-            return {"apex RMS, cm": None, "apex bias, cm": None}
-        return {"apex RMS, cm": 100.0 * math.sqrt(square), "apex bias, cm": 100.0 * bias}
-
-    def recorded(self, moment: task.Moment) -> dict[str, jax.Array]:
-        """Bounces, and the apex so far."""
-        return {"bounced": moment.metrics["bounced"], "apex": moment.state.apex}
-
     def plots(self, recording: task.Recording) -> tuple[task.Histogram | task.Hits, ...]:
         """Apex errors, and where the ball hits the paddle."""
-        apex = np.roll(recording.task["apex"], 1, axis=0)
-        bounces = (recording.task["bounced"] > 0) & recording.running
-        bounces[: max(1, round(SETTLING_SECONDS / self.config.control_dt))] = False
-        errors = (apex - recording.command["target_height"])[bounces]
+        bounces = (recording.metrics["bounced"] > 0) & recording.running
+        bounces[: round(SETTLING_SECONDS / self.config.control_dt)] = False
+        errors = 100.0 * recording.metrics["apex_offset"][bounces]
+        title = "apex minus target height, cm"
         return (
-            task.Histogram(
-                "apex minus target height, cm", "bounces", 100.0 * errors, 100.0 * MAX_APEX_ERROR
-            ),
+            task.Histogram(title, "bounces", errors, 100.0 * MAX_APEX_ERROR),
             task.Hits("hits on the paddle, cm", bounces),
         )
 
@@ -430,10 +383,6 @@ class Bounce(task.Task):
             task.Marker("target_height", target, (0.05, 0.001, 0.0), green, "cylinder"),
             task.Marker("paddle_home", self.focus(), (0.05, 0.065, 0.001), blue, "frame"),
         )
-
-    def levels(self, command: dict[str, float]) -> dict[str, float]:
-        """The target height."""
-        return {"target": command["target_height"]}
 
     def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
         """Bounces in a row, and the target height."""

@@ -74,11 +74,6 @@ class RewardInputs:
         """Distance of the paddle's height from home, m."""
         return jnp.abs(self.paddle_position[2] - self.home.paddle_home_height)
 
-    @property
-    def gravity(self) -> float:
-        """Gravity in the ballistic formulas, m/s^2."""
-        return self.home.gravity
-
 
 class PositionReward(RewardTerm):
     """Horizontal position: keep the ball above the target point, especially when it is near the
@@ -101,8 +96,6 @@ class PositionReward(RewardTerm):
 class OutOfPositionReward(RewardTerm):
     """Out of position: a smooth penalty for a large horizontal error."""
 
-    weight: Finite = 1.0
-    """Weight of the term."""
     magnitude: NonNegative = 2.0
     """Largest penalty."""
     threshold: Distance = 0.05
@@ -136,10 +129,10 @@ class VelocityMatchingReward(RewardTerm):
         """The velocity of a case is 0 where the condition of that case does not hold."""
         vz, delta_h = inputs.vz, inputs.delta_h
         rising_below = (vz > 0.0) & (delta_h > 0.0)
-        squared_up = jnp.square(vz) - 2.0 * inputs.gravity * delta_h
+        squared_up = jnp.square(vz) - 2.0 * inputs.home.gravity * delta_h
         v_up = jnp.where(rising_below, safe_sqrt(squared_up), 0.0)
         falling_above = (vz < 0.0) & (delta_h < 0.0)
-        squared_down = jnp.square(vz) + 2.0 * inputs.gravity * jnp.abs(delta_h)
+        squared_down = jnp.square(vz) + 2.0 * inputs.home.gravity * jnp.abs(delta_h)
         v_down = jnp.where(falling_above, -safe_sqrt(squared_down), 0.0)
         v_near = jnp.where(jnp.abs(delta_h) < self.near_distance, vz, 0.0)
 
@@ -167,8 +160,6 @@ class HeightReward(RewardTerm):
 class HeightProgressReward(RewardTerm):
     """Height progress: get the ball high at all, so that the policy discovers hitting early."""
 
-    weight: Finite = 1.0
-    """Weight of the term."""
     base_height: Coordinate = 0.2
     """Ball height above which the term grows, m."""
     gain: NonNegative = 2.0
@@ -197,7 +188,7 @@ class ControlledUpwardReward(RewardTerm):
     """Upward velocity above which the term no longer grows, m/s."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
-        v_ideal = safe_sqrt(2.0 * inputs.gravity * inputs.delta_h)
+        v_ideal = safe_sqrt(2.0 * inputs.home.gravity * inputs.delta_h)
         v_ideal = jnp.clip(v_ideal, self.min_ideal_velocity, self.max_ideal_velocity)
         q_pos = gaussian(inputs.err_xy, self.position_scale)
         q_vel = gaussian(inputs.vz - v_ideal, self.velocity_scale)
@@ -286,8 +277,6 @@ class PaddleHomeReward(RewardTerm):
 class ExcessiveUpwardReward(RewardTerm):
     """Excessive upward velocity: a smooth penalty for a ball hit too hard."""
 
-    weight: Finite = 1.0
-    """Weight of the term."""
     magnitude: NonNegative = 1.0
     """Largest penalty."""
     threshold: Velocity = 3.5
@@ -322,8 +311,6 @@ class DownwardVelocityReward(RewardTerm):
 class PaddleHeightViolationReward(RewardTerm):
     """Paddle height violation: a linear penalty beyond the tolerance around home."""
 
-    weight: Finite = 1.0
-    """Weight of the term."""
     gain: NonNegative = 20.0
     """Penalty for each metre beyond the tolerance, 1/m."""
     tolerance: Distance = 0.1

@@ -197,9 +197,6 @@ class Juggle(task.Task):
             task.Marker("next ball", place, (0.021, 0.021, 0.001), (1.0, 0.8, 0.1, 0.9), "frame"),
         )
 
-    def levels(self, command: dict[str, float]) -> dict[str, float]:
-        return {"target": command["target_height"]}
-
     def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
         return {"target": f"{command['target_height']:.2f} m"}
 

@@ -199,15 +199,8 @@ class Track(task.Task):
             task.share_of_episodes("stable", f"episodes that last {length}", episodes.lasted, 0.99),
         )
 
-    def ranking(self, episodes: task.Episodes) -> dict[str, task.Figure]:
-        (fast,) = (r.value for r in self.results(episodes) if r.name == "fast error")
-        return {"moving point, cm": fast}
-
     def markers(self, command: Any, metrics: Any) -> tuple[task.Marker, ...]:
         return paths.markers(command, self.config.path_size)
 
     def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
         return {"path": f"{paths.name(command)}, {command['point_speed']:.2f} m/s"}
-
-    def levels(self, command: dict[str, float]) -> dict[str, float]:
-        return {"target": command["target_height"]}
