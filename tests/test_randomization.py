@@ -196,7 +196,10 @@ def test_a_share_of_the_terms_is_drawn() -> None:
         ({"paddle_tilt": [[0.0] * 3, [0.1] * 3]}, "two lists with one for each of 2 axes"),
         ({"paddle_tilt": [[0.0, 0.2], [0.1, 0.1]]}, "paddle_tilt (0.2, 0.1) is not a range"),
         ({"servo_gain": [[0.9] * 6, [1.1] * 5]}, "two numbers, or two lists with one for each"),
-        ({"servo_gain": [[0.9] * 5, [1.1] * 5]}, "is for 5 joints, but default_joint_angles"),
+        (
+            {"servo_gain": [[0.9] * 5, [1.1] * 5]},
+            "servo_gain has 5 numbers, but default_joint_angles",
+        ),
         ({"servo_gain": [[0.9] * 6, [math.inf] * 6]}, "servo_gain is inf, but must be a finite"),
     ],
 )

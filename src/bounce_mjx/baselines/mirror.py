@@ -37,11 +37,9 @@ _ITERATIONS = 4
 
 def observing(config: WorldConfig) -> WorldConfig:
     """A config whose observation has what the law needs, if the task has it."""
-    names = _needs(config)
-    seen = {name: max(1, getattr(config.observation, name, 1)) for name in names}
-    known = {name: count for name, count in seen.items() if hasattr(config.observation, name)}
-    observation = config.observation.model_copy(update=known)
-    return config.model_copy(update={"observation": observation})
+    seen, names = config.observation, _needs(config)
+    counts = {name: max(1, getattr(seen, name)) for name in names if hasattr(seen, name)}
+    return config.model_copy(update={"observation": seen.model_copy(update=counts)})
 
 
 def _needs(config: WorldConfig) -> tuple[str, ...]:
@@ -61,15 +59,11 @@ class MirrorLaw:
         """
         config, model = env.config, env.mj_model
         missing = [name for name in _needs(config) if name not in config.observation.lengths()]
-        if "target_height" in missing or config.num_balls > 1:
+        if missing or config.num_balls > 1:
             raise UserError(
-                f"the mirror law bounces one ball at a target_height, and the task "
-                f"{type(env.task).__name__} has none; give a policy"
-            )
-        if missing:
-            raise UserError(
-                f"the mirror law needs {', '.join(missing)} in the observation; set "
-                f"env.observation.{missing[0]} to 1"
+                f"the mirror law bounces one ball with {', '.join(_needs(config))} in the "
+                f"observation; the task {type(env.task).__name__} has {config.num_balls}, and "
+                f"lacks {', '.join(missing) or 'nothing'}; give a policy"
             )
         self._env, at = env, env.addresses
         self._arm, self._servos = list(at.arm_qpos), list(at.actuators)
@@ -100,8 +94,7 @@ class MirrorLaw:
         return jnp.vectorize(self._action, signature="(n)->(a)")(observation)
 
     def _action(self, observation: jax.Array) -> jax.Array:
-        config = self._env.config
-        layout = self._env.layout
+        config, layout = self._env.config, self._env.layout
         # The newest value of each quantity comes first.
         seen = {part.name: observation[layout[part.name]][: part.size] for part in layout.parts}
         ball, velocity = seen["ball_position"], seen["ball_velocity"]

@@ -112,31 +112,24 @@ def step(
     env: AnyEnv,
     state: VectorState,
     action: jax.Array,
-    key: jax.Array,
+    key: jax.Array | None,
     episode_steps: int,
     ranges: Any = None,
+    fresh: State | None = None,
 ) -> tuple[VectorState, VectorStep]:
     """Advances every environment, and resets every ended episode with a new sample.
 
     Args:
       action: [B, A].
-      key: consumed by the resets.
+      key: consumed by the resets; None with `fresh`.
       episode_steps: time limit of an episode in steps.
       ranges: ranges of the randomisation; None for the environment's own.
+      fresh: result of `first_states`, which replaces the states of ended episodes, instead of a
+        sample with `key`; one sample for many steps costs less. An environment that ends twice with
+        the same `fresh` starts twice alike.
     """
-    fresh = first_states(env, key, state.clock.shape[0], ranges)
-    return step_with(env, state, action, fresh, episode_steps)
-
-
-def step_with(
-    env: AnyEnv, state: VectorState, action: jax.Array, fresh: State, episode_steps: int
-) -> tuple[VectorState, VectorStep]:
-    """`step` with initial states from before; one sample for many steps costs less.
-
-    Args:
-      fresh: result of `first_states`, which replaces the states of ended episodes. An environment
-        that ends twice with the same `fresh` starts twice alike.
-    """
+    if fresh is None:
+        fresh = first_states(env, key, state.clock.shape[0], ranges)
     stepped = jax.vmap(env.step, in_axes=-1, out_axes=-1)(state.env, action.T)
     clock, length = state.clock + 1, state.length + 1
     episode_return = state.episode_return + stepped.reward

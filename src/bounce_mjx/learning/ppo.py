@@ -235,7 +235,9 @@ class PPO:
             normalized = normalize(inputs, state.statistics.normalizer)
             policy = self.distribution(state.params, normalized, noise_bounds(config))
             action = policy.mean + policy.std * noise
-            env_state, result = vector.step_with(env, env_state, action, fresh, self.episode_steps)
+            env_state, result = vector.step(
+                env, env_state, action, None, self.episode_steps, fresh=fresh
+            )
             # An environment times out at most once in a rollout, because no time limit is shorter.
             final_inputs = self.network_inputs(result.final_observation, result.metrics)
             timeout_inputs = jnp.where(result.truncated[:, None], final_inputs, timeout_inputs)

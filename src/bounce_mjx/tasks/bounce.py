@@ -253,27 +253,19 @@ class Bounce(task.Task):
         )
         return after, bounced
 
-    def first_quantities(
-        self, measured: dict[str, jax.Array]
-    ) -> tuple[MeasuredFlight, dict[str, jax.Array]]:
+    def first_quantities(self, measured: task.Values) -> tuple[MeasuredFlight, task.Values]:
         """Before the first bounce, its quantities are those of the start."""
-        height = measured["ball_position"][2]
-        zero = jnp.zeros_like(height)
-        flight = MeasuredFlight(height, jnp.zeros((), bool), lowest=height, time=zero)
-        return flight, {
+        ball = measured["ball_position"]
+        zero = jnp.zeros_like(ball[2])
+        flight = MeasuredFlight(ball[2], jnp.zeros((), bool), lowest=ball[2], time=zero)
+        return flight, _at_bounce(measured, ball) | {
             "apex_error": zero[None],
-            "bounce_position": measured["ball_position"][:2],
             "bounce_interval": zero[None],
-            "bounce_joint_angles": measured["joint_angles"],
-            "bounce_joint_velocities": measured["joint_velocities"],
         }
 
     def next_quantities(
-        self,
-        memory: MeasuredFlight,
-        histories: dict[str, jax.Array],
-        measured: dict[str, jax.Array],
-    ) -> tuple[MeasuredFlight, dict[str, jax.Array]]:
+        self, memory: MeasuredFlight, histories: task.Values, measured: task.Values
+    ) -> tuple[MeasuredFlight, task.Values]:
         """A measured bounce starts when the ball is first measured near the paddle. Its position
         and joints are taken at the ball's lowest measured point."""
         height = measured["ball_picture"][2]
@@ -281,23 +273,20 @@ class Bounce(task.Task):
         starts = is_low & ~memory.is_low
         at_lowest = starts | (is_low & (height < memory.lowest))
         time = memory.time + self.config.control_dt
-        new = {
-            "apex_error": (memory.apex - measured["target_height"], starts),
-            "bounce_interval": (time[None], starts),
-            "bounce_position": (measured["ball_picture"][:2], at_lowest),
-            "bounce_joint_angles": (measured["joint_angles"], at_lowest),
-            "bounce_joint_velocities": (measured["joint_velocities"], at_lowest),
-        }
         flight = MeasuredFlight(
             apex=jnp.where(is_low, height, jnp.maximum(memory.apex, height)),
             is_low=is_low,
             lowest=jnp.where(at_lowest, height, memory.lowest),
             time=jnp.where(starts, 0.0, time),
         )
+        at_start = {
+            "apex_error": memory.apex - measured["target_height"],
+            "bounce_interval": time[None],
+        }
+        new = at_start | _at_bounce(measured, measured["ball_picture"])
         return flight, {
-            name: task.latest(history, value, is_new=starts, changes=changes)
-            for name, history in histories.items()
-            for value, changes in [new[name]]
+            name: task.latest(x, new[name], starts, starts if name in at_start else at_lowest)
+            for name, x in histories.items()
         }
 
     def tally(self, moment: task.Moment) -> task.Tally:
@@ -395,3 +384,12 @@ class Bounce(task.Task):
         """The paddle's home."""
         reward = self.config.reward
         return reward.target_x, reward.target_y, reward.paddle_home_height
+
+
+def _at_bounce(measured: task.Values, ball: jax.Array) -> task.Values:
+    """The measured quantities of a bounce at a ball's position [3], m."""
+    return {
+        "bounce_position": ball[:2],
+        "bounce_joint_angles": measured["joint_angles"],
+        "bounce_joint_velocities": measured["joint_velocities"],
+    }

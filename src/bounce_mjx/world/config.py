@@ -188,8 +188,8 @@ class WorldConfig(StrictModel):
         for key, count in counts.items():
             if count != self.num_joints:
                 raise ValueError(
-                    f"{key} is for {count} joints, but default_joint_angles has "
-                    f"{self.num_joints}; give a number for each acting joint"
+                    f"{key} has {count} numbers, but default_joint_angles has {self.num_joints}; "
+                    "give one for each acting joint"
                 )
         if limits.velocity is not None and self.action.base == "measured":
             # A command that follows the measured angle, which follows the command, oscillates.
