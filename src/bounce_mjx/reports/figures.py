@@ -145,7 +145,10 @@ def _draw_curve(axes: Axes, groups: Sequence[Group], shown: Curve) -> None:
         if curves:
             steps, mean, deviation = mean_and_band(curves)
             low, mean, high = (shown.scale * (mean + side * deviation) for side in (-1, 0, 1))
-            axes.plot(steps, mean, color=colour, linewidth=1.6, label=literal(group.label))
+            # A line of one point shows nothing.
+            marker = "." if len(steps) == 1 else ""
+            label = literal(group.label)
+            axes.plot(steps, mean, color=colour, marker=marker, linewidth=1.6, label=label)
         if len(curves) > 1:
             for curve in curves:
                 axes.plot(curve.steps, shown.scale * curve.values, color=colour, alpha=0.3, lw=0.7)
@@ -169,7 +172,9 @@ def add_legend(figure: Figure) -> None:
     for axes in figure.axes:
         lines, labels = axes.get_legend_handles_labels()
         handles |= zip(labels, lines, strict=True)
-    columns = max(1, min(round(figure.get_figwidth() / PANEL_WIDTH), len(handles)))
+    # About 0.1 inches a letter with its share of the line and of the gaps.
+    widest = max(0.1 * len(label) + 0.6 for label in handles or [""])
+    columns = max(1, min(int(figure.get_figwidth() / widest), len(handles)))
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
 
 
