@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import importlib
 import inspect
+import os
 import pkgutil
 import re
 import runpy
@@ -331,21 +332,17 @@ def short_training(folder: Path) -> Callable:
 
 
 SLOW_PAGES = "libraries.md", "training.md"
-RUN_ELSEWHERE = {"libraries.md": 3}
-"""How many first snippets of a page `test_package.py` runs unchanged."""
 
 
 @pytest.mark.parametrize(
     "page",
     [
-        pytest.param(page.name, marks=[pytest.mark.slow] * (page.name in SLOW_PAGES))
-        for page in PAGES
-        if page.parent == CHECKOUT / "docs" and examples(page.name, "python")
+        pytest.param(page, marks=[pytest.mark.slow] * (page in SLOW_PAGES))
+        for page in (os.path.relpath(path, CHECKOUT / "docs") for path in PAGES)
+        if examples(page, "python")
     ],
 )
-def test_python_of_a_page_runs(
-    page: str, capsys, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_python_of_a_page_runs(page: str, capsys, tmp_path: Path, monkeypatch, request) -> None:
     """From top to bottom, as a notebook; excerpts are those of their file. Compiled functions are
     only traced, which takes a tenth of the time, and a training is short."""
     monkeypatch.setattr(bounce_mjx, "train", short_training(tmp_path), raising=False)
@@ -354,8 +351,11 @@ def test_python_of_a_page_runs(
         shapes = functools.partial(jax.eval_shape, function)
         return lambda *args: jax.tree.map(lambda x: jnp.ones(x.shape, x.dtype), shapes(*args))
 
+    if page == "libraries.md":
+        for fixture in ("opengl", "torch_libraries"):
+            request.getfixturevalue(fixture)
     names: dict = {"traced": traced}
-    for example in examples(page, "python")[RUN_ELSEWHERE.get(page, 0) :]:
+    for example in examples(page, "python"):
         if page == "tasks.md":
             assert example in (CHECKOUT / "examples/dribble_task.py").read_text("utf-8")
             continue

@@ -74,35 +74,3 @@ def test_wheel_holds_the_package_and_its_data(wheel: Path) -> None:
         expected |= {f"bounce_mjx/{p.relative_to(CHECKOUT)}" for p in data}
     assert expected <= names
     assert {name.split("/")[0].split("-")[0] for name in names} == {"bounce_mjx"}
-
-
-@pytest.mark.parametrize(
-    ("page", "number", "printed", "needs"),
-    [
-        ("README.md", 0, "(64, 29) ", None),
-        pytest.param(
-            "docs/libraries.md",
-            0,
-            "(29,) (480, 640, 3) (64, 29)\n",
-            "opengl",
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            "docs/libraries.md",
-            1,
-            "torch.Size([64, 29]) ",
-            "torch_libraries",
-            marks=pytest.mark.slow,
-        ),
-        ("docs/libraries.md", 2, "(64, 29) 0", None),
-    ],
-    ids=["jax", "gymnasium", "torch", "brax"],
-)
-def test_example_of_a_page_runs(page, number, printed, needs, request, capsys):
-    """The first examples for each kind of user run unchanged."""
-    if needs:
-        request.getfixturevalue(needs)
-    text = (CHECKOUT / page).read_text(encoding="utf-8")
-    example = text.split("```python\n")[1 + number].split("```")[0]
-    exec(compile(example, page, "exec"), {})
-    assert capsys.readouterr().out.startswith(printed)
