@@ -2,17 +2,23 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
 from rich.console import Console
 
-from bounce_mjx.commands.run_options import PolicyCommand
-from bounce_mjx.config.command_line import parse
+from bounce_mjx.commands.run_options import RunCommand
+from bounce_mjx.config.command_line import Flag, parse
 from bounce_mjx.errors import UserError, exit_on_user_error
 
 
-class ExportCommand(PolicyCommand):
+class ExportCommand(RunCommand):
     """Exports a trained policy as an ONNX file."""
 
+    checkpoint: Annotated[Path | None, Flag(metavar="[CHECKPOINT]", is_positional=True)] = None
+    """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, or a
+    policy that comes with the package: pretrained, robust, robust_small, or the name of a task or
+    an arm. The default is the newest run, or the task's policy in the package if there is no
+    run."""
     onnx: Path | None = None
     """ONNX file to write: normaliser, network and clipping in one graph, and metadata."""
 

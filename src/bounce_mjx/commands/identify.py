@@ -1,10 +1,10 @@
 """Estimates a robot's world from its logs: `bounce-mjx identify LOG... --out world.yaml`."""
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from rich.console import Console
 
@@ -14,9 +14,6 @@ from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.identify import Topics
 from bounce_mjx.runs.config import read_preset
-
-if TYPE_CHECKING:
-    from bounce_mjx.identify.stages import Identified
 
 
 class IdentifyCommand(StrictModel):
@@ -48,7 +45,7 @@ def main(args: Sequence[str]) -> None:
         raise UserError("no log is given; name the CSV files or bags to identify from")
     from bounce_mjx.identify.reading import read_log
     from bounce_mjx.identify.stages import identify, join
-    from bounce_mjx.identify.world import compare, to_yaml
+    from bounce_mjx.identify.world import compare, estimates, sentences, to_yaml
     from bounce_mjx.reports.identification import identification_page
     from bounce_mjx.robot.model import joint_names, load_model
     from bounce_mjx.runs.files import check_output, write_output
@@ -74,7 +71,16 @@ def main(args: Sequence[str]) -> None:
         say(f"warning: {warning}")
     set_up_jax(config)
     found = identify(config, log, command.camera_rotation, lambda line: say(f"  {line}"))
-    for line in _describe(found, names):
+    for entry in estimates(found, names):
+        seen = "" if entry.seen else "  (not shown by the log)"
+        interval = f"{entry.low:.5g} to {entry.high:.5g} {entry.unit}".rstrip()
+        say(f"{entry.label}: {entry.value:.5g}, {interval}{seen}")
+    for sensor, error in found.after.items():
+        held = found.held_out.get(sensor)
+        rest = "" if held is None else f", {held:.2f} in windows held out"
+        before = found.before.get(sensor, float("nan"))
+        say(f"{sensor}: error {before:.2f} times the noise before, {error:.2f} after{rest}")
+    for line in sentences(found, names):
         say(line)
     if known is not None:
         changed = compare(known, found, names)
@@ -89,19 +95,3 @@ def main(args: Sequence[str]) -> None:
     for path, content in files.items():
         write_output(path, content)
         say(str(path))
-
-
-def _describe(found: "Identified", joint_names: Sequence[str]) -> Iterator[str]:
-    """Lines about each estimate and each sensor, and what the log cannot show."""
-    from bounce_mjx.identify.world import estimates, sentences
-
-    for entry in estimates(found, joint_names):
-        seen = "" if entry.seen else "  (not shown by the log)"
-        interval = f"{entry.low:.5g} to {entry.high:.5g} {entry.unit}".rstrip()
-        yield f"{entry.label}: {entry.value:.5g}, {interval}{seen}"
-    for sensor, error in found.after.items():
-        held = found.held_out.get(sensor)
-        rest = "" if held is None else f", {held:.2f} in windows held out"
-        before = found.before.get(sensor, float("nan"))
-        yield f"{sensor}: error {before:.2f} times the noise before, {error:.2f} after{rest}"
-    yield from sentences(found, joint_names)

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.console import Console
 from rich.progress import Progress
 
 from bounce_mjx.commands.run_options import OneActorCommand
@@ -23,7 +22,6 @@ from bounce_mjx.resources import POLICIES, resource_path
 from bounce_mjx.runs.config import TrainConfig
 
 if TYPE_CHECKING:
-    from bounce_mjx.evaluation.robustness import RobustnessReport
     from bounce_mjx.evaluation.suite import Condition
 
 
@@ -56,7 +54,13 @@ def main(args: Sequence[str]) -> None:
     not, 2 on a mistake."""
     command = parse(RobustnessCommand, args, prog="bounce-mjx robustness")
     from bounce_mjx.evaluation.robustness import RobustnessReport, measure_conditions
-    from bounce_mjx.runs.files import writable
+    from bounce_mjx.reports.figures import image
+    from bounce_mjx.reports.robustness import (
+        ROBUSTNESS_FILE,
+        robustness_figure,
+        robustness_table,
+    )
+    from bounce_mjx.runs.files import to_json, writable, write_output
     from bounce_mjx.runs.folders import MIRROR_LAW
     from bounce_mjx.runs.reading import read_actor
     from bounce_mjx.training.setup import set_up_jax
@@ -90,7 +94,13 @@ def main(args: Sequence[str]) -> None:
         measured=outcomes[0].measured,
         outcomes=outcomes,
     )
-    _write_report(report, out, console)
+    console.print(robustness_table(report))
+    figure = robustness_figure(report)
+    files = {ROBUSTNESS_FILE: to_json(report.model_dump())}
+    files |= {f"robustness.{suffix}": image(figure, suffix) for suffix in ("png", "svg")}
+    for name, content in files.items():
+        write_output(out / name, content)
+    print(*(out / name for name in files), sep="\n")
     sys.exit(0 if report.passed else 1)
 
 
@@ -112,22 +122,3 @@ def _read_conditions(
     if command.assumed:
         return conditions[: 1 + len(assumed)], f"twice what {command.world} assumes", ""
     return conditions, str(path), read_suite(path).version
-
-
-def _write_report(report: "RobustnessReport", out: Path, console: Console) -> None:
-    """Prints a report, and writes it and its pictures into a folder."""
-    from bounce_mjx.reports.figures import image
-    from bounce_mjx.reports.robustness import (
-        ROBUSTNESS_FILE,
-        robustness_figure,
-        robustness_table,
-    )
-    from bounce_mjx.runs.files import to_json, write_output
-
-    console.print(robustness_table(report))
-    figure = robustness_figure(report)
-    files = {ROBUSTNESS_FILE: to_json(report.model_dump())}
-    files |= {f"robustness.{suffix}": image(figure, suffix) for suffix in ("png", "svg")}
-    for name, content in files.items():
-        write_output(out / name, content)
-    print(*(out / name for name in files), sep="\n")

@@ -118,16 +118,6 @@ class WorldCommand(ActorCommand):
         return config if self.world is None else in_world(config, self.world)[0]
 
 
-class PolicyCommand(RunCommand):
-    """A command line about a trained policy."""
-
-    checkpoint: Annotated[Path | None, Flag(metavar="[CHECKPOINT]", is_positional=True)] = None
-    """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, or a
-    policy that comes with the package: pretrained, robust, robust_small, or the name of a task or
-    an arm. The default is the newest run, or the task's policy in the package if there is no
-    run."""
-
-
 class _FirstFlags(StrictModel):
     """The flag that decides which commands there are."""
 

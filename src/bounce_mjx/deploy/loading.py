@@ -28,7 +28,18 @@ def load_policy(
     Raises:
       UserError: there is no such policy, the file is damaged, or a name is missing or given twice.
     """
-    loaded = DeployedPolicy(*_model(policy, task))
+    path, source = Path(policy), str(policy)
+    if policy in POLICIES:
+        path = resource_path(f"{POLICIES[policy]}/{policy}.onnx")
+        source = f"the policy {policy}"
+    try:
+        model = _export(path, task) if path.is_dir() else path.read_bytes()
+    except OSError as error:
+        raise UserError(
+            f"the policy {path} cannot be read ({error.strerror}); give {', '.join(POLICIES)}, "
+            "a .onnx file or a run's folder"
+        ) from error
+    loaded = DeployedPolicy(model, source)
     if joint_names is not None:
         names = check_names(joint_names, loaded.metadata.joint_names, "joint_names")
         loaded.metadata = loaded.metadata._replace(joint_names=names)
@@ -47,23 +58,6 @@ def check_names(names: Sequence[str], own: Sequence[str], option: str) -> tuple[
             f"has the {len(own)} joints {', '.join(own)}; give one name for each, in this order"
         )
     return tuple(names)
-
-
-def _model(policy: str | os.PathLike, task: str | None) -> tuple[bytes, str]:
-    """The content of a policy's ONNX file, and the policy's name for messages."""
-    if policy in POLICIES:
-        path = resource_path(f"{POLICIES[policy]}/{policy}.onnx")
-        return path.read_bytes(), f"the policy {policy}"
-    path = Path(policy)
-    if path.is_dir():
-        return _export(path, task), str(path)
-    try:
-        return path.read_bytes(), str(path)
-    except OSError as error:
-        raise UserError(
-            f"the policy {path} cannot be read ({error.strerror}); give {', '.join(POLICIES)}, "
-            "a .onnx file or a run's folder"
-        ) from error
 
 
 def _export(run: Path, task: str | None) -> bytes:

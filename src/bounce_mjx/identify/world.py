@@ -207,17 +207,16 @@ def to_yaml(found: Identified, log: Log, joint_names: Sequence[str], robot: str 
     for name, (low, high, words) in _measure_sensors(found, log).items():
         ranges[name] = _clip(name, (low, high))
         sources[name] = f"{words} in {log.source}."
-    content: dict[str, Any] = {} if robot is None else {"robot": robot}
-    content["env"] = {"randomization": ranges}
-    content["sources"] = {f"randomization.{name}": text for name, text in sources.items()}
-    content["assumed"] = [f"randomization.{name}" for name in assumed]
+    head = {} if robot is None else {"robot": robot}
+    head["env"] = {"randomization": ranges}
+    tail = {"sources": {f"randomization.{name}": text for name, text in sources.items()}}
+    tail["assumed"] = [f"randomization.{name}" for name in assumed]
     # The numbers of an end on one line, and sources below one another.
-    parts = [
-        yaml.safe_dump({key: value}, sort_keys=False, default_flow_style=style, width=100)
-        for key, value in content.items()
-        for style in [None if key == "env" else False]
+    texts = [
+        yaml.safe_dump(part, sort_keys=False, default_flow_style=style, width=100)
+        for part, style in ((head, None), (tail, False))
     ]
-    return f"# Identified from {log.source}: bounce-mjx train --world FILE\n{''.join(parts)}"
+    return f"# Identified from {log.source}: bounce-mjx train --world FILE\n{''.join(texts)}"
 
 
 def compare(world: NamedWorld, found: Identified, joint_names: Sequence[str]) -> list[str]:

@@ -26,8 +26,9 @@ def identification_page(
       world: the file of the identified world.
     """
     listed = estimates(found, joint_names)
+    marks = {True: "", False: "not shown by the log: the prior"}
     rows = [
-        [e.label, f"{e.value:.3g}", f"{e.low:.3g} to {e.high:.3g} {e.unit}", "" if e.seen else "no"]
+        [e.label, f"{e.value:.3g}", f"{e.low:.3g} to {e.high:.3g} {e.unit}", marks[e.seen]]
         for e in sorted(listed, key=lambda e: not e.seen)
     ]
     parts = found.before, found.after, found.held_out
@@ -46,7 +47,7 @@ below with the interval that contains it with 95% probability.</p>
 <p><b>How sure:</b> {_describe_fit(found)}</p>
 <p><b>What to do:</b> {_advise(bool(doubts), world)}</p>
 <h2>Estimates</h2>
-{table(["quantity", "estimate", "95% interval", "shown by the log, or the prior stands"], rows)}
+{table(["quantity", "estimate", "95% interval", ""], rows)}
 <h2>Errors in units of the sensors' noise</h2>
 {table(["sensor", "model's own world", "identified", "windows held out"], fits)}
 {figures_html(figures)}

@@ -57,7 +57,13 @@ def show(
     each = max(1, options.num_envs // len(shown))
     with console.status("compiling"):
         simulation = _simulate(shown, each, options.seed, commands, viewer == "browser")
-    present(simulation, _page_start(shown, each))
+    if len(shown) == 1:
+        present(simulation, PageStart(shown[0].title, None, each))
+    else:
+        letters = string.ascii_uppercase[: len(shown)]
+        titles = [f"{letter}: {one.title}" for letter, one in zip(letters, shown, strict=True)]
+        names = [letter for letter in letters for _ in range(each)]
+        present(simulation, PageStart(", ".join(titles), names, len(names)))
 
 
 Present = Callable[[Simulation, PageStart], None]
@@ -163,13 +169,3 @@ def _simulate(
         simulation.world = None if is_sampled else {}
         simulations.append(simulation)
     return SideBySide(simulations) if len(simulations) > 1 else simulations[0]
-
-
-def _page_start(shown: Sequence[Shown], each: int) -> PageStart:
-    """The titles, and how many robots are shown."""
-    if len(shown) == 1:
-        return PageStart(shown[0].title, None, each)
-    letters = string.ascii_uppercase[: len(shown)]
-    titles = [f"{letter}: {one.title}" for letter, one in zip(letters, shown, strict=True)]
-    names = [letter for letter in letters for _ in range(each)]
-    return PageStart(", ".join(titles), names, len(names))

@@ -108,9 +108,8 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         if render_mode not in (None, "rgb_array"):
             raise UserError(f'render_mode is {render_mode!r}; choose "rgb_array" or omit it')
         self.render_mode, self._picture = render_mode, (width, height, camera)
-        self._renderer: Renderer | None = None
         if render_mode is not None:
-            self._open_renderer()
+            _ = self._renderer  # which a missing camera or library makes fail
         self.single_action_space = Box(-1.0, 1.0, (self.task.action_size,), np.float32)
         self.single_observation_space = Box(
             -np.inf, np.inf, (self.task.observation_size,), np.float32
@@ -262,8 +261,6 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         if self.render_mode is None:
             return None
         self._check_started()
-        if self._renderer is None:
-            self._open_renderer()
         env, state = self._episodes.env, self._episodes.env.pipeline_state
         command, metrics = (at_index(values, index) for values in (state.command, env.metrics))
         return self._renderer.render(np.array(state.physics.qpos[:, index]), command, metrics)
@@ -278,22 +275,24 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
 
     def close_extras(self, **kwargs: Any) -> None:
         """Frees the renderer."""
-        if self._renderer is not None:
+        if self.__dict__.pop("_renderer", None) is not None:
             self._close_renderer()
-            self._renderer = None
 
     @functools.cached_property
     def _programs(self) -> Programs:
         return shared_programs(self.config)
 
     def __getstate__(self) -> dict[str, Any]:
-        state = self.__dict__ | {"_episodes": jax.device_get(self._episodes), "_renderer": None}
-        return {k: v for k, v in state.items() if k not in ("_programs", "_close_renderer")}
+        state = self.__dict__ | {"_episodes": jax.device_get(self._episodes)}
+        made_anew = "_programs", "_renderer", "_close_renderer"
+        return {name: value for name, value in state.items() if name not in made_anew}
 
-    def _open_renderer(self) -> None:
-        self._renderer = Renderer(self.task, *self._picture, plain=True)
+    @functools.cached_property
+    def _renderer(self) -> Renderer:
+        renderer = Renderer(self.task, *self._picture, plain=True)
         # Also closed at exit, where OpenGL would be unloaded before the renderer.
-        self._close_renderer = weakref.finalize(self, self._renderer.close)
+        self._close_renderer = weakref.finalize(self, renderer.close)
+        return renderer
 
     def _check_started(self) -> None:
         if self._episodes is None:
