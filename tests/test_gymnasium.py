@@ -257,28 +257,6 @@ def test_skrl_wraps_the_vector(need, vectorised):
     twin.close()
 
 
-def test_pictures_show_the_state(single, vectorised):
-    single.reset(seed=0)
-    first = single.render()
-    assert first.shape == (480, 640, 3) and first.dtype == np.uint8
-    # The arm is orange.
-    red, green, blue = first.reshape(-1, 3).astype(int).T
-    assert ((red > 150) & (green > 50) & (green < 150) & (blue < 80)).sum() > 2000
-    for _ in range(8):
-        single.step(np.ones(6, np.float32))
-    assert (np.abs(single.render().astype(int) - first).max(axis=-1) > 60).sum() > 300
-    vectorised.reset(seed=0)
-    pictures = vectorised.render()
-    assert [picture.shape for picture in pictures] == [(64, 96, 3)] * NUM_ENVS
-    assert not np.array_equal(pictures[0], pictures[1])
-    side = gymnasium.make_vec(
-        ENV_ID, NUM_ENVS, render_mode="rgb_array", camera="side", width=96, height=64
-    )
-    side.reset(seed=0)
-    assert not np.array_equal(side.render()[0], pictures[0])
-    side.close()
-
-
 def test_process_forked_after_jax_ran_refuses_to_hang(monkeypatch):
     env = environments.TaskEnv()
     monkeypatch.setattr(environments, "_jax_process", 1)

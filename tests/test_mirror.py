@@ -1,6 +1,5 @@
 """The mirror law: its kinematics, its impacts, and that it keeps a ball up with different arms."""
 
-import importlib
 from pathlib import Path
 
 import jax
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 
 from bounce_mjx.baselines.mirror import MirrorLaw, observing
-from bounce_mjx.commands import play
 from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import judge
@@ -72,11 +70,3 @@ def test_the_law_keeps_the_ball_up(env: Env) -> None:
     assert values["stable"] == values["consecutive bounces"] == 100.0
     assert values["height"] > 90.0 and values["horizontal position"] > 95.0
     assert report.details["mean_consecutive_bounces"] > 8.0
-
-
-def test_the_word_mirror_is_shown_beside_a_policy(tmp_path, monkeypatch, capsys) -> None:
-    show = importlib.import_module("bounce_mjx.viewers.show")
-    titles = []
-    monkeypatch.setattr(show, "show", lambda shown, *_, **__: titles.extend(x.title for x in shown))
-    play.main(["pretrained", "mirror"])
-    assert titles[0].startswith("pretrained, ") and titles[1:] == ["mirror law"]

@@ -65,15 +65,6 @@ def test_playground_loads_the_environment_without_a_network(monkeypatch):
     np.testing.assert_array_equal(state.data.time, 0.0)
 
 
-def test_playground_has_its_ppo_parameters():
-    """They are the project's own; those of other environments stay as they are."""
-    parameters = manipulation_params.brax_ppo_config(ENV_NAME, "jax")
-    assert (parameters.num_envs, parameters.discounting) == (4096, 0.98)
-    assert parameters.batch_size * parameters.num_minibatches == parameters.num_envs
-    other = manipulation_params.brax_ppo_config("PandaPickCube", "jax")
-    assert other.num_envs != parameters.num_envs
-
-
 @pytest.mark.parametrize("task", TASKS)
 def test_playground_has_the_other_tasks(task):
     """With their time limits, their own PPO parameters, and worlds of their model."""

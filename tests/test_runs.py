@@ -12,7 +12,6 @@ import threading
 import unittest.mock
 from pathlib import Path
 
-import numpy as np
 import pytest
 from rich.console import Console
 
@@ -344,17 +343,6 @@ def test_results_are_read_as_they_were_written(tmp_path: Path, progress: Progres
     ]
     assert results.best == progress.best
     assert Progress.model_validate(json.loads(to_json(progress.model_dump()))) == progress
-
-
-def test_json_has_null_where_there_is_no_finite_number(progress: Progress) -> None:
-    def refuse(constant: str) -> None:
-        raise AssertionError(constant)
-
-    progress.improves(report_of([math.nan, math.inf, None, -math.inf, 5.0]), 128, 0.0)
-    text = to_json(results_of(progress) | {"numpy": np.float64(math.nan), "tuple": (math.nan, 1)})
-    plain = json.loads(text, parse_constant=refuse)
-    assert [plain["evaluations"][1][name] for name in NAMES] == [None, None, None, None, 5.0]
-    assert (plain["numpy"], plain["tuple"]) == (None, [None, 1])
 
 
 @pytest.mark.parametrize("change", [None, {"results": [3]}, {"seconds": {"train": math.inf}}])

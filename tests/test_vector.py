@@ -1,7 +1,6 @@
 """A batch steps as single environments do, and reports and resets what has ended."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -121,24 +120,3 @@ def test_termination_at_the_limit_is_not_a_time_out(unlimited, reset, step, acti
     one_less, _ = run(reset, step, actions[: episode_steps + 1], int(ended_at))
     assert one_less.truncated[ended_at - 1, i] and not one_less.terminated[ended_at - 1, i]
     assert not one_less.terminated[ended_at, i]
-
-
-def test_nan_action_ends_one_episode_and_leaves_the_others_alone(reset, step, actions):
-    state = reset(RESET_KEY)
-    broken = actions[0].copy()
-    broken[2] = np.nan
-    expected = step(state, actions[0], STEP_KEYS[0], NO_LIMIT)
-    actual = step(state, broken, STEP_KEYS[0], NO_LIMIT)
-    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(actual))
-    np.testing.assert_array_equal(actual[1].terminated, [False, False, True, False])
-    np.testing.assert_array_equal(actual[1].metrics["non_finite"], [0, 0, 1, 0])
-    others = np.array([0, 1, 3])
-    # The batch is last in the states and first in the results.
-    for a, b in zip(jax.tree.leaves(expected[0]), jax.tree.leaves(actual[0]), strict=True):
-        np.testing.assert_array_equal(a[..., others], b[..., others])
-    for a, b in zip(jax.tree.leaves(expected[1]), jax.tree.leaves(actual[1]), strict=True):
-        np.testing.assert_array_equal(a[others], b[others])
-    next_state, result = step(actual[0], actions[1], STEP_KEYS[1], NO_LIMIT)
-    assert not result.terminated.any()
-    np.testing.assert_array_equal(next_state.clock, [2, 2, 1, 2])
-    assert jnp.all(jnp.isfinite(result.final_observation))
