@@ -43,7 +43,7 @@ BROKEN = {
         "tool",
         "2 driven joints (r_j1, r_j2) in addition to the arm",
     ),
-    "no actuators": (mjcf(arm(), ""), "tool", "no actuators", "<position>"),
+    "no actuators": (mjcf(arm(), ""), "tool", "no actuator on j1, j2", "<position>"),
     "idle joint": (mjcf(arm(), motors("j1 j2 j3 j5 j6")), "tool", "on j4", "--joints"),
     "weak motors": (mjcf(arm(), motors(ARM_JOINTS, 2.0)), "tool", "no servo strong enough"),
     "missing mesh": (

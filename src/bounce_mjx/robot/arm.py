@@ -184,16 +184,10 @@ def find_site(model: mujoco.MjModel, config: RobotConfig) -> tuple[int, np.ndarr
 
 
 def _other_sites(model: mujoco.MjModel) -> str:
-    """The remedy for a wrong site: the sites and bodies that enough joints lead to."""
-
-    def is_led(body: int) -> bool:
-        return model.body_jntnum[_chain(model, body)].sum() >= MIN_JOINTS
-
-    names = [model.site(i).name for i in range(model.nsite) if is_led(model.site_bodyid[i])]
-    names += [model.body(i).name for i in range(1, model.nbody) if is_led(i)]
-    if not any(names):
-        return f"give an arm with a named site or body beyond at least {MIN_JOINTS} joints"
-    return f"give --site one of the sites and bodies {_list(names, 80)}"
+    """The remedy for a wrong site: the sites and bodies of the arm."""
+    names = [model.site(i).name for i in range(model.nsite)]
+    names += [model.body(i).name for i in range(1, model.nbody)]
+    return f"give --site a site or body beyond {MIN_JOINTS} joints, of {_list(names, 80)}"
 
 
 class _Builder:
@@ -257,21 +251,17 @@ class _Builder:
     def _actuators(self, joints: list[int]) -> dict[int, int]:
         """The actuator of each joint that has one, and so of each acting joint."""
         model, actuators = self._model, {}
-        if model.nactuator == 0:
-            raise UserError(
-                "no actuators; add a <position> or <motor> with a force limit for each joint"
-            )
         for a in range(model.nactuator):
             joint = int(model.actuator_trnid[a, 0])
-            if int(model.actuator_trntype[a]) not in _JOINT_TRANSMISSIONS:
-                continue
-            if joint in joints and joint in actuators:
-                raise UserError(f"several actuators on {joint_name(model, joint)}; give it one")
-            actuators[joint] = a
+            if int(model.actuator_trntype[a]) in _JOINT_TRANSMISSIONS:
+                if joint in joints and joint in actuators:
+                    raise UserError(f"several actuators on {joint_name(model, joint)}; give it one")
+                actuators[joint] = a
         idle = [joint_name(model, joint) for joint in joints if joint not in actuators]
         if idle:
             raise UserError(
-                f"no actuator on {_list(idle)}; add one, or name the acting joints with --joints"
+                f"no actuator on {_list(idle)}; add a <position> or <motor> with a force limit, or "
+                "name the acting joints with --joints"
             )
         return actuators
 
@@ -543,32 +533,28 @@ def _servo_range(model: mujoco.MjModel, actuator: int) -> tuple[float, float]:
 def _force_limit(model: mujoco.MjModel, joint: int, actuator: int) -> float | None:
     """Largest force of a joint's actuator, None for no limit: by the force range, by the control
     range of a plain motor, or by the joint's own limit."""
-    limit, gear = np.inf, abs(float(model.actuator_gear[actuator, 0]))
-    if model.actuator_forcelimited[actuator]:
-        limit = _both_ways(model.actuator_forcerange[actuator], "forcerange", model, joint)
-    is_motor = model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_NONE
+    m, a = model, actuator
+    gear, gain = m.actuator_gear[a, 0], m.actuator_gainprm[a, 0]
     # A <pid> has several controls; the other arrays have one row for each actuator.
-    control = model.actuator_ctrladr[actuator]
-    if is_motor and model.actuator_ctrllimited[control]:
-        largest = _both_ways(model.actuator_ctrlrange[control], "ctrlrange", model, joint)
-        limit = min(limit, largest * abs(float(model.actuator_gainprm[actuator, 0])))
-    limit *= gear
-    if model.jnt_actfrclimited[joint]:
-        span = model.jnt_actfrcrange[joint]
-        limit = min(limit, _both_ways(span, "actuatorfrcrange", model, joint))
+    control = m.actuator_ctrladr[a]
+    is_motor = m.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_NONE
+    clipped = is_motor and m.actuator_ctrllimited[control]
+    limit = np.inf
+    for limited, name, span, factor in (
+        (m.actuator_forcelimited[a], "forcerange", m.actuator_forcerange[a], gear),
+        (clipped, "ctrlrange", m.actuator_ctrlrange[control], gear * gain),
+        (m.jnt_actfrclimited[joint], "actuatorfrcrange", m.jnt_actfrcrange[joint], 1.0),
+    ):
+        low, high = map(float, span)
+        if limited and not low < 0.0 < high:
+            most = max(-low, high)
+            raise UserError(
+                f"the {name} {low:g} to {high:g} on {joint_name(model, joint)}, so its actuator "
+                f"pushes one way only; give a range around 0, such as {-most:g} to {most:g}"
+            )
+        if limited:
+            limit = min(limit, float(min(-low, high) * abs(factor)))
     return limit if np.isfinite(limit) else None
-
-
-def _both_ways(span: np.ndarray, name: str, model: mujoco.MjModel, joint: int) -> float:
-    """Largest force or control within a range [2] that has both signs."""
-    low, high = map(float, span)
-    if not low < 0.0 < high:
-        raise UserError(
-            f"the {name} {low:g} to {high:g} on {joint_name(model, joint)}, so its actuator pushes "
-            f"one way only; give a range around 0, such as {-max(-low, high):g} to "
-            f"{max(-low, high):g}"
-        )
-    return min(-low, high)
 
 
 def _chain(model: mujoco.MjModel, end: int) -> list[int]:

@@ -177,14 +177,16 @@ def _targets(control: Control, step: jax.Array) -> tuple[Scalar, ...]:
 
 
 @functools.lru_cache(maxsize=16)
-def _paddle_position(model: FusedModel, given: jax.tree_util.PyTreeDef) -> Callable[..., Vec]:
+def _paddle_position(
+    model: FusedModel, given: jax.tree_util.PyTreeDef
+) -> Callable[..., tuple[Scalar, ...]]:
     """`paddle_position` as a function of the joint angles and the given parameters; cached
     like `_substeps`."""
     n = len(model.links)
 
-    def position(*scalars: Scalar) -> Vec:
+    def position(*scalars: Scalar) -> tuple[Scalar, ...]:
         world = read_model(model.mj_model, given.unflatten(scalars[n:]))
-        return paddle_origin(world, chain.forward_kinematics(world.links, scalars[:n]))
+        return tuple(paddle_origin(world, chain.forward_kinematics(world.links, scalars[:n])))
 
     return jax.jit(position, inline=True)
 

@@ -162,11 +162,6 @@ def read_model(
     return model
 
 
-def floats(values: np.ndarray) -> Vec:
-    """An array as Python floats, which fold."""
-    return Vec(map(float, values))
-
-
 def exact(rotation: Sequence[Sequence[Scalar]]) -> Mat:
     """Rotation matrix; entries within rounding error of -1, 0 and 1 become exact and fold."""
 
@@ -200,7 +195,7 @@ def _read_links(m: EditedModel) -> tuple[list[chain.Link], dict[int, Frame]]:
         frame = Frame(origin, rotation)
         for joint in range(c.body_jntadr[body], c.body_jntadr[body] + c.body_jntnum[body]):
             slides = c.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
-            anchor = ZERO3 if slides else floats(c.jnt_pos[joint])
+            anchor = ZERO3 if slides else m.peek("jnt_pos", joint)
             origin = frame.origin + frame.rotation @ anchor
             link_of[body] = len(links)
             links.append(_read_joint(m, joint, Frame(origin, frame.rotation)))
@@ -222,7 +217,7 @@ def _read_joint(m: EditedModel, joint: int, frame: Frame) -> chain.Link:
     return chain.Link(
         offset=frame.origin,
         rotation=frame.rotation,
-        axis=floats(c.jnt_axis[joint]),
+        axis=m.peek("jnt_axis", joint),
         slides=bool(c.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE),
         zero_position=m["qpos0", at],
         mass=0.0,
@@ -240,7 +235,7 @@ def _read_joint(m: EditedModel, joint: int, frame: Frame) -> chain.Link:
 
 def _with_body(m: EditedModel, link: chain.Link, body: int, frame: Frame) -> chain.Link:
     """Link with the mass of one more body, whose frame is given in the link."""
-    mass, inertial = m["body_mass", body], _inertial_frame(m.model, body)
+    mass, inertial = m["body_mass", body], _inertial_frame(m, body)
     centre = frame.origin + frame.rotation @ inertial.origin
     principal = frame.rotation @ inertial.rotation
     lever = centre @ centre
@@ -261,17 +256,16 @@ def _with_body(m: EditedModel, link: chain.Link, body: int, frame: Frame) -> cha
     )
 
 
-def _inertial_frame(mj_model: mujoco.MjModel, body: int) -> Frame:
+def _inertial_frame(m: EditedModel, body: int) -> Frame:
     """Inertial frame of a body in the body's frame."""
-    m = mj_model
-    frame = Frame(floats(m.body_ipos[body]), _rotation(m.body_iquat[body]))
-    return _apply_flag(m.body_sameframe[body], frame, frame)
+    frame = Frame(m.peek("body_ipos", body), _rotation(m.model.body_iquat[body]))
+    return _apply_flag(m.model.body_sameframe[body], frame, frame)
 
 
 def _geom_frame(m: EditedModel, geom: int) -> Frame:
     """Frame of a geom in its body's frame."""
     frame = Frame(m["geom_pos", geom], _rotation(m["geom_quat", geom]))
-    inertial = _inertial_frame(m.model, int(m.model.geom_bodyid[geom]))
+    inertial = _inertial_frame(m, int(m.model.geom_bodyid[geom]))
     return _apply_flag(m["geom_sameframe", geom], frame, inertial)
 
 
@@ -313,7 +307,7 @@ def _read_servo(m: EditedModel, actuator: int, joint: int) -> Servo:
         else None,
         gain_stiffness=mul(gain_stiffness, gear**2),
         gain_damping=mul(gain_damping, gear**2),
-        joint_range=floats(c.jnt_actfrcrange[joint]) if joint_limited else None,
+        joint_range=m.peek("jnt_actfrcrange", joint) if joint_limited else None,
         carries_weight=bool(c.jnt_actgravcomp[joint]),
     )
 
