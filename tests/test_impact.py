@@ -13,8 +13,7 @@ from bounce_mjx.evaluation.c_episodes import episode_models
 from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, edited_model, make_engine
 from bounce_mjx.physics.control import drag
 from bounce_mjx.robot.model import find_addresses
-from bounce_mjx.world.impact import Impact, damping, first_impact
-from bounce_mjx.world.randomization import physics_parameters
+from bounce_mjx.world.randomization import contact_damping, impact_damping, physics_parameters
 
 
 def test_the_air_brakes_with_the_square_of_the_speed():
@@ -65,7 +64,6 @@ def test_worlds_with_a_sloped_restitution_are_mujocos():
         world = {name: float(value[w]) for name, value in pipeline.world.items()}
         paddle = find_addresses(model).paddle_geom
         reach = model.geom_size[paddle].min() + model.geom_size[find_addresses(model).ball_geom, 0]
-        dampings = np.asarray(pipeline.impact.damping)[w]
         data, jacobian, speed = mujoco.MjData(model), np.zeros((3, model.nv)), 0.0
         data.qpos[:], data.qvel[:] = (np.asarray(x)[w] for x in pipeline.physics[:2])
         for t in range(STEPS):
@@ -74,9 +72,8 @@ def test_worlds_with_a_sloped_restitution_are_mujocos():
             mujoco.mj_jacGeom(model, data, jacobian, None, paddle)
             if data.qpos[8] - data.geom_xpos[paddle, 2] - reach > 0.01:
                 speed = (jacobian @ data.qvel)[2] - data.qvel[8]
-            ends = slice(0, 2) if speed < 2.45 else slice(1, 3)
-            line = np.polyfit(np.array([1.0, 2.45, 4.0])[ends], dampings[ends], 1)
-            model.pair_solref[0, 1] = -np.polyval(line, speed)
+            restitution = world["restitution"] - world["restitution_slope"] * (speed - 2.45)
+            model.pair_solref[0, 1] = -contact_damping(restitution, -model.pair_solref[0, 0])
             data.ctrl[:] = controls[t][w]
             for _ in range(10):
                 push_by_air(model, data, world["air_drag"], world["air_lift"])
@@ -95,13 +92,15 @@ def test_a_changed_world_keeps_the_slope():
     env = BounceBall(EnvConfig(randomization=SLOPED))
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))
     before = state.pipeline_state
-    fast = before._replace(impact=before.impact._replace(speed=4.0))
+    fast = before._replace(impact=jnp.float32(4.0))
 
     def damped(world: dict) -> float:
         return float(env.with_world(fast, world).parameters.contact_damping)
 
     own = damped(before.world)
-    assert own == pytest.approx(float(damping(fast.impact)), rel=1e-6)
+    assert own == pytest.approx(
+        float(impact_damping(before.world, env.mj_model, fast.impact)), rel=1e-6
+    )
     flat = before.world | {"restitution_slope": jnp.float32(0.0)}
     level = physics_parameters(flat, env.mj_model).contact_damping
     assert damped(flat) == pytest.approx(float(level), rel=1e-5)
@@ -115,8 +114,7 @@ def test_a_changed_world_keeps_the_slope():
 def test_a_drop_bounces_with_the_restitution_of_its_speed(mj_model, speed, restitution, slope):
     """On C, in the mean over the phases of the first contact's physics step."""
     world = {"restitution": jnp.float32(restitution), "restitution_slope": jnp.float32(slope)}
-    impact: Impact = first_impact(world, mj_model)
-    given = PhysicsParameters(contact_damping=damping(impact._replace(speed=jnp.float32(speed))))
+    given = PhysicsParameters(contact_damping=impact_damping(world, mj_model, speed))
     model = edited_model(mj_model, given)
     rebounds = []
     for gap in speed * np.linspace(0.001, 0.002, 10, endpoint=False):

@@ -147,13 +147,12 @@ def _add_arguments(
             elif mark.is_positional and not field.is_required():
                 own["nargs"] = "?"
         name = key.rpartition(".")[0] or "arguments"
-        if name not in groups:
-            groups[name] = parser.add_argument_group(name)
+        group = groups[name] = groups.get(name) or parser.add_argument_group(name)
         if mark.is_positional:
             parser.usage += f" {own['metavar']}"
-            groups[name].add_argument(key, **own)
+            group.add_argument(key, **own)
         else:
-            groups[name].add_argument(_flag(key, field), dest=key, **own)
+            group.add_argument(_flag(key, field), dest=key, **own)
 
 
 def _is_list(kind: Any) -> bool:

@@ -33,7 +33,7 @@ from bounce_mjx.task.task import Start, Step, Task, TaskStep
 from bounce_mjx.world import noise
 from bounce_mjx.world.actuation import Actuation, Actuators, recurs
 from bounce_mjx.world.config import WorldConfig
-from bounce_mjx.world.impact import Impact, damping, first_impact, next_impact
+from bounce_mjx.world.impact import next_impact
 from bounce_mjx.world.noise import Clock
 from bounce_mjx.world.observation import Kinematics
 from bounce_mjx.world.randomization import TERMS, Ranges, World, physics_parameters, sample_world
@@ -74,8 +74,8 @@ class EnvState(NamedTuple):
     """For a randomised world, or an observation with a history."""
     redraw: Redraw | None = None
     """For commands that change within an episode."""
-    impact: Impact | None = None
-    """For a restitution that depends on the speed."""
+    impact: jax.Array | None = None
+    """Speed of the next impact [], m/s, for a restitution that depends on it."""
     actuation: Actuation = Actuation()
     sensing: Sensing | None = None
     """For an observation that differs from the true state of one instant."""
@@ -266,9 +266,9 @@ class Env:
         truth = self.kinematics(state)
         task = self.task.reset(Start(truth, command, task_draws))
         state = state._replace(task=task, command=self._next_command(task, command))
-        if not gives(own_parameters, "contact_damping", "pair_solref"):
-            impact = first_impact(world, self.mj_model)
-            state = self._with_impact(state._replace(impact=impact), truth)
+        given = gives(own_parameters, "contact_damping", "pair_solref")
+        if "restitution_slope" in world and not given:
+            state = self._with_impact(state._replace(impact=jnp.zeros((), draws.dtype)), truth)
         if self._sensors.are_needed:
             state = state._replace(sensing=self._sensors.first(self._sensed(state, truth)))
         return State(
@@ -427,12 +427,11 @@ class Env:
         """The state whose parameters have the damping of the next impact."""
         if state.impact is None:
             return state
-        physics, parameters = state.physics, state.parameters
-        impact = next_impact(
-            state.impact, self.mj_model, self.engine, parameters, physics.qpos, truth
-        )
-        parameters = parameters._replace(contact_damping=damping(impact))
-        return state._replace(impact=impact, parameters=parameters)
+        parameters, qpos = state.parameters, state.physics.qpos
+        given = state.impact, state.world, self.mj_model, self.engine
+        speed, damping = next_impact(*given, parameters, qpos, truth)
+        parameters = parameters._replace(contact_damping=damping)
+        return state._replace(impact=speed, parameters=parameters)
 
     def _sensed(self, state: EnvState, truth: Kinematics) -> Sensed:
         known = _entries(state.command) | {"action": state.last_action}
@@ -487,20 +486,19 @@ class Env:
 
     def with_world(self, state: EnvState, world: World) -> EnvState:
         """The state with other values of the terms of its world."""
-        own, impact = MODEL_PARAMETERS, state.impact
+        own = MODEL_PARAMETERS
         if self._randomize is not None:
             given = jax.eval_shape(self._randomize, jax.random.PRNGKey(0))
             pairs = zip(given, state.parameters, strict=True)
             own = PhysicsParameters(*(None if x is None else value for x, value in pairs))
-        parameters = self._parameters(world, own)
-        if impact is not None:
-            impact = impact._replace(damping=first_impact(world, self.mj_model).damping)
-            parameters = parameters._replace(contact_damping=damping(impact))
-        return state._replace(world=world, parameters=parameters, impact=impact)
+        parameters = self._parameters(world, own, state.impact)
+        return state._replace(world=world, parameters=parameters)
 
-    def _parameters(self, world: World, own: PhysicsParameters) -> PhysicsParameters:
+    def _parameters(
+        self, world: World, own: PhysicsParameters, impact: jax.Array | None = None
+    ) -> PhysicsParameters:
         """The physics of a world, in which the parameters of `randomize` replace its own."""
-        pairs = zip(own, physics_parameters(world, self.mj_model), strict=True)
+        pairs = zip(own, physics_parameters(world, self.mj_model, impact), strict=True)
         return PhysicsParameters(*(sampled if x is None else x for x, sampled in pairs))
 
     def _privileged_metrics(self, world: World, truth: Kinematics) -> dict[str, jax.Array]:

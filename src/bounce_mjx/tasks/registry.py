@@ -31,11 +31,8 @@ _files: dict[bytes, types.ModuleType] = {}
 _named: dict[str, type[Task]] = {}
 
 _OWN = {
-    "balance": "bounce_mjx.tasks.balance:Balance",
-    "bounce": "bounce_mjx.tasks.bounce:Bounce",
-    "catch": "bounce_mjx.tasks.catch:Catch",
-    "juggle": "bounce_mjx.tasks.juggle:Juggle",
-    "track": "bounce_mjx.tasks.track:Track",
+    name: f"bounce_mjx.tasks.{name}:{name.title()}"
+    for name in ("balance", "bounce", "catch", "juggle", "track")
 }
 
 

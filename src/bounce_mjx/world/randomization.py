@@ -322,10 +322,12 @@ def sample_world(
     return world
 
 
-def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParameters:
-    """Parameters of the physics for a sampled world."""
+def physics_parameters(
+    world: World, mj_model: mujoco.MjModel, impact_speed: jax.Array | None = None
+) -> PhysicsParameters:
+    """Parameters of the physics for a sampled world; `impact_speed` is of `impact_damping`."""
     # The engines are not needed to read a config.
-    from bounce_mjx.physics.edited import direct_solref, own_parameters
+    from bounce_mjx.physics.edited import own_parameters
     from bounce_mjx.physics.parameters import PhysicsParameters
 
     terms = {name: term for name, term in TERMS.items() if name in world and term.parameter}
@@ -335,12 +337,25 @@ def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParamet
     for name, (*_, parameter, operation) in terms.items():
         value, own_value = world[name], getattr(own, parameter)
         if operation is None:
-            given[parameter] = contact_damping(value, direct_solref(mj_model)[0])
+            given[parameter] = impact_damping(world, mj_model, impact_speed)
         else:
             if own_value is not None:
                 own_value = jnp.asarray(own_value, value.dtype)
             given[parameter] = operation(own_value, value)
     return PhysicsParameters(**given)
+
+
+def impact_damping(
+    world: World, mj_model: mujoco.MjModel, speed: jax.Array | None = None
+) -> jax.Array:
+    """Damping [] of the contact, 1/s, in an impact at a speed [], m/s; None for a restitution that
+    does not depend on it."""
+    from bounce_mjx.physics.edited import direct_solref
+
+    restitution = world["restitution"]
+    if speed is not None:
+        restitution = restitution - world["restitution_slope"] * (speed - IMPACT_SPEED)
+    return contact_damping(restitution, direct_solref(mj_model)[0])
 
 
 # Damping ratios of the contact, and the measured restitution: the mean of the drops on the held
