@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 from rich.markup import escape
-from rich.table import Table
+from rich.table import Column, Table
 
 from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.world.config import WorldConfig
@@ -43,21 +43,17 @@ def short_text(value: float | None) -> str:
     return figure_text(value, ".2f" if value is None or abs(value) < 10.0 else ".1f")
 
 
-def _plain_table(title: str) -> Table:
+def _plain_table(title: str, *columns: Column | str) -> Table:
     """A table without lines, so that the results fit into 80 columns."""
-    return Table(
-        title=escape(title), title_justify="left", box=None, pad_edge=False, padding=(0, 1, 0, 0)
-    )
+    title, padding = escape(title), (0, 1, 0, 0)
+    look = dict(title_justify="left", box=None, pad_edge=False, padding=padding)
+    return Table(*columns, title=title, **look)
 
 
 def results_table(report: Report, title: str) -> Table:
     """The results as a table."""
-    table = _plain_table(title)
-    for column in ("result", "measured"):
-        table.add_column(column)
-    table.add_column("value", justify="right")
-    table.add_column("bound")
-    table.add_column()
+    value = Column("value", justify="right")
+    table = _plain_table(title, "result", "measured", value, "bound", "")
     for result in report.results:
         bound, _, condition = result.bound.partition(" (")
         if result.passed is None:
@@ -76,9 +72,9 @@ def seeds_table(reports: dict[int, Report | None]) -> Table:
       reports: reports by seed; None for a seed that diverged before its first evaluation.
     """
     known = [report for report in reports.values() if report is not None]
-    table = _plain_table("best checkpoint of each seed")
-    for header in ("seed", *(result.name for result in known[0].results), "all met"):
-        table.add_column(header.replace(" ", "\n"), justify="right")
+    headers = "seed", *(result.name for result in known[0].results), "all met"
+    columns = [Column(header.replace(" ", "\n"), justify="right") for header in headers]
+    table = _plain_table("best checkpoint of each seed", *columns)
     for seed, report in reports.items():
         if report is None:
             table.add_row(str(seed), "diverged")

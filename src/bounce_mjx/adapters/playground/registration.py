@@ -1,6 +1,7 @@
 """The environments in MuJoCo Playground's registry."""
 
 import functools
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -36,26 +37,22 @@ def register() -> None:
         make = functools.partial(PlaygroundBounceBall, task=task)
         manipulation.register_environment(name, make, functools.partial(default_config, task))
     registry.ALL_ENVS = (*registry.ALL_ENVS, *ENVIRONMENTS)
-    load, randomizer = manipulation.load, manipulation.get_domain_randomizer
-    ppo_parameters = manipulation_params.brax_ppo_config
 
-    def load_environment(env_name: str, config: Any = None, config_overrides: Any = None) -> Any:
-        if env_name in ENVIRONMENTS:
-            return PlaygroundBounceBall(config, config_overrides, ENVIRONMENTS[env_name])
-        return load(env_name, config, config_overrides)
+    def extend(module: Any, function: str, own: Callable[..., Any]) -> None:
+        """Calls `own` with the task, in place of a function, where the name is one of these."""
+        other = getattr(module, function)
 
-    def get_randomizer(env_name: str) -> Any:
-        if env_name in ENVIRONMENTS:
-            return functools.partial(domain_randomize, task=ENVIRONMENTS[env_name])
-        return randomizer(env_name)
+        def call(env_name: str, *args: Any, **named: Any) -> Any:
+            if env_name in ENVIRONMENTS:
+                return own(ENVIRONMENTS[env_name], *args, **named)
+            return other(env_name, *args, **named)
 
-    def get_parameters(env_name: str, impl: str | None = None) -> config_dict.ConfigDict:
-        if env_name in ENVIRONMENTS:
-            return brax_ppo_config(ENVIRONMENTS[env_name])
-        return ppo_parameters(env_name, impl)
+        setattr(module, function, call)
 
-    manipulation.load, manipulation.get_domain_randomizer = load_environment, get_randomizer
-    manipulation_params.brax_ppo_config = get_parameters
+    extend(manipulation, "load", lambda task, *x, **y: PlaygroundBounceBall(*x, **y, task=task))
+    randomizer = "get_domain_randomizer"
+    extend(manipulation, randomizer, lambda task: functools.partial(domain_randomize, task=task))
+    extend(manipulation_params, "brax_ppo_config", lambda task, *_, **__: brax_ppo_config(task))
 
 
 def domain_randomize(model: Any, rng: Any, task: str = DEFAULT) -> tuple[Any, Any]:
