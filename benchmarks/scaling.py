@@ -11,7 +11,6 @@ and waits.
 """
 
 import concurrent.futures
-import functools
 import itertools
 import statistics
 import sys
@@ -85,14 +84,10 @@ def programs(configs: list[TrainConfig]) -> list[Callable[[], object]]:
         for trainer in trainers:
             trainer.compile(pool)
 
-    blocks = [
-        functools.partial(trainer.run, iterations_per_block(config), lambda: False)
-        for config, trainer in zip(configs, trainers, strict=True)
-    ]
-    for trainer, block in zip(trainers, blocks, strict=True):
+    for trainer in trainers:
         trainer.start()
-        block()
-    return blocks
+        trainer.run()
+    return [trainer.run for trainer in trainers]
 
 
 def seconds_of(block: Callable[[], object]) -> float:

@@ -2,8 +2,6 @@
 one (`test_job.py` has the job's own logic)."""
 
 import concurrent.futures
-import contextlib
-import io
 import itertools
 import json
 import multiprocessing
@@ -24,7 +22,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from bounce_mjx.commands import train as train_command
@@ -41,8 +38,6 @@ from bounce_mjx.runs.folders import (
 from bounce_mjx.runs.reading import read_actor, read_policy, read_record
 from bounce_mjx.runs.writing import save_checkpoint
 from bounce_mjx.tasks.bounce_ball import BounceBall
-from bounce_mjx.training import job as training_job
-from bounce_mjx.training import ppo_trainer
 from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.ppo_trainer import PPOTrainer, make_mesh
 from tiny_runs import STEPS, TIMEOUT, TINY, arrays, job, shared_run
@@ -118,32 +113,6 @@ def test_a_signal_saves_and_says_how_to_resume(tmp_path: Path, straight: Path) -
         straight = train(tmp_path / "straight", total)
     train_command.main([*resume_command(said), "--total-steps", str(total)])
     assert_same_training(run, straight)
-
-
-@pytest.mark.slow
-def test_a_slow_block_is_stopped_between_two_iterations(tmp_path: Path, monkeypatch) -> None:
-    """On MJX a block may take minutes. The resumed training first completes the block."""
-    monkeypatch.setattr(ppo_trainer, "iterations_per_block", lambda *_: 1)
-    flags = [*TINY, "--block-steps", "128", "--total-steps", "256", "--no-report"]
-
-    class Stopped(PPOTrainer):
-        def run(self, iterations, stopping):
-            os.kill(os.getpid(), signal.SIGTERM)
-            while not stopping():
-                time.sleep(0.01)
-            return super().run(iterations, stopping)
-
-    def train(name: str, trainer: type[PPOTrainer], **resumed) -> Path:
-        command = train_command.read_command([*flags, "--log-dir", str(tmp_path / name)])
-        console = Console(file=io.StringIO())
-        with contextlib.suppress(training_job.TrainingStopped):
-            training_job.train(command.training, console, make_trainer=trainer, **resumed)
-        return next((tmp_path / name).iterdir())
-
-    stopped = train("stopped", Stopped)
-    assert latest_checkpoint(stopped).steps == 64
-    train("stopped", PPOTrainer, resume=stopped)
-    assert_same_training(stopped, train("straight", PPOTrainer))
 
 
 @pytest.mark.parametrize("pause", [0.0, 0.8], ids=["told twice", "second Ctrl-C"])

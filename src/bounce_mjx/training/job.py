@@ -417,13 +417,7 @@ class Job:
 
     def _run_block(self) -> None:
         started = time.perf_counter()
-        # A run that was stopped inside a block first completes that block.
-        rest = self.block_steps - self.steps % self.block_steps
-        block = self.pool.submit(
-            self.trainer.run,
-            rest // self.config.ppo.batch_steps,
-            lambda: self.stop.requested and jax.process_count() == 1,
-        )
+        block = self.pool.submit(self.trainer.run)
         if not self.stop.wait_for(block):
             self.say("stopping after this block; the same signal again ends it at once")
         metrics = block.result()
@@ -432,10 +426,9 @@ class Job:
             raise UserError(f"these settings cannot be trained: {wrong}")
         self.keeps_folder = True
         faults = metrics.pop("fault")
-        done = faults.shape[1] * self.config.ppo.batch_steps
-        self.steps += done
-        rate = done * self.config.num_seeds / seconds
-        metrics["speed/steps_per_second"] = np.full((self.config.num_seeds, 1), rate)
+        self.steps += self.block_steps
+        rate = len(faults) * self.block_steps / seconds
+        metrics["speed/steps_per_second"] = np.full((len(faults), 1), rate)
         points = block_points(metrics)
         # At the mean speed so far with its evaluations.
         share = (self.config.total_steps - self.steps) / (self.steps - self.first_step)

@@ -7,7 +7,6 @@ statistics. With several seeds each device holds some of them.
 
 import concurrent.futures
 import functools
-from collections.abc import Callable
 
 import jax
 import numpy as np
@@ -44,9 +43,6 @@ class PPOTrainer:
           UserError: the config does not fit the devices or the environment.
         """
         self._config, self._observation_size = config, env.observation_size
-        # On MJX, a block may take minutes, and could not be stopped before its end.
-        on_mjx = env.engine.name == "mjx"
-        self._compiled_iterations = 1 if on_mjx else iterations_per_block(config)
         self.mesh = make_mesh(config.num_devices, config.ppo, config.num_seeds)
         trainer = find_algorithm(config.algorithm)(config.ppo, env, episode_steps(config))
         several = config.num_seeds > 1
@@ -62,7 +58,7 @@ class PPOTrainer:
             return init((jax.vmap(key) if several else key)(seeds))
 
         def train_block(state: TrainingState) -> tuple[TrainingState, Metrics]:
-            return run(state, self._compiled_iterations)
+            return run(state, iterations_per_block(config))
 
         # One object each, not methods, so that JAX traces them only once.
         self._initial_state, self._train_block = initial_state, train_block
@@ -112,15 +108,10 @@ class PPOTrainer:
         if state is not None:
             self.state = hosts.distribute(state, self._sharding)
 
-    def run(self, iterations: int, stopping: Callable[[], bool]) -> Metrics:
-        program, parts = self._run.result(), []
-        for _ in range(iterations // self._compiled_iterations):
-            self.state, metrics = program(self.state)
-            shape = (self._config.num_seeds, -1)
-            parts.append({name: np.asarray(x).reshape(shape) for name, x in metrics.items()})
-            if stopping():
-                break
-        return {name: np.concatenate([part[name] for part in parts], 1) for name in parts[0]}
+    def run(self) -> Metrics:
+        self.state, metrics = self._run.result()(self.state)
+        shape = (self._config.num_seeds, -1)
+        return {name: np.asarray(x).reshape(shape) for name, x in metrics.items()}
 
     def snapshot(self) -> Snapshot:
         state = hosts.gather(self.state)
@@ -137,9 +128,7 @@ class PPOTrainer:
 
 def episode_steps(config: TrainConfig) -> int:
     """Control steps after which the training truncates an episode."""
-    limit = config.ppo.training_episode_seconds
-    if limit is None:
-        return config.env.episode_steps
+    limit = config.ppo.training_episode_seconds or config.env.episode_seconds
     return min(config.env.episode_steps, max(1, round(limit / config.env.control_dt)))
 
 

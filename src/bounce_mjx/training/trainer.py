@@ -1,7 +1,6 @@
 """The interface between the job and an algorithm that trains policies."""
 
 import concurrent.futures
-from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -64,12 +63,8 @@ class Trainer(Protocol):
             their inputs.
         """
 
-    def run(self, iterations: int, stopping: Callable[[], bool]) -> Metrics:
-        """Trains for I iterations, or fewer where a slow trainer sees between two of them that
-        `stopping` is true.
-
-        Args:
-          iterations: a block's, or the rest of a block that was stopped.
+    def run(self) -> Metrics:
+        """Trains for a block of I iterations.
 
         Returns:
           Metrics, each [S, I]. "fault" is the number, from 1, of the first quantity of `checked`
