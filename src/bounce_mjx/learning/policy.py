@@ -77,8 +77,7 @@ def make_networks(
     critic_size += num_critic_metrics
     return Networks(
         policy_network=NetworkFunctions(
-            init=lambda key: policy.init(key, jnp.zeros((1, observation_size))),
-            apply=policy.apply,
+            init=lambda key: policy.init(key, jnp.zeros((1, observation_size))), apply=policy.apply
         ),
         value_network=NetworkFunctions(
             init=lambda key: value.init(key, jnp.zeros((1, critic_size))),

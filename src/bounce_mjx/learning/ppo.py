@@ -297,15 +297,10 @@ class PPO:
         inputs = normalize(inputs, state.statistics.normalizer)
         values = self.values(state.params, inputs)
         values, timeout_values = values[:-1], values[-1]
-        advantage = generalized_advantages(
-            rollout.reward,
-            values[:-1],
-            jnp.where(rollout.truncated, timeout_values, values[1:]),
-            rollout.terminated,
-            rollout.truncated,
-            self.config.discount,
-            self.config.gae_lambda,
-        )
+        following = jnp.where(rollout.truncated, timeout_values, values[1:])
+        over = rollout.terminated, rollout.truncated
+        rates = self.config.discount, self.config.gae_lambda
+        advantage = generalized_advantages(rollout.reward, values[:-1], following, *over, *rates)
         return advantage, advantage + values[:-1]
 
     def update(
@@ -524,10 +519,7 @@ def adapt_learning_rate(
 
 
 def first_fault(
-    reward: jax.Array,
-    statistics: RunningStatistics,
-    minibatch_metrics: Metrics,
-    params: Params,
+    reward: jax.Array, statistics: RunningStatistics, minibatch_metrics: Metrics, params: Params
 ) -> jax.Array:
     """Number [], from 1, of the first quantity of `CHECKED` that was not finite in an iteration; 0
     if all were finite.

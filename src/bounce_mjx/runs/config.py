@@ -19,7 +19,7 @@ from bounce_mjx.lazy import jax
 from bounce_mjx.learning.config import PPO_NAME, PPOConfig, find_algorithm
 from bounce_mjx.resources import PRETRAINED, resource_path
 from bounce_mjx.robot.config import is_packaged
-from bounce_mjx.runs.copies import ROBOT, task_of_run
+from bounce_mjx.runs.copies import ROBOT, task_of_run, unnamed_code
 from bounce_mjx.runs.files import check_copy
 from bounce_mjx.task.task import Task
 from bounce_mjx.tasks.registry import (
@@ -202,10 +202,7 @@ def load_config(
     for key, (given, default) in defaults.items():
         name = values[key] = given or values.get(key, default)
         if given is None and is_file(name):
-            raise UserError(
-                f"{source} has its {key} in the file {name}, which is code; name it yourself to "
-                f"run it: --{key} {name}"
-            )
+            raise unnamed_code(source, key, name)
     algorithm = values["algorithm"]
     ppo = PPOConfig if algorithm == PPO_NAME else find_algorithm(algorithm).Config
     config_class = train_config(find_task(values["task"]), ppo=ppo)

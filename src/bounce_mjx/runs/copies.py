@@ -116,11 +116,16 @@ def task_of_run(name: str, run: Path, given: str | None) -> type[Task]:
         registry.admit(name, registry.find_task(given))
     task = registry.known_task(name)
     if task is None:
-        raise UserError(
-            f"the run {run} was trained with a task in a file, which is code; name it to run it: "
-            f"--task FILE.py:{name.rpartition(':')[2]} (the run's copy is {shlex.quote(name)})"
-        )
+        raise unnamed_code(f"the run {run}", "task", name)
     return task
+
+
+def unnamed_code(source: str, key: str, name: str) -> UserError:
+    """The refusal to run the file of a task or an algorithm that the user has not named."""
+    return UserError(
+        f"{source} has its {key} in a file, which is code; name it to run it: --{key} "
+        f"{shlex.quote(name)}"
+    )
 
 
 def identify_task(name: str) -> str:

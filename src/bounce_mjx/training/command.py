@@ -23,6 +23,7 @@ from bounce_mjx.runs.config import (
     runs_folder,
     train_config,
 )
+from bounce_mjx.runs.copies import unnamed_code
 from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file, is_same_code
 from bounce_mjx.world.config import WorldConfig
 
@@ -109,10 +110,7 @@ class Start(StrictModel):
                     "it, name the run's copy, or start a new run"
                 )
         if is_file(base.algorithm) and self.algorithm is None:
-            raise UserError(
-                f"the run {run} was trained with an algorithm in a file, which is code; name it to "
-                f"run it: --algorithm {base.algorithm}"
-            )
+            raise unnamed_code(f"the run {run}", "algorithm", base.algorithm)
         if self.total_steps is None:
             return base
         from bounce_mjx.runs.folders import runs_of_seeds
