@@ -215,7 +215,8 @@ def test_the_page_of_a_training_shows_its_newest_policy(
     watch(monkeypatch, Simulation, "step", step)
     panels: list[watched._Panel] = []
     watch(monkeypatch, watched._Panel, "show", lambda panel, _: panels.append(panel))
-    training = TrainingPage(TrainConfig(), "127.0.0.1", 8500, Console(file=printed, width=200))
+    address = watched.Address("127.0.0.1", 8500, ())
+    training = TrainingPage(TrainConfig(), address, Console(file=printed, width=200))
     wait_until(lambda: "watch: " in printed.getvalue())
     client = Client(re.search(r"http://\S+", printed.getvalue())[0])
     means = {"episode/return": 1.0, "task/apex_error": 0.02, "speed/steps_per_second": 2e6}

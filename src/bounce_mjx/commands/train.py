@@ -46,10 +46,10 @@ def main(args: Sequence[str]) -> None:
         console, page = stdout(quiet=not hosts.is_leader()), None
         if command.watch and hosts.is_leader():
             # Only a training run that is watched pays for this import.
-            from bounce_mjx.training.watch import TrainingPage
+            from bounce_mjx.training.watch import Address, TrainingPage
 
-            address = command.watch_host, command.watch_port
-            page = TrainingPage(command.training, *address, console, command.watch_allow_host)
+            address = Address(command.watch_host, command.watch_port, command.watch_allow_host)
+            page = TrainingPage(command.training, address, console)
         if command.resume is None:
             files = preset_files(command.config, command.task, machine)
             say(console, f"config: {' on '.join(map(shown_file, reversed(files)))}")

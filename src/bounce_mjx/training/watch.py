@@ -5,7 +5,6 @@ import html
 import queue
 import signal
 import threading
-from collections.abc import Collection
 
 import jax
 import numpy as np
@@ -36,24 +35,17 @@ class TrainingPage:
     """A callback of a training that serves a page from its own thread. The simulation runs
     on the CPU, so that training on a GPU keeps its speed."""
 
-    def __init__(
-        self,
-        config: TrainConfig,
-        host: str,
-        port: int,
-        console: Console,
-        allowed: Collection[str] = (),
-    ):
+    def __init__(self, config: TrainConfig, address: Address, console: Console):
         """Starts the thread, which serves the page and compiles the simulation.
 
         Args:
-          allowed: see `open_server`.
+          address: with the first port to try.
 
         Raises:
           UserError: the page cannot be served there.
         """
         self._config, self._console = config, console
-        self._address = Address(host, free_port(host, port), allowed)
+        self._address = address._replace(port=free_port(address.host, address.port))
         self._news: queue.SimpleQueue[Event | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
