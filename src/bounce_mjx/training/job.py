@@ -292,16 +292,10 @@ class Job:
             self.logs[member.run].start(member.config, resumed)
             call_all(self.callbacks, "start", member.run, member.config)
 
-    def _tell(
-        self,
-        member: SeedRun,
-        points: dict[str, float],
-        report: Report | None = None,
-        policy: Policy | None = None,
-    ) -> None:
-        """Logs an event of a seed, and tells the callbacks."""
+    def _tell(self, member: SeedRun, metrics: dict[str, float], **evaluation: Any) -> None:
+        """Logs an `Event` of a seed, and tells the callbacks."""
         if hosts.is_leader():
-            event = Event(member.run, member.config, self.steps, points, report, policy)
+            event = Event(member.run, member.config, self.steps, metrics, **evaluation)
             self.logs[member.run](event)
             answers = [callback(event) for callback in self.callbacks]
             self.ended |= any(answer is False for answer in answers)
@@ -374,7 +368,7 @@ class Job:
         ]
         self.say(evaluation_line(self.config.num_seeds, self.steps, [x[1] for x in evaluated]))
         for member, report, policy in evaluated:
-            self._tell(member, points_of(report), report, policy)
+            self._tell(member, points_of(report), report=report, policy=policy)
         seconds, scores = sum(self.seconds.values()), {}
         self._end_save()
         for member, report, policy in evaluated:

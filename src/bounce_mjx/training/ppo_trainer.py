@@ -7,6 +7,7 @@ statistics. With several seeds each device holds some of them.
 
 import concurrent.futures
 import functools
+from typing import Any
 
 import jax
 import numpy as np
@@ -15,15 +16,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig, find_algorithm
-from bounce_mjx.learning.ppo import (
-    CHECKED,
-    Params,
-    TrainingState,
-    num_groups,
-    policy_of,
-    population,
-)
-from bounce_mjx.learning.statistics import RunningStatistics
+from bounce_mjx.learning.ppo import CHECKED, TrainingState, num_groups, policy_of, population
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training import hosts
 from bounce_mjx.training.setup import compiler_options
@@ -91,11 +84,7 @@ class PPOTrainer:
         self._init = pool.submit(init.lower(self._seeds).compile)
         return self._run
 
-    def start(
-        self,
-        state: TrainingState | None = None,
-        networks: tuple[Params, RunningStatistics] | None = None,
-    ) -> None:
+    def start(self, state: Any = None, networks: Any = None) -> None:
         if state is None:
             self.state = jax.block_until_ready(self._init.result()(self._seeds))
         if networks is not None:
