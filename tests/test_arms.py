@@ -58,12 +58,6 @@ def place_ball(arm: Arm, qpos: np.ndarray, local: np.ndarray) -> None:
     qpos[arm.at.ball_qpos[:3],] = paddle.xpos + paddle.xmat.reshape(3, 3) @ local
 
 
-def drop_on_paddle(arm: Arm, qpos: np.ndarray, qvel: np.ndarray, rng: np.random.Generator) -> None:
-    """Puts the ball of one state above the paddle, in place."""
-    place_ball(arm, qpos, np.array([*rng.uniform(-0.02, 0.02, 2), rng.uniform(0.03, 0.06)]))
-    qvel[arm.at.ball_qvel,] = [0.0, 0.0, rng.uniform(-1.0, 0.0), *rng.uniform(-30.0, 30.0, 3)]
-
-
 @pytest.mark.usefixtures("float64")
 @pytest.mark.slow
 def test_2000_steps_of_any_arm_are_mujocos(arm):
@@ -86,7 +80,10 @@ def test_2000_steps_of_any_arm_are_mujocos(arm):
         if i % STEPS_OF_A_BALL == 0:
             state = PhysicsState(*(np.array(x) for x in state[:2]))
             for data, qpos, qvel in zip(reference.data, *state[:2], strict=True):
-                drop_on_paddle(arm, data.qpos, data.qvel, rng)
+                above = np.array([*rng.uniform(-0.02, 0.02, 2), rng.uniform(0.03, 0.06)])
+                place_ball(arm, data.qpos, above)
+                spin = rng.uniform(-1.0, 0.0), *rng.uniform(-30.0, 30.0, 3)
+                data.qvel[at.ball_qvel,] = [0.0, 0.0, *spin]
                 qpos[at.ball_qpos,] = data.qpos[at.ball_qpos,]
                 qvel[at.ball_qvel,] = data.qvel[at.ball_qvel,]
         ctrl = targets(arm, rng, COUNT)

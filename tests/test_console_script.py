@@ -33,18 +33,12 @@ def test_help_lists_the_commands(capsys) -> None:
     assert sorted(listed.split("|")) == sorted(console_script.COMMANDS)
 
 
-def lost_pipe() -> int:
-    """The end of a pipe whose reader has ended, such as head."""
-    read, write = os.pipe()
-    os.close(read)
-    return write
-
-
 @pytest.mark.parametrize(("args", "status"), [(["--help"], 0), (["evl"], 2)])
 def test_an_output_that_cannot_be_written_is_dropped(args: list[str], status: int) -> None:
-    """A mistake is said on stderr."""
+    """To a reader that has ended, such as head; a mistake is said on stderr."""
     command = [sys.executable, "-m", "bounce_mjx", *args]
-    output = lost_pipe()
+    read, output = os.pipe()
+    os.close(read)
     streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     streams["stderr" if status else "stdout"] = output
     done = subprocess.run(command, **streams, text=True)

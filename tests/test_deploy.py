@@ -154,11 +154,6 @@ def draw_inputs(name: str, runs: dict[str, Path]) -> tuple[dict, np.ndarray]:
     return inputs, np.asarray(networks.act(policy, observation))
 
 
-def session_of(run: Path) -> onnxruntime.InferenceSession:
-    model = export_onnx(find_checkpoint(run))
-    return onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
-
-
 # Functions of a vector x [3], a matrix a [2, 3], a number s, whole numbers i [3], and truth values
 # b [3] and p. Together they have every operation that a graph may have.
 FUNCTIONS = {
@@ -247,7 +242,9 @@ def test_an_operation_without_a_counterpart_is_named(rows) -> None:
 def test_onnx_equals_jax(name: str, runs: dict[str, Path]) -> None:
     inputs, expected = draw_inputs(name, runs)
     given = {input_name(quantity): values for quantity, values in inputs.items()}
-    (actions,) = session_of(runs[name]).run(["action"], given)
+    graph = export_onnx(find_checkpoint(runs[name]))
+    session = onnxruntime.InferenceSession(graph, providers=["CPUExecutionProvider"])
+    (actions,) = session.run(["action"], given)
     np.testing.assert_allclose(actions, expected, rtol=0.0, atol=1e-5)
     # Some actions are clipped and some are not.
     assert 0.0 < np.mean(np.abs(expected) == 1.0) < 0.9

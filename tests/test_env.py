@@ -351,12 +351,6 @@ def flights(*apexes):
     return [pair for apex in apexes for pair in ((apex, 0.0), (0.1, -2.0), (0.1, 2.0))]
 
 
-def counts_at_bounces(*apexes, **settings):
-    bounced, counts, _ = drive(flights(*apexes), **settings)
-    assert bounced == [False, False, True] * len(apexes)
-    return counts[2::3]
-
-
 @pytest.mark.parametrize(
     ("apexes", "settings", "expected"),
     [
@@ -372,7 +366,8 @@ def counts_at_bounces(*apexes, **settings):
     ],
 )
 def test_bounce_count(apexes, settings, expected):
-    assert counts_at_bounces(*apexes, **settings) == expected
+    bounced, counts, _ = drive(flights(*apexes), **settings)
+    assert bounced == [False, False, True] * len(apexes) and counts[2::3] == expected
 
 
 def test_apex_is_the_highest_point_since_the_bounce():

@@ -65,11 +65,6 @@ def test_the_time_limit_is_that_of_the_config() -> None:
             assert make(TASK_ID, **settings).spec.max_episode_steps == steps
 
 
-def make_sync(mode, wrap=lambda env: env) -> SyncVectorEnv:
-    made = [lambda: wrap(gymnasium.make(ENV_ID, max_episode_steps=LIMIT))] * NUM_ENVS
-    return SyncVectorEnv(made, autoreset_mode=mode)
-
-
 def falling_actions(steps: int) -> np.ndarray:
     """Actions [steps, B, 6] that turn the arms of the last two environments away from the ball."""
     actions = 0.1 * np.random.default_rng(0).normal(size=(steps, NUM_ENVS, 6))
@@ -136,7 +131,9 @@ def test_gymnasium_checks_pass(single):
 def test_vector_equals_gymnasiums_vector_of_single_environments(mode):
     """Observations, rewards, ends, infos and their masks, over falls, time-outs and resets."""
     same_step = mode is AutoresetMode.SAME_STEP
-    envs, reference = make_vec(mode), make_sync(mode, *[RecordEpisodeStatistics] * same_step)
+    wrap = RecordEpisodeStatistics if same_step else lambda env: env
+    made = [lambda: wrap(gymnasium.make(ENV_ID, max_episode_steps=LIMIT))] * NUM_ENVS
+    envs, reference = make_vec(mode), SyncVectorEnv(made, autoreset_mode=mode)
     assert envs.autoreset_mode is envs.metadata["autoreset_mode"] is mode
     assert_same(envs.reset(seed=[5, 6, 9]), reference.reset(seed=[5, 6, 9]), 1e-6)
     ends = np.zeros((2, NUM_ENVS), bool)

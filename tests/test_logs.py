@@ -77,14 +77,6 @@ def with_cell(row: int, column: int, cell: str):
     return change
 
 
-def without_column(title: str):
-    def change(lines: list[str]) -> list[str]:
-        at = lines[0].split(",").index(title)
-        return [",".join(c for i, c in enumerate(x.split(",")) if i != at) for x in lines]
-
-    return change
-
-
 def scaled(start: str, factor: float, title: str | None = None):
     """Multiplies the columns whose title starts so."""
 
@@ -103,10 +95,6 @@ def scaled(start: str, factor: float, title: str | None = None):
     return change
 
 
-def renamed(lines: list[str]) -> list[str]:
-    return [lines[0].replace("left", "shoulder").replace("right", "elbow"), *lines[1:]]
-
-
 def swapped(lines: list[str]) -> list[str]:
     return [*lines[:40], lines[50], *lines[40:50], *lines[51:]]
 
@@ -117,32 +105,19 @@ def swapped(lines: list[str]) -> list[str]:
         (lambda lines: [], r"the log .+ has 0 rows of 0 cells, .+ record with"),
         (lambda lines: lines[:40], r"log.csv has 39 joint angles; record at least 100"),
         (
-            without_column("joint_angles.right [rad]"),
+            lambda lines: [",".join(np.delete(line.split(","), 2)) for line in lines],
             r"has no column joint_angles\.right \[rad\]; its columns are time, joint_angles\.left",
         ),
-        (
-            lambda lines: [lines[0], *(changed(x, 0, 2, "") for x in lines[1:])],
-            r"120 of the 120 joint angles in .+: row 2 lacks one of its 2 numbers",
-        ),
-        (
-            lambda lines: [*lines[:5], lines[5] + ",1", *lines[6:]],
-            r"cannot be read \(the number of columns changed from 12 to 13",
-        ),
+        (lambda lines: [*lines[:5], lines[5] + ",1", *lines[6:]], "columns changed from 12 to 13"),
         (
             scaled("joint_angles", 57.3),
-            r"joint_angles\.right .+ is -28\.\d+ rad .+ if these are degrees, write .+ \[deg\]",
+            r"is -28\.\d+ rad .+ if these are degrees, write .+ \[deg\]",
         ),
         (scaled("time", 1000.0), r"are 10 s apart, .+ if the times are milliseconds, write time"),
         (scaled("time", -1.0), r"119 of the 120 joint angles .+ row 3 has a time out of order"),
         (scaled("ball_position", 1000.0), r"the ball .+ write ball_position\.x \[mm\]"),
-        (
-            renamed,
-            r"no column joint_angles\.left .+ joint_angles\.shoulder, .+ give .+ --joint-names",
-        ),
-        (
-            lambda lines: [*lines[:3], "\x00\x01", *lines[3:]],
-            r"cannot be read \(the number of columns",
-        ),
+        (lambda lines: [lines[0].replace("left", "a"), *lines[1:]], "angles.a, .+ --joint-names"),
+        (lambda lines: [*lines[:3], "\x00\x01", *lines[3:]], r"cannot be read \(the number of col"),
     ],
 )
 def test_a_wrong_log_is_refused_by_one_sentence(change, sentence: str, tmp_path: Path) -> None:

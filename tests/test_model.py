@@ -77,16 +77,6 @@ def test_an_edited_model_is_an_error():
         jax.eval_shape(env.reset, key)
 
 
-def env_of(tmp_path, *edits: tuple[str, str]) -> BounceBall:
-    text = XML
-    for old, new in edits:
-        assert old in text
-        text = text.replace(old, new, 1)
-    mjcf = tmp_path / "robot.xml"
-    mjcf.write_text(text)
-    return BounceBall(EnvConfig(mjcf=mjcf))
-
-
 def targets(env: BounceBall, angle: float, action: float) -> np.ndarray:
     qpos = jnp.full(env.mj_model.nq, angle)
     physics = PhysicsState(qpos, jnp.zeros(env.mj_model.nv))
@@ -95,10 +85,9 @@ def targets(env: BounceBall, angle: float, action: float) -> np.ndarray:
 
 def test_with_a_gear_the_target_is_the_actuators_length(tmp_path):
     """A servo whose length is a multiple of the angle holds its joint like a servo without gear."""
-    geared = env_of(
-        tmp_path, ('<position kp="20000" kv="200"', '<position gear="-2" kp="5000" kv="50"')
-    )
-    plain = BounceBall()
+    path, servos = tmp_path / "robot.xml", '<position kp="20000" kv="200"'
+    path.write_text(XML.replace(servos, '<position gear="-2" kp="5000" kv="50"'))
+    geared, plain = BounceBall(EnvConfig(mjcf=path)), BounceBall()
     np.testing.assert_allclose(targets(geared, 0.2, 0.5), -2.0 * targets(plain, 0.2, 0.5))
     after = []
     for env in (geared, plain):

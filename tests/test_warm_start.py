@@ -102,12 +102,9 @@ def test_the_small_robust_policy_can_be_trained_further() -> None:
     assert str(command.warm_start) == "robust_small"
     assert command.env.randomization.terms and command.env.randomization.share == 1.0
     params, _ = read_start(command, Env(command.env))
-    own = read_policy(pretrained_checkpoint("robust_small"), load_run_config_of("robust_small"))
+    checkpoint = pretrained_checkpoint("robust_small")
+    own = read_policy(checkpoint, load_run_config(checkpoint.run))
     jax.tree.map(np.testing.assert_array_equal, params.policy, own.params)
-
-
-def load_run_config_of(name: str):
-    return load_run_config(pretrained_checkpoint(name).run)
 
 
 def test_the_latest_run_is_that_of_the_task_wherever_the_new_one_lies(
