@@ -328,8 +328,9 @@ def test_three_joints_suffice_to_lift_and_tilt(tmp_path, capsys) -> None:
     """Also on a base with a free joint, which is fixed; the observation has 2n + 17 numbers."""
     base = f'<body><freejoint/><geom size="0.1"/>{LIFT}</body>'
     (tmp_path / "arm.xml").write_text(mjcf(base, motors("lift roll pitch", 60.0)))
-    line = f"{tmp_path}/arm.xml --site tool --out {tmp_path}/arm.yaml --task juggle"
-    adopt_command.main(line.split())
+    for task in ("juggle", "bounce"):
+        line = f"{tmp_path}/arm.xml --site tool --out {tmp_path}/arm.yaml --task {task}"
+        adopt_command.main(line.split())
     said = capsys.readouterr().out
     assert len(re.findall(r": bounce-mjx (?:view|train) --task juggle --robot ", said)) == 2
     env = BounceBall(load_config(tmp_path / "arm.yaml").env)
