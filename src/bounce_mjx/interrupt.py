@@ -1,9 +1,7 @@
 """Ctrl-C, SIGTERM and SIGHUP as requests: a handler that raised an exception would lose it wherever
 Python drops exceptions, such as in JAX's callback of the garbage collection."""
 
-import atexit
 import concurrent.futures
-import functools
 import os
 import signal
 import sys
@@ -11,12 +9,9 @@ import threading
 import time
 import types
 from collections.abc import Callable
-from typing import Any, ClassVar, NoReturn, TypeVar
+from typing import NoReturn, TypeVar
 
 Result = TypeVar("Result")
-
-INTERRUPTED = 130
-"""Exit status of a process that Ctrl-C ended, by the shells' convention."""
 
 _POLL_SECONDS = 0.1
 # Launchers forward a Ctrl-C to a process that has already received it from the terminal, and a
@@ -102,30 +97,9 @@ def in_daemon_thread(function: Callable[[], Result]) -> concurrent.futures.Futur
     return future
 
 
-class DaemonThreads(concurrent.futures.Executor):
-    """A thread for each call, for which the end of the process does not wait: for compilations,
-    which cannot be stopped."""
-
-    _running: ClassVar[set[concurrent.futures.Future]] = set()
-    """Those of all instances; a call that has ended is let go, with its result."""
-
-    def submit(self, function: Callable[..., Result], /, *args: Any, **kwargs: Any):
-        """Calls a function in a thread of its own."""
-        future = in_daemon_thread(functools.partial(function, *args, **kwargs))
-        self._running.add(future)
-        future.add_done_callback(self._running.discard)
-        return future
-
-    @staticmethod
-    @atexit.register
-    def _leave() -> None:
-        if DaemonThreads._running:
-            # After an exception that nobody caught, the interpreter has its value.
-            leave(INTERRUPTED if hasattr(sys, "last_value") else 0)
-
-
-def leave(status: int = INTERRUPTED) -> NoReturn:
-    """Ends the process at once, without waiting for its threads.
+def leave(status: int = 130) -> NoReturn:
+    """Ends the process at once, without waiting for its threads; the default status is that of
+    Ctrl-C by the shells' convention.
 
     A normal exit of the interpreter would free memory that a compilation in another thread still
     uses.

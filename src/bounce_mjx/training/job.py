@@ -22,7 +22,7 @@ import bounce_mjx
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.evaluation.results import Report
-from bounce_mjx.interrupt import DaemonThreads, Interrupted, StopRequest
+from bounce_mjx.interrupt import Interrupted, StopRequest
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.runs import folders, reading, writing
 from bounce_mjx.runs.config import TrainConfig
@@ -258,16 +258,15 @@ class Job:
         def compile() -> None:
             # The longest program is traced first: Python traces one program at a time while XLA
             # compiles others.
-            compiling = self.trainer.compile(threads)
+            compiling = self.trainer.compile(self.pool)
             parts = self.config, self.env, self.trainer.mesh
-            self.evaluators = make_evaluators(*parts, threads)
+            self.evaluators = make_evaluators(*parts, self.pool)
             self.opening = self.pool.submit(self._open_logs)
             self.opening.add_done_callback(lambda _: [*map(importlib.import_module, _SLOW_MODULES)])
             compiling.result()
 
-        threads = DaemonThreads()
         with self.console.status("compiling"):
-            compiling = threads.submit(compile)
+            compiling = self.pool.submit(compile)
             if not self.stop.wait_for(compiling):
                 raise Interrupted
         compiling.result()
