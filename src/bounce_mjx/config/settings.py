@@ -99,13 +99,12 @@ class StrictModel(pydantic.BaseModel):
         those of its class."""
         if not isinstance(values, dict):
             return values
-        defaults = {name: field.default for name, field in cls.model_fields.items()}
-        return {
-            name: merged(default.model_dump(exclude_unset=True), value)
-            if isinstance(default := defaults.get(name), StrictModel) and isinstance(value, dict)
-            else value
-            for name, value in values.items()
+        groups = {
+            name: field.default.model_dump(exclude_unset=True)
+            for name, field in cls.model_fields.items()
+            if isinstance(field.default, StrictModel) and isinstance(values.get(name), dict)
         }
+        return values | {name: merged(own, values[name]) for name, own in groups.items()}
 
 
 def types_in(kind: Any) -> Iterator[Any]:
