@@ -118,7 +118,7 @@ class _Robot:
         self.has_ball = True
 
     def ball(self) -> np.ndarray:
-        return self.data.qpos[list(self.addresses.ball_qpos[:3])].copy()
+        return self.data.qpos[list(self.addresses.balls[0].qpos[:3])].copy()
 
     def angles(self) -> np.ndarray:
         true = self.data.qpos[self.qpos] + self.bias + self.play
@@ -149,7 +149,7 @@ class _Robot:
         if self.flaw == "asymmetric friction":
             friction = world["joint_frictionloss"] * _ASYMMETRY
             d.qfrc_applied[self.qvel] = -friction * np.tanh(np.abs(d.qvel[self.qvel]) / 0.02)
-        body, speed = self.addresses.balls[0].body, d.qvel[list(self.addresses.ball_qvel[:3])]
+        body, speed = self.addresses.balls[0].body, d.qvel[list(self.addresses.balls[0].qvel[:3])]
         force = -world.get("air_drag", 0.0) * np.linalg.norm(speed) * speed
         d.xfrc_applied[body, :3] = m.body_mass[body] * force
         before = self.ball()

@@ -410,7 +410,7 @@ def arms():
         env = BounceBall(config)
         qpos, addresses = env.mj_model.qpos0.copy(), env.addresses
         qpos[addresses.arm_qpos,] = config.default_joint_angles
-        qpos[addresses.ball_qpos[:3],] = config.ball_init_pos
+        qpos[addresses.balls[0].qpos[:3],] = config.ball_init_pos
         with Renderer(env, 480, 520) as renderer:
             axes.imshow(renderer.render(qpos, {"target_height": 0.5}))
         axes.set_title(title)

@@ -15,8 +15,8 @@ def own_parameters(mj_model: mujoco.MjModel) -> PhysicsParameters:
     at = find_addresses(mj_model)
     stiffness, damping = direct_solref(mj_model)
     return PhysicsParameters(
-        ball_mass=mj_model.body_mass[at.ball_body],
-        ball_radius=mj_model.geom_size[at.ball_geom, 0],
+        ball_mass=mj_model.body_mass[at.balls[0].body],
+        ball_radius=mj_model.geom_size[at.balls[0].geom, 0],
         contact_stiffness=np.array(stiffness),
         contact_damping=np.array(damping),
         servo_gain=mj_model.actuator_gainprm[at.actuators, 0],

@@ -55,7 +55,7 @@ def place_ball(arm: Arm, qpos: np.ndarray, local: np.ndarray) -> None:
     data.qpos[:] = qpos
     mujoco.mj_kinematics(arm.model, data)
     paddle = data.geom("blocker")
-    qpos[arm.at.ball_qpos[:3],] = paddle.xpos + paddle.xmat.reshape(3, 3) @ local
+    qpos[arm.at.balls[0].qpos[:3],] = paddle.xpos + paddle.xmat.reshape(3, 3) @ local
 
 
 @pytest.mark.usefixtures("float64")
@@ -83,9 +83,9 @@ def test_2000_steps_of_any_arm_are_mujocos(arm):
                 above = np.array([*rng.uniform(-0.02, 0.02, 2), rng.uniform(0.03, 0.06)])
                 place_ball(arm, data.qpos, above)
                 spin = rng.uniform(-1.0, 0.0), *rng.uniform(-30.0, 30.0, 3)
-                data.qvel[at.ball_qvel,] = [0.0, 0.0, *spin]
-                qpos[at.ball_qpos,] = data.qpos[at.ball_qpos,]
-                qvel[at.ball_qvel,] = data.qvel[at.ball_qvel,]
+                data.qvel[at.balls[0].qvel,] = [0.0, 0.0, *spin]
+                qpos[at.balls[0].qpos,] = data.qpos[at.balls[0].qpos,]
+                qvel[at.balls[0].qvel,] = data.qvel[at.balls[0].qvel,]
         ctrl = targets(arm, rng, COUNT)
         state = step(state, ctrl)
         contacts += reference.step(ctrl, NUM_SUBSTEPS)

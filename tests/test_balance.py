@@ -82,19 +82,19 @@ def test_a_ball_slides_and_rolls_on_fused_as_on_c(env: Env) -> None:
         mujoco.mj_kinematics(model, data)
         normal = data.geom_xmat[at.paddle_geom].reshape(3, 3)[:, 2]
         centre = data.geom_xpos[at.paddle_geom] + (HALF_SIZE + RADIUS - 1e-4) * normal
-        qpos[i, list(at.ball_qpos[:3])] = centre
-    qvel[0, at.ball_qvel[0]] = 0.1
+        qpos[i, list(at.balls[0].qpos[:3])] = centre
+    qvel[0, at.balls[0].qvel[0]] = 0.1
     ends = []
     for i in range(2):
         data = mujoco.MjData(model)
         data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[i], qvel[i], angles[i]
         mujoco.mj_step(model, data, 300)
-        ends.append(data.qvel[list(at.ball_qvel)].copy())
+        ends.append(data.qvel[list(at.balls[0].qvel)].copy())
     step = jax.jit(
         jax.vmap(lambda s, ctrl: env.engine.step(PhysicsParameters(), s, Control(ctrl), 300))
     )
     after = step(PhysicsState(jnp.asarray(qpos), jnp.asarray(qvel), None), jnp.asarray(angles))
-    np.testing.assert_allclose(after.qvel[:, list(at.ball_qvel)], ends, atol=2e-3, rtol=1e-3)
+    np.testing.assert_allclose(after.qvel[:, list(at.balls[0].qvel)], ends, atol=2e-3, rtol=1e-3)
     # Friction at the contact keeps the angular momentum about it: 5/7 of the speed is left. On the
     # slope a solid ball rolls with 5/7 of the acceleration of one that slides.
     speeds = np.array(ends)[:, 0]

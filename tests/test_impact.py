@@ -63,7 +63,9 @@ def test_worlds_with_a_sloped_restitution_are_mujocos():
         converged(model, 20)
         world = {name: float(value[w]) for name, value in pipeline.world.items()}
         paddle = find_addresses(model).paddle_geom
-        reach = model.geom_size[paddle].min() + model.geom_size[find_addresses(model).ball_geom, 0]
+        reach = (
+            model.geom_size[paddle].min() + model.geom_size[find_addresses(model).balls[0].geom, 0]
+        )
         data, jacobian, speed = mujoco.MjData(model), np.zeros((3, model.nv)), 0.0
         data.qpos[:], data.qvel[:] = (np.asarray(x)[w] for x in pipeline.physics[:2])
         for t in range(STEPS):

@@ -41,9 +41,11 @@ def moving(env: BounceBall, batch: int) -> tuple[PhysicsState, jax.Array]:
     paddle = jax.vmap(partial(env.engine.paddle_position, MODEL), in_axes=-1, out_axes=-1)(
         physics.qpos
     )
-    height = jnp.where(jnp.arange(batch) % 2 == 0, paddle[2] + 0.02, physics.qpos[at.ball_qpos[2]])
-    qpos = physics.qpos.at[jnp.array(at.ball_qpos[:2])].set(paddle[:2])
-    qpos = qpos.at[at.ball_qpos[2]].set(height)
+    height = jnp.where(
+        jnp.arange(batch) % 2 == 0, paddle[2] + 0.02, physics.qpos[at.balls[0].qpos[2]]
+    )
+    qpos = physics.qpos.at[jnp.array(at.balls[0].qpos[:2])].set(paddle[:2])
+    qpos = qpos.at[at.balls[0].qpos[2]].set(height)
     qvel = physics.qvel + jax.random.normal(jax.random.PRNGKey(1), physics.qvel.shape)
     return PhysicsState(qpos, qvel), qpos[jnp.array(at.arm_qpos)] + 0.05
 

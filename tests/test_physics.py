@@ -240,8 +240,8 @@ EQUIVALENT = {
 def reordered(at: Addresses, states):
     """Reorders `States` or a `PhysicsState` to the addresses of an edited model."""
     qpos, qvel = np.empty_like(states.qpos), np.empty_like(states.qvel)
-    qpos[:, at.arm_qpos + at.ball_qpos] = states.qpos
-    qvel[:, at.arm_qvel + at.ball_qvel] = states.qvel
+    qpos[:, at.arm_qpos + at.balls[0].qpos] = states.qpos
+    qvel[:, at.arm_qvel + at.balls[0].qvel] = states.qvel
     if isinstance(states, PhysicsState):
         return PhysicsState(qpos, qvel)
     ctrl = np.empty_like(states.ctrl)

@@ -185,7 +185,7 @@ def test_one_step_in_random_worlds_is_mujocos(env) -> None:
         mujoco.mj_kinematics(model, data)
         paddle = data.geom("blocker")
         local = rng.uniform(-1.0, 1.0, 3) * (0.04, 0.05, 0.012)
-        row[at.ball_qpos[:3],] = paddle.xpos + paddle.xmat.reshape(3, 3) @ local
+        row[at.balls[0].qpos[:3],] = paddle.xpos + paddle.xmat.reshape(3, 3) @ local
     ctrl = np.zeros((count, model.nu))
     ctrl[:, at.actuators] = angles + rng.uniform(-0.1, 0.1, (count, 6))
     states, parameters = States(qpos, qvel, ctrl), random_parameters(model, count, seed=2)

@@ -75,7 +75,7 @@ class MirrorLaw:
         self._place = np.array([*config.ball_init_pos[:2], float(home[2])])
         self._gravity = model.opt.gravity.copy()
         # From the paddle's centre to that of a ball that touches it, m.
-        self._contact_distance = float(height + model.geom_size[at.ball_geom, 0])
+        self._contact_distance = float(height + model.geom_size[at.balls[0].geom, 0])
         self._read_servos(model, list(at.arm_qvel))
 
     def _read_servos(self, model: mujoco.MjModel, dofs: list[int]) -> None:

@@ -221,7 +221,7 @@ def _check_frame(windows: Windows, config: WorldConfig, source: str) -> None:
     """
     model, offsets = world_model(config, visual=False), []
     addresses, data = find_addresses(model), mujoco.MjData(model)
-    paddle, radius = addresses.paddle_geom, model.geom_size[addresses.ball_geom, 0]
+    paddle, radius = addresses.paddle_geom, model.geom_size[addresses.balls[0].geom, 0]
     for s in np.flatnonzero(windows.has_ball & np.any(windows.angle_weights > 0.0, axis=1)):
         bounce = windows.bounces[s]
         since = np.abs(windows.angle_times[s] - bounce)

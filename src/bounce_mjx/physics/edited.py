@@ -290,6 +290,6 @@ def contact_pairs(mj_model: mujoco.MjModel) -> list[int]:
     geoms = {at.paddle_geom, *(ball.geom for ball in at.balls)}
     both = zip(mj_model.pair_geom1.tolist(), mj_model.pair_geom2.tolist(), strict=True)
     pairs = {i: set(pair) for i, pair in enumerate(both) if geoms.issuperset(pair)}
-    first = {at.paddle_geom, at.ball_geom}
+    first = {at.paddle_geom, at.balls[0].geom}
     own = sorted(pairs, key=lambda i: pairs[i] != first)
     return own if own and pairs[own[0]] == first else []

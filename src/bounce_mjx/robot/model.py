@@ -59,26 +59,6 @@ class Addresses(NamedTuple):
     balls: tuple[BallAddresses, ...]
     paddle_geom: int
 
-    @property
-    def ball_body(self) -> int:
-        """Body of the first ball."""
-        return self.balls[0].body
-
-    @property
-    def ball_geom(self) -> int:
-        """Geom of the first ball."""
-        return self.balls[0].geom
-
-    @property
-    def ball_qpos(self) -> tuple[int, ...]:
-        """Position (3) and quaternion (4) of the first ball in qpos."""
-        return self.balls[0].qpos
-
-    @property
-    def ball_qvel(self) -> tuple[int, ...]:
-        """Linear (3) and angular (3) velocity of the first ball in qvel."""
-        return self.balls[0].qvel
-
 
 def scene_spec(mjcf: Path | None, robot: RobotConfig) -> tuple[mujoco.MjSpec, Path]:
     """Spec of the whole scene, and the path of its MJCF file.

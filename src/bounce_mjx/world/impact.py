@@ -39,7 +39,7 @@ def next_impact(
         moving[address] = truth.joint_velocities[i]
     paddle_position = lambda qpos: engine.paddle_position(parameters, qpos)  # noqa: E731
     _, paddle_velocity = jax.jvp(paddle_position, (qpos,), (jnp.stack(moving),))
-    geom, radius = addresses.ball_geom, parameters.ball_radius
+    geom, radius = addresses.balls[0].geom, parameters.ball_radius
     radius = mj_model.geom_size[geom, 0] if radius is None else radius
     radius = (parameters.entries or {}).get(f"geom_size[{geom}, 0]", radius)
     height = radius + np.min(mj_model.geom_size[addresses.paddle_geom])
