@@ -13,18 +13,11 @@ from bounce_mjx.adapters.gymnasium.registration import ENV_ID
 from bounce_mjx.adapters.sb3 import Sb3VecEnv
 from bounce_mjx.errors import UserError
 
+torch.set_num_threads(1)
 NUM_ENVS = 3
 LIMIT, STEPS = 36, 45
 TARGET = 28
 """Index of the target height in an observation."""
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture

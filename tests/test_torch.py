@@ -29,19 +29,12 @@ from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import find_checkpoint, runs_in
 from bounce_mjx.runs.reading import read_policy
 
+# Threads that wait for a busy core slow tiny networks down a hundredfold.
+torch.set_num_threads(1)
 NUM_ENVS = 4
 # Each test includes both a fall (the ball reaches the floor after 0.3 s) and time-outs.
 EPISODE_STEPS = 20
 EXAMPLES = Path(__file__).parents[1] / "examples"
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """PyTorch threads that wait for a busy core slow tiny networks down a hundredfold."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")
