@@ -58,9 +58,8 @@ def place_ball(arm: Arm, qpos: np.ndarray, local: np.ndarray) -> None:
     qpos[arm.at.balls[0].qpos[:3],] = paddle.xpos + paddle.xmat.reshape(3, 3) @ local
 
 
-@pytest.mark.usefixtures("float64")
 @pytest.mark.slow
-def test_2000_steps_of_any_arm_are_mujocos(arm):
+def test_2000_steps_of_any_arm_are_mujocos(arm, float64):
     """Both engines run freely; neither sees the other's state. Some servos, joints and targets are
     at their limits, and some are not."""
     model, at = arm
@@ -102,8 +101,7 @@ def test_2000_steps_of_any_arm_are_mujocos(arm):
     assert error < 1e-9
 
 
-@pytest.mark.usefixtures("float64")
-def test_one_step_of_any_arm_in_random_worlds_is_mujocos(arm):
+def test_one_step_of_any_arm_in_random_worlds_is_mujocos(arm, float64):
     """As the model is and with all parameters given; links and paddle have welded bodies."""
     model, at = arm
     count, rng = 32, np.random.default_rng(1)

@@ -100,8 +100,7 @@ def num_pressed(model: mujoco.MjModel, states: States) -> np.ndarray:
     # Newton's method is slow for the last one.
     [(2, None), (3, None), (2, 0.3), (2, (0.02, 0.2))],
 )
-@pytest.mark.usefixtures("float64")
-def test_one_step_of_several_balls_is_mujocos(num_balls, friction):
+def test_one_step_of_several_balls_is_mujocos(num_balls, friction, float64):
     """From states with one to all contacts at once."""
     model = balls_model(num_balls, friction)
     assert unsupported_feature(model, "fused") is None
@@ -114,8 +113,7 @@ def test_one_step_of_several_balls_is_mujocos(num_balls, friction):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("float64")
-def test_given_parameters_act_on_all_balls():
+def test_given_parameters_act_on_all_balls(float64):
     """All parameters at once, against C on `edited_model`; without and with friction."""
     model, count = balls_model(2), 120
     states = hostile_states(model, count, seed=1)
@@ -146,8 +144,7 @@ def drop(model: mujoco.MjModel, data: mujoco.MjData, ball: int, rng: np.random.G
 @pytest.mark.parametrize(
     ("num_balls", "friction"), [(2, None), (3, None), (2, 0.3)], ids=["two", "three", "friction"]
 )
-@pytest.mark.usefixtures("float64")
-def test_several_balls_stay_with_mujoco_for_2000_steps(num_balls, friction):
+def test_several_balls_stay_with_mujoco_for_2000_steps(num_balls, friction, float64):
     """Each engine runs freely; a lost ball is dropped again. Balls that meet amplify differences:
     the engines are closer at any time than two runs of C that start a picometre apart."""
     count, substeps = 16, 10
@@ -194,8 +191,7 @@ def test_several_balls_stay_with_mujoco_for_2000_steps(num_balls, friction):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("float64")
-def test_the_gradient_of_touching_balls_is_that_of_finite_differences():
+def test_the_gradient_of_touching_balls_is_that_of_finite_differences(float64):
     """Of a sum of the velocities after a step with all contacts, with respect to the state."""
     model = balls_model(2, 0.3)
     states = hostile_states(model, 400, seed=3)
@@ -229,8 +225,7 @@ def test_the_gradient_of_touching_balls_is_that_of_finite_differences():
 
 @pytest.mark.slow
 @pytest.mark.separate_loops
-@pytest.mark.usefixtures("float64")
-def test_mjx_agrees_on_several_balls():
+def test_mjx_agrees_on_several_balls(float64):
     model, count = balls_model(2), 8
     states = hostile_states(model, 64, seed=4)
     some = np.flatnonzero(num_pressed(model, states) >= 2)[:count]

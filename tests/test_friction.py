@@ -55,8 +55,7 @@ def frictional(old: str = "condim", new: str = "condim") -> mujoco.MjModel:
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=() if n in FAST_MODELS else pytest.mark.slow) for n in MODELS]
 )
-@pytest.mark.usefixtures("float64")
-def test_one_step_of_a_frictional_model_is_mujocos(name):
+def test_one_step_of_a_frictional_model_is_mujocos(name, float64):
     """From states that stick, slip and separate, on faces, edges and corners."""
     model = frictional(*MODELS[name])
     states = touching_states(model, 240, seed=0)
@@ -75,8 +74,7 @@ ELLIPTIC = ('cone="pyramidal"', 'cone="elliptic"')
 
 @pytest.mark.slow
 @pytest.mark.separate_loops
-@pytest.mark.usefixtures("float64")
-def test_the_elliptic_cone_goes_to_mjx():
+def test_the_elliptic_cone_goes_to_mjx(float64):
     """Which agrees with C, from states that stick, slip and separate on a face of the paddle."""
     model = frictional(*ELLIPTIC)
     engine = make_engine(model, "auto")
@@ -105,8 +103,7 @@ def test_a_given_friction_with_the_elliptic_cone_is_refused():
         engine.step(given, state, Control(jnp.zeros(model.nu)), 1)
 
 
-@pytest.mark.usefixtures("float64")
-def test_one_step_with_a_given_friction_is_mujocos(mj_model):
+def test_one_step_with_a_given_friction_is_mujocos(mj_model, float64):
     """Alone in a frictionless model and with all other parameters, against `edited_model`."""
     states = touching_states(mj_model, 96, seed=1)
     coefficients = 10.0 ** np.random.default_rng(0).uniform(-3.0, 0.5, 96)
@@ -121,8 +118,7 @@ def test_one_step_with_a_given_friction_is_mujocos(mj_model):
 
 @pytest.mark.parametrize("frictionloss", [0.0, 10.0], ids=["sliding", "sliding and dry"])
 @pytest.mark.slow
-@pytest.mark.usefixtures("float64")
-def test_frictional_worlds_stay_with_mujoco_for_2000_steps(frictionloss):
+def test_frictional_worlds_stay_with_mujoco_for_2000_steps(frictionloss, float64):
     """Each engine runs freely in 64 random worlds with servos at their limits, with sliding
     friction of the ball, with and without dry friction of the joints. A lost ball is dropped again.
 
@@ -230,8 +226,7 @@ def sticking_and_sliding(
 
 
 @pytest.mark.parametrize("name", WORLDS)
-@pytest.mark.usefixtures("float64")
-def test_one_step_with_dry_friction_is_mujocos(name):
+def test_one_step_with_dry_friction_is_mujocos(name, float64):
     """In each state, some of the joints stick, some slide, and some are close to the limit."""
     make, draws_all = WORLDS[name]
     model, parameters = make(), PhysicsParameters()
@@ -251,8 +246,7 @@ def test_one_step_with_dry_friction_is_mujocos(name):
     assert_same_step(fused_steps(model, parameters, states), expected)
 
 
-@pytest.mark.usefixtures("float64")
-def test_dry_friction_follows_its_flag():
+def test_dry_friction_follows_its_flag(float64):
     """With the flag off, C ignores the model's dry friction and a given one."""
     model = edited("<flag ", '<flag frictionloss="disable" ')
     model.dof_frictionloss[:6] = 5.0

@@ -42,8 +42,7 @@ WORLDS, STEPS = 3, 60
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("float64")
-def test_worlds_with_a_sloped_restitution_are_mujocos():
+def test_worlds_with_a_sloped_restitution_are_mujocos(float64):
     """Each engine runs freely; here the damping of each control step is set in the C model."""
     env = BounceBall(EnvConfig(randomization=SLOPED, ball_init_pos=(0.58856, 0.0, 0.2)))
     keys = jax.random.split(jax.random.PRNGKey(0), WORLDS)

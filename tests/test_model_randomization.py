@@ -90,8 +90,7 @@ def test_models_of_parameters_are_read_back(mj_model, base):
                 )
 
 
-@pytest.mark.usefixtures("float64")
-def test_entries_act_as_in_mujoco(mj_model):
+def test_entries_act_as_in_mujoco(mj_model, float64):
     """Random changes of every field that the fused engine reads, in one step against C."""
     count, rng = 48, np.random.default_rng(0)
     links, ball, paddle = range(2, 7), mj_model.body("ball_link").id, mj_model.geom("blocker").id

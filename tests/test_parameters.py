@@ -33,8 +33,7 @@ _NOT_IN_THE_MODEL = ("contact_friction", "force_limit", "frictionloss", "entries
 FIELDS = [f for f in PhysicsParameters._fields if f not in _NOT_IN_THE_MODEL]
 
 
-@pytest.mark.usefixtures("float64")
-def test_one_step_in_random_worlds_is_mujocos(mj_model):
+def test_one_step_in_random_worlds_is_mujocos(mj_model, float64):
     """All parameters are given, with contacts of every kind; with force limits, at which servos
     have no implicit damping, some servos are at their limits and some are not."""
     count = 128
@@ -56,8 +55,7 @@ def test_one_step_in_random_worlds_is_mujocos(mj_model):
 
 
 @pytest.mark.parametrize("field", FIELDS)
-@pytest.mark.usefixtures("float64")
-def test_one_given_number_leaves_the_others_to_the_model(mj_model, field):
+def test_one_given_number_leaves_the_others_to_the_model(mj_model, field, float64):
     """One field is given and the rest is None, with a solref in the standard format."""
     model = edited('solref="-98696 -31.4"', 'solref="0.02 0.3"')
     states, _ = random_states(model, 4, seed=3)
@@ -69,8 +67,7 @@ def test_one_given_number_leaves_the_others_to_the_model(mj_model, field):
 
 @pytest.mark.slow
 @pytest.mark.separate_loops
-@pytest.mark.usefixtures("float64")
-def test_mjx_carries_worlds(mj_model):
+def test_mjx_carries_worlds(mj_model, float64):
     """Free run against C over control steps, in random worlds with friction, spin in air and
     servos at their limits."""
     count, num_substeps, air_drag, air_lift = 4, 5, 0.2, 0.05
@@ -124,8 +121,7 @@ def test_a_parameter_of_another_shape_is_refused(mj_model):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("float64")
-def test_each_number_alone_acts_as_in_mujoco(mj_model):
+def test_each_number_alone_acts_as_in_mujoco(mj_model, float64):
     """In one batch with shared states and parameters, except for one random field."""
     count, size = 8, 8 * len(FIELDS)
     states, _ = random_states(mj_model, count, seed=1)

@@ -44,8 +44,7 @@ def batched(step):
     return jax.jit(steps, static_argnums=2)
 
 
-@pytest.mark.usefixtures("float64")
-def test_one_step_from_random_states_is_mujocos(mj_model):
+def test_one_step_from_random_states_is_mujocos(mj_model, float64):
     """Wide joint angles, contacts of every kind, spin, orientation."""
     states, local = random_states(mj_model, 512, seed=0)
     expected, forces = c_steps(mj_model, states)
@@ -57,8 +56,7 @@ def test_one_step_from_random_states_is_mujocos(mj_model):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("float64")
-def test_2000_random_action_steps_are_mujocos(mj_model, fused_step):
+def test_2000_random_action_steps_are_mujocos(mj_model, fused_step, float64):
     """Both engines run freely; neither sees the other's state."""
     # A bounce off an edge of the paddle amplifies rounding errors, even between two runs of MuJoCo
     # (with an arm turned by 1e-14 rad, the ends can differ by 1e-7 m/s). Seeds 0 to 7 stay below
@@ -250,8 +248,7 @@ def reordered(at: Addresses, states):
 
 
 @pytest.mark.parametrize("name", [*SUPPORTED, *EQUIVALENT])
-@pytest.mark.usefixtures("float64")
-def test_supported_models_step_as_mujoco_does(mj_model, name):
+def test_supported_models_step_as_mujoco_does(mj_model, name, float64):
     """One step from random states at the paddle of the edited model."""
     model = edited(*(SUPPORTED.get(name) or EQUIVALENT[name]))
     at = find_addresses(model)
@@ -424,8 +421,7 @@ def test_mjx_refuses_features_that_it_ignores(name):
         make_engine(edited(old, new), "mjx")
 
 
-@pytest.mark.usefixtures("float64")
-def test_ten_substeps_are_ten_steps(mj_model, fused_step):
+def test_ten_substeps_are_ten_steps(mj_model, fused_step, float64):
     """The engine updates the ball's orientation once for all substeps."""
     state = bouncing_states(mj_model, np.random.default_rng(0))
     state.qpos[:, 8] -= 0.03  # many of the ten steps are then in contact

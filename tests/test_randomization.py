@@ -315,8 +315,7 @@ def simulated_targets(asked: np.ndarray, delay: int, lag: float | None, n: int) 
 
 
 @pytest.mark.parametrize("lag", [None, 0.0, 7.3])
-@pytest.mark.usefixtures("float64")
-def test_late_and_lagging_targets_are_those_of_a_simulation(lag: float | None) -> None:
+def test_late_and_lagging_targets_are_those_of_a_simulation(lag: float | None, float64) -> None:
     """Delays of any number of physics steps, up to three control steps."""
     n, dt = 10, 0.01
     lags = {} if lag is None else {"servo_lag": (0.0, 0.01)}
@@ -435,8 +434,7 @@ def c_run(free_run: Run, w: int, shift: float = 0.0) -> tuple[PhysicsState, int]
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("float64")
-def test_drawn_worlds_are_mujocos_over_2000_steps(free_run: Run) -> None:
+def test_drawn_worlds_are_mujocos_over_2000_steps(free_run: Run, float64) -> None:
     """Each engine runs freely. Contacts amplify differences, in a few worlds by a factor of a
     million; in these worlds the engines are as close as two runs of C with balls that start a
     picometre apart."""

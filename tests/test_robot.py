@@ -171,8 +171,7 @@ def test_only_the_arm_is_left(env) -> None:
     assert model.opt.gravity[2] == -9.81 and model.npair == 1
 
 
-@pytest.mark.usefixtures("float64")
-def test_one_step_in_random_worlds_is_mujocos(env) -> None:
+def test_one_step_in_random_worlds_is_mujocos(float64, env) -> None:
     model, at = env.mj_model, env.addresses
     count, rng = 32, np.random.default_rng(1)
     qpos = np.tile(model.qpos0, (count, 1))

@@ -305,8 +305,7 @@ def test_bounces_are_those_of_the_measurements(watch) -> None:
                 assert part["apex_error"][t, i, 0] == pytest.approx(apex - target, abs=1e-9)
 
 
-@pytest.mark.usefixtures("float64")
-def test_latency_without_a_camera_and_velocity_by_differences() -> None:
+def test_latency_without_a_camera_and_velocity_by_differences(float64) -> None:
     """A picture at every control step; the velocity is the difference from the previous picture."""
     run = watching(camera=False, velocity="differences")
     seen = run(ball_latency=(0.0, 0.03))
