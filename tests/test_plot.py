@@ -234,6 +234,7 @@ def test_tensorboard_reads_everything_back(trained: Path) -> None:
     assert set(tags["tensors"]) == {"config/text_summary", "results/text_summary"}
     for name in tags["tensors"]:
         assert log.SummaryMetadata(name).plugin_data.plugin_name == "text"
+    assert log.SummaryMetadata("_hparams_/session_start_info").plugin_data.plugin_name == "hparams"
     assert not any(tags[kind] for kind in ("audio", "histograms", "distributions"))
     groups = {name.partition("/")[0] for name in tags["scalars"]}
     assert groups == {"episode", "loss", "policy", "results", "reward", "speed", "task"}

@@ -46,6 +46,19 @@ BROKEN = {
     "no actuators": (mjcf(arm(), ""), "tool", "no actuator on j1, j2", "<position>"),
     "idle joint": (mjcf(arm(), motors("j1 j2 j3 j5 j6")), "tool", "on j4", "--joints"),
     "weak motors": (mjcf(arm(), motors(ARM_JOINTS, 2.0)), "tool", "no servo strong enough"),
+    "servos beyond the joints": (
+        mjcf(
+            arm(),
+            "".join(
+                f'<position joint="{name}" kp="500" ctrlrange="90 180"/>'
+                for name in ARM_JOINTS.split()
+            ),
+        ),
+        "tool",
+        "the range -3 to 3 of j1",
+        "reaches 90 to 180",
+        "ctrlrange",
+    ),
     "missing mesh": (
         mjcf(
             arm(tip='<geom type="mesh" mesh="m"/>'),

@@ -63,6 +63,14 @@ def names(values: dict, prefix: str = "") -> list[str]:
     return [*leaves, *[prefix.rstrip(".")] * bool(leaves and prefix), *sum(inner, [])]
 
 
+def test_noise_that_the_policy_does_not_see_is_named() -> None:
+    noise = {"ball_velocity_noise": (0.0, 0.1), "ball_position_noise": (0.0, 0.01)}
+    seen = {"ball_position": 1, "ball_velocity": 0}
+    env = config("bounce", randomization=noise, observation=seen)
+    assert env.unseen_noise == ("ball_velocity_noise",)
+    assert not config("bounce", randomization=noise).unseen_noise
+
+
 @pytest.mark.parametrize("line", WRONG.strip().splitlines(), ids=lambda line: line.split("#")[0])
 def test_a_wrong_unit_is_refused_by_name(line: str) -> None:
     values = yaml.safe_load(line)

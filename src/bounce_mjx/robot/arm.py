@@ -326,6 +326,11 @@ class _Builder:
             own = model.jnt_range[i] if model.jnt_limited[i] else (-np.inf, np.inf)
             least, greatest = _servo_range(model, a)
             low, high = max(own[0], least), min(own[1], greatest)
+            if not low < high:
+                raise UserError(
+                    f"the range {own[0]:g} to {own[1]:g} of {joint_name(model, i)}, but a servo "
+                    f"that reaches {least:g} to {greatest:g}; correct its ctrlrange"
+                )
             if low - own[0] > _NARROWER or own[1] - high > _NARROWER:
                 narrowed.append(joint_name(model, i))
             joint.limited = mujoco.mjtLimited.mjLIMITED_FALSE

@@ -113,7 +113,8 @@ def check_output(path: Path | None, flag: str, suffixes: tuple[str, ...] = ()) -
       suffixes: the ends of the name that it may have; by default, any.
 
     Raises:
-      UserError: it has another suffix, or is in a folder that does not exist.
+      UserError: it has another suffix, may not be written, is a folder, or is in one that does not
+        exist.
     """
     if path is None:
         return
@@ -121,6 +122,10 @@ def check_output(path: Path | None, flag: str, suffixes: tuple[str, ...] = ()) -
         raise UserError(f"{flag} {path} does not end in {' or '.join(suffixes)}; rename it")
     if not os.path.isdir(path.absolute().parent):
         raise UserError(f"the folder of {flag} {path} does not exist; make it")
+    if os.path.isdir(path):
+        raise UserError(f"{flag} {path} is a folder; give a file")
+    if not os.access(path if os.path.exists(path) else path.absolute().parent, os.W_OK):
+        raise UserError(f"{flag} {path} may not be written; give another file")
 
 
 def seal(folder: Path) -> None:

@@ -24,6 +24,7 @@ from bounce_mjx.learning.statistics import RunningStatistics, init_statistics
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
 from bounce_mjx.runs.files import MANIFEST_FILE, check_integrity, first_mistake, read_json
 from bounce_mjx.runs.folders import MIRROR_LAW, Checkpoint, best_checkpoint
+from bounce_mjx.tasks.registry import is_file
 
 POLICY, TRAINING, NETWORKS, RECORD = "policy", "training", "networks", "record"
 """Items of a checkpoint: what acts; what a training continues from; both networks, with which
@@ -35,8 +36,6 @@ RESUMABLE_KEYS = frozenset(
     "total_steps eval_every eval_episodes screening_episodes eval_seed stop_when_solved log_dir "
     "num_devices".split()
 )
-# The checkpoint has the paths of the original files, and the run's config those of its own copies.
-_COPIED_KEYS = {"env.mjcf", "task", "algorithm"}
 # Version 0.1 wrote a checkpoint's plain data into this file, and arrays of one chunk in OCDBT and
 # zarr without orbax's own metadata.
 _OLD_RECORD = "run.json"
@@ -141,7 +140,9 @@ def read_record(checkpoint: Checkpoint) -> Record:
         raise _damaged(checkpoint, ValueError(first_mistake(error))) from error
     except (OSError, ValueError) as error:
         raise _damaged(checkpoint, error) from error
-    if differing := differing_keys(run_config, config) - RESUMABLE_KEYS - _COPIED_KEYS:
+    # The checkpoint has the paths of the original files, and the run's config those of its copies.
+    files = {key for key in ("task", "algorithm") if is_file(getattr(config, key))}
+    if differing := differing_keys(run_config, config) - RESUMABLE_KEYS - files - {"env.mjcf"}:
         raise UserError(
             f"the checkpoint {folder} has a different config from "
             f"{checkpoint.run / CONFIG_FILE}, which differs in {', '.join(sorted(differing))}; "

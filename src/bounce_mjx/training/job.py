@@ -183,6 +183,8 @@ class Job:
         if mesh.size > 1:
             self.device = f"{mesh.size} x {self.device}"
         self.say(f"physics: {self.env.engine.name} ({self.env.engine.reason})")
+        for term in config.env.unseen_noise:
+            self.say(f"warning: the policy does not see what {term} changes")
         self.say(f"device: {self.device}  run: {self.run}")
         bound = "at most " if config.stop_when_solved else ""
         self.say(f"steps: {bound}{config.total_steps:,}, in blocks of {self.block_steps:,}")

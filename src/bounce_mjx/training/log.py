@@ -4,7 +4,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from bounce_mjx.config.files import dump_config
+from bounce_mjx.config.files import dump_config, flat
 from bounce_mjx.reports.tables import results_markdown
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training.callbacks import Event
@@ -28,7 +28,7 @@ class TensorBoardLog:
         self.flush()
 
     def start(self, config: TrainConfig, steps: int | None) -> None:
-        """Logs the config.
+        """Logs the config, as text and as hyperparameters.
 
         Args:
           steps: the step from which a resumed run continues; TensorBoard drops all later points.
@@ -38,6 +38,11 @@ class TensorBoardLog:
             self._add(step=steps + 1, session_log=start)
         text = f"```yaml\n{dump_config(config)}```"
         self.add(self.summary.text("config", text), steps or 0)
+        plain = flat(config.model_dump(mode="json")).items()
+        plain = {name: x if isinstance(x, int | float) else str(x) for name, x in plain}
+        shown = dict.fromkeys(("results/mean_return", "episode/return"), 0.0)
+        for part in self.summary.hparams(plain, shown):
+            self.add(part, 0)
 
     def __call__(self, event: Event) -> None:
         """Writes the points of an event, and the table of an evaluation."""

@@ -259,6 +259,20 @@ class WorldConfig(StrictModel):
         return {}
 
     @property
+    def unseen_noise(self) -> tuple[str, ...]:
+        """Terms of the randomisation that change measurements which the policy does not see."""
+        seen, terms = self.observation, self.randomization.terms
+        if seen.lengths("task"):
+            return ()
+        velocity = seen.ball_velocity and seen.velocity == "measured"
+        unseen = {
+            "joint_velocity_": seen.joint_velocities,
+            "ball_velocity_": velocity,
+            "ball_position_": seen.ball_position or (seen.ball_velocity and not velocity),
+        }
+        return tuple(t for t in terms if any(t.startswith(p) and not s for p, s in unseen.items()))
+
+    @property
     def heights(self) -> dict[str, float]:
         """The heights that are over the paddle at a reset, by their settings, m; a task has its
         own."""
