@@ -1,5 +1,6 @@
 """The viewers' simulation: its frames, commands, pushes, worlds, clock and markers."""
 
+import itertools
 import re
 import time
 from pathlib import Path
@@ -21,8 +22,9 @@ from bounce_mjx.tasks.bounce import BounceConfig
 from bounce_mjx.tasks.bounce_rewards import BounceReward
 from bounce_mjx.viewers import show
 from bounce_mjx.viewers.controls import direction
-from bounce_mjx.viewers.display import Display, marker_body
+from bounce_mjx.viewers.display import Display, camera_pose, marker_body
 from bounce_mjx.viewers.options import ViewerOptions
+from bounce_mjx.viewers.scene import _grid as scene_grid
 from bounce_mjx.viewers.simulation import (
     EnvFrame,
     Simulation,
@@ -223,6 +225,44 @@ def test_a_model_without_markers_gets_them(tmp_path: Path) -> None:
     assert marker_position(display, "target_height")[2] == 0.5
     home_height = env.config.reward.paddle_home_height
     assert marker_position(display, "paddle_home")[2] == pytest.approx(home_height)
+
+
+def projected(points: np.ndarray, focus, aspect: float, offsets, zoom=1.0) -> np.ndarray:
+    """Points [N, 3] in the picture [N, 2]: -1 to 1 from left to right and from below."""
+    position, gaze = camera_pose(offsets, focus, aspect, zoom)
+    forward = (gaze - position) / np.linalg.norm(gaze - position)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    seen = (points - position) @ np.stack([right, np.cross(right, forward), forward]).T
+    return seen[:, :2] / seen[:, 2:] / np.tan(np.radians(20.0)) / (aspect, 1.0)
+
+
+ASPECTS = (0.46, 0.85, 2.0)
+"""Width / height of a picture."""
+
+
+HOMES = ((0.58856, 0.0, 0.05), (0.67, 0.0, 0.4), (0.0, 0.55, 0.25), (-0.6, 0.0, 0.3))
+
+
+def test_on_a_phone_the_panel_leaves_the_arm_and_the_ball_visible() -> None:
+    """It covers the lower three fifths."""
+    home = np.array(HOMES[0])
+    parts = np.array([(-0.1, 0.0, 0.0), home + (0.05, 0.0, 0.0), home + (0.0, 0.0, 0.8)])
+    points = projected(parts, home, 390 / 844, np.zeros((1, 3)))
+    assert np.all(np.abs(points[:, 0]) < 1.0)
+    assert np.all((points[:, 1] > 0.2) & (points[:, 1] < 1.0))
+
+
+@pytest.mark.parametrize("home", HOMES, ids=["default", "raised", "turned", "behind"])
+def test_the_camera_sees_every_robot(home) -> None:
+    """Base, paddle, and the ball at the highest target."""
+    x, y, z = home
+    paddle = np.array([x, y, 0.0]) * (1.0 + 0.05 / np.hypot(x, y)) + (0.0, 0.0, z)
+    parts = np.array([(-0.1, 0.0, 0.0), paddle, (x, y, z + 0.8)])
+    for number, aspect in itertools.product((1, 2, 4, 16), ASPECTS):
+        offsets = scene_grid(number)
+        points = (offsets[:, None] + parts).reshape(-1, 3)
+        assert np.all(np.abs(projected(points, np.array(home), aspect, offsets)) < 1.0)
 
 
 VIEWS = {

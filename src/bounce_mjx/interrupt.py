@@ -14,10 +14,10 @@ from typing import NoReturn, TypeVar
 Result = TypeVar("Result")
 
 _POLL_SECONDS = 0.1
-# Launchers forward a Ctrl-C to a process that has already received it from the terminal, and a
-# terminal that goes away is reported by its shell and by the kernel.
+# Launchers forward a Ctrl-C to a process that has already received it from the terminal.
 _SAME_REQUEST_SECONDS = 0.5
-_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+# Windows has no SIGHUP.
+_SIGNALS = [getattr(signal, n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, n)]
 
 
 class Interrupted(KeyboardInterrupt):
@@ -76,10 +76,12 @@ class StopRequest:
     def _handle(self, number: int, frame: types.FrameType | None) -> None:
         if self._requested_at is None:
             self._requested_at = time.monotonic()
-        elif time.monotonic() - self._requested_at > _SAME_REQUEST_SECONDS:
-            if callable(previous := self._previous.get(number)):
-                previous(number, frame)
-            os._exit(128 + number)
+        # A terminal that goes away asks only once, but its shell and the kernel both say so.
+        elif number in (signal.SIGINT, signal.SIGTERM):
+            if time.monotonic() - self._requested_at > _SAME_REQUEST_SECONDS:
+                if callable(previous := self._previous.get(number)):
+                    previous(number, frame)
+                os._exit(128 + number)
 
 
 def in_daemon_thread(function: Callable[[], Result]) -> concurrent.futures.Future[Result]:
