@@ -93,7 +93,7 @@ def test_a_ball_slides_and_rolls_on_fused_as_on_c(env: Env) -> None:
     step = jax.jit(
         jax.vmap(lambda s, ctrl: env.engine.step(PhysicsParameters(), s, Control(ctrl), 300))
     )
-    after = step(PhysicsState(jnp.asarray(qpos), jnp.asarray(qvel), None), jnp.asarray(angles))
+    after = step(PhysicsState(jnp.asarray(qpos), jnp.asarray(qvel)), jnp.asarray(angles))
     np.testing.assert_allclose(after.qvel[:, list(at.balls[0].qvel)], ends, atol=2e-3, rtol=1e-3)
     # Friction at the contact keeps the angular momentum about it: 5/7 of the speed is left. On the
     # slope a solid ball rolls with 5/7 of the acceleration of one that slides.

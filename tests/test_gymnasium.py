@@ -172,7 +172,6 @@ def test_wrong_arguments_and_options_give_one_sentence(vectorised):
     with pytest.raises(TypeError, match="unexpected keyword argument 'frameskip'"):
         gymnasium.make_vec(ENV_ID, 2, frameskip=2)
     for arguments, sentence in (
-        ({"target_hight_range": (0, 1)}, "unknown key target_hight_range; did you"),
         ({"render_mode": "human"}, "render_mode is 'human'"),
         ({"max_episode_steps": 3000}, "must be from 1 to the 2000 steps .* episode_seconds makes"),
         ({"num_envs": 0}, "num_envs is 0, but must"),
