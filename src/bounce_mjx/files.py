@@ -5,9 +5,6 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-UNFINISHED = ".unfinished-"
-"""Start of the name of a file that is being written."""
-
 
 @contextlib.contextmanager
 def new_file(path: Path) -> Iterator[Path]:
@@ -19,7 +16,7 @@ def new_file(path: Path) -> Iterator[Path]:
     Raises:
       OSError: the file cannot replace the other.
     """
-    new = path.with_name(f"{UNFINISHED}{os.urandom(8).hex()}{path.suffix}")
+    new = path.with_name(f".unfinished-{os.urandom(8).hex()}{path.suffix}")
     try:
         yield new
         new.replace(path)
