@@ -1,14 +1,18 @@
-"""The benchmarks: figures of the ranking, and the search."""
+"""The benchmarks: figures of the ranking; the arm as URDF and the delays in other simulators."""
 
 import importlib
 import re
 from pathlib import Path
 
+import mujoco
 import numpy as np
-import optuna
 import pytest
 
+from bounce_mjx import load_policy
+from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.robustness import ConditionOutcome
+from bounce_mjx.resources import POLICIES, resource_path
+from bounce_mjx.runs.config import load_run_config
 
 
 def script(name: str):
@@ -22,7 +26,7 @@ def script(name: str):
     return module
 
 
-rank, sweep = map(script, ("rank", "sweep"))
+rank, simulators = map(script, ("rank", "simulators"))
 
 
 def outcome(name: str, strength: float, lasted: float) -> ConditionOutcome:
@@ -48,57 +52,55 @@ def test_the_interval_is_that_of_the_mean(rank) -> None:
     assert rank.interval([None], ".1f") == "-" and rank.interval([2.0, 2.0], ".1f") == "2.0"
 
 
-CONFIG = """
-env: {episode_seconds: 0.2}
-ppo: {num_envs: 8, rollout_length: 8, num_minibatches: 2, num_epochs: 1, hidden_layers: [16]}
-eval_every: 64
-"""
+@pytest.mark.parametrize("policy", ["pretrained", "ur5e"])
+def test_the_urdf_is_the_models_arm(simulators, policy: str) -> None:
+    """MuJoCo's own reader finds the paddle where the model has it, and the same inertia."""
+    model = Env(load_run_config(resource_path(POLICIES[policy])).env).mj_model
+    parts, addresses = simulators.make_parts(model), simulators.find_addresses(model)
+    urdf = mujoco.MjModel.from_xml_string(parts.urdf)
+    mine, theirs = mujoco.MjData(model), mujoco.MjData(urdf)
+    angles = np.random.default_rng(0).uniform(-2.0, 2.0, len(parts.links))
+    mine.qpos[list(addresses.arm_qpos)] = theirs.qpos[:] = angles
+    inertias = []
+    for of, data in ((model, mine), (urdf, theirs)):
+        mujoco.mj_forward(of, data)
+        inertias.append(np.zeros((of.nv, of.nv)))
+        mujoco.mj_fullM(of, data, inertias[-1])
+    arm = list(addresses.arm_qvel)
+    expected = inertias[0][np.ix_(arm, arm)] - np.diag(parts.armature)
+    np.testing.assert_allclose(inertias[1], expected, atol=1e-6)
+    paddle = addresses.paddle_geom
+    assert urdf.ngeom == 1
+    np.testing.assert_allclose(theirs.geom_xpos[0], mine.geom_xpos[paddle], atol=1e-6)
+    np.testing.assert_allclose(theirs.geom_xmat[0], mine.geom_xmat[paddle], atol=1e-6)
+    np.testing.assert_allclose(urdf.geom_size[0], model.geom_size[paddle], atol=1e-9)
 
 
-@pytest.fixture
-def search(sweep, tmp_path: Path):
-    """The module of the search, and its command with two trials."""
-    (tmp_path / "tiny.yaml").write_text(CONFIG)
-    command = sweep.Command(
-        config=tmp_path / "tiny.yaml",
-        trials=2,
-        seeds=2,
-        steps=128,
-        episodes=2,
-        storage=tmp_path / "sweep.db",
-        out=tmp_path,
+@pytest.mark.parametrize("timestep, steps", [(0.001, 240), (1.0 / 240.0, 58)])
+def test_commands_and_pictures_are_late(simulators, timestep: float, steps: int) -> None:
+    sent, seen = [], []
+    targets = np.zeros(6)
+    simulator = simulators.Simulator(
+        lambda *_: None,
+        lambda: (home, np.zeros(6)),
+        lambda: np.full((1, 9), float(len(sent))),
+        lambda angles: np.copyto(targets, angles),
+        lambda: sent.append(targets.copy()),
+        lambda: None,
     )
-    return sweep, command
-
-
-def states(storage: Path) -> list[str]:
-    study = optuna.load_study(study_name="bounce_mjx", storage=f"sqlite:///{storage}")
-    return [trial.state.name for trial in study.trials]
-
-
-def test_an_interrupted_search_continues(search, monkeypatch):
-    module, command = search
-    base = module.read_preset(command.config)
-    tried = []
-
-    def killed(trial, *_):
-        trial.suggest_float("discount", *module.SPACE["discount"][:2])
-        raise SystemExit
-
-    def value(trial, *_):
-        discount = trial.suggest_float("discount", *module.SPACE["discount"][:2])
-        tried.append(discount)
-        trial.set_user_attr("spread_over_seeds", 0.0)
-        trial.set_user_attr("solved_at_the_end", 0)
-        return discount
-
-    monkeypatch.setattr(module, "run_trial", killed)
-    with pytest.raises(SystemExit):
-        module.search(command, base)
-    monkeypatch.setattr(module, "run_trial", value)
-    module.search(command, base)
-    # The interrupted trial is repeated with the same values, which are the preset's.
-    assert tried[0] == base.ppo.discount
-    assert states(command.storage).count("COMPLETE") == 2
-    module.search(command, base)
-    assert len(tried) == 2, "a finished search tries nothing more"
+    policy = load_policy("pretrained")
+    home = np.array(policy.metadata.default_joint_angles)
+    world = simulators.World(action_latency=0.02, ball_latency=0.03, timestep=timestep)
+    episode = simulators.Episode(policy, simulator, world)
+    episode.reset(home, np.zeros((1, 3)), np.zeros((1, 3)))
+    for number in range(24):
+        seen.append(episode.measure())
+        episode.run(np.full((10, 6), float(number + 1)))
+    # 24 control steps of 10 ms; a time step belongs to the control step in which it begins.
+    assert len(sent) == steps
+    started = np.arange(steps) * timestep
+    expected = np.maximum(np.floor((started - 0.02) / 0.01 + 1e-6) + 1.0, 0.0)
+    np.testing.assert_array_equal(np.array(sent)[:, 0], np.where(expected, expected, home[0]))
+    assert [x["ball_age"] for x in seen[:5]] == pytest.approx([0.0, 0.01, 0.02, 0.03, 0.03])
+    begun = round(0.2 / timestep)
+    assert seen[23]["ball_position"][0, 0] == begun
