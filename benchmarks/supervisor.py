@@ -17,11 +17,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from bounce_mjx import load_policy
-from bounce_mjx.deploy.chain import paddle_pose
-from bounce_mjx.deploy.faults import EARLIER, FLYING, faults, make_bounds, picture_age
+from bounce_mjx.deploy.faults import Watch, picture_age
 from bounce_mjx.deploy.metadata import Metadata
 from bounce_mjx.env.env import Env, State
 from bounce_mjx.evaluation.episodes import reset_episodes
@@ -62,11 +60,11 @@ def recorder(name: str, episodes: int, latencies: list[float] | None) -> Any:
         else:
             command = env.servo_targets(now.physics, action)[: env.action_size]
         return {
-            "angles": angles,
-            "velocities": velocities,
+            "joint_angles": angles,
+            "joint_velocities": velocities,
             "commands": command,
-            "ball": ball.reshape(-1, 3),
-            "age": age,
+            "ball_position": ball,
+            "ball_age": age,
         }
 
     @jax.jit
@@ -85,53 +83,23 @@ def recorder(name: str, episodes: int, latencies: list[float] | None) -> Any:
     return run
 
 
-def windows(values: np.ndarray, steps: int) -> np.ndarray:
-    """The last values [T, steps, J] of each step; before the first one, the arm rested."""
-    padded = np.concatenate([np.repeat(values[:1], steps - 1, axis=0), values])
-    return np.moveaxis(sliding_window_view(padded, steps, axis=0), -1, 1)
-
-
-def facts(metadata: Metadata, episode: dict[str, np.ndarray], window: int) -> dict[str, Any]:
-    """The facts of each step [T] for the rules, as the supervisor finds them."""
-    angles, ball, age = episode["angles"], episode["ball"], episode["age"]
-    sent = np.concatenate([angles[:1], episode["commands"][:-1]])
-    paddle, _ = paddle_pose(metadata, angles)
-    times = np.arange(len(angles)) * metadata.control_dt
-    is_new = np.append(True, np.any(ball[1:] != ball[:-1], axis=(1, 2)))
-    newest = np.maximum.accumulate(np.where(is_new, np.arange(len(angles)), 0))
-    taken = (times - age)[newest]
-    numbers, pictures = np.cumsum(is_new) - 1, np.append(np.flatnonzero(is_new), -1)
-    before, earlier = (pictures[np.maximum(numbers - k, -1)] for k in (1, EARLIER))
-    flies = np.max(ball[..., 2], axis=1) > paddle[:, 2] + FLYING
-    balls = [np.where(i[:, None, None] < 0, np.nan, ball[i]) for i in (before, earlier)]
-    between = np.maximum(taken - taken[before], metadata.control_dt)
-    return {
-        "angles": windows(angles, window + 1),
-        "commands": windows(sent, window + 1),
-        "velocities": episode["velocities"],
-        "paddle": paddle,
-        "ball": ball,
-        "ball_motion": (ball - balls[0]) / between[:, None, None],
-        "earlier_ball": balls[1],
-        "age": np.where(flies, np.maximum(age, times - taken), age),
-    }
-
-
-def first(found: list, step: int = 0) -> tuple[int, str]:
+def first(metadata: Metadata, episode: dict[str, np.ndarray], start: int = 0) -> tuple[int, str]:
     """The first step from one on that breaks a rule, and the rule's code."""
-    steps = [
-        (step + int(np.argmax(wrong[step:])), rule.fault)
-        for rule, wrong, _ in found
-        if np.any(wrong[step:])
-    ]
-    return min(steps, key=lambda s: s[0], default=(len(found[0][1]), "none"))
+    watch = Watch(metadata, picture_age(metadata), 2.0 * metadata.control_dt)
+    angles, commands = episode["joint_angles"], episode["commands"]
+    watch.rest(angles[0], angles[0])
+    watch.begin()
+    for step in range(len(angles)):
+        measured = {name: np.ravel(values[step]) for name, values in episode.items()}
+        sent = commands[step - 1] if step else angles[0]
+        found = list(watch.faults(measured, sent))
+        if found and step >= start:
+            return step, found[0][0]
+    return len(angles), "none"
 
 
 def delays(
-    metadata: Metadata,
-    bounds: dict[str, Any],
-    episode: dict[str, np.ndarray],
-    rng: np.random.Generator,
+    metadata: Metadata, episode: dict[str, np.ndarray], rng: np.random.Generator
 ) -> dict[str, float]:
     """Times from a fault until a rule is broken, s; infinite where none is in 2 s."""
     length = int(np.sum(episode["running"]))
@@ -139,14 +107,14 @@ def delays(
         return {}
     step, found = int(rng.integers(50, length - 100)), {}
     episode = {key: value[step - 50 : min(step + 200, length)] for key, value in episode.items()}
-    step, length = 50, len(episode["age"])
+    step, length = 50, len(episode["ball_age"])
     repeated = {
-        f"the angle of joint {j + 1}": ("angles", j) for j in range(len(metadata.joint_names))
+        f"the angle of joint {j + 1}": ("joint_angles", j) for j in range(len(metadata.joint_names))
     }
-    for name, (kind, entry) in ({"a picture": ("ball", ...)} | repeated).items():
+    for name, (kind, entry) in ({"a picture": ("ball_position", ...)} | repeated).items():
         changed = {key: value.copy() for key, value in episode.items()}
         changed[kind][step:, entry] = changed[kind][step, entry]
-        at, _ = first(faults(bounds, facts(metadata, changed, bounds["angles"].window)), step)
+        at, _ = first(metadata, changed, step)
         found[name] = (at - step) * metadata.control_dt if at < length else np.inf
     return found
 
@@ -154,18 +122,17 @@ def delays(
 def judge(name: str, given: argparse.Namespace, rng: np.random.Generator) -> None:
     """Prints the first alarms of a policy's episodes, and the times from faults."""
     metadata = load_policy(name).metadata
-    bounds = make_bounds(metadata, picture_age(metadata), 2.0, None)
     run = recorder(name, min(_BATCH, given.episodes), given.latencies)
     alarms, late, lasted = Counter(), {}, 0
     for batch in range(-(-given.episodes // _BATCH)):
         rows = jax.tree.map(np.asarray, run(jax.random.key(1000 * given.seed + batch)))
-        for n in range(len(rows["age"])):
+        for n in range(len(rows["running"])):
             episode = {key: value[n] for key, value in rows.items()}
             length = int(np.sum(episode["running"]))
             lasted += length == len(episode["running"])
-            step, fault = first(faults(bounds, facts(metadata, episode, bounds["angles"].window)))
+            step, fault = first(metadata, episode)
             alarms[fault if step < length else "none"] += 1
-            for kind, delay in delays(metadata, bounds, episode, rng).items():
+            for kind, delay in delays(metadata, episode, rng).items():
                 late.setdefault(kind, []).append(delay)
     print(f"{name}: {lasted} episodes last; first alarms: {dict(alarms)}", flush=True)
     for kind, values in late.items():

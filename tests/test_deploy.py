@@ -16,10 +16,10 @@ import onnxruntime
 import pytest
 
 from bounce_mjx import BounceBall, EnvConfig, load_policy
-from bounce_mjx.deploy.chain import paddle_pose
 from bounce_mjx.deploy.export import export_onnx, policy_metadata
 from bounce_mjx.deploy.graph import onnx_graph
 from bounce_mjx.deploy.metadata import CommandLimits, CommandRange, from_entries, to_entries
+from bounce_mjx.deploy.motion import paddle_position
 from bounce_mjx.deploy.policy import DeployedPolicy
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
@@ -312,7 +312,7 @@ def test_paddle_position_is_that_of_mujoco(tmp_path: Path) -> None:
         angles = rng.uniform(-2.0, 2.0, 6)
         data.qpos[:6] = angles
         mujoco.mj_kinematics(model, data)
-        position = paddle_pose(metadata, angles)[0]
+        position = paddle_position(metadata, angles)
         np.testing.assert_allclose(position, data.geom("blocker").xpos, atol=1e-12)
 
 

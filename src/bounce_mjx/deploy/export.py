@@ -79,11 +79,6 @@ def export_onnx(checkpoint: Checkpoint) -> bytes:
     with jax.enable_x64(False):
         function, inputs = _control_step(config.env, act)
         graph = onnx_graph(function, inputs, f"the task {config.env.task.__name__}")
-    texts = {
-        part.name: f"the newest first; {part.unit or 'no unit'}" for part in _inputs(config.env)
-    }
-    for tensor in (*graph.input, *graph.output):
-        tensor.doc_string = (texts | {"action": metadata.action}).get(tensor.name, "")
     model = onnx.helper.make_model(
         graph,
         producer_name="bounce_mjx",

@@ -1,9 +1,12 @@
-"""The commands that a robot gets between two actions."""
+"""The commands that a robot gets between two actions, and where they bring the paddle."""
 
 import numpy as np
 
 from bounce_mjx.deploy.metadata import Metadata
 from bounce_mjx.robot.setpoints import JointLimits, Setpoint, command, next_setpoint
+
+# [k, i, j]: the matrix of the cross product with the unit vector k.
+_CROSS = np.cross(np.eye(3), np.eye(3)[:, None])
 
 
 class Motion:
@@ -21,75 +24,75 @@ class Motion:
             velocity, acceleration = np.array(limits.velocity), np.array(limits.acceleration)
             smoothing = None if limits.jerk is None else 2.0 * acceleration / np.array(limits.jerk)
             self._limits = JointLimits(velocity, acceleration, smoothing, tuple(self.ranges))
-        self._start = self._end = None
+        self.start: Setpoint | None = None
+        """The command at the start of the control step, before the mean that limits the jerk."""
+        self.end: Setpoint | None = None
+        """That at its end; None before there is a command."""
 
     def rest(self, angles: np.ndarray | None) -> None:
         """The arm rests, with its servos at these angles [J]; None: at those of the next step."""
         still = np.zeros(self.ranges.shape[1])
-        self._start = None
-        self._end = None if angles is None else Setpoint(np.array(angles, float), still, still)
+        self.start = None
+        self.end = None if angles is None else Setpoint(np.array(angles, float), still, still)
 
     def begin(self, angles: np.ndarray | None = None) -> None:
         """Begins a control step where the last one ended, the first one at the measured angles
         [J]."""
-        if self._end is None:
+        if self.end is None:
             self.rest(np.clip(angles, *self.ranges))
-        self._start = self._end
+        self.start = self.end
 
     def withdraw(self) -> None:
         """Takes back the commands of the control step."""
-        self._end = self._start
+        self.end = self.start
 
     def hold(self) -> None:
         """A control step in which the commands brake, within the limits, or rest."""
         self.begin()
-        self.aim(self.position)
+        self.aim(self.start.position)
 
     def move(self, target: np.ndarray, speed: float) -> None:
         """A control step in which the commands move toward joint angles [J] (rad), at most at a
         speed (rad/s) from which half of the acceleration stops there."""
         self.begin()
-        left = target - self.position
+        left = target - self.start.position
         if self._limits is not None:
             speed = np.minimum(speed, np.sqrt(self._limits.acceleration * np.abs(left)))
         step = speed * self._duration
-        self.aim(self.position + np.clip(left, -step, step))
-
-    @property
-    def is_known(self) -> bool:
-        """Whether there is a command."""
-        return self._end is not None
-
-    @property
-    def position(self) -> np.ndarray:
-        """Command [J] at the start of the control step, before the mean that limits the jerk."""
-        return self._start.position
-
-    @property
-    def end(self) -> np.ndarray:
-        """Command [J] at the end of the control step, before that mean."""
-        return self._end.position
+        self.aim(self.start.position + np.clip(left, -step, step))
 
     @property
     def is_still(self) -> bool:
         """Whether the command rests at the end of the control step."""
-        return not (np.any(self._end.velocity) or np.any(self._end.acceleration))
+        return not (np.any(self.end.velocity) or np.any(self.end.acceleration))
 
     def aim(self, target: np.ndarray) -> None:
         """Moves the joints toward a target [J], to be there at the end of the control step."""
         # An arm beyond its range comes back by its own speed.
         low, high = self.ranges
-        low, high = np.minimum(low, self.position), np.maximum(high, self.position)
+        low, high = np.minimum(low, self.start.position), np.maximum(high, self.start.position)
         target = np.clip(target, low, high)
         if self._limits is None:
             still = np.zeros(len(target))
-            self._end = Setpoint(target, still, still)
+            self.end = Setpoint(target, still, still)
         else:
-            self._end = next_setpoint(self._limits, self._start, target, self._duration, np)
+            self.end = next_setpoint(self._limits, self.start, target, self._duration, np)
 
     def at(self, times: np.ndarray) -> np.ndarray:
         """Commands [M, J] at times [M] since the start of the control step, s."""
-        if self._limits is None or self._start is None:
-            return np.tile(self._end.position, (len(times), 1))
-        acceleration, smoothing = self._end.acceleration, self._limits.smoothing
-        return command(self._start, acceleration, np.asarray(times)[:, None], np, smoothing)
+        if self._limits is None or self.start is None:
+            return np.tile(self.end.position, (len(times), 1))
+        acceleration, smoothing = self.end.acceleration, self._limits.smoothing
+        return command(self.start, acceleration, np.asarray(times)[:, None], np, smoothing)
+
+
+def paddle_position(metadata: Metadata, joint_angles: np.ndarray) -> np.ndarray:
+    """World position [..., 3] (m) of the paddle's centre at joint angles [..., J] (rad), by
+    Rodrigues' formula for the hinges' rotations."""
+    position = np.array(metadata.paddle)
+    for link in reversed(metadata.chain):
+        angles = (joint_angles[..., link.joint] - link.reference)[..., None, None]
+        turn = np.tensordot(link.axis, _CROSS, 1)
+        rotation = np.eye(3) + np.sin(angles) * turn + (1.0 - np.cos(angles)) * (turn @ turn)
+        position = link.position + (rotation @ position[..., None])[..., 0]
+    return position

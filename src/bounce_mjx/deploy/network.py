@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from bounce_mjx.deploy.chain import paddle_pose
 from bounce_mjx.deploy.metadata import IS_FIRST, MEASURED, NEXT, Metadata, from_entries
+from bounce_mjx.deploy.motion import paddle_position
 from bounce_mjx.errors import UserError, needed
 
 Measurements = dict[str, np.ndarray]
@@ -79,7 +79,7 @@ class OnnxNetwork:
         newest = known | {
             "action": action,
             "past_actions": action,
-            "paddle_position": paddle_pose(self.metadata, known["joint_angles"])[0],
+            "paddle_position": paddle_position(self.metadata, known["joint_angles"]),
             "ball_picture": known["ball_position"],
         }
         if self.metadata.velocity == "differences":

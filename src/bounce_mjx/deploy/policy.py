@@ -116,7 +116,7 @@ class DeployedPolicy:
         self._refuse_impossible(measured)
         angles = measured.get("joint_angles")
         if angles is not None and self.metadata.max_lead is not None:
-            last = self.motion.end if self.motion.is_known else angles
+            last = angles if self.motion.end is None else self.motion.end.position
             measured["servo_lead"] = last - angles
         time = float(measured.pop("time")[0]) if "time" in measured else None
         steps = self._steps_since(time)
@@ -183,7 +183,7 @@ class DeployedPolicy:
     @property
     def targets(self) -> np.ndarray | None:
         """Servo targets [J] at the end of the control step, rad; None before the first step."""
-        if not self.motion.is_known:
+        if self.motion.end is None:
             return None
         return self.motion.at(np.array([self.metadata.control_dt]))[0]
 
@@ -205,7 +205,7 @@ class DeployedPolicy:
         """Aims the commands of the control step at the targets of an action [J]."""
         base, lead = self._measured["joint_angles"], self.metadata.max_lead
         if lead is not None:
-            base = np.clip(self.motion.position, base - lead, base + lead)
+            base = np.clip(self.motion.start.position, base - lead, base + lead)
         self.motion.aim(base + self.metadata.action_scale * action)
 
     @property
@@ -273,27 +273,22 @@ class DeployedPolicy:
 
     def _refuse_impossible(self, measured: Measurements) -> None:
         """Raises UserError for a measurement that no world of the training can hold."""
-        farthest = self.metadata.ball.distance
-        far = np.linalg.norm(measured.get("ball_position", np.zeros(3)).reshape(-1, 3), axis=1)
-        if np.max(far) > 2.0 * farthest:
-            raise UserError(
-                f"the measurement ball_position is {np.max(far):.3g} m from the robot's base, but "
-                f"no ball of the training farther than {farthest:.3g} m; give metres in the "
-                "robot's frame"
-            )
-        ranges = [
-            (name, measured[name][0], *command.range, max(np.ptp(command.range), _OUTSIDE))
-            for name, command in self.metadata.commands.items()
+        farthest, places = self.metadata.ball.distance, measured.get("ball_position", np.zeros(3))
+        distance = np.max(np.linalg.norm(places.reshape(-1, 3), axis=1))
+        ranges = [("the distance of ball_position", distance, 0.0, farthest, farthest, "m")]
+        ranges += [
+            (name, measured[name][0], *ends, max(np.ptp(ends), _OUTSIDE), unit or "no unit")
+            for name, (ends, unit) in self.metadata.commands.items()
             if name in measured
         ]
         angles = measured.get("joint_angles", ())
         joints = zip(self.metadata.joint_names, angles, *self.motion.ranges, strict=False)
-        ranges += [("the angle of " + joint, *given, _OUTSIDE) for joint, *given in joints]
-        for name, value, low, high, room in ranges:
+        ranges += [("the angle of " + joint, *given, _OUTSIDE, "rad") for joint, *given in joints]
+        for name, value, low, high, room, unit in ranges:
             if not low - room <= value <= high + room:
                 raise UserError(
                     f"{name} is {value:.3g}, but the training had {low:.3g} to {high:.3g} "
-                    f"({self.units.get(name, 'rad')}); give this unit, and the policy's order"
+                    f"({unit}); give this unit, the robot's frame, and the policy's order"
                 )
 
 

@@ -1,14 +1,13 @@
 """A supervisor between a policy and an arm."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from bounce_mjx.deploy.chain import paddle_pose
-from bounce_mjx.deploy.faults import EARLIER, FLYING, faults, make_bounds, picture_age
-from bounce_mjx.deploy.network import Measurements
+from bounce_mjx.deploy.faults import Fault, Watch, picture_age
+from bounce_mjx.deploy.motion import paddle_position
 from bounce_mjx.errors import UserError
 
 if TYPE_CHECKING:
@@ -54,17 +53,17 @@ class Supervisor:
         ):
             if not 0.0 < value <= most:
                 raise UserError(f"{name} is {value}; give a number above 0 and at most {most:g}")
-        corners = np.array(box, float)
-        if corners.shape != (2, 3) or not np.all(corners[0] < corners[1]):
+        self._box, self._most_idle = np.array(box, float), max_steps_late
+        if self._box.shape != (2, 3) or not np.all(self._box[0] < self._box[1]):
             raise UserError(f"the box is {box}; give its lowest and its highest x, y and z, m")
-        self._allowed = make_bounds(metadata, age, max_steps_late, corners)
+        self._watch = Watch(metadata, age, max_steps_late * metadata.control_dt)
         self.state: State = "homing"
         self.fault: str | None = None
         """Code of the rule that was broken, such as `ball_lost`; `measurement` for a measurement
         that the policy refuses, `stopped` after `stop`."""
         self.reason: str | None = None
         """Why the arm has stopped or brakes."""
-        self._past: np.ndarray | None = None
+        self._is_moving_home = False
 
     def start(self) -> None:
         """Starts an episode.
@@ -78,9 +77,8 @@ class Supervisor:
                 "after a stop, and commands until the arm is home"
             )
         self._policy.reset(self._policy.targets)
-        self._time: float | None = None
+        self._watch.begin()
         self._idle = 0
-        self._pictures: list[tuple[np.ndarray, float]] = []
         self.state = "running"
 
     def stop(self, reason: str, fault: str = "stopped") -> None:
@@ -96,7 +94,8 @@ class Supervisor:
         """
         if self.state != "stopped":
             raise UserError(f"the arm is {self.state}; restart it when it has stopped")
-        self.state, self.fault, self.reason, self._past = "homing", None, None, None
+        self.state, self.fault, self.reason = "homing", None, None
+        self._is_moving_home = False
 
     def commands(self, measurements: Mapping[str, Any]) -> np.ndarray:
         """Commands [M, J] of a control step at the robot's rate, rad.
@@ -132,25 +131,24 @@ class Supervisor:
         given = {k: v for k, v in measurements.items() if k == "joint_angles"}
         return self._policy.check(given, ("joint_angles",))["joint_angles"]
 
-    def _is_fine(self, facts: dict[str, Any]) -> bool:
-        """Brakes if the facts break a rule, and says whether they keep all."""
-        for rule, is_broken, number in faults(self._allowed, facts):
-            if is_broken:
-                self.stop(rule.reason.format(number), rule.fault)
-                return False
-        return True
+    def _stop_at(self, faults: Iterable[Fault]) -> bool:
+        """Brakes at the first of the faults, and says whether there is one."""
+        for code, reason in faults:
+            self.stop(reason, code)
+            return True
+        return False
 
     def _go_home(self, measurements: Mapping[str, Any]) -> None:
         """A step of the way home."""
         policy, angles = self._policy, self._angles(measurements)
         home = np.array(policy.metadata.default_joint_angles)
-        if self._past is None:
+        if not self._is_moving_home:
             # A small distance is the arm's load, and needs no step of the command.
             if policy.targets is None or not self._are_near(policy.targets, angles):
                 policy.reset(angles)
-            rest = [[angles], [policy.targets]]
-            self._past = np.repeat(rest, self._allowed["angles"].window + 1, axis=1)
-        if not self._is_fine(self._window(angles)):
+            self._watch.rest(angles, policy.targets)
+            self._is_moving_home = True
+        if self._stop_at(self._watch.arm_faults(angles, policy.targets)):
             return
         if np.abs(policy.targets - home).max() > _HOME_TOLERANCE:
             policy.motion.move(home, _HOME_SPEED)
@@ -160,60 +158,25 @@ class Supervisor:
         self.state = "ready" if is_home else "homing"
 
     def _are_near(self, one: np.ndarray, other: np.ndarray) -> bool:
-        return bool(np.max(np.abs(one - other)) <= self._allowed["angles"].offset)
+        return bool(np.max(np.abs(one - other)) <= self._watch.offset)
 
     def _follow(self, measurements: Mapping[str, Any]) -> None:
         """A step of the policy."""
         policy = self._policy
         measured = policy.check(measurements, dict.fromkeys((*policy.needs, "joint_angles")))
-        if not self._is_fine(self._facts(measured)):
+        if self._stop_at(self._watch.faults(measured, policy.targets)):
             return
         last = policy.step_number
         policy.step(measurements)
         self._idle = self._idle + 1 if policy.step_number == last else 0
         if self._idle:
             policy.motion.hold()
-        target = paddle_pose(policy.metadata, policy.targets)[0]
-        if not self._is_fine({"idle": self._idle, "target": target}):
-            policy.motion.withdraw()
-
-    def _window(self, angles: np.ndarray) -> dict[str, np.ndarray]:
-        """The last angles and commands, with those of this control step."""
-        now = [[angles], [self._policy.targets]]
-        self._past = np.concatenate([self._past[:, 1:], now], axis=1)
-        return {"angles": self._past[0], "commands": self._past[1]}
-
-    def _facts(self, measured: Measurements) -> dict[str, Any]:
-        """The facts of a running episode, for the rules."""
-        angles, dt = measured["joint_angles"], self._policy.metadata.control_dt
-        facts: dict[str, Any] = self._window(angles)
-        facts["paddle"] = paddle_pose(self._policy.metadata, angles)[0]
-        last = self._time
-        self._time = float(measured["time"][0]) if "time" in measured else (last or 0.0) + dt
-        if last is not None:
-            self._time = max(self._time, last)
-            facts["elapsed"] = self._time - last
-        if "joint_velocities" in measured:
-            facts["velocities"] = measured["joint_velocities"]
-        if "ball_velocity" in measured:
-            facts["ball_velocity"] = measured["ball_velocity"].reshape(-1, 3)
-        if "ball_position" in measured:
-            age = float(measured["ball_age"][0]) if "ball_age" in measured else None
-            facts |= self._picture(measured["ball_position"].reshape(-1, 3), age, facts["paddle"])
-        return facts
-
-    def _picture(self, ball: np.ndarray, age: float | None, paddle: np.ndarray) -> dict[str, Any]:
-        """The facts of the ball's newest picture [B, 3] and of the ones before."""
-        if not self._pictures or np.any(ball != self._pictures[-1][0]):
-            self._pictures = [*self._pictures[-EARLIER:], (ball, self._time - (age or 0.0))]
-        seen = self._pictures
-        # A ball in flight that does not move is an old picture, whatever its age is said to be.
-        if age is None or np.max(ball[:, 2]) > paddle[2] + FLYING:
-            age = max(self._time - seen[-1][1], age or 0.0)
-        facts = {"ball": ball, "age": age, "earlier_ball": np.full(ball.shape, np.nan)}
-        if len(seen) > EARLIER:
-            facts["earlier_ball"] = seen[0][0]
-        if len(seen) > 1:
-            between = max(seen[-1][1] - seen[-2][1], self._policy.metadata.control_dt)
-            facts["ball_motion"] = (ball - seen[-2][0]) / between
-        return facts
+        target = paddle_position(policy.metadata, policy.targets)
+        outside = np.max([self._box[0] - target, target - self._box[1]])
+        if self._idle > self._most_idle:
+            self.stop(f"{self._idle} calls in a row are no new step", "no_step")
+        elif outside > 0.0:
+            self.stop(f"the paddle's command is {outside:.3g} m outside the box", "box")
+        else:
+            return
+        policy.motion.withdraw()
