@@ -35,6 +35,8 @@ _STYLE = {
     "grid.color": "#e3e3e3",
     "axes.axisbelow": True,
     "legend.frameon": False,
+    # Names of tasks may have a $.
+    "text.parse_math": False,
     # The same figure gives the same file.
     "svg.hashsalt": "bounce_mjx",
     # Okabe and Ito's palette, whose colours colour-blind readers can distinguish.
@@ -118,11 +120,6 @@ def pixels(figure: Figure) -> np.ndarray:
     return np.array(canvas.buffer_rgba())[..., :3]
 
 
-def literal(text: str) -> str:
-    """A text that matplotlib does not read as a formula."""
-    return text.replace("$", r"\$")
-
-
 def make_panels(count: int, columns: int, height: float) -> tuple[Figure, list[Axes]]:
     """A figure with a number of panels in rows of a height in inches."""
     columns = max(1, min(columns, count))
@@ -147,8 +144,7 @@ def _draw_curve(axes: Axes, groups: Sequence[Group], shown: Curve) -> None:
             low, mean, high = (shown.scale * (mean + side * deviation) for side in (-1, 0, 1))
             # A line of one point shows nothing.
             marker = "." if len(steps) == 1 else ""
-            label = literal(group.label)
-            axes.plot(steps, mean, color=colour, marker=marker, linewidth=1.6, label=label)
+            axes.plot(steps, mean, color=colour, marker=marker, lw=1.6, label=group.label)
         if len(curves) > 1:
             for curve in curves:
                 axes.plot(curve.steps, shown.scale * curve.values, color=colour, alpha=0.3, lw=0.7)
@@ -160,7 +156,7 @@ def _draw_curve(axes: Axes, groups: Sequence[Group], shown: Curve) -> None:
                 axes.plot(points.steps, heights, "o", color=f"C{i}", ms=4.0, label=label)
             if (steps := run.solved_steps) is not None:
                 axes.axvline(steps, color=f"C{i}", ls=":", lw=1.0, label="all results met")
-    axes.set_title(literal(shown.title))
+    axes.set_title(shown.title)
     axes.set_xlim(left=0)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
@@ -190,8 +186,7 @@ def _draw_heights(axes: Axes, env: Env, recording: Recording) -> None:
     for i, name in enumerate(levels[0]):
         heights = [level[name] for level in levels]
         constant = f" {heights[0]:.2f} m" if len(set(heights)) == 1 else ""
-        label = literal(f"{name}{constant}")
-        axes.plot(time, heights, color=f"C{2 + i}", label=label)
+        axes.plot(time, heights, color=f"C{2 + i}", label=f"{name}{constant}")
     axes.plot(time, recording.ball[:steps, ..., 2, 0], color="C0", label="ball")
     axes.plot(time, recording.paddle[:steps, 2, 0], color="C1", label="paddle")
     axes.set_xlim(0.0, env.config.episode_seconds)
@@ -204,12 +199,9 @@ def _draw_heights(axes: Axes, env: Env, recording: Recording) -> None:
 
 def _draw_histogram(axes: Axes, plot: Histogram) -> None:
     values, bound = plot.values, plot.bound
-    axes.set_title(literal(f"{plot.title} ({len(values):,} {plot.counted})"))
-    axes.set_ylabel(literal(plot.counted))
-    if not len(values):
-        _note(axes, f"no {plot.counted}")
-        return
-    half = max(1.25 * bound, 1.05 * float(np.abs(values).max()))
+    axes.set_title(f"{plot.title} ({len(values):,} {plot.counted})")
+    axes.set_ylabel(plot.counted)
+    half = max(1.25 * bound, 1.05 * float(np.abs(values).max(initial=0.0)))
     axes.hist(values, bins=51, range=(-half, half), color="C0")
     for side in (-1, 1):
         axes.axvline(side * bound, color="C2", linestyle="--")
@@ -233,17 +225,10 @@ def _draw_hits(axes: Axes, env: Env, plot: Hits, points: np.ndarray) -> None:
     x, y = 100.0 * points.T[:2]
     axes.plot(y, x, ".", markersize=3, alpha=0.4, color="C0", markeredgewidth=0)
     axes.set(
-        title=literal(f"{plot.title} ({len(points):,})"),
+        title=f"{plot.title} ({len(points):,})",
         xlabel="paddle's y",
         ylabel="paddle's x",
         xlim=(-1.3 * half_y, 1.3 * half_y),
         ylim=(-1.3 * half_x, 1.3 * half_x),
         aspect="equal",
     )
-    if not len(points):
-        _note(axes, "none")
-
-
-def _note(axes: Axes, text: str) -> None:
-    place = dict(ha="center", va="center", transform=axes.transAxes)
-    axes.text(0.5, 0.5, literal(text), color=_GREY, **place)

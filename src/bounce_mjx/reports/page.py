@@ -25,7 +25,7 @@ from bounce_mjx.reports.figures import (
 )
 from bounce_mjx.reports.html_page import data_url, figures_html, page, table
 from bounce_mjx.reports.robustness import load_robustness, robustness_figure
-from bounce_mjx.reports.tables import details_line, figure_text, result_cells, robot_name
+from bounce_mjx.reports.tables import details_line, result_cells, robot_name
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.files import write_output
 from bounce_mjx.runs.folders import Checkpoint
@@ -97,22 +97,13 @@ def _html(
     figures: dict[str, Figure],
     replay: str,
 ) -> str:
-    report = results.best
-    seconds = results.seconds
+    report, evaluated = results.best, len(results.evaluations)
+    seconds = results.seconds | {"total": sum(results.seconds.values())}
     phases = [[name, f"{value:.1f}"] for name, value in seconds.items()]
-    names = [result.name for result in report.results]
-    evaluations = [
-        [
-            f"{e.steps:,}",
-            *(figure_text(e.model_extra.get(name)) for name in names),
-            "pass" if e.passed else "screening" if e.screening else "-",
-        ]
-        for e in results.evaluations
-    ]
     resets = "fresh resets" if results.fresh_resets else "the resets of the selection"
     body = f"""<h1>{report.summary}</h1>
 <p>Run <code>{html.escape(str(run))}</code>, seed {config.seed}, task {html.escape(config.task)} on
-the robot {html.escape(robot_name(config.env))}. The best of {len(evaluations)} evaluations, after
+the robot {html.escape(robot_name(config.env))}. The best of {evaluated} evaluations, after
 {results.best_steps:,} of {results.trained_steps:,} environment steps, on {resets}:
 {html.escape(details_line(report))}.</p>
 <p>Trained on {html.escape(results.device)} with bounce_mjx {html.escape(results.version or "?")};
@@ -122,8 +113,6 @@ the robot {html.escape(robot_name(config.env))}. The best of {len(evaluations)} 
 <iframe title="Replay" src="{data_url("text/html", replay.encode())}"></iframe>
 {figures_html(figures, _CAPTIONS)}
 <h2>Where the time went</h2>
-{table(["phase", "seconds"], [*phases, ["total", f"{sum(seconds.values()):.1f}"]])}
-<h2>All evaluations</h2>
-{table(["environment steps", *names, "all met"], evaluations)}
+{table(["phase", "seconds"], phases)}
 <details><summary>Config</summary><pre>{html.escape(dump_config(config))}</pre></details>"""
     return page(run.name, body)

@@ -16,7 +16,7 @@ from rich.table import Table
 
 from bounce_mjx.evaluation.robustness import ConditionOutcome, RobustnessReport
 from bounce_mjx.evaluation.suite import NOMINAL
-from bounce_mjx.reports.figures import PANEL_WIDTH, literal, style
+from bounce_mjx.reports.figures import PANEL_WIDTH, style
 from bounce_mjx.reports.tables import short_text
 from bounce_mjx.runs.files import read_stored
 
@@ -108,7 +108,7 @@ def robustness_figure(report: RobustnessReport) -> Figure:
     axes = figure.subplots()
     cells = max(8, *(len(outcomes) for _, outcomes in rows))
     axes.set(xlim=(0.0, cells), ylim=(len(rows), 0.0), xticks=[], frame_on=False)
-    axes.set_yticks(np.arange(len(rows)) + 0.5, [literal(label) for label, _ in rows])
+    axes.set_yticks(np.arange(len(rows)) + 0.5, [label for label, _ in rows])
     axes.tick_params(length=0, labelsize=8)
     axes.grid(False)
     for y, (label, (_, outcomes)) in enumerate(zip(axes.get_yticklabels(), rows, strict=True)):
@@ -134,7 +134,7 @@ def robustness_figure(report: RobustnessReport) -> Figure:
     bar.set_label("lowest result of those in %", fontsize=8)
     missed = "   ".join(f"{letter} {name}" for name, letter in letters.items())
     below = f"{_TICK} all judged results met; missed: {missed}; framed: within the trained ranges"
-    figure.supxlabel(literal(below), fontsize=8, wrap=True)
+    figure.supxlabel(below, fontsize=8, wrap=True)
     return figure
 
 
