@@ -154,8 +154,9 @@ def minimise(
         fit = Fit(vector, starts, line.predicted, weights, now)
         at_guess = (starts - guess)[:, entries] / reach
         reduced = _eliminate(line.white, line.by_unknown * scale, line.by_state * reach, at_guess)
-        hessian = reduced.information + np.eye(len(unknowns))
-        slope = reduced.gradient + (vector[unknowns] - layout.mean[unknowns]) / scale
+        hessian = np.sum(reduced.informations, axis=0) + np.eye(len(unknowns))
+        from_mean = (vector[unknowns] - layout.mean[unknowns]) / scale
+        slope = np.sum(reduced.gradients, axis=0) + from_mean
         vectors = np.repeat(vector[None], num_tried, axis=0)
         states = np.repeat(starts[None], num_tried, axis=0)
         for i, (damping, share) in enumerate(itertools.product(_DAMPINGS, _SHARES)):
@@ -372,16 +373,6 @@ class _Reduced(NamedTuple):
     """Change [S, D, F] of the starts with the unknowns."""
     own: np.ndarray
     """Change [S, D] of the starts if no unknown changes."""
-
-    @property
-    def information(self) -> np.ndarray:
-        """Of all windows [F, F]."""
-        return np.sum(self.informations, axis=0)
-
-    @property
-    def gradient(self) -> np.ndarray:
-        """Of all windows [F]."""
-        return np.sum(self.gradients, axis=0)
 
     def states(self, change: np.ndarray) -> np.ndarray:
         """Change [S, D] of the starts for a change [F] of the unknowns."""

@@ -4,6 +4,7 @@ files, by `rosbags` (the extra `identify`)."""
 import csv
 import re
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -102,10 +103,11 @@ def _read_columns(path: Path) -> dict[str, tuple[str, np.ndarray]]:
         header, *lines = path.read_text("utf-8-sig").splitlines() or [""]
         delimiter = max(",;\t", key=header.count)
         titles = next(csv.reader([header], delimiter=delimiter), [])
+        lines = [line.replace('"', "") for line in lines]
         if delimiter != ",":
             lines = [line.replace(",", ".") for line in lines]
-        options = dict(delimiter=delimiter, comments=None, quotechar='"', ndmin=2)
-        cells = np.loadtxt(lines, converters=_read_number, **options) if lines else np.zeros((0, 0))
+        options = dict(delimiter=delimiter, comments=None, ndmin=2)
+        cells = np.genfromtxt(lines, **options) if lines else np.zeros((0, 0))
     except (OSError, ValueError) as error:
         raise UserError(
             f"the log {path} cannot be read ({shorten(reason_of(error))}); give a CSV file in "
@@ -125,13 +127,6 @@ def _read_columns(path: Path) -> dict[str, tuple[str, np.ndarray]]:
     return columns
 
 
-def _read_number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return np.nan
-
-
 def read_bag(path: Path, joint_names: Sequence[str], topics: Topics) -> Log:
     """Reads a bag. Times are the header's stamps, or the bag's where a topic has none. Messages
     without a number for each joint are left out and counted.
@@ -141,17 +136,8 @@ def read_bag(path: Path, joint_names: Sequence[str], topics: Topics) -> Log:
       UserError: the bag cannot be read, a topic is missing or of another type, no message has a
         joint, the ball is in two frames, or as `make_log`.
     """
-    found, num_joints = _read_messages(path, topics), len(joint_names)
-    angles, targets = (
-        _make_rows(
-            f"{name} of {topic} in {path}",
-            found[topic],
-            num_joints,
-            lambda message: _read_angles(message, joint_names),
-        )
-        for name, topic in (("joint angles", topics.joints), ("servo targets", topics.targets))
-    )
-    for topic in (topics.joints, topics.targets):
+    found, rows = _read_messages(path, topics), []
+    for name, topic in (("joint angles", topics.joints), ("servo targets", topics.targets)):
         given = {joint for _, message in found[topic] for joint in getattr(message, "name", ())}
         missing = [joint for joint in joint_names if joint not in given]
         if given and missing:
@@ -160,6 +146,9 @@ def read_bag(path: Path, joint_names: Sequence[str], topics: Topics) -> Log:
                 f"and {missing[0]} is missing; give the log's robot with --robot, or the driver's "
                 "names with --joint-names"
             )
+        read, source = partial(_read_angles, joint_names=joint_names), f"{topic} in {path}"
+        rows.append(_make_rows(f"{name} of {source}", found[topic], len(joint_names), read))
+    angles, targets = rows
     name = f"pictures of the ball of {topics.ball} in {path}"
     balls = _make_rows(name, found[topics.ball], 3, _read_position)
     seen = np.flatnonzero(np.isfinite(balls.values).all(axis=1))

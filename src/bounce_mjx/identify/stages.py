@@ -144,7 +144,7 @@ def identify(
     """
     times = {name: _straighten(getattr(log, name)) for name in ("times", "target_times")}
     log = log._replace(**times)
-    windows = cut(log, config.physics_dt, min_windows=5)
+    windows = cut(log, config.physics_dt)
     bounces = int(np.sum(windows.has_ball))
     with_ball = bounces >= _FEWEST_BOUNCES
     progress(f"{len(windows.first)} windows, {bounces} with a bounce")

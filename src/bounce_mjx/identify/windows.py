@@ -21,7 +21,7 @@ _BEFORE, _AFTER = 0.55, 0.2
 _AFTER_SHARE = 0.3
 _SECONDS = MAX_DELAY + _BEFORE + _AFTER + 0.03
 _SHORTEST = 0.16
-_MOST = 240
+_FEWEST, _MOST = 5, 240
 _PADDING = 8
 _PICTURE_GAP = 0.06
 _JOINT_GAP = 0.1
@@ -88,18 +88,15 @@ class Windows(NamedTuple):
         return np.arange(self.starts.shape[1]) < 2 * self.angles.shape[2]
 
 
-def cut(log: Log, physics_dt: float, min_windows: int = 1) -> Windows:
+def cut(log: Log, physics_dt: float) -> Windows:
     """Cuts a log into windows, `_MOST` at most: of more, every k-th is used.
 
-    Args:
-      min_windows: the smallest number.
-
     Raises:
-      UserError: there are fewer.
+      UserError: there are fewer than five.
     """
     spans = [(b - before, b + after, b) for b, before, after in _find_bounces(log)]
     spans += [(start, end, np.nan) for start, end in _find_rests(log, spans)]
-    if len(spans) < min_windows:
+    if len(spans) < _FEWEST:
         raise UserError(
             f"{log.source} has {len(spans)} stretches of unbroken joint angles and servo targets; "
             "record at least 5 s"
