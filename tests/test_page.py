@@ -83,7 +83,7 @@ def handshake(address: str, host: str | None, origin: str | None) -> int:
 
 
 LOOPBACK = "http://127.0.0.1:PORT http://localhost:PORT http://[::1]:9 https://LocalHost"
-STRANGE = "http://evil.test:PORT http://192.0.2.1:PORT http://localhost.evil.test http://"
+STRANGE = "http://evil.test:PORT http://localhost.evil.test http://"
 HOSTS = {
     "local": ("127.0.0.1", (), LOOPBACK, STRANGE),
     "everywhere": (

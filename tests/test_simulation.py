@@ -75,7 +75,7 @@ def test_frames_describe_one_state(env: BounceBall, recording: EnvFrame) -> None
         for i in range(2):
             display.pose(recording.qpos[step, i], at_index(frame_at(recording, step).command, i))
             geom = display.data.geom
-            np.testing.assert_allclose(geom("ball").xpos, recording.ball[step, i], atol=1e-6)
+            np.testing.assert_allclose(geom("ball").xpos, recording.balls[step, i, 0], atol=1e-6)
             np.testing.assert_allclose(geom("blocker").xpos, recording.paddle[step, i], atol=1e-5)
     assert np.all(recording.qpos[0, 0, :6] != recording.qpos[0, 1, :6])
 
@@ -86,7 +86,7 @@ def test_time_runs_until_the_episode_ends(recording: EnvFrame, env: BounceBall) 
     np.testing.assert_array_equal(np.flatnonzero(recording.over[:, 0]), [steps])
     np.testing.assert_allclose(recording.time[steps + 1], env.dt)
     start = np.asarray(env.config.ball_init_pos)
-    distance = np.abs(recording.ball[steps + 1] - start)
+    distance = np.abs(recording.balls[steps + 1, :, 0] - start)
     assert np.all(distance < env.config.reset.ball_position + 0.001)
     assert np.all(recording.metrics["n_bounces"][steps + 1] == 0)
 
@@ -120,7 +120,7 @@ def test_an_exchanged_policy_acts(env: BounceBall) -> None:
 def test_a_push_adds_its_velocity_to_the_ball_once(mirrored: Simulation) -> None:
     steps, push = 5, np.array([0.2, -0.1, 0.3])
     mirrored.reset()
-    start = mirrored.frame.ball
+    start = mirrored.frame.balls[:, 0]
     mirrored.push(tuple(push))
     for _ in range(steps):
         mirrored.step()
@@ -128,7 +128,7 @@ def test_a_push_adds_its_velocity_to_the_ball_once(mirrored: Simulation) -> None
     # The sum of a semi-implicit integrator's steps, in place of g t^2 / 2.
     fall = 0.5 * GRAVITY * flight * (flight + mirrored.env.config.physics_dt)
     expected = start + push * flight - np.array([0.0, 0.0, fall])
-    np.testing.assert_allclose(mirrored.frame.ball, expected, atol=1e-5)
+    np.testing.assert_allclose(mirrored.frame.balls[:, 0], expected, atol=1e-5)
 
 
 def test_steps_become_due_with_the_clock(mirrored: Simulation, monkeypatch) -> None:

@@ -27,8 +27,6 @@ from websockets.http11 import Request, Response
 
 from bounce_mjx.errors import UserError
 
-_LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")
-_ALL_ADDRESSES = ("0.0.0.0", "::", "")
 # The longest message of a page, its camera, has 400 bytes.
 _MAX_BYTES = 4096
 _MAX_NUMBER = 1e6
@@ -111,16 +109,12 @@ def _stop(server: viser.ViserServer) -> None:
 def _make_rule(host: str, allowed: Collection[str]) -> Callable[[Headers], bool]:
     """A function of a request's headers: whether it is from the page itself, or of no browser."""
     proxies = {name.lower() for name in allowed}
-    names = proxies | {*_LOCAL_NAMES, host.lower()}
-    is_everywhere = host in _ALL_ADDRESSES
-    if is_everywhere:
-        names.add(socket.gethostname().lower())
+    names = proxies | {"localhost", host.lower(), socket.gethostname().lower()}
 
     def is_name(name: str) -> bool:
         """Whether the page may be opened at a name. No website can let an address point here."""
-        if is_everywhere and name not in names:
-            with contextlib.suppress(ValueError):
-                return bool(ipaddress.ip_address(name))
+        with contextlib.suppress(ValueError):
+            return bool(ipaddress.ip_address(name))
         return name in names
 
     def is_own(headers: Headers) -> bool:

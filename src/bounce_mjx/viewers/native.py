@@ -8,7 +8,6 @@ from collections.abc import Callable
 import mujoco
 import mujoco.viewer
 
-from bounce_mjx.errors import UserError
 from bounce_mjx.viewers.display import Display, Trail
 from bounce_mjx.viewers.offscreen import draw_trail
 from bounce_mjx.viewers.simulation import Simulation, environment_pose, in_real_time
@@ -23,17 +22,6 @@ def has_display() -> bool:
         return bool(named) and subprocess.run(probe, capture_output=True).returncode == 0
     # On a Mac, MuJoCo's viewer needs its own interpreter, mjpython.
     return sys.platform != "darwin" or "MJPYTHON_BIN" in os.environ
-
-
-def check_display() -> None:
-    """Raises:
-    UserError: no window can be opened.
-    """
-    if not has_display():
-        raise UserError(
-            "--viewer native needs a display that works (DISPLAY names it), and on a Mac mjpython; "
-            "use --viewer browser"
-        )
 
 
 def show_window(simulation: Simulation, seconds: float | None, is_over: Callable[[], bool]) -> None:

@@ -12,7 +12,7 @@ from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.robot.model import fingerprint
 from bounce_mjx.runs.files import check_output, write_output
-from bounce_mjx.viewers.native import check_display, has_display, show_window
+from bounce_mjx.viewers.native import has_display, show_window
 from bounce_mjx.viewers.options import MAX_ENVS, Address, PageStart, ViewerOptions
 from bounce_mjx.viewers.simulation import Controller, SideBySide, Simulation
 from bounce_mjx.viewers.world import reset_ranges, with_sliders
@@ -81,9 +81,16 @@ def _viewer(options: ViewerOptions, several: bool) -> str:
         raise UserError("a window or a video shows one policy; show several with --viewer browser")
     if is_recorded:
         return "recording"
-    if options.viewer == "auto":
-        return "native" if not several and has_display() else "browser"
-    return options.viewer
+    if options.viewer == "browser" or several:
+        return "browser"
+    if has_display():
+        return "native"
+    if options.viewer == "native":
+        raise UserError(
+            "--viewer native needs a display that works (DISPLAY names it), and on a Mac mjpython; "
+            "use --viewer browser"
+        )
+    return "browser"
 
 
 def _recording(options: ViewerOptions, console: Console) -> Present:
@@ -115,8 +122,7 @@ def _recording(options: ViewerOptions, console: Console) -> Present:
 
 
 def _window(options: ViewerOptions, console: Console) -> Present:
-    """Opens MuJoCo's window; checks the display at once."""
-    check_display()
+    """Opens MuJoCo's window."""
 
     def present(simulation: Simulation, start: PageStart) -> None:
         with StopRequest() as stop:

@@ -61,11 +61,6 @@ class EnvFrame(NamedTuple):
     """Whether the episode ended on this step [N], because the ball was lost or an arm joint was too
     fast."""
 
-    @property
-    def ball(self) -> np.ndarray:
-        """Centre of the first ball [N, 3], m."""
-        return self.balls[..., 0, :]
-
 
 class _Changes(NamedTuple):
     """What a user changes before a step."""

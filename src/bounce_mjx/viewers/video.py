@@ -146,7 +146,7 @@ def draw_frames(
             frame = frame_at(frames, i)
             trail.add(frame)
             picture = renderer.render(*environment_pose(frame, 0), trail.points[:, 0])
-            yield caption(picture, frame_readings(env, frame), frame.ball[0, 2])
+            yield caption(picture, frame_readings(env, frame), frame.balls[0, 0, 2])
 
 
 def caption(picture: np.ndarray, readings: dict[str, str], height: float) -> np.ndarray:
