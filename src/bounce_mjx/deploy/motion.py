@@ -3,7 +3,7 @@
 import numpy as np
 
 from bounce_mjx.deploy.metadata import Metadata
-from bounce_mjx.robot.setpoints import JointLimits, Setpoint, command, next_setpoint
+from bounce_mjx.robot.setpoints import Setpoint, command, joint_limits, next_setpoint
 
 # [k, i, j]: the matrix of the cross product with the unit vector k.
 _CROSS = np.cross(np.eye(3), np.eye(3)[:, None])
@@ -14,16 +14,12 @@ class Motion:
     policy has them, else a target for the whole control step."""
 
     def __init__(self, metadata: Metadata):
-        limits, self._duration = metadata.limits, metadata.control_dt
+        self._duration = metadata.control_dt
         self.ranges = np.array(
             [(-np.inf, np.inf) if x is None else x for x in metadata.joint_ranges]
         ).T
         """Lower and upper ends [2, J] of the joints' ranges, rad."""
-        self._limits = None
-        if limits is not None:
-            velocity, acceleration = np.array(limits.velocity), np.array(limits.acceleration)
-            smoothing = None if limits.jerk is None else 2.0 * acceleration / np.array(limits.jerk)
-            self._limits = JointLimits(velocity, acceleration, smoothing, tuple(self.ranges))
+        self._limits = joint_limits(metadata.limits, *self.ranges)
         self.start: Setpoint | None = None
         """The command at the start of the control step, before the mean that limits the jerk."""
         self.end: Setpoint | None = None

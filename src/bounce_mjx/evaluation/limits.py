@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bounce_mjx.robot.setpoints import Setpoint, command
+from bounce_mjx.robot.setpoints import Setpoint, command, joint_limits
 from bounce_mjx.task.shown import Recording
 from bounce_mjx.world.config import WorldConfig
 
@@ -35,9 +35,8 @@ def limit_shares(config: WorldConfig, recording: Recording, rate: float = 1000) 
     limits = config.robot.limits
     given = {name: getattr(limits, name) for name in ("velocity", "acceleration", "jerk")}
     bounds = {name: np.array(bound)[:, None] for name, bound in given.items() if bound is not None}
-    smoothing = None
-    if limits.jerk is not None:
-        smoothing = 2.0 * bounds["acceleration"] / bounds["jerk"]
+    smoothing = joint_limits(limits).smoothing
+    smoothing = None if smoothing is None else smoothing[:, None]
     velocities, running = (np.asarray(x) for x in (recording.command_velocity, recording.running))
     duration = config.control_dt
     count = max(1, round(duration * rate))

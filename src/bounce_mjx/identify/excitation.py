@@ -9,7 +9,7 @@ import numpy as np
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.contacts import ContactChecker
-from bounce_mjx.robot.model import find_addresses, joint_names, load_model
+from bounce_mjx.robot.model import find_addresses, joint_names, joint_ranges, load_model
 from bounce_mjx.world.config import WorldConfig
 
 MARGIN = 0.01
@@ -63,7 +63,7 @@ def excite(
       UserError: the start pose has a contact with the floor or the table, or a joint cannot move.
     """
     model = load_model(config.mjcf, config.physics_dt, visual=False, robot=config.robot)
-    addresses, n, dt = find_addresses(model), config.num_joints, config.control_dt
+    n, dt = config.num_joints, config.control_dt
     home, names = np.array(config.default_joint_angles), joint_names(model)
     limits = config.robot.limits
     bounds = np.stack(
@@ -73,8 +73,7 @@ def excite(
         ]
     )
     bounds[0] = np.minimum(bounds[0], max_velocity)
-    low, high = model.jnt_range[list(addresses.arm_joints)].T
-    low, high = (np.where(low < high, end, x) for end, x in ((low, -np.inf), (high, np.inf)))
+    low, high = joint_ranges(model)
     centre = _lift_paddle(model, home, low + _FROM_END, high - _FROM_END)
     room = np.minimum(centre - low, high - centre) - _FROM_END
     amplitudes = np.minimum(_LARGEST_AMPLITUDE, room)

@@ -23,8 +23,7 @@ from bounce_mjx.robot.arm import (
     read_spec,
 )
 from bounce_mjx.robot.balls import MAX_BALLS, add_balls, ball_name
-from bounce_mjx.robot.config import LimitsConfig, RobotConfig
-from bounce_mjx.robot.setpoints import JointLimits
+from bounce_mjx.robot.config import RobotConfig
 
 # Starts of the names of a model's fields with physics in them, and those of colours among them.
 _PHYSICAL = ("body_", "jnt_", "dof_", "geom_", "pair_", "actuator_", "eq_", "tendon_", "qpos")
@@ -145,20 +144,10 @@ def paddle_home(
     return x, y, z
 
 
-def command_limits(
-    limits: LimitsConfig, mj_model: mujoco.MjModel, addresses: Addresses
-) -> list[JointLimits] | None:
-    """The limits of each acting joint's command; None if the commands have none."""
-    if limits.velocity is None:
-        return None
-    result = []
-    for i, joint in enumerate(addresses.arm_joints):
-        low, high = map(float, mj_model.jnt_range[joint])
-        acceleration = limits.acceleration[i]
-        smoothing = None if limits.jerk is None else 2.0 * acceleration / limits.jerk[i]
-        span = (low, high) if low < high else None
-        result.append(JointLimits(limits.velocity[i], acceleration, smoothing, span))
-    return result
+def joint_ranges(mj_model: mujoco.MjModel) -> np.ndarray:
+    """Lower and upper ends [2, n] of the acting joints' ranges, rad; infinite without a range."""
+    low, high = mj_model.jnt_range[list(find_addresses(mj_model).arm_joints)].T
+    return np.where(low < high, (low, high), ((-np.inf,), (np.inf,)))
 
 
 def _limit_torques(mj_model: mujoco.MjModel, addresses: Addresses, robot: RobotConfig) -> None:

@@ -16,7 +16,7 @@ import scipy.optimize
 from bounce_mjx.errors import UserError
 from bounce_mjx.robot.arm import joint_name
 from bounce_mjx.robot.config import PaddleConfig
-from bounce_mjx.robot.model import Addresses, find_addresses
+from bounce_mjx.robot.model import Addresses, find_addresses, joint_ranges
 
 # Length that makes rotations comparable with displacements: about a forearm, m/rad.
 _LENGTH = 0.25
@@ -130,15 +130,13 @@ class _Search:
         self._joints = np.array(self._at.arm_joints)
         # The last link, to which the paddle's own body is welded.
         self._body = int(model.body_weldid[model.geom_bodyid[self._at.paddle_geom]])
-        low, high = model.jnt_range[self._joints].T
-        free = low >= high
-        self._range = np.where(free, -np.inf, low), np.where(free, np.inf, high)
+        self._range = low, high = joint_ranges(model)
         # A servo whose joint is at its limit could move it one way only.
         margin = np.minimum(_LEAST_MARGIN, 0.1 * (high - low))
         self._inside = self._range[0] + margin, self._range[1] - margin
         # The seeds of a hinge lie within half a turn.
         self._hinge = model.jnt_type[self._joints] == mujoco.mjtJoint.mjJNT_HINGE
-        wide = np.where(self._hinge, np.pi, np.where(free, 0.5, np.inf))
+        wide = np.where(self._hinge, np.pi, np.where(np.isinf(low), 0.5, np.inf))
         self._centre = centre = np.clip(model.qpos0[self._qpos], *self._inside)
         self._seeds = [np.clip(centre + side * wide, *self._inside) for side in (-1.0, 1.0)]
         # MuJoCo skips the transformation of a geom flagged as sharing its body's frame.

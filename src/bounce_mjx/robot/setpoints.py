@@ -33,22 +33,24 @@ A jump b of the acceleration at the time 0 adds b times the averaged and lagged 
 from types import ModuleType
 from typing import Any, NamedTuple
 
+import numpy as np
+
 Number = Any
 """A float, or an array of NumPy or JAX with an entry for each joint."""
 
 
 class JointLimits(NamedTuple):
-    """Limits of the command of one joint, or of several."""
+    """Limits of the commands of several joints; each a number for all, or an array [n]."""
 
     velocity: Number
     """rad/s."""
     acceleration: Number
     """rad/s^2."""
     smoothing: Number | None = None
-    """Time of the mean that limits the jerk, s: twice the acceleration over the jerk; None for a
-    joint without such a limit. At most a control step."""
-    range: tuple[Number, Number] | None = None
-    """Lowest and highest command, rad; infinite or None for a joint without a range."""
+    """Time of the mean that limits the jerk, s: twice the acceleration over the jerk; None without
+    such a limit. At most a control step."""
+    range: tuple[Number, Number] = (-np.inf, np.inf)
+    """Lowest and highest command, rad; infinite for a joint without a range."""
 
 
 class Setpoint(NamedTuple):
@@ -60,6 +62,20 @@ class Setpoint(NamedTuple):
     """rad/s."""
     acceleration: Number
     """During the whole step, rad/s^2."""
+
+
+def joint_limits(limits: Any, *range: np.ndarray) -> JointLimits | None:
+    """The limits of an arm's commands; None if they have none.
+
+    Args:
+      limits: velocity, acceleration and jerk of the joints, such as `LimitsConfig`.
+      range: lower and upper ends [n] of the joints' ranges, rad.
+    """
+    if limits is None or limits.velocity is None:
+        return None
+    acceleration = np.array(limits.acceleration)
+    smoothing = None if limits.jerk is None else 2.0 * acceleration / np.array(limits.jerk)
+    return JointLimits(np.array(limits.velocity), acceleration, smoothing, range)
 
 
 def next_setpoint(
@@ -75,13 +91,10 @@ def next_setpoint(
     """
     position, velocity, _ = start
     asked = (target - position) / duration
-    least, most = -limits.velocity, limits.velocity
-    if limits.range is not None:
-        low, high = limits.range
-        most = xp.minimum(most, _stopping_velocity(high - position, velocity, limits, duration, xp))
-        least = xp.maximum(
-            least, -_stopping_velocity(position - low, -velocity, limits, duration, xp)
-        )
+    low, high = limits.range
+    up = _stopping_velocity(high - position, velocity, limits, duration, xp)
+    down = _stopping_velocity(position - low, -velocity, limits, duration, xp)
+    least, most = xp.maximum(-limits.velocity, -down), xp.minimum(limits.velocity, up)
     change = limits.acceleration * duration
     after = xp.clip(asked, least, most)
     after = xp.clip(after, velocity - change, velocity + change)

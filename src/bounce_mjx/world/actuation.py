@@ -2,7 +2,6 @@
 lag, pushes, and the air."""
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -12,8 +11,8 @@ import numpy as np
 
 from bounce_mjx.physics import Control
 from bounce_mjx.physics.control import Moving, servo_target
-from bounce_mjx.robot.model import command_limits, find_addresses
-from bounce_mjx.robot.setpoints import Setpoint, next_setpoint
+from bounce_mjx.robot.model import find_addresses, joint_ranges
+from bounce_mjx.robot.setpoints import Setpoint, joint_limits, next_setpoint
 from bounce_mjx.world import noise
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.noise import Clock
@@ -39,18 +38,18 @@ class Actuators:
     """The actuators of a world."""
 
     def __init__(self, config: WorldConfig, mj_model: mujoco.MjModel):
-        self._config, self._model = config, mj_model
-        self._addresses = find_addresses(mj_model)
-        self._motion = command_limits(config.robot.limits, mj_model, self._addresses)
+        self._config, self._nu, self._addresses = config, mj_model.nu, find_addresses(mj_model)
+        self._range = joint_ranges(mj_model)
+        self._limits = joint_limits(config.robot.limits, *self._range)
         self._gears = mj_model.actuator_gear[list(self._addresses.actuators), 0].tolist()
 
     def first(self, qpos: jax.Array) -> Actuation:
         """Memory at a reset, with the servos at rest at qpos [nq]."""
         config, still = self._config, jnp.zeros(self._config.num_joints, qpos.dtype)
-        joints, last = self._joint_targets(qpos, still), None
+        wanted, last = self._joint_targets(self._angles(qpos), still), None
         if config.action.base == "target":
-            last = Setpoint(jnp.stack(joints), still, still)
-        control, setpoint = self._command(joints, last)
+            last = Setpoint(wanted, still, still)
+        control, setpoint = self._command(wanted, last)
         memory = start_actuation(config.randomization, config.control_dt, control)
         return memory._replace(setpoint=setpoint)
 
@@ -69,12 +68,12 @@ class Actuators:
           action: clipped [n].
           clock: before the step; None for a world that is not randomised.
         """
-        config, error = self._config, None
+        config, angles = self._config, self._angles(qpos)
         if "joint_angle_noise" in world:
             # The same noise as in the observation from which the policy chose the action.
             numbers, _ = noise.joints(clock.counter, config.num_joints, action.dtype)
-            error = world["joint_angle_noise"] * numbers
-        wanted = self._joint_targets(qpos, action, error, before.setpoint)
+            angles = angles + world["joint_angle_noise"] * numbers
+        wanted = self._joint_targets(angles, action, before.setpoint)
         control, setpoint = self._command(wanted, before.setpoint)
         control, memory = add_delay(world, before, control, config.control_dt, config.num_substeps)
         control = control._replace(air_drag=world.get("air_drag"), air_lift=world.get("air_lift"))
@@ -86,76 +85,56 @@ class Actuators:
         self, qpos: jax.Array, action: jax.Array, last: Setpoint | None = None
     ) -> jax.Array:
         """`Env.servo_targets`, at the joint angles in qpos [nq]."""
-        return self._ctrl(self._joint_targets(qpos, action, None, last))
+        return self._ctrl(self._joint_targets(self._angles(qpos), action, last))
+
+    def _angles(self, qpos: jax.Array) -> jax.Array:
+        return jnp.stack([qpos[i] for i in self._addresses.arm_qpos])
 
     def _joint_targets(
-        self,
-        qpos: jax.Array,
-        action: jax.Array,
-        error: jax.Array | None = None,
-        last: Setpoint | None = None,
-    ) -> list[jax.Array]:
-        """The target [] of each joint, rad: one scalar per joint, which XLA fuses with the physics;
-        it would not fuse an indexed update.
+        self, angles: jax.Array, action: jax.Array, last: Setpoint | None = None
+    ) -> jax.Array:
+        """The target of each joint [n], rad.
 
         Args:
-          error: error of the measured angles [n], rad, without the offset of the encoders' zeros,
-            which the servo shares.
+          angles: measured [n], rad, without the offset of the encoders' zeros, which the servo
+            shares.
           last: the last commands, to which the action adds, within `max_lead` of the measured
             angles; None if it adds to these.
         """
-        config, targets = self._config, []
-        for i, joint in enumerate(self._addresses.arm_joints):
-            angle = qpos[self._addresses.arm_qpos[i]]
-            if error is not None:
-                angle = angle + error[i]
-            if last is not None:
-                lead = config.action.max_lead
-                angle = jnp.clip(last.position[i], angle - lead, angle + lead)
-            target = angle + config.action_scale * action[i]
-            low, high = (float(limit) for limit in self._model.jnt_range[joint])
-            targets.append(jnp.clip(target, low, high) if low < high else target)
-        return targets
+        if last is not None:
+            lead = self._config.action.max_lead
+            angles = jnp.clip(last.position, angles - lead, angles + lead)
+        targets = angles + self._config.action_scale * action
+        return jnp.clip(targets, *jnp.asarray(self._range, targets.dtype))
 
-    def _command(
-        self, wanted: list[jax.Array], last: Setpoint | None
-    ) -> tuple[Control, Setpoint | None]:
-        """The control that takes each joint to a target [], as far as its limits allow, and the
-        command at the end of the step."""
-        if self._motion is None:
-            after = None if last is None else Setpoint(jnp.stack(wanted), None, None)
+    def _command(self, wanted: jax.Array, last: Setpoint | None) -> tuple[Control, Setpoint | None]:
+        """The control that takes the joints to their targets [n], as far as the limits allow, and
+        the command at the end of the step."""
+        if self._limits is None:
+            after = None if last is None else Setpoint(wanted, None, None)
             return Control(self._ctrl(wanted)), after
-        dt, substep = self._config.control_dt, self._config.physics_dt
-        starts = [Setpoint(*(x[i] for x in last)) for i in range(len(wanted))]
-        ends = [
-            next_setpoint(limits, start, target, dt, jnp)
-            for limits, start, target in zip(self._motion, starts, wanted, strict=True)
-        ]
+        substep, smoothing = self._config.physics_dt, self._limits.smoothing
+        after = next_setpoint(self._limits, last, wanted, self._config.control_dt, jnp)
+        if smoothing is not None:
+            # An actuator of no joint has a target of zero, whatever the time.
+            times = np.ones(self._nu)
+            times[[*self._addresses.actuators]] = smoothing / substep
+            smoothing = jnp.asarray(times, wanted.dtype)
         moving = Moving(
-            velocity=self._ctrl([start.velocity * substep for start in starts]),
-            acceleration=self._ctrl([end.acceleration * substep**2 for end in ends]),
-            before=self._ctrl([start.acceleration * substep**2 for start in starts]),
-            smoothing=self._smoothing(wanted[0].dtype),
+            velocity=self._ctrl(last.velocity * substep),
+            acceleration=self._ctrl(after.acceleration * substep**2),
+            before=self._ctrl(last.acceleration * substep**2),
+            smoothing=smoothing,
         )
-        control = Control(self._ctrl([start.position for start in starts]), moving)
-        return control, Setpoint(*map(jnp.stack, zip(*ends, strict=True)))
+        return Control(self._ctrl(last.position), moving), after
 
-    def _smoothing(self, dtype: jnp.dtype) -> jax.Array | None:
-        """Physics steps [nu] of the mean that limits the jerk of each servo target."""
-        if self._motion[0].smoothing is None:
-            return None
-        # An actuator of no joint has a target of zero, whatever the time.
-        times, dt = np.ones(self._model.nu), self._config.physics_dt
-        times[[*self._addresses.actuators]] = [limits.smoothing / dt for limits in self._motion]
-        return jnp.asarray(times, dtype)
-
-    def _ctrl(self, values: Sequence[jax.Array]) -> jax.Array:
-        """Inputs of the actuators [nu] from a value [] of each joint's angle."""
-        ctrl = [jnp.zeros_like(values[0])] * self._model.nu
-        for actuator, gear, value in zip(
-            self._addresses.actuators, self._gears, values, strict=True
-        ):
-            ctrl[actuator] = value if gear == 1.0 else gear * value
+    def _ctrl(self, values: jax.Array) -> jax.Array:
+        """Inputs of the actuators [nu] from a value of each joint's angle [n]."""
+        # XLA fuses this with the physics; it would not fuse an indexed update.
+        ctrl = [jnp.zeros_like(values[0])] * self._nu
+        for i, actuator in enumerate(self._addresses.actuators):
+            gear = self._gears[i]
+            ctrl[actuator] = values[i] if gear == 1.0 else gear * values[i]
         return jnp.stack(ctrl)
 
     def _push(self, world: World, clock: Clock) -> jax.Array:
@@ -177,19 +156,14 @@ def start_actuation(config: RandomizationConfig, control_dt: float, rest: Contro
     queue = None
     if config.action_latency is not None:
         length = math.floor(config.action_latency[1] / control_dt) + 2
-        queue = jax.tree.map(
-            lambda x: jnp.broadcast_to(x, (length, *x.shape)), _with_past(rest, rest)
-        )
+        queue = jax.tree.map(lambda x: jnp.broadcast_to(x, (length, *x.shape)), _varying(rest))
     return Actuation(queue=queue, filtered=None if config.servo_lag is None else rest.ctrl)
 
 
-def _with_past(control: Control, before: Control) -> Control:
-    """A control for the queue, with what its targets did in the step before the one before."""
+def _varying(control: Control) -> Control:
+    """The control without what is the same in each step."""
     moving = control.moving
-    if moving is None:
-        return control
-    earlier = None if moving.smoothing is None else before.moving.before
-    return control._replace(moving=moving._replace(smoothing=None, earlier=earlier))
+    return control._replace(moving=moving and moving._replace(smoothing=None))
 
 
 def add_delay(
@@ -202,18 +176,23 @@ def add_delay(
     """
     queue, filtered, moving = memory.queue, memory.filtered, control.moving
     if queue is not None:
-        newest = _with_past(control, jax.tree.map(lambda q: q[0], queue))
-        queue = jax.tree.map(lambda new, q: jnp.concatenate([new[None], q[:-1]]), newest, queue)
+        shift = lambda new, q: jnp.concatenate([new[None], q[:-1]])  # noqa: E731
+        queue = jax.tree.map(shift, _varying(control), queue)
         latency = world["action_latency"] / control_dt
         # Without the 1e-4, rounding could turn a latency of one 10 ms step into zero whole steps
         # and a switch at the end of the step.
         whole = jnp.floor(latency + 1e-4)
-        control = jax.tree.map(lambda q: entry_at(q, whole), queue)
+        control, older = (
+            jax.tree.map(lambda q, age=age: entry_at(q[age:], whole), queue) for age in (0, 1)
+        )
         if moving is None:
-            control = control._replace(previous=entry_at(queue.ctrl[1:], whole))
+            control = control._replace(previous=older.ctrl)
         elif moving.smoothing is not None:
-            duration = jnp.asarray(num_substeps, control.ctrl.dtype)
-            late = control.moving._replace(smoothing=moving.smoothing, duration=duration)
+            late = control.moving._replace(
+                smoothing=moving.smoothing,
+                earlier=older.moving.before,
+                duration=jnp.asarray(num_substeps, control.ctrl.dtype),
+            )
             control = control._replace(moving=late)
         control = control._replace(switch=jnp.round((latency - whole) * num_substeps))
     if filtered is not None:
