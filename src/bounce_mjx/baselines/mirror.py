@@ -19,7 +19,7 @@ import numpy as np
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
-from bounce_mjx.robot.model import find_addresses
+from bounce_mjx.robot.model import find_addresses, scatter
 from bounce_mjx.world.config import WorldConfig
 
 # Restitution of the ball on the paddle.
@@ -149,11 +149,7 @@ class MirrorLaw:
     def _pose(self, angles: jax.Array) -> jax.Array:
         """Forward kinematics [5] of joint angles [n], as `_paddle`."""
         paddle_position = self._env.engine.paddle_position
-        # One scalar per entry, which XLA fuses with the physics.
-        entries = [jnp.asarray(q, angles.dtype) for q in self._env.mj_model.qpos0]
-        for i, address in enumerate(self._arm):
-            entries[address] = angles[i]
-        qpos = jnp.stack(entries)
+        qpos = scatter(self._env.mj_model.qpos0, self._arm, angles)
         above = MODEL_PARAMETERS._replace(paddle_position=jnp.asarray(self._above, angles.dtype))
         centre = paddle_position(MODEL_PARAMETERS, qpos)
         return jnp.concatenate([centre, (paddle_position(above, qpos) - centre)[:2]])

@@ -85,20 +85,18 @@ def env_values(mjcf: Path, adoption: "Adoption", config_class: type[WorldConfig]
       config_class: the settings' class.
     """
     pose = adoption.pose
-    x, y, z = (round(coordinate, 4) + 0.0 for coordinate in pose.paddle)
+    x, y, z = (round(coordinate, 4) + 0.0 for coordinate in pose.paddle.tolist())
     return {
         "mjcf": str(WorldConfig(mjcf=mjcf).mjcf),
         "robot": adoption.config.model_dump(mode="json", exclude_defaults=True),
         "action_scale": adoption.action_scale,
-        "default_joint_angles": [round(angle, 5) for angle in pose.angles],
+        "default_joint_angles": [round(angle, 5) for angle in pose.angles.tolist()],
         **config_class.settings_at((x, y, z)),
     }
 
 
 def describe(adoption: "Adoption") -> list[str]:
     """Lines about an adopted arm: its pose, its servos, and the changes to the user's model."""
-    from bounce_mjx.robot.arm import limit_words
-
     pose, arm = adoption.pose, adoption.arm
     x, y, z = (round(coordinate, 6) + 0.0 for coordinate in pose.paddle)
     strength = f"{pose.acceleration:.0f} m/s^2 upward in addition to holding the arm"
@@ -112,8 +110,10 @@ def describe(adoption: "Adoption") -> list[str]:
     for name, angle, inertia, servo in zip(
         arm.joint_names, pose.angles, pose.inertia, adoption.servos, strict=True
     ):
+        most = servo.force_limit
+        limit = "no force limit" if most is None else f"force limit {most:.4g}"
         lines.append(
             f"  {name}: {angle:+.3f} rad, inertia {inertia:.3g}, kp {servo.stiffness:.4g}, "
-            f"kv {servo.damping:.4g}, {limit_words(servo.force_limit)}"
+            f"kv {servo.damping:.4g}, {limit}"
         )
     return [*lines, "changes to the model:", *(f"  {change}" for change in arm.changes)]

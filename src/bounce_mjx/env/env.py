@@ -25,6 +25,7 @@ from bounce_mjx.robot.model import (
     find_addresses,
     fingerprint,
     joint_names,
+    joint_ranges,
     load_model,
 )
 from bounce_mjx.robot.setpoints import Setpoint
@@ -150,16 +151,15 @@ class Env:
     def _check_start(self) -> None:
         """Checks that the joint angles of a reset, and the heights over the paddle, fit the arm."""
         config, model, acting = self.config, self.mj_model, joint_names(self.mj_model)
-        angles, ranges = config.default_joint_angles, model.jnt_range[[*self.addresses.arm_joints]]
+        angles, ranges = config.default_joint_angles, joint_ranges(model)
         if len(angles) != len(acting):
             name = f"the MJCF file {config.mjcf}" if config.mjcf else "the model"
             raise UserError(
                 f"default_joint_angles has {len(angles)} numbers, but {name} has {len(acting)} "
                 f"joints with an actuator ({', '.join(acting)}); give one number for each"
             )
-        for name, angle, (low, high) in zip(acting, angles, ranges, strict=True):
-            if not low < high:
-                low, high = -_MAX_ANGLE, _MAX_ANGLE
+        ranges = np.nan_to_num(ranges, posinf=_MAX_ANGLE, neginf=-_MAX_ANGLE)
+        for name, angle, low, high in zip(acting, angles, *ranges, strict=True):
             if not low - _ROUNDING <= angle <= high + _ROUNDING:
                 raise UserError(
                     f"default_joint_angles has {angle:g} for {name}, whose range is {low:.4g} to "

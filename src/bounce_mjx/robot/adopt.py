@@ -9,6 +9,7 @@ import numpy as np
 from bounce_mjx.errors import UserError
 from bounce_mjx.robot.arm import (
     BALL_BODY_NAME,
+    BODY_FIELDS,
     PADDLE_BODY_NAME,
     Arm,
     ServoSettings,
@@ -29,7 +30,6 @@ _LARGEST_SPREAD = 4.0
 # Largest difference of an arm in the scene from its file compiled alone: MuJoCo rounds frames that
 # are almost the same.
 _EQUAL = 1e-6
-_BODY_FIELDS = ("pos", "quat", "ipos", "iquat", "mass", "inertia")
 # Torque of a kept servo at the action 1, in multiples of the torque that holds the arm.
 _LEAST_HOLD = 1.5
 
@@ -71,7 +71,7 @@ def adopt(mjcf: Path, config: RobotConfig, control_dt: float, is_mount_given: bo
         model = compile_spec(arm.spec, path)
         check_as_alone(arm, model)
         choices = [config.paddle] if is_mount_given else mounts(config.paddle)
-        pose = find_pose(model, arm.force_limits, choices)
+        pose = find_pose(model, [servo.force_limit for servo in arm.servos], choices)
         servos, scale, are_kept = _servos(model, arm, pose, control_dt)
         update = {"paddle": pose.mount}
         if not are_kept:
@@ -92,27 +92,25 @@ def _servos(
     hinge = model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE
     speed = np.where(hinge, _HINGE_SPEED, _SLIDE_SPEED)
     passive = model.dof_damping[list(addresses.arm_qvel)]
-    own = [servo for servo in arm.servos if servo is not None]
-    if len(own) == len(joints):
-        stiffness = np.array([servo.stiffness for servo in own])
-        damping = np.array([servo.damping for servo in own]) + passive
+    stiffnesses, dampings, limits = zip(*arm.servos, strict=True)
+    if None not in stiffnesses:
+        stiffness, damping = np.array(stiffnesses), np.array(dampings) + passive
         scales = speed * damping / stiffness
         scale = float(np.exp(np.mean(np.log(np.maximum(scales, 1e-9)))))
-        ratio = damping / (2.0 * np.sqrt(stiffness * np.array(pose.inertia)))
+        ratio = damping / (2.0 * np.sqrt(stiffness * pose.inertia))
         suits = (
             np.min(ratio) >= _LEAST_DAMPING_RATIO
             and np.max(scales) <= _LARGEST_SPREAD * np.min(scales)
             and np.all(stiffness * scale >= _LEAST_HOLD * np.abs(pose.holding))
         )
         if suits:
-            return tuple(own), _four_digits(scale), True
+            return arm.servos, _four_digits(scale), True
     # Critical damping at the natural frequency 1 / control_dt: within a control step a joint comes
     # to rest, and physics steps of a fifth of it are stable.
     frequency = 1.0 / control_dt
     scale = 2.0 * _HINGE_SPEED / frequency
-    damping = 2.0 * frequency * np.array(pose.inertia)
+    damping = 2.0 * frequency * pose.inertia
     stiffness = damping * speed / scale
-    limits = arm.force_limits
     made = zip(stiffness, damping, limits, strict=True)
     servos = tuple(ServoSettings(_four_digits(k), _four_digits(d), limit) for k, d, limit in made)
     return servos, _four_digits(scale), False
@@ -129,13 +127,10 @@ def check_as_alone(arm: Arm, model: mujoco.MjModel) -> None:
     """
     added = (BALL_BODY_NAME, PADDLE_BODY_NAME)
     bodies = [b for b in range(1, model.nbody) if model.body(b).name not in added]
-    joints = find_addresses(model).arm_joints
-    for field, here, alone in (
-        *((f"body_{name}", bodies, arm.own.bodies) for name in _BODY_FIELDS),
-        *((f"jnt_{name}", joints, arm.own.joints) for name in ("pos", "axis")),
-    ):
-        expected = getattr(arm.own.model, field)[list(alone)]
-        error = np.max(np.abs(getattr(model, field)[list(here)] - expected))
+    joints = list(find_addresses(model).arm_joints)
+    for field, expected in arm.alone.items():
+        here = getattr(model, field)[bodies if field in BODY_FIELDS else joints]
+        error = np.max(np.abs(here - expected))
         if error > _EQUAL * np.max(np.abs(expected)):
             raise UserError(
                 f"an arm that changes in the task's scene, where its {field} differs by "

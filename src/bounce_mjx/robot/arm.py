@@ -23,6 +23,8 @@ PADDLE_GEOM_NAME = "blocker"
 MIN_JOINTS = 3
 
 PADDLE_BODY_NAME = "paddle"
+BODY_FIELDS = ("body_pos", "body_quat", "body_ipos", "body_iquat", "body_mass", "body_inertia")
+JOINT_FIELDS = ("jnt_pos", "jnt_axis")
 # Viewers show the groups 0 to 2.
 HIDDEN_GROUP = 3
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
@@ -31,28 +33,17 @@ _NARROWER = 1e-3
 _HANDLE_RADIUS = 0.011
 # Without what only its simulations need; a later version may move its files.
 _INSTALLED_AS = {"robosuite": ("--no-deps", "robosuite==1.5.2")}
-_JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 
 
 class ServoSettings(NamedTuple):
-    """A position servo of one joint."""
+    """A position servo of one joint, or another actuator, which has a force limit alone."""
 
-    stiffness: float
+    stiffness: float | None
     """N m/rad, or N/m."""
-    damping: float
+    damping: float | None
     """N m s/rad, or N s/m."""
     force_limit: float | None
     """N m, or N; None for no limit."""
-
-
-class Own(NamedTuple):
-    """The user's file compiled alone."""
-
-    model: mujoco.MjModel
-    joints: list[int]
-    """The acting joints in it."""
-    bodies: list[int]
-    """The bodies in it that the scene has too."""
 
 
 class Arm(NamedTuple):
@@ -61,13 +52,13 @@ class Arm(NamedTuple):
     spec: mujoco.MjSpec
     joint_names: tuple[str, ...]
     """The acting joints, from the base to the paddle."""
-    servos: tuple[ServoSettings | None, ...]
-    """The MJCF's own position servo of each acting joint; None for another actuator."""
-    force_limits: tuple[float | None, ...]
-    """Largest force of the MJCF's actuator of each acting joint, N m or N; None for no limit."""
+    servos: tuple[ServoSettings, ...]
+    """The MJCF's own actuator of each acting joint."""
     changes: tuple[str, ...]
     """Changes to the user's model, one sentence each."""
-    own: Own
+    alone: dict[str, np.ndarray]
+    """`BODY_FIELDS` and `JOINT_FIELDS` of the model that is the user's file compiled alone: of the
+    bodies that the scene has too, and of the acting joints."""
 
 
 def locate(mjcf: Path) -> Path:
@@ -205,7 +196,6 @@ class _Builder:
         joints = self._acting_joints(chain)
         actuators = self._actuators(joints)
         servos = tuple(_servo(model, j, actuators[j]) for j in joints)
-        limits = tuple(_force_limit(model, j, actuators[j]) for j in joints)
         names = tuple(joint_name(model, j) for j in joints)
         holder = self._arm.bodies[end]
         holder.name = holder.name or "end_effector"
@@ -216,8 +206,9 @@ class _Builder:
         scene = self._attach(holder.name, position, quaternion)
         self._replace_servos(scene, names)
         kept = [b for b in range(1, model.nbody) if not is_below(model, b, loose)]
-        own = Own(model, joints, kept)
-        return Arm(scene, names, servos, limits, tuple(self._changes), own)
+        alone = {name: getattr(model, name)[kept] for name in BODY_FIELDS}
+        alone |= {name: getattr(model, name)[joints] for name in JOINT_FIELDS}
+        return Arm(scene, names, servos, tuple(self._changes), alone)
 
     def _acting_joints(self, chain: list[int]) -> list[int]:
         model, given = self._model, self._config.joints
@@ -253,7 +244,7 @@ class _Builder:
         model, actuators = self._model, {}
         for a in range(model.nactuator):
             joint = int(model.actuator_trnid[a, 0])
-            if int(model.actuator_trntype[a]) in _JOINT_TRANSMISSIONS:
+            if model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT:
                 if joint in joints and joint in actuators:
                     raise UserError(f"several actuators on {joint_name(model, joint)}; give it one")
                 actuators[joint] = a
@@ -431,24 +422,15 @@ class _Builder:
             )
         for actuator in list(scene.actuators):
             scene.delete(actuator)
-        given = zip(
-            names,
-            config.servo_stiffness,
-            config.servo_damping,
-            config.servo_force_limit,
-            strict=True,
-        )
-        for name, stiffness, damping, limit in given:
+        settings = config.servo_stiffness, config.servo_damping, config.servo_force_limit
+        for name, stiffness, damping, limit in zip(names, *settings, strict=True):
             joint = mujoco.mjtTrn.mjTRN_JOINT
             actuator = scene.add_actuator(name=f"servo/{name}", target=name, trntype=joint)
             actuator.set_to_position(kp=stiffness, kv=damping)
             if limit is not None:
                 actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
                 actuator.forcerange = [-limit, limit]
-            self._changes.append(
-                f"replaced the actuator of {name} with a position servo: kp {stiffness:.4g}, "
-                f"kv {damping:.4g}, {limit_words(limit)}"
-            )
+        self._changes.append("replaced the actuators with position servos")
 
 
 def _add_paddle(paddle: mujoco.MjsBody, config: RobotConfig, default: mujoco.MjsDefault) -> None:
@@ -490,21 +472,17 @@ def _handle_length(blade: PaddleConfig) -> float:
     return float(distance - inside - _HANDLE_RADIUS + 0.5 * min(blade.half_size))
 
 
-def limit_words(limit: float | None) -> str:
-    """A force limit for a line of text."""
-    return "no force limit" if limit is None else f"force limit {limit:.4g}"
-
-
-def _servo(model: mujoco.MjModel, joint: int, actuator: int) -> ServoSettings | None:
-    """The position servo that drives a joint; None for another actuator."""
+def _servo(model: mujoco.MjModel, joint: int, actuator: int) -> ServoSettings:
+    """The actuator that drives a joint."""
+    limit = _force_limit(model, joint, actuator)
     plain = model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_NONE
     if not (plain and is_position_servo(model, actuator)):
-        return None
+        return ServoSettings(None, None, limit)
     gear = float(model.actuator_gear[actuator, 0])
     return ServoSettings(
         float(model.actuator_gainprm[actuator, 0] * gear**2),
         float(-model.actuator_biasprm[actuator, 2] * gear**2) + 0.0,
-        _force_limit(model, joint, actuator),
+        limit,
     )
 
 

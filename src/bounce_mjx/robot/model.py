@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -150,6 +151,15 @@ def joint_ranges(mj_model: mujoco.MjModel) -> np.ndarray:
     return np.where(low < high, (low, high), ((-np.inf,), (np.inf,)))
 
 
+def scatter(rest: np.ndarray, places: Sequence[int], values: jax.Array) -> jax.Array:
+    """The numbers `rest` [m], such as `qpos0`, with the values [n] at some places."""
+    # One scalar per entry, which XLA fuses with the physics; it would not fuse an indexed update.
+    entries = list(rest)
+    for place, value in zip(places, values, strict=True):
+        entries[place] = value
+    return jnp.stack([jnp.asarray(entry, values.dtype) for entry in entries])
+
+
 def _limit_torques(mj_model: mujoco.MjModel, addresses: Addresses, robot: RobotConfig) -> None:
     """Applies `robot.limits.torque` to the servos, where theirs are not lower."""
     torques = robot.limits.torque
@@ -209,13 +219,8 @@ def _check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
 
     With a <pid>, which has several controls, an actuator's index would not be its control's.
     """
-    several = np.flatnonzero(mj_model.actuator_ctrlnum != 1)
-    if several.size:
-        name = mj_model.actuator(several[0]).name or f"number {several[0]}"
-        raise UserError(
-            f"an actuator ({name}) with {mj_model.actuator_ctrlnum[several[0]]} controls; drive "
-            "each joint by a <position>, which has one"
-        )
+    if np.any(mj_model.actuator_ctrlnum != 1):
+        raise UserError("an actuator with several controls; drive each joint by a <position>")
     for joint, actuator in zip(addresses.arm_joints, addresses.actuators, strict=True):
         direct = mj_model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_NONE
         if not (direct and is_position_servo(mj_model, actuator)):

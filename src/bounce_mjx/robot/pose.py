@@ -44,20 +44,20 @@ _HEADROOM = 1.0
 class PaddlePose(NamedTuple):
     """A start pose, with a level paddle."""
 
-    angles: tuple[float, ...]
-    """Positions of the acting joints, rad; of a slide, m."""
-    paddle: tuple[float, float, float]
-    """Centre of the paddle, m."""
+    angles: np.ndarray
+    """Positions of the acting joints [n], rad; of a slide, m."""
+    paddle: np.ndarray
+    """Centre of the paddle [3], m."""
     mount: PaddleConfig
     """The paddle as it is held in this pose."""
     manipulability: float
     """Smallest singular value of the scaled Jacobian of the task directions."""
     acceleration: float
     """Largest upward acceleration of the paddle by the actuators' force limits, m/s^2."""
-    inertia: tuple[float, ...]
-    """Reflected inertia of each acting joint: the diagonal of the mass matrix, kg m^2 or kg."""
-    holding: tuple[float, ...]
-    """Force of each acting joint that holds the arm, N m or N."""
+    inertia: np.ndarray
+    """Reflected inertia of each acting joint [n]: the diagonal of the mass matrix, kg m^2 or kg."""
+    holding: np.ndarray
+    """Force of each acting joint that holds the arm [n], N m or N."""
     reach: float
     """Largest horizontal distance of the paddle from the first joint, m."""
     score: float
@@ -89,8 +89,7 @@ def find_pose(
       UserError: the paddle cannot be level, tilted or lifted, or no servo is strong enough.
     """
     search = _Search(model, force_limits)
-    reach = search.reach()
-    poses = [pose for choice in choices for pose in search.level_poses(choice, reach)]
+    poses = [pose for choice in choices for pose in search.level_poses(choice)]
     names = ", ".join(joint_name(model, j) for j in find_addresses(model).arm_joints)
     for suits, problem in (
         (
@@ -143,13 +142,8 @@ class _Search:
         model.geom_sameframe[self._at.paddle_geom] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
         mujoco.mj_kinematics(model, self._data)
         self._base = self._data.xanchor[self._joints[0]].copy()
-
-    def reach(self) -> float:
-        distances = []
-        for _ in range(500):
-            paddle, _ = self._forward(self._rng.uniform(*self._seeds))
-            distances.append(np.hypot(*(paddle - self._base)[:2]))
-        return float(max(distances))
+        paddles = [self._forward(self._rng.uniform(*self._seeds))[0] for _ in range(500)]
+        self._reach = float(max(np.hypot(*(paddle - self._base)[:2]) for paddle in paddles))
 
     def _forward(self, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Position [3] and normal [3] of the paddle."""
@@ -165,22 +159,22 @@ class _Search:
         mujoco.mj_jac(self._model, self._data, linear, angular, paddle, self._body)
         return np.vstack([linear, _LENGTH * angular])[:, self._dofs]
 
-    def level_poses(self, choice: PaddleConfig, reach: float) -> Iterator[PaddlePose | None]:
+    def level_poses(self, choice: PaddleConfig) -> Iterator[PaddlePose | None]:
         """Poses with a level paddle in front of the robot, at many distances and heights; None for
         one in the way of the ball or in the floor."""
         # The paddle's body has the frame of the site.
         quaternion = np.array(choice.quaternion)
         self._model.geom_quat[self._at.paddle_geom] = quaternion / np.linalg.norm(quaternion)
         self._model.geom_pos[self._at.paddle_geom] = choice.position
-        distances = reach * np.array([0.45, 0.6, 0.75])
-        lowest = max(_LOWEST, self._base[2] - 0.3 * reach)
-        heights = lowest + reach * np.array([0.0, 0.15, 0.3])
+        distances = self._reach * np.array([0.45, 0.6, 0.75])
+        lowest = max(_LOWEST, self._base[2] - 0.3 * self._reach)
+        heights = lowest + self._reach * np.array([0.0, 0.15, 0.3])
         for distance, height in itertools.product(distances, heights):
             goal = np.array([self._base[0] + distance, self._base[1], height])
             for _ in range(_TRIES):
                 angles = self._solve(self._rng.uniform(*self._seeds), goal)
                 if angles is not None:
-                    yield self._rate(angles, choice, reach)
+                    yield self._rate(angles, choice)
 
     def _solve(self, angles: np.ndarray, goal: np.ndarray) -> np.ndarray | None:
         """The pose near the goal with a level paddle; None if the search finds none."""
@@ -218,7 +212,7 @@ class _Search:
         in_front = paddle[0] - self._base[0] > 0.3 * np.hypot(*(goal - self._base)[:2])
         return angles if in_front and paddle[2] > 0.03 else None
 
-    def _rate(self, angles: np.ndarray, choice: PaddleConfig, reach: float) -> PaddlePose | None:
+    def _rate(self, angles: np.ndarray, choice: PaddleConfig) -> PaddlePose | None:
         """The pose with its score; None if the arm is in the way of the ball or in the floor."""
         paddle, _ = self._forward(angles)
         if not self._is_clear(paddle):
@@ -238,16 +232,9 @@ class _Search:
         # The distance to the nearest joint limit as a share of half a radian.
         margin = float(np.clip(np.min(np.minimum(angles - low, high - angles)) / 0.5, 0.0, 1.0))
         strong = min(1.0, max(acceleration, 0.0) / _AMPLE_ACCELERATION)
+        score, inertia = smallest * margin * strong, np.diag(mass)
         return PaddlePose(
-            tuple(angles.tolist()),
-            tuple(paddle.tolist()),
-            choice,
-            smallest,
-            acceleration,
-            tuple(np.diag(mass).tolist()),
-            tuple(holding.tolist()),
-            reach,
-            score=smallest * margin * strong,
+            angles, paddle, choice, smallest, acceleration, inertia, holding, self._reach, score
         )
 
     def _is_clear(self, paddle: np.ndarray) -> bool:

@@ -39,10 +39,8 @@ class Rewards(task.StrictModel):
 
 
 class Observation(task.ObservationConfig):
-    """What a robot with a camera measures, and the point."""
+    """The world's quantities, and the point."""
 
-    ball_quaternion: task.History = 0
-    ball_angular_velocity: task.History = 0
     point_x: Annotated[task.History, task.Quantity(1, "m", "command")] = 1
     """Point on the paddle, from its centre along the world's x."""
     point_y: Annotated[task.History, task.Quantity(1, "m", "command")] = 1
@@ -61,8 +59,8 @@ class Config(task.WorldConfig):
     """The noise of a reset."""
     friction: Friction | None = 0.3
     """Coefficient of sliding friction between ball and paddle; null for the MJCF's."""
-    observation: Observation = Observation()
-    """The quantities that the policy sees."""
+    observation: Observation = Observation(ball_quaternion=0, ball_angular_velocity=0)
+    """The quantities that the policy sees: what a robot with a camera measures, and the point."""
     randomization: task.RandomizationConfig = task.RandomizationConfig(
         push_speed=(0.1, 0.1), push_interval=(2.0, 2.0)
     )

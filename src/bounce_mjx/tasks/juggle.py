@@ -36,10 +36,8 @@ class Rewards(task.StrictModel):
 
 
 class Observation(task.ObservationConfig):
-    """The world's quantities without the balls' rotation; the height; and the next ball."""
+    """The world's quantities, the height, and the next ball."""
 
-    ball_quaternion: task.History = 0
-    ball_angular_velocity: task.History = 0
     target_height: Annotated[task.History, task.Quantity(1, "m", "command")] = 1
     next_ball: Annotated[task.History, task.Quantity(9)] = 1
     """Of the ball that lands next: its landing from the paddle and from the column (m), its
@@ -62,7 +60,7 @@ class Config(task.WorldConfig):
     """The episode ends when a ball is this far from the top of its column, m; or when two touch."""
     action: task.ActionConfig = task.ActionConfig(base="target")
     """What an action adds to."""
-    observation: Observation = Observation()
+    observation: Observation = Observation(ball_quaternion=0, ball_angular_velocity=0)
     """The quantities that the policy sees."""
     reward: Rewards = Rewards()
     """The reward terms."""

@@ -43,10 +43,8 @@ class Rewards(task.StrictModel):
 
 
 class Observation(task.ObservationConfig):
-    """The world's quantities without the ball's rotation; the point; and where to aim."""
+    """The world's quantities, the point, and where to aim."""
 
-    ball_quaternion: task.History = 0
-    ball_angular_velocity: task.History = 0
     target_x: Annotated[task.History, task.Quantity(1, "m", "command")] = 1
     target_y: Annotated[task.History, task.Quantity(1, "m", "command")] = 1
     target_height: Annotated[task.History, task.Quantity(1, "m", "command")] = 1
@@ -69,7 +67,7 @@ class Config(task.WorldConfig):
     max_distance: Length = 0.7
     """The episode ends when the ball is this far from the point, or lower than home, m."""
     action: task.ActionConfig = task.ActionConfig(base="target")
-    observation: Observation = Observation()
+    observation: Observation = Observation(ball_quaternion=0, ball_angular_velocity=0)
     """The quantities that the policy sees."""
     reward: Rewards = Rewards()
     """The reward terms."""

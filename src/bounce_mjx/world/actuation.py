@@ -11,7 +11,7 @@ import numpy as np
 
 from bounce_mjx.physics import Control
 from bounce_mjx.physics.control import Moving, servo_target
-from bounce_mjx.robot.model import find_addresses, joint_ranges
+from bounce_mjx.robot.model import find_addresses, joint_ranges, scatter
 from bounce_mjx.robot.setpoints import Setpoint, joint_limits, next_setpoint
 from bounce_mjx.world import noise
 from bounce_mjx.world.config import WorldConfig
@@ -41,7 +41,7 @@ class Actuators:
         self._config, self._nu, self._addresses = config, mj_model.nu, find_addresses(mj_model)
         self._range = joint_ranges(mj_model)
         self._limits = joint_limits(config.robot.limits, *self._range)
-        self._gears = mj_model.actuator_gear[list(self._addresses.actuators), 0].tolist()
+        self._gears = mj_model.actuator_gear[list(self._addresses.actuators), 0]
 
     def first(self, qpos: jax.Array) -> Actuation:
         """Memory at a reset, with the servos at rest at qpos [nq]."""
@@ -130,12 +130,8 @@ class Actuators:
 
     def _ctrl(self, values: jax.Array) -> jax.Array:
         """Inputs of the actuators [nu] from a value of each joint's angle [n]."""
-        # XLA fuses this with the physics; it would not fuse an indexed update.
-        ctrl = [jnp.zeros_like(values[0])] * self._nu
-        for i, actuator in enumerate(self._addresses.actuators):
-            gear = self._gears[i]
-            ctrl[actuator] = values[i] if gear == 1.0 else gear * values[i]
-        return jnp.stack(ctrl)
+        gears = jnp.asarray(self._gears, values.dtype)
+        return scatter(np.zeros(self._nu), self._addresses.actuators, gears * values)
 
     def _push(self, world: World, clock: Clock) -> jax.Array:
         """Velocity [3] that a push adds to the ball at the start of a control step, m/s; 0 at most

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.physics import Engine, PhysicsParameters
-from bounce_mjx.robot.model import find_addresses
+from bounce_mjx.robot.model import find_addresses, scatter
 from bounce_mjx.world.observation import Kinematics
 from bounce_mjx.world.randomization import World, impact_damping
 
@@ -34,11 +34,9 @@ def next_impact(
       before: the speed until then; 0 at a reset.
     """
     addresses = find_addresses(mj_model)
-    moving = [jnp.zeros_like(qpos[0])] * mj_model.nq
-    for i, address in enumerate(addresses.arm_qpos):
-        moving[address] = truth.joint_velocities[i]
+    moving = scatter(np.zeros(mj_model.nq), addresses.arm_qpos, truth.joint_velocities)
     paddle_position = lambda qpos: engine.paddle_position(parameters, qpos)  # noqa: E731
-    _, paddle_velocity = jax.jvp(paddle_position, (qpos,), (jnp.stack(moving),))
+    _, paddle_velocity = jax.jvp(paddle_position, (qpos,), (moving,))
     geom, radius = addresses.balls[0].geom, parameters.ball_radius
     radius = mj_model.geom_size[geom, 0] if radius is None else radius
     radius = (parameters.entries or {}).get(f"geom_size[{geom}, 0]", radius)

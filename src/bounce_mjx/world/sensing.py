@@ -10,7 +10,7 @@ import mujoco
 
 from bounce_mjx.physics import Engine
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
-from bounce_mjx.robot.model import find_addresses
+from bounce_mjx.robot.model import find_addresses, scatter
 from bounce_mjx.robot.setpoints import Setpoint
 from bounce_mjx.world import noise
 from bounce_mjx.world.actuation import entry_at
@@ -147,11 +147,8 @@ class Sensors:
             lead = now.setpoint.position - (angles - world.get("encoder_bias", 0.0))
             measured["servo_lead"] = lead
         if self._misjudges_paddle:
-            qpos = [jnp.asarray(coordinate, angles.dtype) for coordinate in self._qpos]
-            for i, address in enumerate(self._arm):
-                qpos[address] = angles[i]
-            position = self._engine.paddle_position(MODEL_PARAMETERS, jnp.stack(qpos))
-            measured["paddle_position"] = position
+            qpos = scatter(self._qpos, self._arm, angles)
+            measured["paddle_position"] = self._engine.paddle_position(MODEL_PARAMETERS, qpos)
         return picture, measured
 
 
