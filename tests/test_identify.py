@@ -118,7 +118,7 @@ def test_intervals_know_that_residuals_of_a_window_are_correlated() -> None:
     problem = linear_problem(flight_log(20.0), random)
     layout, w = problem.layout, problem.windows
     truth, weights = layout.mean, problem.weights(pictures=0.0)
-    free, place = layout.free(["arm"]), layout.slices["delay"].start
+    place = layout.slices["delay"].start
     late = truth + 0.02 * (np.arange(len(truth)) == place)
     clean, moved = (w.split(problem.predict(x, w.starts))[0] for x in (truth, late))
     along = moved - clean
@@ -127,7 +127,7 @@ def test_intervals_know_that_residuals_of_a_window_are_correlated() -> None:
         common = random.normal(size=(len(w.first), 1, 1))
         noisy = clean + 1e-3 * random.normal(size=clean.shape) + common * along
         one = problem._replace(windows=w._replace(angles=noisy))
-        fit = minimise(one, Fit(truth, w.starts), free, weights, 4)
+        fit = minimise(one, Fit(truth, w.starts), ["arm"], weights, 4)
         information, covariance = certainty(one, fit)
         estimates.append(fit.vector[place])
         deviations.append(np.sqrt(covariance[place, place]))

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.baselines.mirror import upper_face
-from bounce_mjx.deploy.graph import EXTRA, onnx_graph
+from bounce_mjx.deploy.graph import onnx_graph
 from bounce_mjx.deploy.metadata import (
     FORMAT,
     IS_FIRST,
@@ -65,7 +65,7 @@ def export_onnx(checkpoint: Checkpoint) -> bytes:
       UserError: the checkpoint is damaged, its arm or its task cannot be exported, or onnx is not
         installed.
     """
-    with needed("onnx", EXTRA):
+    with needed("onnx", "bounce_mjx[export]"):
         import onnx
     config = load_run_config(checkpoint.run)
     checkpoint, policy, _ = read_actor(checkpoint, config)

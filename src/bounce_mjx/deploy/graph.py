@@ -12,10 +12,7 @@ import jax
 import numpy as np
 from jax.extend.core import Jaxpr, JaxprEqn, Literal, Var
 
-from bounce_mjx.errors import UserError, needed
-
-EXTRA = "bounce_mjx[export]"
-"""What pip installs for an export."""
+from bounce_mjx.errors import UserError
 
 Value = str | np.ndarray
 """A value of the graph by its name, or a constant."""
@@ -80,7 +77,7 @@ def onnx_graph(
       owner: whose function it is, for the error.
 
     Raises:
-      UserError: the function uses an operation without a counterpart, or onnx is not installed.
+      UserError: the function uses an operation without a counterpart.
     """
     graph = _Graph(owner)
     closed, outputs = jax.make_jaxpr(function, return_shape=True)(inputs)
@@ -146,8 +143,8 @@ def _evaluate(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray
 
 class _Graph:
     def __init__(self, owner: str):
-        with needed("onnx", EXTRA):
-            from onnx import helper, numpy_helper
+        from onnx import helper, numpy_helper
+
         self.helper, self._from_array, self._owner = helper, numpy_helper.from_array, owner
         self.nodes: list[Any] = []
         self.constants: dict[tuple, Any] = {}

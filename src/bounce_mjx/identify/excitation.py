@@ -52,8 +52,9 @@ def excite(
 ) -> Excitation:
     """Plans an excitation that starts and ends at `config.default_joint_angles`.
 
-    The arm first lifts the paddle, for room above the floor. The joints' amplitudes are halved
-    until no pose has a contact. Of a robot with `robot.limits`, all targets keep to them.
+    The arm first lifts the paddle, for room above the floor. The amplitude of the joint that is
+    farthest out is halved until no pose has a contact. Of a robot with `robot.limits`, all targets
+    keep to them.
 
     Args:
       max_velocity: largest speed of a target, of each joint or of all, rad/s.
@@ -107,27 +108,15 @@ def excite(
         if (hit := next(poses, None)) is None:
             return Excitation(names, times, targets, np.max(np.abs(targets - home), axis=0))
         step, pair = hit
-        moving = _find_movers(contacts, pair, targets[step], rests[step])
-        amplitudes = np.where(moving, 0.5 * amplitudes, amplitudes)
-        if not np.any(moving) or np.min(amplitudes) < _SMALLEST_AMPLITUDE:
-            mover = names[int(np.argmax(moving))] if np.any(moving) else "the lifted arm"
+        joint = int(np.argmax(np.abs(targets[step] - rests[step])))
+        amplitudes[joint] *= 0.5
+        is_at_rest = pair in contacts.touching(rests[step])
+        if is_at_rest or amplitudes[joint] < _SMALLEST_AMPLITUDE:
+            mover = "the lifted arm" if is_at_rest else names[joint]
             raise UserError(
                 f"{mover} cannot move around the start pose without {_contact(contacts, pair)}; "
                 "change default_joint_angles or --table-height"
             )
-
-
-def _find_movers(
-    contacts: ContactChecker, pair: tuple[int, int], pose: np.ndarray, rest: np.ndarray
-) -> np.ndarray:
-    """Which joints [n] bring a pair of parts together in a pose [n]: those without whose motion
-    from the rest [n] it is apart, or all if none is alone."""
-    moved = np.abs(pose - rest) > 1e-3
-    if pair in contacts.touching(rest):
-        return np.zeros_like(moved)
-    trials = np.where(np.eye(len(pose), dtype=bool), rest, pose)
-    alone = moved & [pair not in contacts.touching(trial) for trial in trials]
-    return alone if np.any(alone) else moved
 
 
 def _contact(contacts: ContactChecker, pair: tuple[int, int]) -> str:

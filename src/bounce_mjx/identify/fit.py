@@ -107,17 +107,21 @@ class Problem(NamedTuple):
         white = balls - common * (share * along)[..., None, :]
         return np.concatenate([x.reshape(*scaled.shape[:-1], -1) for x in (angles, white)], axis=-1)
 
-    def weights(self, pictures: np.ndarray | float = 1.0) -> np.ndarray:
-        """Weights [S, A n + 3 B]; those of the pictures [S, B] are multiplied by `pictures`."""
+    def weights(
+        self, pictures: np.ndarray | float = 1.0, windows: np.ndarray | float = 1.0
+    ) -> np.ndarray:
+        """Weights [S, A n + 3 B]; those of the pictures [S, B] are multiplied by `pictures`, and
+        those of the windows [S, 1] by `windows`."""
         w = self.windows
         angles = np.repeat(w.angle_weights, w.angles.shape[2], axis=1)
-        return np.concatenate([angles, np.repeat(w.picture_weights * pictures, 3, axis=1)], axis=1)
+        balls = np.repeat(w.picture_weights * pictures, 3, axis=1)
+        return np.concatenate([angles, balls], axis=1) * windows
 
 
 def minimise(
     problem: Problem,
     fit: Fit,
-    free: np.ndarray,
+    stages: Sequence[str],
     weights: np.ndarray,
     iterations: int,
     free_states: np.ndarray | None = None,
@@ -126,13 +130,13 @@ def minimise(
     fraction of what a change of the unknowns by their deviation does.
 
     Args:
-      free: which unknowns [P] may change.
+      stages: those whose unknowns may change; of none, the starts alone.
       weights: of the measurements [S, M].
       free_states: which entries [D] of the starts may change; all by default.
     """
     layout, guess = problem.layout, problem.windows.starts
     deviations, _, searched = _scale_starts(problem.windows)
-    unknowns = np.flatnonzero(free)
+    unknowns = np.flatnonzero(layout.free(stages))
     entries = np.flatnonzero(searched if free_states is None else searched & free_states)
     scale, reach = layout.deviation[unknowns], deviations[entries]
     # The start of a window that does not count stays as it is.

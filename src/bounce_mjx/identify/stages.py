@@ -85,7 +85,9 @@ def sensor_noise(log: Log) -> Noise:
     quarter of the log."""
     weights = np.array([1.0, -3.0, 3.0, -1.0]) / np.sqrt(20.0)
     third = np.stack([np.convolve(a, weights, "valid") for a in log.joint_angles.T], axis=1)
-    angles = _rms_at_rest(third)
+    parts = np.array_split(third**2, max(len(third) // 200, 1))
+    means = np.sort([np.mean(part, axis=0) for part in parts], axis=0)
+    angles = np.sqrt(means[len(means) // 4])
     balls = np.full(3, 0.002)
     if len(log.ball_positions) > 200:
         # Unequal intervals, as pictures are lost: a parabola through five neighbours.
@@ -117,14 +119,6 @@ def _straighten(times: np.ndarray) -> np.ndarray:
     return np.concatenate(stretches)
 
 
-def _rms_at_rest(values: np.ndarray) -> np.ndarray:
-    """Root mean square [k] in the quietest quarter of stretches of 200 rows."""
-    count = max(len(values) // 200, 1)
-    parts = np.array_split(values**2, count)
-    means = np.sort([np.mean(part, axis=0) for part in parts], axis=0)
-    return np.sqrt(means[count // 4])
-
-
 def identify(
     config: WorldConfig,
     log: Log,
@@ -154,15 +148,15 @@ def identify(
     simulate = make_simulator(config, layout, log, windows)
     problem = Problem(simulate, windows, layout, sensor_noise(log), progress)
     progress("arm")
-    fit = _search(problem, _guess_arm(problem), ["arm"], 10, 0.0, windows.arm_state)
-    stages, states, pictures = ["arm"], windows.arm_state, 1.0
+    stages, states, pictures, seen = ["arm"], windows.arm_state, 1.0, _training(problem)
+    fit = minimise(problem, _guess_arm(problem), stages, problem.weights(0.0, seen), 10, states)
     if with_ball:
         fit, pictures = _fit_ball(problem, fit)
         stages, states = ["arm", "flight", "bounce"], None
     progress("all")
-    fit = _search(problem, fit, stages, 3, pictures, states)
-    unseen = _fit_held_out(problem, fit, pictures, states)
-    fit = _search(problem, unseen, stages, 3, pictures, states, np.ones(1))
+    fit = minimise(problem, fit, stages, problem.weights(pictures, seen), 3, states)
+    unseen = minimise(problem, fit, [], problem.weights(pictures, 1.0 - seen), 3, states)
+    fit = minimise(problem, unseen, stages, problem.weights(pictures), 3, states)
     nominal = {name: TERMS[name].nominal for name in layout.terms if name in TERMS}
     own = layout.vector({name: value for name, value in nominal.items() if value is not None})
     before = fit._replace(predicted=problem.predict(own, fit.starts))
@@ -183,33 +177,6 @@ def _training(problem: Problem) -> np.ndarray:
     """1 for each window of the search [S, 1], 0 for those held out."""
     index = np.arange(len(problem.windows.first))
     return np.where(index % _HELD_OUT == _HELD_OUT - 1, 0.0, 1.0)[:, None]
-
-
-def _search(
-    problem: Problem,
-    fit: Fit,
-    stages: Sequence[str],
-    iterations: int,
-    pictures: np.ndarray | float = 1.0,
-    states: np.ndarray | None = None,
-    mask: np.ndarray | None = None,
-) -> Fit:
-    """The fit after a search over the unknowns of some stages.
-
-    Args:
-      pictures: weights of the pictures [S, B].
-      states: which entries [D] of the starts may change; all by default.
-      mask: weights of the windows [S, 1]; by default, those held out have none.
-    """
-    weights = problem.weights(pictures) * (_training(problem) if mask is None else mask)
-    return minimise(problem, fit, problem.layout.free(stages), weights, iterations, states)
-
-
-def _fit_held_out(
-    problem: Problem, fit: Fit, pictures: np.ndarray | float, states: np.ndarray | None
-) -> Fit:
-    """The fit after a search over nothing but the starts of the windows held out."""
-    return _search(problem, fit, [], 3, pictures, states, 1.0 - _training(problem))
 
 
 def _check_frame(windows: Windows, config: WorldConfig, source: str) -> None:
@@ -244,24 +211,24 @@ def _check_frame(windows: Windows, config: WorldConfig, source: str) -> None:
 
 def _fit_ball(problem: Problem, fit: Fit) -> tuple[Fit, np.ndarray]:
     """The ball's flights, then its bounces; and the weights of the pictures [S, B]."""
-    windows, states = problem.windows, ~problem.windows.arm_state
+    windows, states, seen = problem.windows, ~problem.windows.arm_state, _training(problem)
     problem.progress("flight")
     flying = windows.picture_times < windows.bounces[:, None] - BEFORE_BOUNCE
-    fit = _search(problem, fit, ["flight"], 4, flying * 1.0, states)
+    fit = minimise(problem, fit, ["flight"], problem.weights(flying, seen), 4, states)
     problem.progress("bounce")
-    stages, few = ["flight", "bounce"], _sample(problem, windows.has_ball)
+    stages, few = ["flight", "bounce"], problem.weights(1.0, _sample(problem, windows.has_ball))
     # A ball that slips and one that sticks are two valleys, and each latency may be one.
     tried = [
         _shift_flights(problem, fit, latency, friction)
         for latency, friction in itertools.product(_BALL_LATENCIES, _FRICTIONS)
     ]
     for kept, iterations in ((4, 1), (1, 2)):
-        found = [_search(problem, x, stages, iterations, 1.0, states, few) for x in tried]
+        found = [minimise(problem, x, stages, few, iterations, states) for x in tried]
         tried = sorted(found, key=lambda fit: fit.cost)[:kept]
-    fit = _search(problem, tried[0], stages, 5, 1.0, states)
-    fit = _fit_held_out(problem, fit, 1.0, states)
+    fit = minimise(problem, tried[0], stages, problem.weights(1.0, seen), 5, states)
+    fit = minimise(problem, fit, [], problem.weights(1.0, 1.0 - seen), 3, states)
     pictures = picture_weights(problem, problem.predict(fit.vector, fit.starts))
-    return _search(problem, fit, stages, 6, pictures, states), pictures
+    return minimise(problem, fit, stages, problem.weights(pictures, seen), 6, states), pictures
 
 
 def _guess_arm(problem: Problem) -> Fit:
@@ -275,7 +242,7 @@ def _guess_arm(problem: Problem) -> Fit:
     )
     starts = np.repeat(problem.windows.starts[None], len(vectors), axis=0)
     counts = np.any(problem.windows.angle_weights > 0.0, axis=1)
-    weights = problem.weights(pictures=0.0) * _sample(problem, counts)
+    weights = problem.weights(0.0, _sample(problem, counts))
     used = np.tile(np.any(weights > 0.0, axis=1), (len(vectors), 1))
     white = problem.whiten(problem.simulate(vectors, starts, used), weights)
     best = int(np.nanargmin(np.sum(white**2, axis=(1, 2))))
