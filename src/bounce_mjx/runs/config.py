@@ -81,8 +81,7 @@ class TrainConfig(StrictModel):
     """End once an evaluation meets all results with a margin. Then 64 other episodes should meet
     them too. It ends at the latest after 1.5 times the steps of the first one that meets all."""
     warm_start: Path | None = None
-    """The run, or the policy of the package, with whose networks, environment and hidden layers the
-    training starts."""
+    """Run, or policy of the package, from whose networks and environment the training starts."""
     log_dir: Path
     """Folder in which the run creates its own, named by the time (UTC)."""
 

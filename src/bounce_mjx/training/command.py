@@ -38,15 +38,15 @@ _SHORT_HELP = (
 class Start(StrictModel):
     """What a training starts from: flags of the command, and arguments of `train`."""
 
-    config: Annotated[tuple[Path, ...], Flag(metavar="PATH", is_repeated=True)] = ()
-    """Preset: the name of a YAML file in configs/, such as cpu or finetune; a task's own preset of
-    that name, such as configs/track/cpu.yaml, has priority. The default is default on an
-    accelerator, and cpu on a CPU. A YAML file of yours lies on that default, or on the preset that
+    config: Annotated[tuple[Path, ...], Flag(metavar="NAME|FILE", is_repeated=True)] = ()
+    """Preset, such as cpu or finetune (a YAML file in configs/), or a YAML file of yours. A task's
+    own preset of that name, such as configs/track/cpu.yaml, has priority. The default is default on
+    an accelerator, and cpu on a CPU. A file of yours lies on that default, or on the preset that
     its key base names. Given again, each file lies on those before it."""
-    robot: Path | None = None
+    robot: Annotated[Path | None, Flag(metavar="NAME|FILE")] = None
     """Config of a robot on top of the preset: the file that bounce-mjx adopt wrote, or the name of
     one in configs/robots/ (ur5e, panda or iiwa)."""
-    world: Path | None = None
+    world: Annotated[Path | None, Flag(metavar="NAME|FILE")] = None
     """Named world in place of the preset's: a YAML file, or the name of one in configs/worlds/
     (ur5e_rtde, panda_fci, iiwa_fri or fast_servo). It may have a robot."""
     resume: Path | None = None

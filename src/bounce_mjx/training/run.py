@@ -1,11 +1,12 @@
 """`train`, and the run that it leaves."""
 
+import contextlib
 import dataclasses
 import functools
 import os
 import shlex
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -140,9 +141,9 @@ def train(
         start = validate(Start, given, "train")
         base = start.base()
         config, resume = start.settle(changed(base, settings), base), start.run
-    _start_jax(config)
-    console = stdout(quiet=quiet or not hosts.is_leader())
-    seeds = job.train(config, console, resume=resume, callbacks=callbacks)
+    with _jax_set_up(config):
+        console = stdout(quiet=quiet or not hosts.is_leader())
+        seeds = job.train(config, console, resume=resume, callbacks=callbacks)
     best = print_results(seeds, console)
     if report and hosts.is_leader():
         leave_report(best, console)
@@ -150,15 +151,18 @@ def train(
     return Run(run, config.task)
 
 
-def _start_jax(config: TrainConfig) -> None:
-    """Starts JAX for this environment, and leaves the process's environment as it was."""
+@contextlib.contextmanager
+def _jax_set_up(config: TrainConfig) -> Iterator[None]:
+    """JAX's settings for this environment. The process's `XLA_FLAGS`, which are a part of a cached
+    program's name, are as before at the end."""
     flags = os.environ.get("XLA_FLAGS")
     set_up_jax(config.env)
-    jax.devices()
-    if flags is None:
+    try:
+        yield
+    finally:
         os.environ.pop("XLA_FLAGS", None)
-    else:
-        os.environ["XLA_FLAGS"] = flags
+        if flags is not None:
+            os.environ["XLA_FLAGS"] = flags
 
 
 def print_results(seeds: Sequence[job.SeedRun], console: Console) -> job.SeedRun:

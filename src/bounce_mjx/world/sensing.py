@@ -41,9 +41,9 @@ class Picture(NamedTuple):
     velocity: jax.Array
     """Measured velocity or difference quotient of the last two pictures [3], m/s."""
     age: jax.Array
-    """Time since the picture was entry_at [], s."""
+    """Time since the picture was taken [], s."""
     number: jax.Array
-    """Number of the last picture due since the reset []; negative for those entry_at before it."""
+    """Number of the last picture due since the reset []; negative for those taken before it."""
 
 
 class Sensing(NamedTuple):
