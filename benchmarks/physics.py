@@ -56,26 +56,26 @@ def jax_program(
     env = Env(task_config(task)(physics=engine))
     batch_last = {"in_axes": -1, "out_axes": -1}
 
-    def control_step(physics, key):
+    def control_step(now, key):
         actions = jax.random.uniform(key, (env.action_size, batch), minval=-1.0, maxval=1.0)
-        targets = jax.vmap(env.servo_targets, **batch_last)(physics, actions)
+        control, _ = jax.vmap(env.control, **batch_last)(now, actions)
         advance = jax.vmap(
             lambda state, ctrl: env.engine.step(
                 PhysicsParameters(), state, Control(ctrl), env.config.num_substeps
             ),
             **batch_last,
         )
-        return advance(physics, targets), None
+        return now._replace(physics=advance(now.physics, control.ctrl)), None
 
-    def run(physics, key):
-        return jax.lax.scan(control_step, physics, jax.random.split(key, control_steps))[0]
+    def run(now, key):
+        return jax.lax.scan(control_step, now, jax.random.split(key, control_steps))[0]
 
     keys = jax.random.split(jax.random.PRNGKey(0), batch)
-    physics = jax.jit(jax.vmap(env.reset, out_axes=-1))(keys).pipeline_state.physics
+    now = jax.jit(jax.vmap(env.reset, out_axes=-1))(keys).pipeline_state
     started = time.perf_counter()
-    program = jax.jit(run).lower(physics, keys[0]).compile()
+    program = jax.jit(run).lower(now, keys[0]).compile()
     compile_seconds = time.perf_counter() - started
-    return lambda: jax.block_until_ready(program(physics, keys[0])), compile_seconds
+    return lambda: jax.block_until_ready(program(now, keys[0])), compile_seconds
 
 
 def c_program(task: str, batch: int, control_steps: int) -> tuple[Callable[[], None], float]:

@@ -54,11 +54,11 @@ def recorder(name: str, episodes: int, latencies: list[float] | None) -> Any:
         if now.sensing is not None:
             angles, velocities = sensing.measured_joints(now.world, now.clock.counter, truth)
             ball, age = now.sensing.picture.position, now.sensing.picture.age
-        _, actuation = env.control(now, action)
+        control, actuation = env.control(now, action)
         if actuation.setpoint is not None:
             command = actuation.setpoint.position
         else:
-            command = env.servo_targets(now.physics, action)[: env.action_size]
+            command = control.ctrl[: env.action_size]
         return {
             "joint_angles": angles,
             "joint_velocities": velocities,

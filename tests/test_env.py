@@ -193,15 +193,14 @@ def test_noise_free_reset_has_the_paddle_at_home():
 
 
 def test_servo_target_is_clipped_to_the_joint_range(env, reset, model):
-    physics = reset(jax.random.key(0)).pipeline_state.physics
+    state = reset(jax.random.key(0)).pipeline_state
     ranges = np.array([model.joint(name).range for name in JOINTS])
     for side, sign in ((0, -1.0), (1, 1.0)):
-        at_limit = physics._replace(
-            qpos=physics.qpos.at[:6].set(jnp.array(ranges[:, side] - sign * 0.005))
-        )
-        outwards = env.servo_targets(at_limit, jnp.full(6, sign))
+        qpos = state.physics.qpos.at[:6].set(jnp.array(ranges[:, side] - sign * 0.005))
+        at_limit = state._replace(physics=state.physics._replace(qpos=qpos))
+        outwards = env.control(at_limit, jnp.full(6, sign))[0].ctrl
         np.testing.assert_allclose(outwards, ranges[:, side], rtol=1e-6)
-        inwards = env.servo_targets(at_limit, jnp.full(6, -sign))
+        inwards = env.control(at_limit, jnp.full(6, -sign))[0].ctrl
         np.testing.assert_allclose(inwards, ranges[:, side] - sign * 0.025, rtol=0, atol=2e-6)
 
 

@@ -50,9 +50,7 @@ def test_worlds_with_a_sloped_restitution_are_mujocos(float64):
     actions = np.random.default_rng(0).uniform(-0.5, 0.5, (STEPS, WORLDS, 6))
     step, state, controls, physics = jax.jit(jax.vmap(env.step)), start, [], []
     for action in actions:
-        controls.append(
-            np.asarray(jax.vmap(env.servo_targets)(state.pipeline_state.physics, action))
-        )
+        controls.append(np.asarray(jax.vmap(env.control)(state.pipeline_state, action)[0].ctrl))
         state = step(state, action)
         physics.append(state.pipeline_state.physics)
     pipeline = start.pipeline_state

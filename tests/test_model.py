@@ -8,6 +8,7 @@ import pytest
 
 from against_c import XML
 from bounce_mjx import BounceBall, EnvConfig
+from bounce_mjx.env.env import EnvState
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics import PhysicsState
 from bounce_mjx.robot.model import load_model
@@ -80,7 +81,8 @@ def test_an_edited_model_is_an_error():
 def targets(env: BounceBall, angle: float, action: float) -> np.ndarray:
     qpos = jnp.full(env.mj_model.nq, angle)
     physics = PhysicsState(qpos, jnp.zeros(env.mj_model.nv))
-    return np.asarray(env.servo_targets(physics, jnp.full(6, action)))
+    state = EnvState(physics, {}, jnp.zeros(6))
+    return np.asarray(env.control(state, jnp.full(6, action))[0].ctrl)
 
 
 def test_with_a_gear_the_target_is_the_actuators_length(tmp_path):

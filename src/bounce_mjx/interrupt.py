@@ -37,12 +37,7 @@ class StopRequest:
     """While entered in the main thread, the first signal only sets `requested`; the same signal
     again goes to the handler before, such as a notebook's, or ends the process at once."""
 
-    def __init__(self, *signals: signal.Signals):
-        """
-        Args:
-          signals: SIGINT, SIGTERM and SIGHUP by default.
-        """
-        self._signals = signals or _SIGNALS
+    def __init__(self) -> None:
         self._requested_at: float | None = None
         self._previous = {}
 
@@ -56,7 +51,7 @@ class StopRequest:
         if threading.current_thread() is threading.main_thread():
             self._previous = {
                 number: signal.signal(number, self._handle)
-                for number in self._signals
+                for number in _SIGNALS
                 if signal.getsignal(number) is not signal.SIG_IGN
             }
         return self

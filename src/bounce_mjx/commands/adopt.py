@@ -100,7 +100,8 @@ def describe(adoption: "Adoption") -> list[str]:
     pose, arm = adoption.pose, adoption.arm
     x, y, z = (round(coordinate, 6) + 0.0 for coordinate in pose.paddle)
     strength = f"{pose.acceleration:.0f} m/s^2 upward in addition to holding the arm"
-    kind = "kept" if adoption.are_kept else "made from the reflected inertia"
+    is_kept = adoption.config.servo_stiffness is None
+    kind = "kept" if is_kept else "made from the reflected inertia"
     lines = [
         f"paddle: level at x {x:.3f}, y {y:.3f}, z {z:.3f} m; the reach is {pose.reach:.2f} m",
         f"manipulability: {pose.manipulability:.3f} (smallest singular value, 0.25 m per radian)",

@@ -114,17 +114,13 @@ def types_in(kind: Any) -> Iterator[Any]:
         yield from types_in(inner)
 
 
-def _is_group(kind: Any) -> bool:
-    """Whether a type is a group of settings."""
-    return isinstance(kind, type) and issubclass(kind, pydantic.BaseModel)
-
-
 def fields_in(group: type[pydantic.BaseModel], prefix: str = "") -> dict[str, FieldInfo]:
     """The settings of a group and of the groups in it, by dotted name."""
     fields = {}
     for name, field in group.model_fields.items():
         inner, key = field.annotation, prefix + name
-        fields |= fields_in(inner, f"{key}.") if _is_group(inner) else {key: field}
+        is_group = isinstance(inner, type) and issubclass(inner, pydantic.BaseModel)
+        fields |= fields_in(inner, f"{key}.") if is_group else {key: field}
     return fields
 
 

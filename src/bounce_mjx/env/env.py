@@ -28,7 +28,6 @@ from bounce_mjx.robot.model import (
     joint_ranges,
     load_model,
 )
-from bounce_mjx.robot.setpoints import Setpoint
 from bounce_mjx.task.rewards import check_names
 from bounce_mjx.task.task import Start, Step, Task, TaskStep
 from bounce_mjx.world import noise
@@ -436,18 +435,6 @@ class Env:
     def _sensed(self, state: EnvState, truth: Kinematics) -> Sensed:
         known = _entries(state.command) | {"action": state.last_action}
         return Sensed(truth, state.world, state.clock, known, state.actuation.setpoint)
-
-    def servo_targets(
-        self, physics: PhysicsState, action: jax.Array, last: Setpoint | None = None
-    ) -> jax.Array:
-        """Servo targets ctrl [nu] of a clipped action [n]: the joint angles plus the scaled action
-        (rad), clipped to the range of each joint that has one, times the gear.
-
-        Args:
-          last: the commands of the last step, to which the action adds instead, within `max_lead`
-            of the joint angles.
-        """
-        return self._actuators.servo_targets(physics.qpos, action, last)
 
     def kinematics(self, state: EnvState) -> Kinematics:
         """True positions and velocities of one environment's state, read from its physics."""

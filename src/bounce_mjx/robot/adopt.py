@@ -44,8 +44,6 @@ class Adoption(NamedTuple):
     arm: Arm
     servos: tuple[ServoSettings, ...]
     """The servo of each acting joint."""
-    are_kept: bool
-    """Whether the servos are the MJCF's own."""
 
 
 def adopt(mjcf: Path, config: RobotConfig, control_dt: float, is_mount_given: bool) -> Adoption:
@@ -72,21 +70,21 @@ def adopt(mjcf: Path, config: RobotConfig, control_dt: float, is_mount_given: bo
         check_as_alone(arm, model)
         choices = [config.paddle] if is_mount_given else mounts(config.paddle)
         pose = find_pose(model, [servo.force_limit for servo in arm.servos], choices)
-        servos, scale, are_kept = _servos(model, arm, pose, control_dt)
+        servos, scale = _servos(model, arm, pose, control_dt)
         update = {"paddle": pose.mount}
-        if not are_kept:
+        if servos is not arm.servos:
             columns = zip(ServoSettings._fields, zip(*servos, strict=True), strict=True)
             update |= {f"servo_{name}": column for name, column in columns}
         adopted = RobotConfig.model_validate(config.model_copy(update=update).model_dump())
-        return Adoption(adopted, scale, pose, build_arm(path, adopted), servos, are_kept)
+        return Adoption(adopted, scale, pose, build_arm(path, adopted), servos)
     except UserError as error:
         raise name_file(path, error) from error
 
 
 def _servos(
     model: mujoco.MjModel, arm: Arm, pose: PaddlePose, control_dt: float
-) -> tuple[tuple[ServoSettings, ...], float, bool]:
-    """The servos, the action scale, and whether the servos are the MJCF's own."""
+) -> tuple[tuple[ServoSettings, ...], float]:
+    """The servos, which are the MJCF's own if these suit, and the action scale."""
     addresses = find_addresses(model)
     joints = list(addresses.arm_joints)
     hinge = model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE
@@ -104,7 +102,7 @@ def _servos(
             and np.all(stiffness * scale >= _LEAST_HOLD * np.abs(pose.holding))
         )
         if suits:
-            return arm.servos, _four_digits(scale), True
+            return arm.servos, _four_digits(scale)
     # Critical damping at the natural frequency 1 / control_dt: within a control step a joint comes
     # to rest, and physics steps of a fifth of it are stable.
     frequency = 1.0 / control_dt
@@ -113,7 +111,7 @@ def _servos(
     stiffness = damping * speed / scale
     made = zip(stiffness, damping, limits, strict=True)
     servos = tuple(ServoSettings(_four_digits(k), _four_digits(d), limit) for k, d, limit in made)
-    return servos, _four_digits(scale), False
+    return servos, _four_digits(scale)
 
 
 def check_as_alone(arm: Arm, model: mujoco.MjModel) -> None:

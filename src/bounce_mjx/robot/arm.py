@@ -300,13 +300,11 @@ class _Builder:
         bodies, parts, drives = list(arm.bodies), list(arm.joints), list(arm.actuators)
         for i, body in enumerate(bodies[1:], start=1):
             body.explicitinertial = True
-            body.mass, body.inertia = model.body_mass[i], model.body_inertia[i]
-            body.ipos, body.iquat = model.body_ipos[i], model.body_iquat[i]
-            body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+            for field in BODY_FIELDS:
+                setattr(body, field.removeprefix("body_"), getattr(model, field)[i])
             body.fullinertia[0] = np.nan
             # A body that the scene fuses would be turned by its angles in the scene's units.
-            body.pos, body.quat = model.body_pos[i], model.body_quat[i]
-            body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+            body.alt.type = body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
             if body.frame is not None:
                 body.set_frame(body.parent.add_frame())
         arm.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE

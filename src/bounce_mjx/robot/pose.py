@@ -94,13 +94,9 @@ def find_pose(
     for suits, problem in (
         (
             lambda pose: True,
-            f"no reachable pose with a level paddle in front of the robot ({names} inside "
-            "their ranges); check the site, or the paddle's position and quaternion",
-        ),
-        (
-            lambda pose: pose is not None,
-            "no level pose in which the links stay above the floor and out of the ball's way; "
-            f"put the base of the joints {names} higher, or move the paddle",
+            f"no reachable pose with a level paddle in front of the robot, {names} inside their "
+            "ranges, and the links above the floor and out of the ball's way; check the site, the "
+            "paddle's position and quaternion, and the height of the base",
         ),
         (
             lambda pose: pose.manipulability >= _LEAST_MANIPULABILITY,
@@ -159,9 +155,9 @@ class _Search:
         mujoco.mj_jac(self._model, self._data, linear, angular, paddle, self._body)
         return np.vstack([linear, _LENGTH * angular])[:, self._dofs]
 
-    def level_poses(self, choice: PaddleConfig) -> Iterator[PaddlePose | None]:
-        """Poses with a level paddle in front of the robot, at many distances and heights; None for
-        one in the way of the ball or in the floor."""
+    def level_poses(self, choice: PaddleConfig) -> Iterator[PaddlePose]:
+        """Poses with a level paddle in front of the robot, at many distances and heights, in which
+        the arm is neither in the way of the ball nor in the floor."""
         # The paddle's body has the frame of the site.
         quaternion = np.array(choice.quaternion)
         self._model.geom_quat[self._at.paddle_geom] = quaternion / np.linalg.norm(quaternion)
@@ -173,7 +169,7 @@ class _Search:
             goal = np.array([self._base[0] + distance, self._base[1], height])
             for _ in range(_TRIES):
                 angles = self._solve(self._rng.uniform(*self._seeds), goal)
-                if angles is not None:
+                if angles is not None and self._is_clear(self._forward(angles)[0]):
                     yield self._rate(angles, choice)
 
     def _solve(self, angles: np.ndarray, goal: np.ndarray) -> np.ndarray | None:
@@ -212,11 +208,9 @@ class _Search:
         in_front = paddle[0] - self._base[0] > 0.3 * np.hypot(*(goal - self._base)[:2])
         return angles if in_front and paddle[2] > 0.03 else None
 
-    def _rate(self, angles: np.ndarray, choice: PaddleConfig) -> PaddlePose | None:
-        """The pose with its score; None if the arm is in the way of the ball or in the floor."""
+    def _rate(self, angles: np.ndarray, choice: PaddleConfig) -> PaddlePose:
+        """The pose with its score."""
         paddle, _ = self._forward(angles)
-        if not self._is_clear(paddle):
-            return None
         # A turn about the vertical does not matter.
         jacobian = self._jacobian(paddle)[:5]
         lifting = jacobian[2:]

@@ -12,7 +12,6 @@ import pydantic
 from pydantic_core import to_jsonable_python
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.files import new_file
 
 MANIFEST_FILE = "manifest.json"
 
@@ -66,6 +65,24 @@ def first_mistake(error: pydantic.ValidationError) -> str:
     """First validation error in stored data, on one line: its place and the expected type."""
     first = error.errors(include_url=False, include_input=False)[0]
     return f"{'.'.join(map(str, first['loc']))[:80]}: {first['msg']}".removeprefix(": ")
+
+
+@contextlib.contextmanager
+def new_file(path: Path) -> Iterator[Path]:
+    """Yields the name of a new file next to `path`, with its suffix, which replaces it at the end
+    of the block; after an exception, the new file is removed.
+
+    A link at `path` is replaced, too, and its target stays as it is.
+
+    Raises:
+      OSError: the file cannot replace the other.
+    """
+    new = path.with_name(f".unfinished-{os.urandom(8).hex()}{path.suffix}")
+    try:
+        yield new
+        new.replace(path)
+    finally:
+        new.unlink(missing_ok=True)
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:

@@ -97,10 +97,10 @@ class Balance(task.Task):
         return 0.7 * REACH * (2.0 * start.draws[2:] - 1.0)
 
     def step(self, centre: jax.Array, step: task.Step) -> task.TaskStep:
-        truth, error = step.truth, _error(step.truth, step.command)
+        truth = step.truth
         offset = truth.ball_position - truth.paddle_position
         values = {
-            "point": task.length(error),
+            "point": task.length(offset[:2] - _point(step.command)),
             "home": task.length(truth.paddle_position - jnp.array(self.focus())),
             "action_rate": jnp.mean(jnp.square(step.action - step.last_action)),
         }
@@ -156,7 +156,3 @@ class Balance(task.Task):
 
 def _point(command: task.Values) -> jax.Array:
     return jnp.stack([command["point_x"], command["point_y"]])
-
-
-def _error(truth: task.Kinematics, command: task.Values) -> jax.Array:
-    return truth.ball_position[:2] - truth.paddle_position[:2] - _point(command)

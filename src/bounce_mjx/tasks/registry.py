@@ -58,10 +58,8 @@ def find_task(name: str) -> type[Task]:
 def task_name(task: type[Task]) -> str:
     """The name under which `find_task` finds a task: its registered name, or FILE.py:CLASS."""
     place = f"{task.__module__}:{task.__qualname__}"
-    for name, value in _registered().items():
-        if value == place:
-            return name
-    return f"{inspect.getsourcefile(task)}:{task.__qualname__}"
+    names = [name for name, value in _registered().items() if value == place]
+    return names[0] if names else f"{inspect.getsourcefile(task)}:{task.__qualname__}"
 
 
 def task_config(task: str | type[Task]) -> type[WorldConfig]:

@@ -3,7 +3,6 @@
 import collections
 import html
 import queue
-import signal
 import threading
 
 import jax
@@ -60,7 +59,7 @@ class TrainingPage:
         self._news.put(None)
         if self._thread.is_alive():
             say(self._console, f"the page stays at {self._address.url} until Ctrl-C")
-        with StopRequest(signal.SIGINT) as stop:
+        with StopRequest() as stop:
             while self._thread.is_alive() and not stop.requested:
                 self._thread.join(0.2)
 

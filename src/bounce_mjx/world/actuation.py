@@ -81,19 +81,13 @@ class Actuators:
             control = control._replace(ball_push=self._push(world, clock))
         return control, memory._replace(setpoint=setpoint)
 
-    def servo_targets(
-        self, qpos: jax.Array, action: jax.Array, last: Setpoint | None = None
-    ) -> jax.Array:
-        """`Env.servo_targets`, at the joint angles in qpos [nq]."""
-        return self._ctrl(self._joint_targets(self._angles(qpos), action, last))
-
     def _angles(self, qpos: jax.Array) -> jax.Array:
         return jnp.stack([qpos[i] for i in self._addresses.arm_qpos])
 
     def _joint_targets(
         self, angles: jax.Array, action: jax.Array, last: Setpoint | None = None
     ) -> jax.Array:
-        """The target of each joint [n], rad.
+        """The target of each joint [n], rad: an angle plus the scaled action, clipped to the range.
 
         Args:
           angles: measured [n], rad, without the offset of the encoders' zeros, which the servo

@@ -156,11 +156,10 @@ class WorldConfig(StrictModel):
     def _read_former(cls, values: Any) -> Any:
         """The configs of 0.1 have the constants of a Kalman filter, and those of 0.1.0 the noise of
         a reset among the other settings."""
-        former = {"estimator", *_FORMER_RESET_KEYS}
-        if not isinstance(values, dict) or not former & values.keys():
+        if not isinstance(values, dict):
             return values
-        moved = {now: values[key] for key, now in _FORMER_RESET_KEYS.items() if key in values}
-        kept = {key: value for key, value in values.items() if key not in former}
+        kept = {key: value for key, value in values.items() if key != "estimator"}
+        moved = {now: kept.pop(key) for key, now in _FORMER_RESET_KEYS.items() if key in kept}
         return kept | ({"reset": moved | dict(kept.get("reset", {}))} if moved else {})
 
     @pydantic.model_validator(mode="after")

@@ -102,10 +102,11 @@ class PlaygroundBounceBall(MjxEnv):
         state = task.reset(rng)
         m, physics = self.mj_model, state.pipeline_state.physics
         dtype = physics.qpos.dtype
+        still = jnp.zeros(self.action_size, dtype)
         data = TaskData(
             **physics._asdict(),
             time=jnp.zeros((), dtype),
-            ctrl=self.task.servo_targets(physics, jnp.zeros(self.action_size, dtype)),
+            ctrl=self.task.control(state.pipeline_state, still)[0].ctrl,
             mocap_pos=jnp.zeros((m.nmocap, 3), dtype),
             mocap_quat=jnp.zeros((m.nmocap, 4), dtype),
             xfrc_applied=jnp.zeros((m.nbody, 6), dtype),
@@ -119,12 +120,11 @@ class PlaygroundBounceBall(MjxEnv):
         physics = PhysicsState(data.qpos, data.qvel)
         before = core.State(data.task._replace(physics=physics), **_common(state))
         after = self.task.step(before, action)
-        acted = after.pipeline_state.last_action
-        ctrl = self.task.servo_targets(physics, acted, data.task.actuation.setpoint)
+        control, _ = self.task.control(before.pipeline_state, action)
         data = data.replace(
             **after.pipeline_state.physics._asdict(),
             time=data.time + self.task.dt,
-            ctrl=ctrl,
+            ctrl=control.ctrl,
             task=after.pipeline_state._replace(physics=None),
         )
         return state.replace(data=data, **_common(after))
