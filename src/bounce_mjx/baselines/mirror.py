@@ -19,7 +19,7 @@ import numpy as np
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
-from bounce_mjx.robot.model import find_addresses, scatter
+from bounce_mjx.robot.model import data_at, find_addresses, scatter
 from bounce_mjx.world.config import WorldConfig
 
 # Restitution of the ball on the paddle.
@@ -84,8 +84,7 @@ class MirrorLaw:
         stiffness = gear * model.actuator_gainprm[self._servos, 0]
         damping = model.dof_damping[dofs] - gear * model.actuator_biasprm[self._servos, 2]
         self._lag = damping / stiffness
-        data = mujoco.MjData(model)
-        data.qpos[self._arm] = self._home
+        data = data_at(model, self._home)
         mujoco.mj_forward(model, data)
         self._sag = (data.qfrc_bias - data.qfrc_passive)[dofs] / stiffness
 
@@ -174,11 +173,8 @@ class MirrorLaw:
 def upper_face(mj_model: mujoco.MjModel, joint_angles: Sequence[float]) -> tuple[np.ndarray, float]:
     """Unit normal [3] of the paddle's face that is the upper one at these joint angles (rad), in
     the frame of the paddle's body, and the face's distance from the paddle's centre, m."""
-    data, addresses = mujoco.MjData(mj_model), find_addresses(mj_model)
-    data.qpos[list(addresses.arm_qpos)] = joint_angles
-    mujoco.mj_kinematics(mj_model, data)
-    paddle, normal = addresses.paddle_geom, np.zeros(3)
-    upward = data.geom_xmat[paddle].reshape(3, 3)[2]
+    paddle, normal = find_addresses(mj_model).paddle_geom, np.zeros(3)
+    upward = data_at(mj_model, joint_angles).geom_xmat[paddle].reshape(3, 3)[2]
     axis = int(np.argmax(abs(upward)))
     face = np.sign(upward[axis]) * np.eye(3)[axis]
     mujoco.mju_rotVecQuat(normal, face, mj_model.geom_quat[paddle])

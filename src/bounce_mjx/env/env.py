@@ -22,6 +22,7 @@ from bounce_mjx.physics.parameters import MODEL_PARAMETERS, gives
 from bounce_mjx.robot.balls import BALLS_APART
 from bounce_mjx.robot.model import (
     check_unedited,
+    data_at,
     find_addresses,
     fingerprint,
     joint_names,
@@ -33,7 +34,7 @@ from bounce_mjx.task.task import Start, Step, Task, TaskStep
 from bounce_mjx.world import noise
 from bounce_mjx.world.actuation import Actuation, Actuators, recurs
 from bounce_mjx.world.config import WorldConfig
-from bounce_mjx.world.impact import next_impact
+from bounce_mjx.world.impact import with_impact
 from bounce_mjx.world.noise import Clock
 from bounce_mjx.world.observation import Kinematics
 from bounce_mjx.world.randomization import TERMS, Ranges, World, physics_parameters, sample_world
@@ -164,10 +165,7 @@ class Env:
                     f"default_joint_angles has {angle:g} for {name}, whose range is {low:.4g} to "
                     f"{high:.4g}; give radians, or metres for a slide, within the range"
                 )
-        data = mujoco.MjData(model)
-        data.qpos[list(self.addresses.arm_qpos)] = angles
-        mujoco.mj_kinematics(model, data)
-        paddle = data.geom_xpos[self.addresses.paddle_geom, 2]
+        paddle = data_at(model, angles).geom_xpos[self.addresses.paddle_geom, 2]
         for name, height in config.heights.items():
             if height <= paddle:
                 raise UserError(
@@ -267,7 +265,8 @@ class Env:
         state = state._replace(task=task, command=self._next_command(task, command))
         given = gives(own_parameters, "contact_damping", "pair_solref")
         if "restitution_slope" in world and not given:
-            state = self._with_impact(state._replace(impact=jnp.zeros((), draws.dtype)), truth)
+            state = state._replace(impact=jnp.zeros((), draws.dtype))
+            state = with_impact(state, self.mj_model, self.engine, truth)
         if self._sensors.are_needed:
             state = state._replace(sensing=self._sensors.first(self._sensed(state, truth)))
         return State(
@@ -323,7 +322,7 @@ class Env:
             "too_fast": jnp.any(jnp.abs(truth.joint_velocities) > self.config.max_joint_velocity),
         }
 
-        now = self._with_impact(now, truth)
+        now = with_impact(now, self.mj_model, self.engine, truth)
         if now.sensing is not None:
             now = now._replace(sensing=self._sensors.next(now.sensing, self._sensed(now, truth)))
         dtype = truth.ball_position.dtype
@@ -421,16 +420,6 @@ class Env:
         named = f"next_command of the task {type(self.task).__name__}"
         check_names(named, "command", following, command)
         return following
-
-    def _with_impact(self, state: EnvState, truth: Kinematics) -> EnvState:
-        """The state whose parameters have the damping of the next impact."""
-        if state.impact is None:
-            return state
-        parameters, qpos = state.parameters, state.physics.qpos
-        given = state.impact, state.world, self.mj_model, self.engine
-        speed, damping = next_impact(*given, parameters, qpos, truth)
-        parameters = parameters._replace(contact_damping=damping)
-        return state._replace(impact=speed, parameters=parameters)
 
     def _sensed(self, state: EnvState, truth: Kinematics) -> Sensed:
         known = _entries(state.command) | {"action": state.last_action}

@@ -138,11 +138,17 @@ def paddle_home(
       UserError: as `load_model`.
     """
     mj_model = load_model(mjcf, 0.001, visual=False, robot=robot)
-    addresses, data = find_addresses(mj_model), mujoco.MjData(mj_model)
-    data.qpos[list(addresses.arm_qpos)] = joint_angles
-    mujoco.mj_kinematics(mj_model, data)
-    x, y, z = (round(float(c), 4) for c in data.geom_xpos[addresses.paddle_geom])
+    paddle = data_at(mj_model, joint_angles).geom(PADDLE_GEOM_NAME).xpos
+    x, y, z = (round(float(c), 4) for c in paddle)
     return x, y, z
+
+
+def data_at(mj_model: mujoco.MjModel, joint_angles: Sequence[float]) -> mujoco.MjData:
+    """The kinematics of a model with the arm at joint angles [n], rad."""
+    data = mujoco.MjData(mj_model)
+    data.qpos[list(find_addresses(mj_model).arm_qpos)] = joint_angles
+    mujoco.mj_kinematics(mj_model, data)
+    return data
 
 
 def joint_ranges(mj_model: mujoco.MjModel) -> np.ndarray:
