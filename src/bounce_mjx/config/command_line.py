@@ -35,12 +35,6 @@ class Flag(NamedTuple):
     """Whether the flag may come several times, each with one of the values."""
 
 
-class _Console(Console):
-    def show_cursor(self, show: bool = True) -> bool:
-        """Never hides it: a signal may end the process before it is shown again."""
-        return False
-
-
 def stdout(**options: Any) -> Console:
     """The console that a command prints to. Elsewhere than on a terminal, such as in a pipe, it
     neither wraps nor cuts a line.
@@ -48,7 +42,9 @@ def stdout(**options: Any) -> Console:
     Args:
       options: arguments of `rich.console.Console`.
     """
-    console = _Console(**options)
+    console = Console(**options)
+    # A signal may end the process before a hidden cursor is shown again.
+    console.show_cursor = lambda show=True: False
     if not console.is_terminal:
         console.width = _NO_WRAP
     return console

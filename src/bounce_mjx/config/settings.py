@@ -56,14 +56,12 @@ Ascending = pydantic.AfterValidator(_check_order)
 
 
 def whole_number(value: Any) -> Any:
-    """A whole number in scientific notation, such as "1e6", as an integer; any other value is
-    returned unchanged. YAML reads 1e6 as a string, because its numbers with an exponent
-    need a decimal point.
+    """A number in scientific notation, such as "1e6", as a float, of which pydantic reads an
+    integer; any other value is returned unchanged. YAML reads 1e6 as a string, because its numbers
+    with an exponent need a decimal point.
     """
-    if isinstance(value, str) and re.fullmatch(r"[+-]?[\d_]*\d(\.\d*)?[eE][+-]?\d+", value):
-        number = float(value)
-        return int(number) if number.is_integer() else value
-    return value
+    is_scientific = r"[+-]?[\d_]*\d(\.\d*)?[eE][+-]?\d+"
+    return float(value) if re.fullmatch(is_scientific, str(value)) else value
 
 
 _WholeNumber = pydantic.BeforeValidator(whole_number)
