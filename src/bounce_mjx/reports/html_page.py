@@ -15,7 +15,7 @@ h1 { margin-bottom: 0; } h2 { margin: 2rem 0 0.5rem; font-size: 1.15rem; }
 .wide { overflow-x: auto; }
 .figures { display: grid; gap: 0 2rem; align-items: start;
   grid-template-columns: repeat(auto-fit, minmax(min(100%, 26rem), 1fr)); }
-figure { margin: 0; } img { width: 100%; } figcaption { font-size: 13px; }
+figure { margin: 0; } img { width: 100%; }
 iframe { width: 100%; height: 28rem; border: 1px solid #ddd; }
 table { border-collapse: collapse; }
 th, td { padding: 0.2rem 0.9rem 0.2rem 0; text-align: left; border-bottom: 1px solid #ddd; }
@@ -45,20 +45,12 @@ def page(title: str, body: str) -> str:
 """
 
 
-def figures_html(figures: Mapping[str, Figure], captions: Mapping[str, str] = {}) -> str:
-    """Figures below their titles, side by side where the page is wide enough.
-
-    Args:
-      captions: sentences below some of them, by the title.
-    """
+def figures_html(figures: Mapping[str, Figure]) -> str:
+    """Figures below their titles, side by side where the page is wide enough."""
     parts = []
     for title, figure in figures.items():
         source = data_url("image/svg+xml", image(figure, "svg"))
-        caption = html.escape(captions.get(title, ""))
-        parts.append(
-            f'<figure><h2>{title}</h2><img alt="{title}" src="{source}">'
-            f"<figcaption>{caption}</figcaption></figure>\n"
-        )
+        parts.append(f'<figure><h2>{title}</h2><img alt="{title}" src="{source}"></figure>\n')
     return f'<div class="figures">{"".join(parts)}</div>'
 
 

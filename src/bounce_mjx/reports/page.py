@@ -38,12 +38,6 @@ REPORT_FILE = "report.html"
 # Panels side by side in a figure that fits a phone, and its width in inches.
 _COLUMNS = 2
 _WIDTH = _COLUMNS * PANEL_WIDTH
-_CAPTIONS = {
-    "Learning curves": "Lines are the training, whose actions are sampled around the policy's "
-    "(exploration); points are evaluations, whose actions are not. Errors rise first: the policy "
-    "tries more before it knows how far each action goes, and its sampled actions scatter most at "
-    "the start."
-}
 
 
 def record_checkpoint(checkpoint: Checkpoint) -> Recording:
@@ -111,7 +105,11 @@ the robot {html.escape(robot_name(config.env))}. The best of {evaluated} evaluat
 {table(["result", "measured", "value", "bound", ""], map(result_cells, report.results))}
 <h2>The policy in its first recorded episode</h2>
 <iframe title="Replay" src="{data_url("text/html", replay.encode())}"></iframe>
-{figures_html(figures, _CAPTIONS)}
+<p>In the learning curves, lines are the training, whose actions are sampled around the policy's
+(exploration); points are evaluations, whose actions are not. Errors rise first: the policy tries
+more before it knows how far each action goes, and its sampled actions scatter most at the start.
+</p>
+{figures_html(figures)}
 <h2>Where the time went</h2>
 {table(["phase", "seconds"], phases)}
 <details><summary>Config</summary><pre>{html.escape(dump_config(config))}</pre></details>"""
