@@ -351,17 +351,18 @@ def gradient():
 
 
 def parity():
-    """The run of `test_2000_random_action_steps_are_mujocos`, with every step's differences."""
+    """A run as `test_2000_random_action_steps_are_mujocos`, with every step's differences."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
     sys.path.insert(0, str(CHECKOUT / "tests"))
-    import test_physics as tests
+    import against_c as tests
     from bounce_mjx import BounceBall
     from bounce_mjx.physics import PhysicsState, make_engine
+    from test_physics import batched
 
     model, rng = BounceBall().mj_model, np.random.default_rng(4)
-    step = tests.batched(make_engine(model, "fused").step)
+    step = batched(make_engine(model, "fused").step)
     state = tests.bouncing_states(model, rng)
     reference = tests.CEngine(model, state)
     errors, contacts = [], []
@@ -377,7 +378,7 @@ def parity():
         state, single = step(state, ctrl, 1), step(reference.state, c_ctrl, 1)
         contacts.append(reference.step(c_ctrl, 1))
         after = reference.state
-        errors.append([max(tests.difference(x, after)) for x in (state, single)])
+        errors.append([np.max(tests.differences(x, after)) for x in (state, single)])
     figure, axes = plt.subplots(figsize=(8.4, 3.2), layout="constrained")
     for error, label, colour in zip(
         np.transpose(errors), ("running freely", "one step from C's state"), LINES, strict=False

@@ -1,5 +1,6 @@
 """The physics against MuJoCo's C engine: random states, steps of both, and their differences."""
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -9,7 +10,14 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, edited_model, fused
+from bounce_mjx.physics import (
+    Control,
+    PhysicsParameters,
+    PhysicsState,
+    edited_model,
+    fused,
+    make_engine,
+)
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import find_addresses
 
@@ -131,13 +139,18 @@ def bouncing_states(mj_model: mujoco.MjModel, rng: np.random.Generator) -> Physi
 
 
 def drop_ball(
-    mj_model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, rng: np.random.Generator
+    mj_model: mujoco.MjModel,
+    qpos: np.ndarray,
+    qvel: np.ndarray,
+    rng: np.random.Generator,
+    i: int = 0,
 ) -> None:
-    """Puts the ball of one state above the paddle, in place."""
-    qpos[6:9] = paddle_frame(mj_model, qpos[:6])[0]
-    qpos[6:9] += [*rng.uniform(-0.02, 0.02, 2), rng.uniform(0.04, 0.1)]
-    qvel[6:9] = [*rng.uniform(-0.2, 0.2, 2), rng.uniform(-2.0, 0.0)]
-    qvel[9:] = rng.uniform(-30.0, 30.0, 3)
+    """Puts ball i of one state above the paddle and the balls before it, in place."""
+    at = find_addresses(mj_model)
+    place = paddle_frame(mj_model, qpos[at.arm_qpos,])[0] + [0.0, 0.0, 0.1 * i]
+    qpos[at.balls[i].qpos[:3],] = place + [*rng.uniform(-0.02, 0.02, 2), rng.uniform(0.04, 0.1)]
+    velocity = [*rng.uniform(-0.2, 0.2, 2), rng.uniform(-2.0, 0.0)]
+    qvel[at.balls[i].qvel,] = [*velocity, *rng.uniform(-30.0, 30.0, 3)]
 
 
 def c_steps(
@@ -189,21 +202,21 @@ def fused_steps(model: mujoco.MjModel, parameters: PhysicsParameters, states: St
 
 
 class CEngine:
-    """Batch of MuJoCo simulations with their own states."""
+    """Batch of MuJoCo simulations with their own states, and their own models or the same."""
 
-    def __init__(self, mj_model: mujoco.MjModel, start: PhysicsState):
-        self.model = mj_model
-        self.data = [mujoco.MjData(mj_model) for _ in start.qpos]
+    def __init__(self, models: mujoco.MjModel | list[mujoco.MjModel], start: PhysicsState):
+        self.models = models if isinstance(models, list) else [models] * len(start.qpos)
+        self.data = [mujoco.MjData(model) for model in self.models]
         for data, qpos, qvel in zip(self.data, *start[:2], strict=True):
             data.qpos[:], data.qvel[:] = qpos, qvel
 
     def step(self, ctrl: np.ndarray, num_substeps: int) -> int:
         """Advances all simulations; returns the number of steps with a contact."""
         contacts = 0
-        for data, targets in zip(self.data, ctrl, strict=True):
+        for model, data, targets in zip(self.models, self.data, ctrl, strict=True):
             data.ctrl[:] = targets
             for _ in range(num_substeps):
-                mujoco.mj_step(self.model, data)
+                mujoco.mj_step(model, data)
                 contacts += data.ncon
         return contacts
 
@@ -214,11 +227,70 @@ class CEngine:
         )
 
 
-def difference(a: PhysicsState, b: PhysicsState) -> tuple[float, float]:
-    """Largest differences of qpos and of qvel."""
-    return tuple(
-        float(np.max(np.abs(np.asarray(x) - y))) for x, y in zip(a[:2], b[:2], strict=True)
+def near(qpos: np.ndarray, action: np.ndarray) -> np.ndarray:
+    """Servo targets close to the angles [N, 6]."""
+    return qpos[:, :6] + 0.03 * action
+
+
+def free_run(
+    base: mujoco.MjModel,
+    models: list[mujoco.MjModel],
+    parameters: PhysicsParameters,
+    start: PhysicsState,
+    rng: np.random.Generator,
+    look: Callable[[mujoco.MjData], dict[str, float]],
+    ctrl: Callable[[np.ndarray, np.ndarray], np.ndarray] = near,
+    flight: int = 200,
+) -> tuple[np.ndarray, int, dict[str, float]]:
+    """2,000 physics steps of worlds in both engines, neither of which sees the other's state.
+
+    A lost ball is dropped again, and all balls after each `flight` control steps. Bounces and balls
+    that meet amplify differences: the engines must be closer at any time than two runs of C with
+    balls that start a picometre apart.
+
+    Args:
+      base, parameters: what the fused engine reads: a model, and the parameters [N, ...].
+      models: C's model of each world.
+      look: figures of a state of C.
+      ctrl: servo targets from generalised positions [N, nq] and random numbers [N, n] in [-1, 1].
+
+    Returns:
+      The largest difference of each world from C [N], the number of steps of C with a contact, and
+      the means of what `look` saw.
+    """
+    at, engine, count = find_addresses(base), make_engine(base, "fused"), len(models)
+    axes = jax.tree.map(lambda _: 0, parameters)
+    step = jax.jit(
+        jax.vmap(lambda p, s, u: engine.step(p, s, Control(u), 10), in_axes=(axes, 0, 0))
     )
+    state, c, shifted = start, CEngine(models, start), CEngine(models, start)
+    contacts, errors, apart, seen = 0, np.zeros(count), np.zeros(count), []
+    for i in range(200):
+        state = PhysicsState(*(np.array(x) for x in state[:2]))
+        for model, data, twin, *ours in zip(models, c.data, shifted.data, *state[:2], strict=True):
+            lowest = paddle_frame(model, data.qpos[at.arm_qpos,])[0][2] - 0.1
+            for k, ball in enumerate(at.balls):
+                if i % flight == 0 or data.qpos[ball.qpos[2]] < lowest:
+                    drop_ball(model, data.qpos, data.qvel, rng, k)
+                    for qpos, qvel in (ours, (twin.qpos, twin.qvel)):
+                        qpos[ball.qpos,] = data.qpos[ball.qpos,]
+                        qvel[ball.qvel,] = data.qvel[ball.qvel,]
+                    twin.qpos[ball.qpos[2]] += PICOMETRE
+        action = rng.uniform(-1.0, 1.0, (count, len(at.arm_qpos)))
+        state = step(parameters, state, ctrl(state.qpos, action))
+        contacts += c.step(ctrl(c.state.qpos, action), 10)
+        shifted.step(ctrl(shifted.state.qpos, action), 10)
+        errors = np.maximum(errors, differences(state, c.state))
+        apart = np.maximum(apart, differences(shifted.state, c.state))
+        assert np.all((errors < 1e-9) | (errors < apart))
+        seen += [look(data) for data in c.data]
+    assert np.quantile(errors, 0.9) < 1e-9
+    return errors, contacts, {name: np.mean([x[name] for x in seen]) for name in seen[0]}
+
+
+def differences(a: PhysicsState, b: PhysicsState) -> np.ndarray:
+    """Largest difference of each state [N]."""
+    return np.maximum(*(np.max(np.abs(x - y), axis=1) for x, y in zip(a[:2], b[:2], strict=True)))
 
 
 def assert_same_step(actual: PhysicsState, expected: PhysicsState) -> None:

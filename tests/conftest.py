@@ -134,11 +134,8 @@ def refused(
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"):
         monkeypatch.delenv(name, raising=False)
 
-    def contents() -> dict[Path, bytes | None]:
-        return {p: p.read_bytes() if p.is_file() else None for p in tmp_path.rglob("*")}
-
     def refuse(line: str | list, *words: str) -> str:
-        before = contents()
+        before = tiny_runs.contents(tmp_path)
         capfd.readouterr()
         with pytest.raises(SystemExit) as ended:
             main(line.split() if isinstance(line, str) else [str(word) for word in line])
@@ -146,7 +143,7 @@ def refused(
         assert ended.value.code == 2 and "Traceback" not in said
         assert re.fullmatch(r"error: .+\n", sentence) and sentence[:-1].isprintable(), sentence
         assert not [word for word in words if word not in sentence], sentence
-        assert contents() == before
+        assert tiny_runs.contents(tmp_path) == before
         return sentence
 
     return refuse

@@ -101,14 +101,12 @@ def test_orbax_alone_reads_a_checkpoint(written: Path, state: TrainingState) -> 
         )
         found = manager.restore(int(folder.name), args=wanted)
     assert found["record"]["steps"] == int(folder.name)
-    expected = jax.tree_util.tree_leaves_with_path(policy)
-    names = [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in expected]
-    theirs = {
-        jax.tree_util.keystr(path, simple=True, separator="."): leaf
-        for path, leaf in jax.tree_util.tree_leaves_with_path(found["policy"])
-    }
-    assert theirs.keys() == set(names)
-    for name, (_, leaf) in zip(names, expected, strict=True):
+    expected, theirs = (
+        {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+        for leaves in map(jax.tree_util.tree_leaves_with_path, (policy, found["policy"]))
+    )
+    assert theirs.keys() == expected.keys()
+    for name, leaf in expected.items():
         np.testing.assert_array_equal(theirs[name], leaf)
 
 

@@ -1,4 +1,4 @@
-"""The console script: its commands, its help, and Ctrl-C while it starts or compiles."""
+"""The console script: its commands, its help, what it imports, and Ctrl-C while it starts."""
 
 import email.message
 import importlib.metadata
@@ -135,6 +135,46 @@ print(*sorted(imported - sys.stdlib_module_names))
     imported = set(done.stdout.split())
     libraries = {name for name in imported if not name.startswith(("_", "cython"))}
     assert "bounce_mjx" in libraries and libraries <= HELP_NEEDS
+
+
+def test_import_is_light(tmp_path: Path) -> None:
+    """The package imports JAX only at its first use, and the environment imports none of the
+    libraries of trainers, other engines, viewers and adapters."""
+    script = """
+import sys
+import bounce_mjx
+print("jax" in sys.modules)
+env = bounce_mjx.BounceBall(bounce_mjx.EnvConfig())
+heavy = (
+    "brax mujoco.mjx trimesh scipy networkx numba flax optax orbax matplotlib gymnasium torch "
+    "array_api_compat stable_baselines3 sbx torchrl skrl"
+)
+print(env.backend, *(name for name in heavy.split() if name in sys.modules))
+print(*sorted(set(bounce_mjx.__all__) & set(dir(bounce_mjx))))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True
+    )
+    names = "BounceBall EnvConfig Run __version__ load_policy train"
+    assert done.stdout.splitlines() == ["False", "fused", names], done.stderr
+
+
+def test_a_missing_extra_is_told_in_one_way() -> None:
+    """To a program as an ImportError, and to the user of a command as one sentence."""
+    script = """
+import importlib, sys
+for library in ("brax", "torch", "stable_baselines3", "ml_collections"):
+    sys.modules[library] = None
+from bounce_mjx.errors import UserError
+for name in ("brax", "sb3", "torch", "playground"):
+    try:
+        importlib.import_module("bounce_mjx.adapters." + name)
+    except ImportError as error:
+        print(isinstance(error, UserError), error)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    sentence = r"True .+ cannot be imported \(.+\); install it with: pip install .+\n"
+    assert re.fullmatch(f"({sentence}){{4}}", done.stdout), done.stdout + done.stderr
 
 
 # Ctrl-C comes while a library is looked for.

@@ -331,7 +331,8 @@ def short_training(folder: Path) -> Callable:
     return train
 
 
-SLOW_PAGES = "libraries.md", "training.md"
+# test_examples.py and test_deploy.py run the most of real-robot.md.
+SLOW_PAGES = "libraries.md", "real-robot.md", "training.md"
 
 
 @pytest.mark.parametrize(

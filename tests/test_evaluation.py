@@ -25,7 +25,6 @@ from bounce_mjx.evaluation.results import Report, Result, judge
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
 from bounce_mjx.learning import policy
 from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.learning.networks import Gaussian
 from bounce_mjx.learning.policy import networks_of
 from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.physics import PhysicsParameters
@@ -442,66 +441,3 @@ def test_another_task_is_counted_and_judged_by_itself(dribbling):
 def test_a_result_may_not_have_the_name_of_a_records_own_key(name: str) -> None:
     with pytest.raises(UserError, match=f"has the name '{name}', .*; choose another name"):
         share_of_episodes(name, "episodes", np.ones(3, bool), 0.9)
-
-
-def holding_policy(networks):
-    """Networks and a policy that hold the paddle level at home, where a ball bounces for about 3 s.
-    If the target is above 0.5 m they tilt the paddle, so that the ball falls off."""
-    home = jnp.array(EnvConfig().default_joint_angles)
-    tilt = jnp.array([0, 0, 0, 0, 0.25, 0])
-
-    def apply(params, obs):
-        wanted = home + tilt * (obs[..., EnvConfig().layout["target_height"]] > 0.5)
-        mean = params["gain"] * (wanted - obs[..., EnvConfig().layout["joint_angles"]])
-        return Gaussian(mean, jnp.ones_like(mean))
-
-    network = networks.policy_network._replace(apply=apply)
-    holding = policy.Policy(init_normalizer(29), {"gain": jnp.float32(50.0)})
-    return networks._replace(policy_network=network), holding
-
-
-@pytest.mark.slow
-def test_evaluator_equals_a_python_loop(networks):
-    episodes, key = 6, jax.random.key(21)
-    env = BounceBall(EnvConfig(episode_seconds=2.6))
-    networks, holding = holding_policy(networks)
-    actual = flat(make_evaluator(env, networks, episodes)(holding, key)[0])
-    del actual["tally"]
-
-    reset, step = jax.jit(env.reset), jax.jit(env.step)
-    act = jax.jit(lambda obs: networks.act(holding, obs))
-    expected = {name: np.zeros(episodes) for name in actual}
-    for i, episode_key in enumerate(jax.random.split(key, episodes)):
-        state, sums = reset(episode_key), dict.fromkeys(actual, 0.0)
-        for t in range(260):
-            state = step(state, act(state.obs))
-            physics = state.pipeline_state.physics
-            sums["steps"] += 1
-            sums["hits"] += float(state.metrics["bounced"])
-            sums["episode_return"] += float(state.reward)
-            sums["n_bounces"] = max(sums["n_bounces"], float(state.metrics["n_bounces"]))
-            if t >= 200:
-                sums["settled_steps"] += 1
-                sums["centred_steps"] += abs(physics.qpos[6] - TARGET_X) <= 0.05
-                if state.metrics["bounced"]:
-                    sums["apex_offset"] += float(state.metrics["apex_offset"])
-                    sums["apex_error^2"] += float(state.metrics["apex_error"]) ** 2
-                    error = float(state.metrics["apex_error"])
-                    sums["settled_bounces"] += 1
-                    sums["accurate_bounces"] += error <= 0.1
-                    sums["apex_error"] += error
-            if physics.qvel[8] > 0:
-                sums["rising_steps"] += 1
-                sums["rising_speed"] += float(physics.qvel[8])
-            if state.done:
-                break
-        else:
-            sums["running"] = 1.0
-        for name, value in sums.items():
-            expected[name][i] = value
-
-    assert 0 < expected["running"].sum() < episodes, "both kinds of episodes are wanted"
-    assert expected["settled_bounces"].sum() > 0
-    for name, value in expected.items():
-        # Each contact magnifies the rounding of the differently compiled steps.
-        np.testing.assert_allclose(actual[name], value, rtol=1e-2, err_msg=name)

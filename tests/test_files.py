@@ -2,6 +2,7 @@
 joined where the engine allows it, unless the user decides."""
 
 import os
+import pwd
 from pathlib import Path
 
 import jax
@@ -43,13 +44,18 @@ def test_an_unfinished_file_leaves_the_old_one(tmp_path: Path, victim: Path) -> 
     assert victim.read_text() == "mine"
 
 
-@pytest.mark.parametrize("free", [True, False])
-def test_compiled_programs_are_kept(free: bool, tmp_path: Path, monkeypatch, capsys) -> None:
-    """A file in the folder's place is left alone: a warning says that nothing is cached."""
+@pytest.mark.parametrize("place", ["free", "taken", "none"])
+def test_compiled_programs_are_kept(place: str, tmp_path: Path, monkeypatch, capsys) -> None:
+    """Where a file has the folder's place, or a user no home, as a number without a name in a
+    container, a warning says that nothing is cached."""
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    if not free:
+    if place == "taken":
         (tmp_path / "bounce_mjx").touch()
+    if place == "none":
+        monkeypatch.delenv("XDG_CACHE_HOME")
+        monkeypatch.delenv("HOME", raising=False)
+        monkeypatch.setattr(pwd, "getpwuid", {}.__getitem__)
     before = jax.config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", None)
     try:
@@ -58,12 +64,12 @@ def test_compiled_programs_are_kept(free: bool, tmp_path: Path, monkeypatch, cap
     finally:
         jax.config.update("jax_compilation_cache_dir", before)
     said = capsys.readouterr().err
-    if free:
+    if place == "free":
         assert (used, said) == (str(tmp_path / "bounce_mjx/jax"), "")
     else:
         assert used is None and said.count("\n") == 1
         assert said.startswith("warning: compiled programs are not cached (")
-        assert f"{tmp_path}/bounce_mjx" in said
+        assert place == "none" or f"{tmp_path}/bounce_mjx" in said
 
 
 @pytest.fixture(scope="module")

@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import pytest
 
 from bounce_mjx.commands.main import main
 from bounce_mjx.deploy.recorder import Recorder
 from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation.contacts import ContactChecker
 from bounce_mjx.identify import Topics
 from bounce_mjx.identify.excitation import excite
 from bounce_mjx.identify.log import Log, align_clocks, check
@@ -371,21 +371,6 @@ def test_the_drivers_names_stand_for_the_robots(tmp_path: Path) -> None:
         read_log(path, model, TOPICS, [*names[:5], names[0]])
 
 
-def contacts_of(model: mujoco.MjModel, qpos: np.ndarray) -> tuple[float, float]:
-    """Height of the lowest corner of the paddle, and the smallest distance between the paddle and
-    the upper arm, m: an independent check of a pose, by MuJoCo's distance of geoms."""
-    data = mujoco.MjData(model)
-    data.qpos[: len(qpos)] = qpos
-    mujoco.mj_kinematics(model, data)
-    paddle = find_addresses(model).paddle_geom
-    size, rotation = model.geom_size[paddle], data.geom_xmat[paddle].reshape(3, 3)
-    lowest = data.geom_xpos[paddle][2] - np.abs(rotation[2]) @ size
-    upper = model.body("Link2").id
-    geoms = range(model.body_geomadr[upper], model.body_geomadr[upper] + model.body_geomnum[upper])
-    least = min(mujoco.mj_geomDistance(model, data, paddle, g, 1.0, None) for g in geoms)
-    return lowest, least
-
-
 def test_excitation_moves_every_joint_within_its_limits_and_without_contacts() -> None:
     config = read_preset(Path("default")).env
     motion = excite(config, 20.0, 1.0)
@@ -397,12 +382,11 @@ def test_excitation_moves_every_joint_within_its_limits_and_without_contacts() -
     speeds = np.abs(np.diff(motion.targets, axis=0)) / config.control_dt
     assert np.all(speeds <= 1.08) and np.all(np.max(speeds, axis=0) > 0.5)
     assert np.all(np.ptp(motion.targets, axis=0) > 0.05)
-    for pose in motion.targets[::10]:
-        lowest, least = contacts_of(model, pose)
-        assert lowest > 0.0 and least > 0.01
     # A table just below the paddle leaves room for no slower paddle than one above the floor.
-    above = excite(config, 20.0, 1.0, table_height=0.01)
-    assert min(contacts_of(model, pose)[0] for pose in above.targets[::10]) > 0.01
+    for table in (None, 0.01):
+        checker = ContactChecker(config, margin=0.005, table_height=table)
+        targets = excite(config, 20.0, 1.0, table_height=table).targets
+        assert not any(checker.touching(pose) for pose in targets[::10])
 
 
 def test_excite_command_writes_a_motion(tmp_path: Path, capsys) -> None:

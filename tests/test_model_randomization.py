@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
-from against_c import assert_same_step, c_steps, converged, fused_steps, touching_states
+from against_c import assert_same_step, c_steps, converged, fused_steps, touching_states, world
 from bounce_mjx.adapters.randomization import parameters_of
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics import Control, PhysicsState, make_engine
@@ -47,10 +47,6 @@ def read(mj_model: mujoco.MjModel, base: mjx.Model, **fields: np.ndarray) -> Phy
     return jax.jit(lambda: jax.vmap(of_one, in_axes=(axes,))(model))()
 
 
-def one_of(parameters: PhysicsParameters, i: int) -> PhysicsParameters:
-    return jax.tree.map(lambda x: np.asarray(x)[i], parameters)
-
-
 def scaled(array: np.ndarray) -> np.ndarray:
     """B arrays, the first one unchanged."""
     return np.stack([array * factor for factor in (1.0, 1.1, 0.9)])
@@ -79,11 +75,11 @@ def test_models_of_parameters_are_read_back(mj_model, base):
     names = [name for name in PhysicsParameters._fields if name != "entries"]
     for given in (*((name,) for name in names), names):
         parameters = PhysicsParameters(**{name: getattr(drawn, name) for name in given})
-        models = [edited_model(mj_model, one_of(parameters, i)) for i in range(BATCH)]
+        models = [edited_model(mj_model, world(parameters, i)) for i in range(BATCH)]
         fields = {name: np.stack([field_of(model, name) for model in models]) for name in FIELDS}
         result = read(mj_model, base, **fields)
         for i, model in enumerate(models):
-            again = edited_model(mj_model, one_of(result, i))
+            again = edited_model(mj_model, world(result, i))
             for name in (*FIELDS, *DERIVED, "pair_dim", "actuator_forcelimited"):
                 np.testing.assert_allclose(
                     field_of(again, name), field_of(model, name), 1e-5, 1e-12, err_msg=name
@@ -118,7 +114,7 @@ def test_entries_act_as_in_mujoco(mj_model, float64):
     states = touching_states(mj_model, count, seed=4)
     models = []
     for i in range(count):
-        models.append(converged(edited_model(mj_model, one_of(parameters, i))))
+        models.append(converged(edited_model(mj_model, world(parameters, i))))
         for name, values in entries.items():
             field, _, index = name[:-1].partition("[")
             place = tuple(map(int, index.split(",")))

@@ -19,7 +19,6 @@ from bounce_mjx.learning.statistics import normalize
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import create_run
 from bounce_mjx.task import Task
-from bounce_mjx.tasks.bounce import Bounce
 from bounce_mjx.training.command import read_command
 
 OBSERVATION = EnvConfig().layout
@@ -120,10 +119,10 @@ class TwoStates:
     backend = "none"
     task = Task
 
-    def __init__(self, first_reward: float, terminates: bool = False, hidden: bool = False):
+    def __init__(self, first_reward: float, terminates: float = 0.0, hidden: bool = False):
         """Leaving the first state pays `first_reward`, leaving the second one pays 1 and
-        terminates the episode if `terminates`. If `hidden`, the two look the same, and only the
-        metric n_bounces tells them apart."""
+        terminates the episode if `terminates` is 1. If `hidden`, the two look the same, and only
+        the metric n_bounces tells them apart."""
         self.first_reward = first_reward
         self.terminates = terminates
         self.hidden = hidden
@@ -153,31 +152,30 @@ def two_state_config(**changes) -> PPOConfig:
     return PPOConfig(**settings | changes)
 
 
-@pytest.mark.parametrize(
-    ("terminates", "expected"),
-    [
-        # The second state is worth 0.1 / (1 - 0.9), the first one 0.9 of that. If a time-out led on
-        # to the first state of the next episode, they would be worth 0.526 and 0.474, and if it
-        # counted as a termination, 0.09 and 0.1.
-        (False, [0.9, 1.0]),
-        (True, [0.09, 0.1]),
-    ],
-)
-def test_time_out_bootstraps_the_old_episodes_last_state(terminates, expected):
-    """The observation does not tell the two states apart, but a metric of the critic does."""
+def test_time_out_bootstraps_the_old_episodes_last_state():
+    """The observation does not tell the two states apart, but a metric of the critic does.
+
+    The second state is worth 0.1 / (1 - 0.9), the first one 0.9 of that. If a time-out led on to
+    the first state of the next episode, they would be worth 0.526 and 0.474, and if it counted as
+    a termination, as it is in the second training, 0.09 and 0.1.
+    """
     config = two_state_config(critic_metrics=("n_bounces",))
-    env = TwoStates(0.0, terminates=terminates, hidden=True)
-    trainer = ppo.PPO(config, env, episode_steps=2)
-    state, metrics = jax.jit(lambda key: trainer.run(trainer.init(key), 500))(jax.random.key(0))
-    networks = policy.make_networks(config, env.observation_size, env.action_size)
+
+    def train(terminates: jax.Array):
+        env = TwoStates(0.0, terminates=terminates, hidden=True)
+        trainer = ppo.PPO(config, env, episode_steps=2)
+        return trainer.run(trainer.init(jax.random.key(0)), 500)
+
+    state, metrics = jax.jit(jax.vmap(train))(jnp.array([0.0, 1.0]))
+    networks = policy.make_networks(config, 2, 1)
     seen = jnp.array([[1.0, 1.0, 0.0], [1.0, 1.0, 1.0]])
-    values = networks.value_network.apply(
-        state.params.value, normalize(seen, state.statistics.normalizer)
-    )
-    np.testing.assert_allclose(values, expected, atol=0.03)
-    np.testing.assert_allclose(metrics["episode/return"][-1], 1.0, rtol=1e-6)
-    np.testing.assert_allclose(metrics["episode/length"][-1], 2.0, rtol=1e-6)
-    assert metrics["reward"][-1] == 0.5
+    values = jax.vmap(
+        lambda params, normalizer: networks.value_network.apply(params, normalize(seen, normalizer))
+    )(state.params.value, state.statistics.normalizer)
+    np.testing.assert_allclose(values, [[0.9, 1.0], [0.09, 0.1]], atol=0.03)
+    np.testing.assert_allclose(metrics["episode/return"][:, -1], 1.0, rtol=1e-6)
+    np.testing.assert_allclose(metrics["episode/length"][:, -1], 2.0, rtol=1e-6)
+    np.testing.assert_array_equal(metrics["reward"][:, -1], 0.5)
 
 
 class Precise(TwoStates):
@@ -202,20 +200,6 @@ def test_the_noise_shrinks_to_its_bound():
     np.testing.assert_allclose(action, 0.3, atol=0.03)
 
 
-def test_the_objective_is_the_smaller_of_the_two():
-    """Schulman et al. 2017, equation 7, at ratios of 0.5 and 1.5."""
-    trainer = ppo.PPO(two_state_config(num_envs=4), TwoStates(1.0), episode_steps=2)
-    params = trainer.init(jax.random.key(0)).params
-    inputs, action, bound = jnp.ones((4, 2)), jnp.full((4, 1), 0.3), jnp.zeros((4, 1))
-    ratio, advantage = np.array([0.5, 0.5, 1.5, 1.5]), np.array([1.0, -1.0, 2.0, -3.0])
-    new = trainer.distribution(params, inputs, bound).log_prob(action)
-    samples = ppo.Samples(inputs, action, new - np.log(ratio), advantage, jnp.zeros(4), bound)
-    epsilon = trainer.config.clip_epsilon
-    expected = -np.mean([0.5, -(1.0 - epsilon), 2.0 * (1.0 + epsilon), -4.5])
-    _, parts = trainer.loss(params, samples)
-    np.testing.assert_allclose(parts["loss/policy"], expected, rtol=1e-5)
-
-
 def test_settings_that_no_training_can_have_are_refused():
     with pytest.raises(UserError, match="rollout_length 2 .* episode of 1 "):
         ppo.PPO(two_state_config(), TwoStates(1.0), episode_steps=1)
@@ -232,83 +216,77 @@ def test_episodes_do_not_all_time_out_together():
 
 
 @pytest.fixture(scope="module")
-def tiny():
-    return PPOConfig(
-        num_envs=8, rollout_length=4, num_minibatches=2, num_epochs=2, hidden_layers=(16,)
+def trainer() -> ppo.PPO:
+    return ppo.PPO(
+        two_state_config(critic_metrics=("n_bounces",)), TwoStates(1.0), episode_steps=100
     )
 
 
 @pytest.fixture(scope="module")
-def trainer(tiny, env):
-    return ppo.PPO(tiny, env, env.config.episode_steps)
+def params(trainer):
+    return jax.jit(trainer.init)(jax.random.key(0)).params
 
 
-@pytest.fixture(scope="module")
-def init(trainer):
-    return jax.jit(trainer.init)
-
-
-@pytest.fixture(scope="module")
-def run(trainer):
-    """A function that runs a number of iterations, compiled once per number."""
-    return jax.jit(trainer.run, static_argnums=1)
-
-
-@pytest.fixture(scope="module")
-def after_two(init, run):
-    """State and metrics after two iterations from key 0."""
-    return run(init(jax.random.key(0)), 2)
-
-
-def test_training_is_a_function_of_its_key(init, run, after_two):
+def test_training_is_a_function_of_its_key(trainer):
     """And changes every parameter."""
+    init, run = jax.jit(trainer.init), jax.jit(lambda state: trainer.run(state, 2))
     first = init(jax.random.key(0))
-    assert_identical(run(first, 2), after_two)
-    other, _ = run(init(jax.random.key(1)), 2)
+    after_two = run(first)
+    assert_identical(run(init(jax.random.key(0))), after_two)
+    other, _ = run(init(jax.random.key(1)))
     for before, a, b in zip(
         *(jax.tree.leaves(x.params) for x in (first, after_two[0], other)), strict=True
     ):
         assert np.any(np.asarray(a) != np.asarray(b)) and np.any(np.asarray(a) != before)
 
 
+def test_the_objective_is_the_smaller_of_the_two(trainer, params):
+    """Schulman et al. 2017, equation 7, at ratios of 0.5 and 1.5."""
+    inputs, action, bound = jnp.ones((4, 3)), jnp.full((4, 1), 0.3), jnp.zeros((4, 1))
+    ratio, advantage = np.array([0.5, 0.5, 1.5, 1.5]), np.array([1.0, -1.0, 2.0, -3.0])
+    new = trainer.distribution(params, inputs, bound).log_prob(action)
+    samples = ppo.Samples(inputs, action, new - np.log(ratio), advantage, jnp.zeros(4), bound)
+    epsilon = trainer.config.clip_epsilon
+    expected = -np.mean([0.5, -(1.0 - epsilon), 2.0 * (1.0 + epsilon), -4.5])
+    _, parts = trainer.loss(params, samples)
+    np.testing.assert_allclose(parts["loss/policy"], expected, rtol=1e-5)
+
+
 def some_samples(trainer, params) -> ppo.Samples:
     """Samples of another policy than that of the parameters."""
     rng = np.random.default_rng(0)
-    size = trainer.env.observation_size + len(trainer.critic_metrics)
-    inputs, action = (jnp.float32(rng.normal(size=(64, n))) for n in (size, 6))
+    inputs, action = (jnp.float32(rng.normal(size=(64, n))) for n in (3, 1))
     bound, target = jnp.zeros((64, 1)), jnp.float32(rng.normal(size=64))
     log_prob = trainer.distribution(params, inputs, bound).log_prob(action)
     return ppo.Samples(inputs, action, log_prob + 0.3 * target, target, target, bound)
 
 
-def test_the_examples_term_weighs_the_change_of_the_action(tiny, env, init):
+def test_the_examples_term_weighs_the_change_of_the_action(trainer, params):
     name = f"{Path(__file__).parents[1] / 'examples/smooth_ppo.py'}:SmoothPPO"
     kind = find_algorithm(name)
-    settings = kind.Config(**tiny.model_dump(), smoothness_cost=1e5)
-    params = init(jax.random.key(0)).params
-    plain, smooth = ppo.PPO(tiny, env, 100), kind(settings, env, 100)
-    samples = some_samples(plain, params)
-    (before, _), (after, metrics) = (x.loss(params, samples) for x in (plain, smooth))
+    settings = kind.Config(**trainer.config.model_dump(), smoothness_cost=1e5)
+    smooth, samples = kind(settings, trainer.env, 100), some_samples(trainer, params)
+    (before, _), (after, metrics) = (x.loss(params, samples) for x in (trainer, smooth))
     assert metrics["loss/smoothness"] > 0.0
     expected = 1e5 * float(metrics["loss/smoothness"])
     assert float(after - before) == pytest.approx(expected, rel=1e-3)
 
 
-def test_a_shared_critic_continues_the_policys_layers(tiny, env):
+def test_a_shared_critic_continues_the_policys_layers(trainer):
     """Both with the chosen activation; the error of the values also trains these layers."""
     changes = {"shared_critic": True, "activation": "tanh"}
-    trainer = ppo.PPO(tiny.model_copy(update=changes), env, 100)
-    params = jax.jit(trainer.init)(jax.random.key(1)).params
-    inputs = jnp.float32(np.random.default_rng(1).normal(size=(5, 29 + len(Bounce.critic_metrics))))
+    shared = ppo.PPO(trainer.config.model_copy(update=changes), trainer.env, 100)
+    params = jax.jit(shared.init)(jax.random.key(1)).params
+    inputs = jnp.float32(np.random.default_rng(1).normal(size=(5, 3)))
     hidden = params.policy["params"]["MLP_0"]["hidden_0"]
     head = params.value["params"]["hidden_0"]
-    features = np.tanh(inputs[:, :29] @ hidden["kernel"] + hidden["bias"])
-    expected = np.concatenate([features, inputs[:, 29:]], 1) @ head["kernel"] + head["bias"]
-    np.testing.assert_allclose(trainer.values(params, inputs), expected[:, 0], atol=1e-5)
-    mean = trainer.distribution(params, inputs, jnp.zeros((5, 1))).mean
+    features = np.tanh(inputs[:, :2] @ hidden["kernel"] + hidden["bias"])
+    expected = np.concatenate([features, inputs[:, 2:]], 1) @ head["kernel"] + head["bias"]
+    np.testing.assert_allclose(shared.values(params, inputs), expected[:, 0], atol=1e-5)
+    mean = shared.distribution(params, inputs, jnp.zeros((5, 1))).mean
     last = params.policy["params"]["Dense_0"]
     np.testing.assert_allclose(mean, features @ last["kernel"] + last["bias"], atol=1e-5)
-    gradient = jax.grad(lambda p: jnp.sum(trainer.values(p, inputs)))(params)
+    gradient = jax.grad(lambda p: jnp.sum(shared.values(p, inputs)))(params)
     assert np.abs(gradient.policy["params"]["MLP_0"]["hidden_0"]["kernel"]).max() > 0
 
 

@@ -12,17 +12,19 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from against_c import XML, converged, difference
+from against_c import XML, converged, differences, push_by_air
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.c_episodes import episode_models
 from bounce_mjx.learning.ppo import PPO
 from bounce_mjx.physics import Control, PhysicsState, edited_model, servo_targets
+from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.world.actuation import add_delay, start_actuation
 from bounce_mjx.world.randomization import (
     TERMS,
     RandomizationConfig,
+    contact_damping,
     physics_parameters,
     sample_world,
 )
@@ -354,19 +356,23 @@ class Run(NamedTuple):
 WORLDS, CONTROL_STEPS = 64, 200
 
 
-@pytest.fixture(scope="module")
-def free_run() -> Run:
-    """64 worlds with draws of all terms of the physics, the actuation and the task. The balls start
-    low and the actions are small, so that the balls bounce and keep bouncing."""
+@functools.cache
+def run(moves: bool) -> Run:
+    """64 worlds with draws of all terms of the task; if bodies move, also of the physics and the
+    actuation. The balls start low and the actions are small, so that the balls bounce and keep
+    bouncing."""
     terms = {
-        "restitution": (0.7, 0.95), "ball_mass": (0.7, 1.3), "ball_radius": (0.9, 1.1),
+        "push_speed": (0.02, 0.05), "push_interval": (0.3, 0.6), "command_interval": (0.4, 0.7),
+        "ball_start": (-0.02, 0.02), "joint_start": (-0.02, 0.02),
+    }  # fmt: skip
+    terms |= {} if not moves else {
+        "restitution": (0.75, 0.95), "restitution_slope": (0.02, 0.05), "air_lift": (0.0, 0.005),
+        "contact_friction": (0.1, 0.4), "ball_mass": (0.7, 1.3), "ball_radius": (0.9, 1.1),
         "air_drag": (0.0, 0.3), "servo_gain": (0.8, 1.2), "servo_damping": (0.8, 1.2),
         "servo_lag": (0.0, 0.02), "joint_damping": (0.0, 5.0), "armature": (0.7, 1.3),
         "joint_frictionloss": (0.0, 10.0), "link_mass": (0.7, 1.3), "torque_limit": (20.0, 100.0),
         "paddle_offset": (-0.01, 0.01), "paddle_tilt": (-0.02, 0.02),
-        "gravity_tilt": (-0.02, 0.02), "action_latency": (0.0, 0.035), "push_speed": (0.02, 0.05),
-        "push_interval": (0.3, 0.6), "command_interval": (0.4, 0.7),
-        "ball_start": (-0.02, 0.02), "joint_start": (-0.02, 0.02),
+        "gravity_tilt": (-0.02, 0.02), "action_latency": (0.0, 0.035),
     }  # fmt: skip
     with jax.enable_x64(True):
         config = EnvConfig(
@@ -380,31 +386,42 @@ def free_run() -> Run:
         actions = np.random.default_rng(1).uniform(-0.15, 0.15, (CONTROL_STEPS, 6, WORLDS))
 
         @jax.jit
-        def run(keys, actions):
+        def steps(keys, actions):
             starts = jax.vmap(env.reset, out_axes=-1)(keys)
 
             def step(state, action):
                 pipeline = state.pipeline_state
                 control, actuation = env.control(pipeline, action)
-                physics = env.engine.step(pipeline.parameters, pipeline.physics, control, 10)
+                physics = pipeline.physics
+                if moves:
+                    physics = env.engine.step(pipeline.parameters, physics, control, 10)
                 after = env.finish_step(state, action, actuation, physics)
                 pipeline = after.pipeline_state
                 target = pipeline.command["target_height"]
                 seen = (physics, control, target, pipeline.redraw.age)
                 return after, seen
 
-            def steps(state, action):
-                return jax.vmap(step, in_axes=-1, out_axes=-1)(state, action)
+            of_all = jax.vmap(step, in_axes=-1, out_axes=-1)
+            return starts, jax.lax.scan(of_all, starts, actions)[1]
 
-            return starts, jax.lax.scan(steps, starts, actions)[1]
-
-        starts, seen = jax.device_get(run(keys, actions))
+        starts, seen = jax.device_get(steps(keys, actions))
     return Run(env, starts, actions, *seen)
+
+
+@pytest.fixture
+def free_run() -> Run:
+    return run(moves=True)
+
+
+@pytest.fixture
+def at_rest() -> Run:
+    return run(moves=False)
 
 
 def c_run(free_run: Run, w: int, shift: float = 0.0) -> tuple[PhysicsState, int]:
     """States [T, ...] of world w on MuJoCo's C engine, and the number of steps with a contact. This
-    function simulates latency, lag, drag and pushes itself. The ball starts higher by `shift`."""
+    function simulates latency, lag, air, pushes and the restitution at the speed of the next impact
+    itself. The ball starts higher by `shift`."""
     start = free_run.starts.pipeline_state
     world = {name: np.asarray(value)[..., w] for name, value in start.world.items()}
     of_world = jax.tree.map(lambda x: np.asarray(x)[..., w : w + 1], start.parameters)
@@ -414,19 +431,28 @@ def c_run(free_run: Run, w: int, shift: float = 0.0) -> tuple[PhysicsState, int]
     data.qpos[:], data.qvel[:] = (x[..., w] for x in start.physics[:2])
     data.qpos[8] += shift
     low, high = model.jnt_range[:6].T
-    ball = model.body("ball_link")
+    at = find_addresses(model)
+    paddle, ball = at.paddle_geom, at.balls[0].geom
+    reach = model.geom_size[paddle].min() + model.geom_size[ball, 0]
+    jacobian, speed = np.zeros((3, model.nv)), 0.0
     delay, lag = round(float(world["action_latency"]) / 1e-3), float(world["servo_lag"]) / 1e-3
     asked, filtered = [data.qpos[:6].copy()], data.qpos[:6].copy()
     after, contacts = [], 0
     for t in range(CONTROL_STEPS):
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_jacGeom(model, data, jacobian, None, paddle)
+        if data.qpos[8] - data.geom_xpos[paddle, 2] - reach > 0.01:
+            speed = (jacobian @ data.qvel)[2] - data.qvel[8]
+        restitution = world["restitution"] - world["restitution_slope"] * (speed - 2.45)
+        model.pair_solref[0, 1] = -contact_damping(restitution, -model.pair_solref[0, 0])
         asked.append(np.clip(data.qpos[:6] + 0.02 * free_run.actions[t, :, w], low, high))
         data.qvel[6:9] += free_run.control.ball_push[t, :, w]
         for i in range(10):
             arrived = asked[max(0, (10 * t + i - delay) // 10 + 1)]
             filtered = arrived + (filtered - arrived) * np.exp(-1.0 / max(lag, 1e-3))
             data.ctrl[:] = filtered
-            drag = world["air_drag"] * np.linalg.norm(data.qvel[6:9]) * data.qvel[6:9]
-            data.xfrc_applied[ball.id, :3] = -ball.mass[0] * drag
+            push_by_air(model, data, world["air_drag"], world["air_lift"])
             mujoco.mj_step(model, data)
             contacts += data.ncon
         after.append((data.qpos.copy(), data.qvel.copy()))
@@ -446,17 +472,17 @@ def test_drawn_worlds_are_mujocos_over_2000_steps(free_run: Run, float64) -> Non
         contacts += touching
         for i, steps in enumerate((slice(0, 50), slice(0, 100), slice(0, 200))):
             until = [PhysicsState(*(x[steps] for x in s[:2])) for s in (reference, ours, shifted)]
-            errors[i, w] = max(difference(until[1], until[0]))
-            apart[i, w] = max(difference(until[2], until[0]))
+            errors[i, w] = np.max(differences(until[1], until[0]))
+            apart[i, w] = np.max(differences(until[2], until[0]))
     assert contacts > 20 * WORLDS
     assert errors[0].max() < 1e-9
     assert np.all((errors < 1e-9) | (errors < apart))
     assert np.mean(errors[2] < 1e-9) > 0.85
 
 
-def test_starts_are_displaced(free_run: Run) -> None:
-    start = free_run.starts.pipeline_state
-    config, qpos = free_run.env.config, np.asarray(start.physics.qpos)
+def test_starts_are_displaced(at_rest: Run) -> None:
+    start = at_rest.starts.pipeline_state
+    config, qpos = at_rest.env.config, np.asarray(start.physics.qpos)
     displaced = qpos[:6] - np.array(config.default_joint_angles)[:, None]
     np.testing.assert_allclose(displaced, start.world["joint_start"], atol=1e-9)
     ball = qpos[6:9] - np.array(config.ball_init_pos)[:, None] - start.world["ball_start"]
@@ -464,8 +490,8 @@ def test_starts_are_displaced(free_run: Run) -> None:
     assert 0.9 * noise < np.abs(ball).max() <= noise
 
 
-def test_pushes_have_their_size_and_interval(free_run: Run) -> None:
-    world, pushes = free_run.starts.pipeline_state.world, free_run.control.ball_push
+def test_pushes_have_their_size_and_interval(at_rest: Run) -> None:
+    world, pushes = at_rest.starts.pipeline_state.world, at_rest.control.ball_push
     size = np.linalg.norm(pushes, axis=1)
     assert np.all(pushes[:, 2] == 0.0)
     angles, first = [], []
@@ -484,10 +510,10 @@ def test_pushes_have_their_size_and_interval(free_run: Run) -> None:
     assert stats.kstest(first, "uniform").pvalue > 1e-3
 
 
-def test_targets_change_at_their_interval(free_run: Run) -> None:
-    world = free_run.starts.pipeline_state.world
-    start = free_run.starts.pipeline_state.command["target_height"]
-    heights = np.concatenate([start[None], free_run.target_height])
+def test_targets_change_at_their_interval(at_rest: Run) -> None:
+    world = at_rest.starts.pipeline_state.world
+    start = at_rest.starts.pipeline_state.command["target_height"]
+    heights = np.concatenate([start[None], at_rest.target_height])
     assert 0.3 <= heights.min() < 0.35 and 0.75 < heights.max() <= 0.8
     for w in range(WORLDS):
         changed = np.flatnonzero(np.diff(heights[:, w]))
@@ -498,4 +524,4 @@ def test_targets_change_at_their_interval(free_run: Run) -> None:
         # The age after the step of the change is one step.
         since = np.arange(CONTROL_STEPS) - changed[:, None]
         age = 1 + np.where(since >= 0, since, np.arange(CONTROL_STEPS)).min(axis=0)
-        np.testing.assert_allclose(free_run.target_age[:, w], 0.01 * age, atol=1e-9)
+        np.testing.assert_allclose(at_rest.target_age[:, w], 0.01 * age, atol=1e-9)

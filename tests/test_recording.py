@@ -1,6 +1,9 @@
 """Recordings of an evaluation's episodes: their content, and the figures from them."""
 
+import functools
+
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -8,6 +11,7 @@ import pytest
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.recording import paddle_points
+from bounce_mjx.evaluation.statistics import accumulate, empty_statistics
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.learning.statistics import init_normalizer
@@ -52,6 +56,23 @@ def stepped(env: BounceBall, networks, policy: Policy):
         states = step(states)
         history.append(jax.device_get(states))
     return jax.tree.map(lambda *x: np.moveaxis(np.stack(x), 1, -1), *history)
+
+
+@pytest.mark.slow
+def test_an_evaluation_counts_the_steps_of_each_episode(
+    env: BounceBall, evaluated, stepped
+) -> None:
+    """Up to its end; `test_evaluation.py` has what is counted in a step."""
+    found, _ = evaluated
+    add = jax.jit(functools.partial(accumulate, env))
+    expected = empty_statistics(env, jax.tree.map(lambda x: x[0], stepped))
+    for i in range(env.config.episode_steps):
+        now = jax.tree.map(lambda x, i=i: jnp.asarray(x[i]), stepped)
+        expected = add(expected, now, jnp.int32(i))
+    assert expected.tally.sums["rising_steps"].all() and expected.tally.maxima["n_bounces"].any()
+    for ours, theirs in zip(*map(jax.tree.leaves, (found, expected)), strict=True):
+        # Each contact magnifies the rounding of the differently compiled steps.
+        np.testing.assert_allclose(ours[:RECORDED], theirs, rtol=1e-2)
 
 
 @pytest.mark.slow

@@ -45,13 +45,14 @@ from tiny_runs import STEPS, TIMEOUT, TINY, arrays, job, shared_run
 
 def train(log_dir: Path, steps: int, *flags: str) -> Path:
     before = set(log_dir.glob("*"))
-    train_command.main([*TINY, "--total-steps", str(steps), "--log-dir", str(log_dir), *flags])
+    flags = "--total-steps", str(steps), "--log-dir", str(log_dir), "--no-report", *flags
+    train_command.main([*TINY, *flags])
     (run,) = set(log_dir.glob("*")) - before
     return run
 
 
 def resume(run: Path, *flags: str) -> None:
-    train_command.main(["--resume", str(run), *flags])
+    train_command.main(["--resume", str(run), "--no-report", *flags])
 
 
 def evaluations(run: Path) -> list[dict]:

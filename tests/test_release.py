@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -41,6 +42,20 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("dist")
     call("uv", "build", "--quiet", "--out-dir", folder, CHECKOUT, folder=folder)
     return next(folder.glob("*.whl"))
+
+
+def test_wheel_holds_the_package_and_its_data(built: Path) -> None:
+    with zipfile.ZipFile(built) as archive:
+        names = set(archive.namelist())
+    source = CHECKOUT / "src"
+    expected = {str(p.relative_to(source)) for p in (source / "bounce_mjx").rglob("*.py")}
+    expected |= {"bounce_mjx/py.typed"}
+    for folder in ("mjcf", "configs", "pretrained"):
+        data = [p for p in (CHECKOUT / folder).rglob("*") if p.is_file()]
+        assert data
+        expected |= {f"bounce_mjx/{p.relative_to(CHECKOUT)}" for p in data}
+    assert expected <= names
+    assert {name.split("/")[0].split("-")[0] for name in names} == {"bounce_mjx"}
 
 
 @pytest.mark.parametrize("version", [HERE, *(v for v in ("3.12", "3.13") if v != HERE)])

@@ -8,7 +8,15 @@ import mujoco
 import numpy as np
 import pytest
 
-from against_c import States, assert_same_step, c_models, c_steps, fused_steps, num_contacts
+from against_c import (
+    States,
+    assert_same_step,
+    c_models,
+    c_steps,
+    fused_steps,
+    num_contacts,
+    paddle_frame,
+)
 from arms import ARM, ARM_JOINTS, arm, hinge, link, mjcf, motors, ur5e
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.commands import adopt as adopt_command
@@ -191,13 +199,10 @@ def test_one_step_in_random_worlds_is_mujocos(float64, env) -> None:
     angles = env.config.default_joint_angles + rng.uniform(-0.5, 0.5, (count, 6))
     qpos[:, at.arm_qpos] = angles
     qvel = rng.uniform(-2.0, 2.0, (count, model.nv))
-    data = mujoco.MjData(model)
     for row in qpos:
-        data.qpos[:] = row
-        mujoco.mj_kinematics(model, data)
-        paddle = data.geom("blocker")
+        centre, axes = paddle_frame(model, row[at.arm_qpos,])
         local = rng.uniform(-1.0, 1.0, 3) * (0.04, 0.05, 0.012)
-        row[at.balls[0].qpos[:3],] = paddle.xpos + paddle.xmat.reshape(3, 3) @ local
+        row[at.balls[0].qpos[:3],] = centre + axes @ local
     ctrl = np.zeros((count, model.nu))
     ctrl[:, at.actuators] = angles + rng.uniform(-0.1, 0.1, (count, 6))
     states, parameters = States(qpos, qvel, ctrl), random_parameters(model, count, seed=2)

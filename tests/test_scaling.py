@@ -191,6 +191,7 @@ def test_the_setting_in_which_hosts_differ_is_named(
         hosts.agree(TrainConfig().model_copy(update=changes), resume)
 
 
+@pytest.mark.slow
 def test_hosts_that_do_not_find_each_other_end_with_a_sentence(tmp_path: Path):
     flags = ["--coordinator-address", f"127.0.0.1:{free_port()}", "--num_processes", 2]
     with job(tmp_path / "log", *flags, "--process_id", 0, "--host-timeout", 2) as alone:
@@ -198,6 +199,7 @@ def test_hosts_that_do_not_find_each_other_end_with_a_sentence(tmp_path: Path):
     assert re.fullmatch(r"error: .+ did not find each other at .+ within 2 s; .+\n", alone.said)
 
 
+@pytest.mark.slow
 def test_distributed_without_a_launcher_gives_one_sentence(tmp_path: Path):
     with job(tmp_path / "log", "--distributed") as alone:
         assert alone.wait() == 2

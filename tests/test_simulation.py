@@ -11,7 +11,6 @@ from rich.console import Console
 
 import viewing
 from bounce_mjx import BounceBall, EnvConfig
-from bounce_mjx.baselines.mirror import MirrorLaw
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.resources import resource_path
@@ -62,10 +61,9 @@ def env(mirrored: Simulation) -> BounceBall:
 
 @pytest.fixture(scope="module")
 def recording(mirrored: Simulation) -> EnvFrame:
-    """A recording from the first reset that is one step longer than an episode."""
-    env = mirrored.env
-    simulation = Simulation(env, make_policy_controller(MirrorLaw(env)), 2, seed=0)
-    return simulation.record(SECONDS + env.dt)
+    """A recording from a reset that is one step longer than an episode."""
+    mirrored.reset()
+    return mirrored.record(SECONDS + mirrored.env.dt)
 
 
 def test_frames_describe_one_state(env: BounceBall, recording: EnvFrame) -> None:

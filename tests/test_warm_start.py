@@ -33,7 +33,7 @@ def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
     log_dir = tmp_path_factory.mktemp("first") / "runs"
     flags = ["--critic-metrics", "n_bounces", "world/*", "--total-steps", str(STEPS)]
     terms = "--randomization.restitution 0.7 0.9 --randomization.air-drag 0.0 0.2".split()
-    train_command.main([*TINY, *flags, *terms, "--log-dir", str(log_dir)])
+    train_command.main([*TINY, *flags, *terms, "--no-report", "--log-dir", str(log_dir)])
     (run,) = log_dir.iterdir()
     return run
 
@@ -83,7 +83,7 @@ def test_a_training_starts_with_the_policy_of_the_run(first: Path, tmp_path: Pat
     args = [*TINY[: TINY.index("--hidden-layers")], *TINY[TINY.index("--block-steps") :]]
     args = [x for x in args if x not in ("--episode-seconds", "0.5")]
     args += ["--config", "cpu", "--warm-start", str(first), "--total-steps", str(STEPS)]
-    train_command.main([*args, "--log-dir", str(tmp_path), "--num-seeds", "2"])
+    train_command.main([*args, "--log-dir", str(tmp_path), "--num-seeds", "2", "--no-report"])
     (run,) = tmp_path.iterdir()
     assert load_run_config(run).warm_start == best_checkpoint(first).folder
     before = json.loads((first / "results.json").read_text())

@@ -48,7 +48,7 @@ def mirrored() -> Simulation:
 
 
 def exchangeable() -> Simulation:
-    """One robot under a policy that is one constant action for all joints, from a new reset with
+    """Two robots under a policy that is one constant action for all joints, from a new reset with
     the policy 0, whatever another file's tests left."""
     simulation = _exchangeable()
     simulation.command, simulation.world, simulation.policy = {}, None, np.float32(0.0)
@@ -63,7 +63,8 @@ def _exchangeable() -> Simulation:
     def controller(policy, states, key):
         return policy + jnp.zeros_like(states.obs[: env.action_size])
 
-    return Simulation(env, controller, 1, seed=0, policy=np.float32(0.0))
+    # As many robots as above, with which it has the program of the reset in common.
+    return Simulation(env, controller, 2, seed=0, policy=np.float32(0.0))
 
 
 class Client:

@@ -43,12 +43,12 @@ def main(args: Sequence[str]) -> None:
     checkpoints = [find_checkpoint(seed) for seed in seeds]
     configs = [command.config(checkpoint.run) for checkpoint in checkpoints]
     groups = group_runs([checkpoint.run for checkpoint in checkpoints])
+    with writable(command.out, "choose another folder with --out"):
+        command.out.mkdir(parents=True, exist_ok=True)
     drawn = {"curves": figures.curves_figure(groups), "rewards": figures.rewards_figure(groups)}
     if len(checkpoints) == 1:
         recording = record_checkpoint(checkpoints[0])
         drawn["evaluation"] = figures.evaluation_figure(Env(configs[0].env), recording)
-    with writable(command.out, "choose another folder with --out"):
-        command.out.mkdir(parents=True, exist_ok=True)
     for name, figure in drawn.items():
         for suffix in command.formats:
             path = command.out / f"{name}.{suffix}"
