@@ -15,7 +15,7 @@ from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.unknowns import CAMERA_ROTATION, Layout
 from bounce_mjx.identify.windows import Windows
 from bounce_mjx.physics import Control, PhysicsState, make_engine
-from bounce_mjx.robot.model import find_addresses
+from bounce_mjx.robot.model import find_addresses, scatter
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import physics_parameters
 
@@ -90,25 +90,19 @@ def _compile(config: WorldConfig, n: int) -> Callable[..., tuple[jax.Array, jax.
     model = world_model(config, visual=False)
     engine, addresses = make_engine(model, config.physics), find_addresses(model)
     ball, dt = addresses.balls[0], config.physics_dt
-    gear = model.actuator_gear[:, 0]
+    gears = model.actuator_gear[list(addresses.actuators), 0]
     shown_q = (*addresses.arm_qpos, *ball.qpos[:3])
     shown_v = (*addresses.arm_qvel, *ball.qvel[:3])
-    rest = jnp.asarray(model.qpos0, jnp.float32)
 
     def first_state(start: jax.Array) -> PhysicsState:
         angles, velocities, position, ball_speeds = jnp.split(start, [n, 2 * n, 2 * n + 3])
-        qpos = rest.at[np.array(shown_q)].set(jnp.concatenate([angles, position]))
-        moving = np.array((*addresses.arm_qvel, *ball.qvel))
-        qvel = jnp.zeros(model.nv, start.dtype)
-        qvel = qvel.at[moving].set(jnp.concatenate([velocities, ball_speeds]))
-        return PhysicsState(qpos, qvel)
+        qpos = scatter(model.qpos0, shown_q, jnp.concatenate([angles, position]))
+        moving, speeds = (*addresses.arm_qvel, *ball.qvel), (velocities, ball_speeds)
+        return PhysicsState(qpos, scatter(np.zeros(model.nv), moving, jnp.concatenate(speeds)))
 
     def advance(parameters, state, target, drag):
-        # One scalar per joint, which XLA fuses with the physics.
-        ctrl = [jnp.zeros_like(drag)] * model.nu
-        for i, actuator in enumerate(addresses.actuators):
-            ctrl[actuator] = float(gear[actuator]) * target[i]
-        return engine.step(parameters, state, Control(jnp.stack(ctrl), air_drag=drag), 1)
+        ctrl = scatter(np.zeros(model.nu), addresses.actuators, gears * target)
+        return engine.step(parameters, state, Control(ctrl, air_drag=drag), 1)
 
     def at(path: jax.Array, speeds: jax.Array, times: jax.Array) -> jax.Array:
         """A path [T, k, L] at times [M, L], by the nearest step and its velocity."""
