@@ -33,6 +33,7 @@ _NARROWER = 1e-3
 _HANDLE_RADIUS = 0.011
 # Without what only its simulations need; a later version may move its files.
 _INSTALLED_AS = {"robosuite": ("--no-deps", "robosuite==1.5.2")}
+_JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 
 
 class ServoSettings(NamedTuple):
@@ -244,7 +245,7 @@ class _Builder:
         model, actuators = self._model, {}
         for a in range(model.nactuator):
             joint = int(model.actuator_trnid[a, 0])
-            if model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT:
+            if int(model.actuator_trntype[a]) in _JOINT_TRANSMISSIONS:
                 if joint in joints and joint in actuators:
                     raise UserError(f"several actuators on {joint_name(model, joint)}; give it one")
                 actuators[joint] = a
