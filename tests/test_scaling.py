@@ -23,8 +23,7 @@ from bounce_mjx.training import hosts, ppo_trainer
 from bounce_mjx.training.command import read_command
 from tiny_runs import STEPS, TINY, arrays, job
 
-# As many environments as eight devices can share.
-SHARED = [*TINY, "--num-envs", "16", "--total-steps", str(2 * STEPS), "--no-report"]
+SHARED = [*TINY, "--total-steps", str(2 * STEPS), "--no-report"]
 SEEDS = 3
 
 

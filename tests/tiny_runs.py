@@ -20,8 +20,9 @@ from bounce_mjx.runs.folders import Checkpoint
 
 TRAIN_SCRIPT = Path(__file__).parent.parent / "train_jax.py"
 STEPS = 256
+# As many environments as eight devices can share.
 TINY = (
-    "--num-envs 8 --rollout-length 8 --num-minibatches 2 --num-epochs 1 --hidden-layers 16 "
+    "--num-envs 16 --rollout-length 4 --num-minibatches 2 --num-epochs 1 --hidden-layers 16 "
     "--block-steps 64 --eval-every 128 --eval-episodes 4 --screening-episodes 0 "
     "--no-stop-when-solved --episode-seconds 0.5"
 ).split()
