@@ -56,12 +56,11 @@ def test_one_step_from_random_states_is_mujocos(mj_model, float64):
 
 @pytest.mark.slow
 def test_2000_random_action_steps_are_mujocos(mj_model, float64):
+    # Of the seeds 0 to 9, seven stay below 1e-9; the others meet only the criterion of `free_run`.
     rng = np.random.default_rng(6)
     start, models = bouncing_states(mj_model, rng), [mj_model] * BATCH
     errors, contacts, _ = free_run(mj_model, models, MODEL, start, rng, lambda _: {})
-    print(f"2,000 steps x {BATCH}: {contacts} contact steps, difference {np.max(errors):.1e}")
-    assert contacts >= 1000
-    assert np.max(errors) < 1e-9
+    assert contacts >= 1000 and np.max(errors) < 1e-9
 
 
 def test_mjx_multiplies_in_full_precision(mj_model):

@@ -72,6 +72,14 @@ def test_a_task_without_events_goes_through_every_command(
     assert policy.step({name: np.zeros(sizes[name]) for name in policy.needs}).shape == (6,)
 
 
+@pytest.mark.parametrize("name", ["balance", "catch", "juggle", "track"])
+def test_every_task_shows_the_balls_rotation_if_asked(name: str) -> None:
+    config = find_task(name).Config()
+    seen = config.observation.model_copy(update={"ball_quaternion": 1, "ball_angular_velocity": 2})
+    size = Env(config.model_copy(update={"observation": seen})).layout.size
+    assert size == Env(config).layout.size + config.num_balls * (4 + 2 * 3)
+
+
 def test_libraries_take_another_task() -> None:
     """Those whose own tests have no other task: the shape of the first observation."""
     pytest.importorskip("brax")
