@@ -374,8 +374,7 @@ def test_apex_is_the_highest_point_since_the_bounce():
     _, _, task = drive(flights(0.5) + falling)
     assert task.apex == np.float32(0.52)
     bounced, counts, task = drive(flights(0.5) + falling + [(0.12, 1.0)])
-    assert bounced[-1] and counts[-1] == 2
-    assert task.apex == np.float32(0.12)
+    assert bounced[-1] and counts[-1] == 2 and task.apex == np.float32(0.12)
 
 
 def test_bounce_is_near_the_paddle():
