@@ -1,5 +1,6 @@
 """Settings of an adopted arm: the paddle, the ball and the servos that its MJCF lacks."""
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -39,8 +40,19 @@ class BallConfig(StrictModel):
 
     radius: Annotated[Positive, Field(le=1.0)] = 0.019
     """Radius, m."""
-    mass: Annotated[Positive, Field(le=1.0)] = 0.0027
+    mass: Positive = 0.0027
     """Mass, kg."""
+
+    @pydantic.model_validator(mode="after")
+    def _check_density(self):
+        density = self.mass / (4.0 / 3.0 * math.pi * self.radius**3)
+        if not 0.5 <= density <= 25_000.0:
+            raise ValueError(
+                f"a mass of {self.mass:g} kg in a radius of {self.radius:g} m is "
+                f"{density:.3g} kg/m^3, but no ball is lighter than 0.5 or heavier than 25,000; "
+                "check both units"
+            )
+        return self
 
 
 class LimitsConfig(StrictModel):
