@@ -20,11 +20,10 @@ class ReportCommand(RunCommand):
 def main(args: Sequence[str]) -> None:
     """Runs the command line."""
     command = parse(ReportCommand, args, prog="bounce-mjx report")
-    from bounce_mjx.reports.page import record_checkpoint, write_report
+    from bounce_mjx.reports.page import write_report
     from bounce_mjx.runs.folders import find_checkpoint, named_run
     from bounce_mjx.training.setup import set_up_jax
 
     checkpoint = find_checkpoint(named_run(command.run, command.folder))
     set_up_jax(command.config(checkpoint.run).env)
-    report, _ = write_report(checkpoint.run, record_checkpoint(checkpoint))
-    print(report)
+    print(write_report(checkpoint.run))

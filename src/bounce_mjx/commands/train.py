@@ -30,7 +30,6 @@ def main(args: Sequence[str]) -> None:
             # CUDA starts during the imports; JAX reports an error where it needs the devices.
             in_daemon_thread(jax.devices)
         from bounce_mjx.training import hosts
-        from bounce_mjx.training.callbacks import WeightsAndBiases
         from bounce_mjx.training.console import say
         from bounce_mjx.training.job import TrainingStopped, named_task
         from bounce_mjx.training.run import train
@@ -56,8 +55,6 @@ def main(args: Sequence[str]) -> None:
             if command.warm_start is not None:
                 say(console, f"warm start: {command.warm_start}")
         callbacks = [] if page is None else [page]
-        if command.wandb is not None:
-            callbacks.append(WeightsAndBiases(command.wandb))
         if command.video:
             from bounce_mjx.training.video import EvaluationVideo
 

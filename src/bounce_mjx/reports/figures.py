@@ -12,7 +12,6 @@ import matplotlib
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import EngFormatter, MaxNLocator
@@ -110,14 +109,6 @@ def image(figure: Figure, suffix: str) -> bytes:
     metadata = {"Date": None} if suffix == "svg" else None
     figure.savefig(buffer, format=suffix, dpi=150, metadata=metadata)
     return buffer.getvalue()
-
-
-@style()
-def pixels(figure: Figure) -> np.ndarray:
-    """A figure as an image [height, width, 3] (uint8)."""
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    return np.array(canvas.buffer_rgba())[..., :3]
 
 
 def make_panels(count: int, columns: int, height: float) -> tuple[Figure, list[Axes]]:

@@ -28,7 +28,7 @@ from bounce_mjx.reports.robustness import load_robustness, robustness_figure
 from bounce_mjx.reports.tables import details_line, result_cells, robot_name
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.files import write_output
-from bounce_mjx.runs.folders import Checkpoint
+from bounce_mjx.runs.folders import Checkpoint, best_checkpoint
 from bounce_mjx.runs.progress import Results, load_results
 from bounce_mjx.runs.reading import read_actor
 from bounce_mjx.task.shown import Recording
@@ -49,14 +49,11 @@ def record_checkpoint(checkpoint: Checkpoint) -> Recording:
     return evaluated.report.recording
 
 
-def write_report(run: Path, recording: Recording) -> tuple[Path, Figure]:
-    """Writes `report.html` into a run's folder.
+def write_report(run: Path, recording: Recording | None = None) -> Path:
+    """Writes `report.html` into a run's folder; its path.
 
     Args:
-      recording: episodes of the run's best checkpoint.
-
-    Returns:
-      The page's path, and its figure of the evaluation.
+      recording: episodes of the run's best checkpoint; by default, new ones.
 
     Raises:
       UserError: the run has no results or no log yet, one of their files is damaged, or the page
@@ -68,11 +65,11 @@ def write_report(run: Path, recording: Recording) -> tuple[Path, Figure]:
     config = load_run_config(run)
     groups = group_runs([run])
     env = Env(config.env)
-    evaluation = evaluation_figure(env, recording, _WIDTH)
+    recording = recording or record_checkpoint(best_checkpoint(run))
     robustness = load_robustness(run)
     figures = {
         "Learning curves": curves_figure(groups, _COLUMNS),
-        "The best checkpoint": evaluation,
+        "The best checkpoint": evaluation_figure(env, recording, _WIDTH),
         "Reward terms": rewards_figure(groups, _COLUMNS),
     }
     if robustness is not None:
@@ -80,7 +77,7 @@ def write_report(run: Path, recording: Recording) -> tuple[Path, Figure]:
     replay = replay_first_episode(env, recording)
     path = run / REPORT_FILE
     write_output(path, _html(run, config, env.engine.name, results, figures, replay))
-    return path, evaluation
+    return path
 
 
 def _html(

@@ -97,16 +97,6 @@ def result_cells(result: Result) -> list[str]:
     return [result.name, result.measured, figure_text(result.value), result.bound, verdict]
 
 
-def results_markdown(report: Report) -> str:
-    """The results as a Markdown table."""
-    lines = ["| result | measured | value | bound | |", "|---|---|---:|---|---|"]
-    for result in report.results:
-        # An unescaped | would begin a new cell.
-        cells = [cell.replace("|", "&#124;") for cell in result_cells(result)]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
 def unsolved_line(report: Report) -> str:
     """What a policy misses, and what may help; empty if it meets all results."""
     missed = [

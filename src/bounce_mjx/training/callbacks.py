@@ -1,7 +1,6 @@
 """What a training tells: an event for each block and evaluation, to functions of the user's."""
 
 import dataclasses
-import hashlib
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -9,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from bounce_mjx.errors import UserError, needed, reason_of
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.runs.config import TrainConfig
@@ -56,46 +54,6 @@ def points_of(report: Report) -> dict[str, float]:
     values |= report.details
     known = {name: x for name, x in values.items() if x is not None and math.isfinite(x)}
     return {f"results/{name}": x for name, x in known.items()}
-
-
-class WeightsAndBiases:
-    """A callback that logs to Weights & Biases, to one run for each seed. A resumed training
-    continues its run."""
-
-    def __init__(self, project: str):
-        self._project, self._runs = project, {}
-
-    def start(self, run: Path, config: TrainConfig) -> None:
-        """
-        Raises:
-          UserError: the package is missing, or Weights & Biases refuses the run, for example
-            without an account.
-        """
-        # Imported only when it is asked for; it takes seconds.
-        with needed("wandb", "bounce_mjx[wandb]"):
-            import wandb
-        try:
-            self._runs[run] = wandb.init(
-                project=self._project,
-                name=run.name,
-                id=hashlib.sha256(str(run.absolute()).encode()).hexdigest()[:16],
-                resume="allow",
-                reinit="create_new",
-                dir=run,
-                config=config.model_dump(mode="json"),
-            )
-        except Exception as error:
-            raise UserError(
-                f"--wandb {self._project} is refused ({reason_of(error)}); run wandb login, or set "
-                "WANDB_MODE to offline"
-            ) from error
-
-    def __call__(self, event: Event) -> None:
-        self._runs[event.run].log(event.metrics, step=event.steps)
-
-    def close(self) -> None:
-        for run in self._runs.values():
-            run.finish()
 
 
 def call_all(callbacks: list[Any], method: str, *arguments: Any) -> None:

@@ -31,7 +31,7 @@ PROG = "bounce-mjx train"
 
 _SHORT_HELP = (
     "task config robot world warm_start resume seed num_seeds total_steps stop_when_solved "
-    "log_dir report watch wandb algorithm ppo.num_envs ppo.learning_rate ppo.hidden_layers"
+    "log_dir report watch algorithm ppo.num_envs ppo.learning_rate ppo.hidden_layers"
 ).split()
 
 
@@ -179,8 +179,6 @@ class TrainCommand(TrainConfig, Start):
     ppo: pydantic.SerializeAsAny[PPOConfig] = PPOConfig()
     report: bool = True
     """Write report.html into the run's folder after the results are printed."""
-    wandb: str | None = None
-    """Project of Weights & Biases to log to, in addition to TensorBoard; needs the extra wandb."""
     video: bool = False
     """Show each evaluated policy as a video in TensorBoard, under Images; the training waits."""
     distributed: bool = False
@@ -193,7 +191,7 @@ class TrainCommand(TrainConfig, Start):
     process_id: NonNegativeInt | None = None
     """Number of this process, from 0; with coordinator-address."""
     watch: bool = False
-    """Serve a page during the training, with the newest policy, the curves and the results."""
+    """Serve a page during the training, with the newest policy and the results."""
     watch_host: str = "127.0.0.1"
     """Address of that page's server; 0.0.0.0 also admits other machines."""
     watch_allow_host: tuple[str, ...] = ()

@@ -33,7 +33,6 @@ from bounce_mjx.training import hosts
 from bounce_mjx.training.callbacks import Callback, Event, block_points, call_all, points_of
 from bounce_mjx.training.console import block_line, evaluation_line, say
 from bounce_mjx.training.evaluators import Evaluators
-from bounce_mjx.training.first_block import fault_of
 from bounce_mjx.training.log import TensorBoardLog
 from bounce_mjx.training.ppo_trainer import PPOTrainer
 from bounce_mjx.training.trainer import Snapshot, Trainer, in_whole_blocks, iterations_per_block
@@ -417,8 +416,6 @@ class Job:
             self.say("stopping after this block; the same signal again ends it at once")
         metrics = block.result()
         seconds = time.perf_counter() - started
-        if self.steps == 0 and (wrong := fault_of(metrics, self.config)) is not None:
-            raise UserError(f"these settings cannot be trained: {wrong}")
         self.keeps_folder = True
         faults = metrics.pop("fault")
         self.steps += self.block_steps

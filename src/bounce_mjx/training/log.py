@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 from bounce_mjx.config.files import dump_config, flat
-from bounce_mjx.reports.tables import results_markdown
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training.callbacks import Event
 
@@ -45,11 +44,9 @@ class TensorBoardLog:
             self.add(part, 0)
 
     def __call__(self, event: Event) -> None:
-        """Writes the points of an event, and the table of an evaluation."""
+        """Writes the points of an event."""
         for name, value in event.metrics.items():
             self.add(self.summary.scalar(name, value), event.steps)
-        if event.report is not None:
-            self.add(self.summary.text("results", results_markdown(event.report)), event.steps)
         self.flush()
 
     def add(self, summary: Any, steps: int) -> None:

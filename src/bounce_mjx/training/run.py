@@ -29,7 +29,6 @@ from bounce_mjx.training import hosts, job
 from bounce_mjx.training.callbacks import Callback
 from bounce_mjx.training.command import Start, changed
 from bounce_mjx.training.console import say
-from bounce_mjx.training.log import TensorBoardLog
 from bounce_mjx.training.setup import set_up_jax
 
 
@@ -185,22 +184,14 @@ def print_results(seeds: Sequence[job.SeedRun], console: Console) -> job.SeedRun
 
 
 def leave_report(seed: job.SeedRun, console: Console) -> None:
-    """Draws the report, and the figure of the final evaluation in the TensorBoard log. The training
-    is already saved, so a failure only prints one line."""
+    """Draws the report. The training is already saved, so a failure only prints one line."""
     started = time.perf_counter()
     try:
         # Imported during the compilation (`Job.compile`).
-        from bounce_mjx.reports import figures, page
+        from bounce_mjx.reports import page
 
         recording = seed.progress.best.recording
-        if recording is None:
-            recording = page.record_checkpoint(folders.find_checkpoint(seed.run))
-        path, evaluation = page.write_report(seed.run, recording)
-        # A new file, because the log of the training is already closed.
-        log = TensorBoardLog(seed.run)
-        picture = log.summary.image("evaluation", figures.pixels(evaluation), dataformats="HWC")
-        log.add(picture, seed.progress.best_steps)
-        log.flush()
+        path = page.write_report(seed.run, recording)
     except Exception as error:
         again = shlex.join([str(seed.run), *job.named_task(seed.config)])
         reason = reason_of(error)

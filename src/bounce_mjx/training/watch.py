@@ -1,12 +1,11 @@
-"""The page of a running training: its newest policy, its curves and its results."""
+"""The page of a running training: its newest policy, its progress and its results."""
 
-import collections
 import html
 import queue
 import threading
+from collections.abc import Callable
 
 import jax
-import numpy as np
 import viser
 from rich.console import Console
 
@@ -17,17 +16,14 @@ from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.learning.policy import make_networks, untrained_policy
 from bounce_mjx.reports.tables import figure_text
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.task.shown import Curve
 from bounce_mjx.training.callbacks import Event
 from bounce_mjx.training.console import say
-from bounce_mjx.viewers.browser import AXIS, LivePage, free_port
+from bounce_mjx.viewers.browser import LivePage, free_port
 from bounce_mjx.viewers.guard import open_server
 from bounce_mjx.viewers.options import Address, PageStart
 from bounce_mjx.viewers.simulation import Simulation, make_policy_controller
 
 _ROBOTS = 4
-_RETURN = Curve("episode/return", "", title="return of an episode")
-_MAX_POINTS = 2000
 
 
 class TrainingPage:
@@ -69,20 +65,20 @@ class TrainingPage:
             with cpu, open_server(*self._address) as server:
                 say(self._console, f"watch: {self._address.url}")
                 side = server.gui.add_panel()
-                panel = _Panel(server.gui, side, self._config)
+                show = add_panel(server.gui, side, self._config)
                 simulation = _simulate(self._config)
                 page = LivePage(server, simulation, PageStart("training"), side)
-                page.run(None, lambda: self._tell(simulation, panel))
+                page.run(None, lambda: self._tell(simulation, show))
         # The training continues without its page.
         except Exception as error:
             reason = reason_of(error)
             say(self._console, f"the page is not served ({reason}); training continues without it")
 
-    def _tell(self, simulation: Simulation, panel: "_Panel") -> None:
+    def _tell(self, simulation: Simulation, show: Callable[[Event | None], None]) -> None:
         """Shows the news since the last call."""
         while not self._news.empty():
             event = self._news.get()
-            panel.show(event)
+            show(event)
             if event is not None and event.policy is not None:
                 simulation.policy = event.policy
 
@@ -96,62 +92,38 @@ def _simulate(config: TrainConfig) -> Simulation:
     return Simulation(env, make_policy_controller(networks), robots, config.seed, policy=policy)
 
 
-class _Panel:
-    """The tab of the training: its progress, its results and the task's curves."""
+def add_panel(
+    gui: viser.GuiApi, side: viser.PanelHandle, config: TrainConfig
+) -> Callable[[Event | None], None]:
+    """Adds the tab of the training, with its progress and its results. The function that it returns
+    shows a block or an evaluation; None is the end of the training."""
+    with side.add_tab("training", viser.Icon.SCHOOL):
+        progress = gui.add_html(_text("compiling"))
+        results = gui.add_html(_text("no evaluation yet; the arm is untrained"))
 
-    def __init__(self, gui: viser.GuiApi, side: viser.PanelHandle, config: TrainConfig):
-        self._total_steps = config.total_steps
-        curves = (_RETURN, *(curve for curve in config.env.task.curves if curve.title))
-        with side.add_tab("training", viser.Icon.SCHOOL):
-            self._progress = gui.add_html(_text("compiling"))
-            self._results = gui.add_html(_text("no evaluation yet; the arm is untrained"))
-            self._plots = [(curve, _add_plot(gui, curve.title)) for curve in curves]
-        self._points = [collections.deque(maxlen=_MAX_POINTS) for _ in curves]
-
-    def show(self, event: Event | None) -> None:
-        """Shows a block or an evaluation; None is the end of the training."""
+    def show(event: Event | None) -> None:
         if event is None:
-            self._progress.content = _text("<b>Training has ended</b>")
+            progress.content = _text("<b>Training has ended</b>")
         elif event.report is not None:
-            self._results.content = results_list(event.report, event.steps)
+            results.content = results_list(event.report, event.steps)
         else:
-            done = f"{event.steps:,} of {self._total_steps:,} steps"
+            done = f"{event.steps:,} of {config.total_steps:,} steps"
             rate = event.metrics["speed/steps_per_second"]
-            self._progress.content = _text(f"<b>{done}</b><br>{rate:,.0f} steps/s")
-            for points, (curve, plot) in zip(self._points, self._plots, strict=True):
-                if curve.tag in event.metrics:
-                    points.append((event.steps / 1e6, curve.scale * event.metrics[curve.tag]))
-                    plot.data = tuple(np.array(points).T)
+            progress.content = _text(f"<b>{done}</b><br>{rate:,.0f} steps/s")
 
-
-def _add_plot(gui: viser.GuiApi, title: str) -> viser.GuiUplotHandle:
-    gui.add_markdown(title)
-    return gui.add_uplot(
-        (np.zeros(1), np.zeros(1)),
-        ({"label": "M steps"}, {"label": title, "stroke": "#e8590c", "width": 2}),
-        axes=({**AXIS, "size": 30}, {**AXIS, "size": 50}),
-        scales={"x": {"time": False}},
-        legend={"show": False},
-        height=130,
-    )
+    return show
 
 
 def results_list(report: Report, steps: int) -> str:
     """The results as HTML, after a number of environment steps."""
     marks = {True: "&#10003;", False: "&#10007;", None: "-"}
-    rows = (
-        (
-            marks[x.passed],
-            html.escape(x.name),
-            figure_text(x.value),
-            html.escape(x.bound.partition(" (")[0]),
-        )
-        for x in report.results
-    )
-    table = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
     kind = "screening" if report.screening else "evaluation"
-    head = f"{kind} at {steps:,} steps:<br><b>{html.escape(report.summary)}</b>"
-    return _text(f'{head}<table style="width:100%;white-space:nowrap">{table}</table>')
+    lines = [f"{kind} at {steps:,} steps:", f"<b>{html.escape(report.summary)}</b>"]
+    for x in report.results:
+        bound = x.bound.partition(" (")[0]
+        line = f"{x.name} {figure_text(x.value)} ({bound})"
+        lines.append(f"{marks[x.passed]} {html.escape(line)}")
+    return _text("<br>".join(lines))
 
 
 def _text(content: str) -> str:
