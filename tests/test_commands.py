@@ -64,7 +64,7 @@ MISTAKES = (
     ("train --warm-start robust_small --hidden-layers 8", "other hidden layers"),
     ("train --warm-start robust_small --observation.action 1", "another observation"),
     ("train --warm-start robust_small --robot ur5e", "--warm-start and --robot"),
-    ("train --warm-start nowhere", "there is no run nowhere, and no policy of this name"),
+    ("train --warm-start nowhere", "there is no checkpoint folder nowhere; give a run"),
     ("train --resume {run} --warm-start robust_small", "--resume cannot change warm_start"),
     ("train --resume {run} --reward.height.weight 1", "cannot change env.reward.height.weight;"),
     ("train --resume {run} --block-steps 128", "cannot change block_steps;", "leave those flags"),

@@ -4,7 +4,6 @@ import concurrent.futures
 import dataclasses
 import errno
 import json
-import math
 import os
 import re
 import shutil
@@ -128,17 +127,6 @@ def test_a_run_without_a_checkpoint_is_told_as_such(runs: Path) -> None:
     for find in (latest_checkpoint, best_checkpoint, find_checkpoint):
         with pytest.raises(UserError, match="2026-01-03 has no checkpoint, because the first"):
             find(runs / "2026-01-03")
-
-
-@pytest.mark.parametrize("place", ["checkpoints", "checkpoints/9"])
-def test_a_training_is_not_resumed_through_a_link(runs: Path, place: str, refused) -> None:
-    """It would write there, and remove the folders that look like checkpoints."""
-    run, other = runs / "2026-01-02", runs / "other"
-    shutil.copytree(run / "checkpoints", other)
-    shutil.rmtree(run / place, ignore_errors=True)
-    (run / place).parent.mkdir(exist_ok=True)
-    (run / place).symlink_to(other)
-    refused(["train", "--resume", run], f"error: {run}/{place} is a link, and training")
 
 
 @pytest.fixture
@@ -345,7 +333,7 @@ def test_results_are_read_as_they_were_written(tmp_path: Path, progress: Progres
     assert Progress.model_validate(json.loads(to_json(progress.model_dump()))) == progress
 
 
-@pytest.mark.parametrize("change", [None, {"results": [3]}, {"seconds": {"train": math.inf}}])
+@pytest.mark.parametrize("change", [None, {"results": [3]}])
 def test_results_of_another_shape(tmp_path: Path, progress: Progress, change) -> None:
     path = tmp_path / "results.json"
     path.write_text(json.dumps(results_of(progress) | change if change else []))

@@ -19,8 +19,7 @@ from bounce_mjx.lazy import jax
 from bounce_mjx.learning.config import PPO_NAME, PPOConfig, find_algorithm
 from bounce_mjx.resources import PRETRAINED, resource_path
 from bounce_mjx.robot.config import is_packaged
-from bounce_mjx.runs.copies import ROBOT, task_of_run, unnamed_code
-from bounce_mjx.runs.files import check_copy
+from bounce_mjx.runs.copies import check_robot, task_of_run, unnamed_code
 from bounce_mjx.task.task import Task
 from bounce_mjx.tasks.registry import (
     DEFAULT,
@@ -167,7 +166,7 @@ def load_run_config(
     its_task = task_of_run(values["task"], run, task)
     config = validate(train_config(its_task, ppo=ppo), values, str(path))
     if config.env.mjcf is not None and not is_packaged(config.env.mjcf):
-        check_copy(config.env.mjcf, run / ROBOT, "--mjcf")
+        check_robot(run)
     return config
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.lazy import mujoco
-from bounce_mjx.runs.files import MANIFEST_FILE, seal, write_atomically
+from bounce_mjx.runs.files import MANIFEST_FILE, check_integrity, seal, write_atomically
 from bounce_mjx.task.task import Task
 from bounce_mjx.tasks import registry
 
@@ -55,6 +55,22 @@ def copy_robot(mjcf: Path, run: Path) -> Path:
             f"not keep a copy of the robot; name it relative to the folder of {mjcf.name}"
         )
     return copied
+
+
+def check_robot(run: Path) -> None:
+    """Checks that a run's copy of its robot is as it was written.
+
+    Raises:
+      UserError: a file is missing or was edited.
+    """
+    try:
+        check_integrity(run / ROBOT)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(
+            f"{run / ROBOT} is not the robot that {run} was trained with ({reason}); restore that "
+            "folder, or train a new run with --mjcf"
+        ) from error
 
 
 def _files_of(mjcf: Path) -> list[Path]:

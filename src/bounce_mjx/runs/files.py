@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import pydantic
 from pydantic_core import to_jsonable_python
 
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import UserError, reason_of, shorten
 
 MANIFEST_FILE = "manifest.json"
 
@@ -36,14 +36,6 @@ def to_json(data: Any) -> str:
     return json.dumps(to_plain(data), indent=2) + "\n"
 
 
-def read_json(path: Path, model: type[ModelT]) -> ModelT:
-    """Reads and validates a JSON file; raises OSError or ValueError if it does not fit `model`."""
-    try:
-        return model.model_validate_json(path.read_bytes())
-    except pydantic.ValidationError as error:
-        raise ValueError(f"{path.name}: {first_mistake(error)}") from error
-
-
 def read_stored(path: Path, model: type[ModelT], remedy: str) -> ModelT | None:
     """The content of a JSON file that a command wrote; None if there is none.
 
@@ -56,15 +48,11 @@ def read_stored(path: Path, model: type[ModelT], remedy: str) -> ModelT | None:
     if not path.is_file():
         return None
     try:
-        return read_json(path, model)
+        return model.model_validate_json(path.read_bytes())
+    # One of pydantic's is a ValueError.
     except (OSError, ValueError) as error:
-        raise UserError(f"{path} is damaged ({error}); {remedy}") from error
-
-
-def first_mistake(error: pydantic.ValidationError) -> str:
-    """First validation error in stored data, on one line: its place and the expected type."""
-    first = error.errors(include_url=False, include_input=False)[0]
-    return f"{'.'.join(map(str, first['loc']))[:80]}: {first['msg']}".removeprefix(": ")
+        reason = shorten(reason_of(error), 200)
+        raise UserError(f"{path} is damaged ({reason}); {remedy}") from error
 
 
 @contextlib.contextmanager
@@ -137,12 +125,11 @@ def check_output(path: Path | None, flag: str, suffixes: tuple[str, ...] = ()) -
         return
     if suffixes and path.suffix.lower() not in suffixes:
         raise UserError(f"{flag} {path} does not end in {' or '.join(suffixes)}; rename it")
-    if not os.path.isdir(path.absolute().parent):
+    folder = path.absolute().parent
+    if not os.path.isdir(folder):
         raise UserError(f"the folder of {flag} {path} does not exist; make it")
-    if os.path.isdir(path):
-        raise UserError(f"{flag} {path} is a folder; give a file")
-    if not os.access(path if os.path.exists(path) else path.absolute().parent, os.W_OK):
-        raise UserError(f"{flag} {path} may not be written; give another file")
+    if os.path.isdir(path) or not os.access(path if os.path.exists(path) else folder, os.W_OK):
+        raise UserError(f"{flag} {path} is a folder, or may not be written; give another file")
 
 
 def seal(folder: Path) -> None:
@@ -152,39 +139,17 @@ def seal(folder: Path) -> None:
 
 def check_integrity(folder: Path) -> None:
     """Raises OSError or ValueError if a file does not match the manifest."""
-    found, expected = _describe_files(folder), read_json(folder / MANIFEST_FILE, Manifest).files
+    manifest = Manifest.model_validate_json((folder / MANIFEST_FILE).read_bytes())
+    found, expected = _describe_files(folder), manifest.files
     for name in sorted(found.keys() | expected.keys()):
         if found.get(name) != expected.get(name):
             raise ValueError(f"{name} is {'not as it was written' if name in found else 'missing'}")
 
 
-def check_copy(path: Path, folder: Path, flag: str) -> None:
-    """Checks that a file is in a run's sealed folder, such as robot, which is as it was written.
-
-    Args:
-      flag: the flag that gives another one to a new run, for the error.
-
-    Raises:
-      UserError: it is another file, or one of the copied files is missing or was edited.
-    """
-    try:
-        if not Path(os.path.abspath(path)).is_relative_to(os.path.abspath(folder)):
-            raise ValueError(f"{path} is outside it")
-        check_integrity(folder)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise UserError(
-            f"{folder} is not the {folder.name} that {folder.parent} was trained with ({reason}); "
-            f"restore that folder, or train a new run with {flag}"
-        ) from error
-
-
 def _describe_files(folder: Path) -> dict[str, dict[str, int | str]]:
-    """Entries of a manifest; ValueError for links and devices, which may be endless."""
+    """Entries of a manifest."""
     entries = {}
-    for path in (folder, *folder.rglob("*")):
-        if path.is_symlink() or not (path.is_file() or path.is_dir()):
-            raise ValueError(f"{path.name} is not a regular file")
+    for path in folder.rglob("*"):
         if path.is_file() and not path.name.startswith(".") and path.name != MANIFEST_FILE:
             with path.open("rb") as file:
                 digest = hashlib.file_digest(file, "sha256").hexdigest()

@@ -66,23 +66,18 @@ MIRROR_LAW = Checkpoint(Path("mirror law"), Path("mirror law"), 0)
 """In place of a checkpoint, the baseline `baselines.mirror`."""
 
 
-def refuse_brackets(folder: Path) -> None:
-    """UserError if orbax would lose arrays in this folder: its search takes brackets for a
-    pattern."""
-    if "[" in str(folder.absolute()):
-        raise UserError(
-            f"{folder.absolute()} has a square bracket, and orbax loses the arrays of checkpoints "
-            "in such a folder; give --log-dir, or move the run to, a folder without one"
-        )
-
-
 def create_run(config: TrainConfig) -> Path:
     """Creates a new run's folder, named after the current time (UTC), with the config in it.
 
     Raises:
       UserError: the folder cannot be written, or the robot cannot be copied into it.
     """
-    refuse_brackets(config.log_dir)
+    if "[" in str(config.log_dir.absolute()):
+        # Its search takes brackets for a pattern.
+        raise UserError(
+            f"{config.log_dir.absolute()} has a square bracket, and orbax loses the arrays of "
+            "checkpoints in such a folder; give --log-dir without one"
+        )
     # Not the local time, which is another one on another machine, and in autumn goes back.
     stamp = datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d_%H-%M-%S")
     with writable(config.log_dir, "choose another folder with --log-dir"):
@@ -130,21 +125,6 @@ def runs_of_seeds(run: Path) -> list[Path]:
     """Existing folders of a run's seeds; the run itself if it has one seed."""
     seeds = (path for path in run.glob("seed_*") if re.fullmatch("seed_[0-9]+", path.name))
     return sorted(path for path in seeds if not path.is_symlink()) or [run]
-
-
-def check_links(run: Path) -> None:
-    """Checks that a run's folder holds no links, through which training would write elsewhere;
-    those of Weights & Biases do not count, as it makes them anew.
-
-    Raises:
-      UserError: there is one, as there may be in a run from someone else.
-    """
-    for path in run.rglob("*"):
-        if path.is_symlink() and "wandb" not in path.relative_to(run).parts[:-1]:
-            raise UserError(
-                f"{path} is a link, and training writes only into the folder of its run; remove "
-                "it, or replace it with its target"
-            )
 
 
 @contextlib.contextmanager
@@ -269,11 +249,6 @@ def choose_checkpoint(path: Path | None, log_dir: Path, console: Console) -> Che
             raise
         console.out(f"no run in {log_dir}: using the policy that comes with the package")
         return pretrained_checkpoint(folders[log_dir])
-    if not os.path.isdir(run):
-        raise UserError(
-            f"there is no run {run}, and no policy of this name; give a run's folder such as "
-            f"runs/bounce_ball/<time stamp>, or {', '.join(POLICIES)}"
-        )
     if run != path:
         results = load_results(_best_seed(run))
         known = results.best.summary if results else "not evaluated"

@@ -1,10 +1,9 @@
 """Evaluations of a run, as stored in its checkpoints and in results.json."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import pydantic
-from pydantic import Field
 
 from bounce_mjx.evaluation.results import Figure, Report
 from bounce_mjx.runs.files import read_stored
@@ -15,15 +14,12 @@ PATIENCE = 1.5
 """Length of a run that waits in vain for a margin, in steps of the first evaluation that met
 all results."""
 
-_Steps = Annotated[int, Field(ge=0, lt=2**63)]
-_Seconds = Annotated[float, Field(allow_inf_nan=False)]
-
 
 class Evaluation(pydantic.BaseModel, extra="allow"):
     """One evaluation: the value of each result by its name."""
 
     __pydantic_extra__: dict[str, Figure]
-    steps: _Steps
+    steps: int
     passed: bool
     screening: bool = False
     """Whether the policy failed the screening, so that no full evaluation followed."""
@@ -35,13 +31,13 @@ class Progress(pydantic.BaseModel):
     best: Report | None = None
     fault: str | None = None
     """First quantity that was not finite, and its step; None unless the training diverged."""
-    best_steps: _Steps = 0
-    solved_steps: _Steps | None = None
+    best_steps: int = 0
+    solved_steps: int | None = None
     """Steps at the first evaluation that met all results: the end of the time "to all five
     results" in every measurement."""
-    solved_seconds: _Seconds | None = None
+    solved_seconds: float | None = None
     """Seconds from the start of the process, without its imports, to the end of that evaluation."""
-    margin_steps: _Steps | None = None
+    margin_steps: int | None = None
     """Steps at the first evaluation that met all with a margin
     (`Report.passed_with_margin`)."""
     evaluations: list[Evaluation] = []
@@ -94,8 +90,8 @@ class Results(Progress):
     device: str
     version: str = ""
     """Version of this package that trained last."""
-    trained_steps: _Steps = 0
-    seconds: dict[str, _Seconds] = {}
+    trained_steps: int = 0
+    seconds: dict[str, float] = {}
     fresh_resets: bool = False
     """Whether the results of `best` come from other resets than the selection of the checkpoint."""
 

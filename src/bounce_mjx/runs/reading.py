@@ -22,7 +22,7 @@ from bounce_mjx.learning.policy import Actor, Policy, make_networks, networks_of
 from bounce_mjx.learning.ppo import Params, names_of_critic_metrics
 from bounce_mjx.learning.statistics import RunningStatistics, init_statistics
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
-from bounce_mjx.runs.files import MANIFEST_FILE, check_integrity, first_mistake, read_json
+from bounce_mjx.runs.files import MANIFEST_FILE, check_integrity
 from bounce_mjx.runs.folders import MIRROR_LAW, Checkpoint, best_checkpoint
 from bounce_mjx.tasks.registry import is_file
 
@@ -134,10 +134,9 @@ def read_record(checkpoint: Checkpoint) -> Record:
             # Its training was killed before it wrote the manifest.
             print(f"warning: {folder} has no {MANIFEST_FILE} to find damage by", file=sys.stderr)
         name = _OLD_RECORD if _is_old(folder) else f"{RECORD}/metadata"
-        record = read_json(folder / name, Record)
+        record = Record.model_validate_json((folder / name).read_bytes())
         config = type(run_config).model_validate(record.config)
-    except pydantic.ValidationError as error:
-        raise _damaged(checkpoint, ValueError(first_mistake(error))) from error
+    # One of pydantic's is a ValueError.
     except (OSError, ValueError) as error:
         raise _damaged(checkpoint, error) from error
     # The checkpoint has the paths of the original files, and the run's config those of its copies.

@@ -237,8 +237,6 @@ class Job:
             shutil.rmtree(self.run, ignore_errors=True)
 
     def _read_resumed(self) -> None:
-        folders.check_links(self.run)
-        folders.refuse_brackets(self.run)
         latest = folders.latest_checkpoint(self.run)
         self.state, record = reading.read_training(latest, self.trainer.state_template())
         self.steps = record.steps
