@@ -54,8 +54,7 @@ class CountingTrainer:
         self.mesh = jax.sharding.Mesh(jax.devices()[:1], ("devices",))
         self.shapes, self.seeds, self.state = policy_shapes(config), config.num_seeds, np.int32(0)
 
-    def state_template(self):
-        return jax.ShapeDtypeStruct((), np.int32)
+    state_template = jax.ShapeDtypeStruct((), np.int32)
 
     def compile(self, pool):
         return pool.submit(lambda: None)

@@ -249,6 +249,7 @@ def test_a_full_disk_costs_points(tmp_path: Path, monkeypatch) -> None:
         raise OSError(errno.ENOSPC, "no space")
 
     log = TensorBoardLog(tmp_path)
+    log.start(TrainConfig(), None)
     (lost,) = tmp_path.glob("events*")
     monkeypatch.setattr(log._writer, "write_event", fail)
     log(Event(tmp_path, TrainConfig(), 64, {"episode/return": 2.5}))

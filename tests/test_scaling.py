@@ -182,7 +182,7 @@ def test_the_setting_in_which_hosts_differ_is_named(
         common = TrainConfig().model_dump(mode="json", exclude={"log_dir"}) | {"resume": None}
         return json.loads(json.dumps([common, common, value]))
 
-    monkeypatch.setattr(hosts, "_exchange", exchange)
+    monkeypatch.setattr(hosts, "exchange", exchange)
     expected = (
         pytest.raises(UserError, match=difference) if difference else contextlib.nullcontext()
     )

@@ -20,6 +20,7 @@ from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.reading import policy_shapes
 from bounce_mjx.training import hosts
 from bounce_mjx.training.setup import compiler_options
+from bounce_mjx.training.trainer import each_seed
 
 Tree = TypeVar("Tree")
 
@@ -127,12 +128,12 @@ class Evaluators:
             chunks = pool.map(evaluate, range(0, episodes, self._chunk))
             parts, recordings = zip(*chunks, strict=True)
         statistics = _joined(parts, episodes)
-        if several:
-            each = [jax.tree.map(lambda x, i=i: x[i], statistics) for i in range(config.num_seeds)]
-            return [judge(self._env, own) for own in each]
-        recorded = min(RECORDED_EPISODES, episodes)
-        recording = _joined(recordings[: -(-recorded // self._chunk)], recorded)
-        return [judge(self._env, statistics, recording)]
+        recording = None
+        if not several:
+            recorded = min(RECORDED_EPISODES, episodes)
+            recording = _joined(recordings[: -(-recorded // self._chunk)], recorded)
+        each = each_seed(statistics, config.num_seeds)
+        return [judge(self._env, own, recording) for own in each]
 
 
 def _joined(chunks: Sequence[Tree], episodes: int) -> Tree:

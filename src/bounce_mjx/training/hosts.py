@@ -92,7 +92,7 @@ def agree(config: TrainConfig, resume: Path | None) -> None:
     # Only the leader uses the folder of the runs.
     plain = config.model_dump(mode="json", exclude={"log_dir"})
     plain["resume"] = resume and os.path.abspath(resume)
-    first, *others = map(flat, _exchange(plain))
+    first, *others = map(flat, exchange(plain))
     for i, other in enumerate(others, start=1):
         for key in sorted(first.keys() | other.keys()):
             ours, theirs = first.get(key), other.get(key)
@@ -104,7 +104,7 @@ def agree(config: TrainConfig, resume: Path | None) -> None:
                 )
 
 
-def _exchange(value: Any) -> list[Any]:
+def exchange(value: Any) -> list[Any]:
     """The values of all processes, by number; every process must call this at the same point. They
     are plain data, and go through JAX's coordination service: the devices may still compile in
     another process, and would not wait for longer than 30 s."""
@@ -137,19 +137,12 @@ def is_leader() -> bool:
 def any_of(flag: bool) -> bool:
     """Whether the flag is set in any process. Every process must call this at the same point; there
     it waits for the others without a time limit."""
-    return any(_exchange(flag))
-
-
-def text_from_leader(text: str | None) -> str:
-    """Returns the leader's text in every process; the others pass None."""
-    return _exchange(text)[0]
+    return any(exchange(flag))
 
 
 def gather(tree: Tree) -> Tree:
     """A pytree of arrays that are sharded over devices of several hosts, as whole NumPy arrays in
     every process."""
-    if jax.process_count() == 1:
-        return jax.tree.map(np.asarray, tree)
     return multihost_utils.process_allgather(tree, tiled=True)
 
 

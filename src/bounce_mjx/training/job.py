@@ -153,10 +153,10 @@ class Job:
         """Makes the folder of a new run, or reads the resumed one, and says what is trained."""
         # Before, a signal ends the process by its default action.
         self.stop = self.stack.enter_context(StopRequest())
-        config, self.keeps_folder = self.config, self.resume is not None
+        config = self.config
         if self.resume is None:
             made = str(folders.create_run(config)) if hosts.is_leader() else None
-            self.run = Path(hosts.text_from_leader(made))
+            self.run = Path(hosts.exchange(made)[0])
         else:
             self.run = self.resume
         self.stack.push(self._remove_unstarted)
@@ -213,12 +213,11 @@ class Job:
             envs = f"{self.config.ppo.num_envs:,} environments"
             return f"{self.device} has too little memory for {envs} ({reason}); lower num_envs"
         fewer = ", with --num-devices 1 if one is left" if self.trainer.mesh.size > 1 else ""
-        return (
-            f"{self.device} failed after {self.steps:,} steps ({reason}); {self._advice()}{fewer}"
-        )
+        return f"{self.device} failed after {self.steps:,} steps ({reason}); {self._advice}{fewer}"
 
+    @property
     def _advice(self) -> str:
-        """The advice to the user after the death of a process or a device."""
+        """What to do after the death of a device or a save."""
         if latest := self._latest():
             return f"{self._go_on} (the last checkpoint is {latest})"
         return "start again, as no checkpoint had been saved yet"
@@ -230,15 +229,16 @@ class Job:
             return folders.latest_checkpoint(self.run).folder
 
     def _remove_unstarted(self, error: type[BaseException] | None, *_) -> None:
-        """Removes the folder of a new run without a checkpoint or a block that can be trained."""
-        if error is not None and not self.keeps_folder and hosts.is_leader():
+        """Removes the folder of a new run without a checkpoint or a block."""
+        is_new = self.resume is None and self.steps == 0
+        if error is not None and is_new and hosts.is_leader() and self._latest() is None:
             # A log that is opened later would make the folder again.
             concurrent.futures.wait([self.opening])
             shutil.rmtree(self.run, ignore_errors=True)
 
     def _read_resumed(self) -> None:
         latest = folders.latest_checkpoint(self.run)
-        self.state, record = reading.read_training(latest, self.trainer.state_template())
+        self.state, record = reading.read_training(latest, self.trainer.state_template)
         self.steps = record.steps
         evaluated = record.progress.get("seeds", [record.progress])
         for member, plain in zip(self.members, evaluated, strict=True):
@@ -315,16 +315,15 @@ class Job:
           TrainingStopped: a stop was requested.
         """
         stopping = self._stopping()
-        is_run = self.resume is not None or self.steps > 0 or self._is_evaluated()
-        if is_run and stopping and not self._is_evaluated():
+        if stopping and not self._is_evaluated():
+            if self.resume is None and self.steps == 0:
+                jax.distributed.shutdown()
+                raise Interrupted
             self._end_save()
             self._save(self.trainer.snapshot(), {})
-        if is_run:
-            self._end_save(is_last=True)
+        self._end_save(is_last=True)
         evaluated = not stopping and self._evaluate_best()
         jax.distributed.shutdown()
-        if not is_run:
-            raise Interrupted
         if not evaluated:
             where = "" if stopping else ", before the final evaluation"
             raise TrainingStopped(f"stopped after {self.steps:,} steps{where}; {self._go_on}")
@@ -414,7 +413,6 @@ class Job:
             self.say("stopping after this block; the same signal again ends it at once")
         metrics = block.result()
         seconds = time.perf_counter() - started
-        self.keeps_folder = True
         faults = metrics.pop("fault")
         self.steps += self.block_steps
         rate = len(faults) * self.block_steps / seconds
@@ -471,7 +469,7 @@ class Job:
             problem = f"{self.run} cannot be written ({error.strerror})"
             if is_last:
                 lost = "so the end of the training is lost; make room, and"
-                raise UserError(f"{problem}, {lost} {self._advice()}") from error
+                raise UserError(f"{problem}, {lost} {self._advice}") from error
             meanwhile = "training continues, and saves at its next evaluation"
             self.say(f"the state is not saved, as {problem}; make room: {meanwhile}")
         if hosts.any_of(problem is not None):
@@ -486,30 +484,22 @@ class Job:
           scores: quality of the policies that were evaluated, by the seed's folder; with several
             seeds, of those that are the best of their seed.
         """
-        self.keeps_folder = True
         if hosts.is_leader():
             # A copy, because the training reuses its buffers meanwhile.
-            checkpoints = self._checkpoints(jax.tree.map(np.array, snapshot), scores)
-            self.saving = self.pool.submit(_write, checkpoints, self._results())
+            policies, state, networks = jax.tree.map(np.array, snapshot)
+            training, is_alone = {reading.TRAINING: state}, len(self.members) == 1
+            saves, records = [], [member.progress.model_dump() for member in self.members]
+            for i, (member, record) in enumerate(zip(self.members, records, strict=True)):
+                items = {reading.POLICY: policies[i], reading.NETWORKS: networks and networks[i]}
+                score = scores.get(member.run, ())
+                if is_alone or score:
+                    items |= training if is_alone else {}
+                    saves.append((member.run, member.config, self.steps, items, record, score))
+            if not is_alone:
+                # Last, as it refers to the best policies of the seeds.
+                saves.append((self.run, self.config, self.steps, training, {"seeds": records}))
+            self.saving = self.pool.submit(_write, saves, self._results())
         self._lap("save")
-
-    def _checkpoints(
-        self, snapshot: Snapshot, scores: dict[Path, tuple[float, ...]]
-    ) -> list[tuple[Any, ...]]:
-        """The arguments of `save_checkpoint` for each checkpoint of a save."""
-        saves, records = [], []
-        networks = snapshot.networks or [None] * len(self.members)
-        for member, policy, both in zip(self.members, snapshot.policies, networks, strict=True):
-            items = {reading.POLICY: policy, reading.NETWORKS: both}
-            record, score = member.progress.model_dump(), scores.get(member.run, ())
-            records.append(record)
-            if member.run != self.run and score:
-                saves.append((member.run, member.config, self.steps, items, record, score))
-        if len(self.members) > 1:
-            items, record, score = {}, {"seeds": records}, ()
-        items[reading.TRAINING] = snapshot.state
-        # Last, as with several seeds it refers to the best policies of the seeds.
-        return [*saves, (self.run, self.config, self.steps, items, record, score)]
 
     def _results(self, fresh_resets: bool = False) -> dict[Path, str]:
         """The content of each seed's results.json; none before its first evaluation."""

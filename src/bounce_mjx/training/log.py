@@ -17,14 +17,13 @@ class TensorBoardLog:
     """
 
     def __init__(self, run: Path):
+        # Imported here, as the imports take a quarter of a second.
         from tensorboardX import event_file_writer, summary
         from tensorboardX.proto import event_pb2
 
         self.summary, self._events = summary, event_pb2
         self._new_writer = event_file_writer.EventsWriter
-        self.run, self._writer = run, None
-        run.mkdir(parents=True, exist_ok=True)
-        self.flush()
+        self._run, self._writer = run, None
 
     def start(self, config: TrainConfig, steps: int | None) -> None:
         """Logs the config, as text and as hyperparameters.
@@ -34,40 +33,30 @@ class TensorBoardLog:
         """
         if steps is not None:
             start = self._events.SessionLog(status=self._events.SessionLog.START)
-            self._add(step=steps + 1, session_log=start)
+            self.add(steps + 1, session_log=start)
         text = f"```yaml\n{dump_config(config)}```"
-        self.add(self.summary.text("config", text), steps or 0)
+        self.add(steps or 0, summary=self.summary.text("config", text))
         plain = flat(config.model_dump(mode="json")).items()
         plain = {name: x if isinstance(x, int | float) else str(x) for name, x in plain}
         shown = dict.fromkeys(("results/mean_return", "episode/return"), 0.0)
         for part in self.summary.hparams(plain, shown):
-            self.add(part, 0)
+            self.add(0, summary=part)
 
     def __call__(self, event: Event) -> None:
         """Writes the points of an event."""
-        for name, value in event.metrics.items():
-            self.add(self.summary.scalar(name, value), event.steps)
-        self.flush()
+        values = (self.summary.scalar(*point).value[0] for point in event.metrics.items())
+        self.add(event.steps, summary=self.summary.Summary(value=values))
 
-    def add(self, summary: Any, steps: int) -> None:
-        """Adds a summary as tensorboardX makes it."""
-        self._add(step=steps, summary=summary)
-
-    def flush(self) -> None:
-        """Writes everything to the file. A file with a point that is only half written ends there
-        for its readers, so that a new one follows it."""
+    def add(self, steps: int, **content: Any) -> None:
+        """Writes an entry as tensorboardX makes it. A file with one that is only half written ends
+        there for its readers, so that a new one follows it."""
         try:
             if self._writer is None:
+                self._run.mkdir(parents=True, exist_ok=True)
                 # Logs that are opened in the same second need different names.
-                self._writer = self._new_writer(f"{self.run / 'events'}", f".{time.time_ns()}")
+                self._writer = self._new_writer(f"{self._run / 'events'}", f".{time.time_ns()}")
+            entry = self._events.Event(wall_time=time.time(), step=steps, **content)
+            self._writer.write_event(entry)
             self._writer.flush()
-        except OSError:
-            self._writer = None
-
-    def _add(self, **content: Any) -> None:
-        try:
-            if self._writer is not None:
-                event = self._events.Event(wall_time=time.time(), **content)
-                self._writer.write_event(event)
         except OSError:
             self._writer = None

@@ -20,7 +20,7 @@ from bounce_mjx.learning.ppo import CHECKED, TrainingState, num_groups, policy_o
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training import hosts
 from bounce_mjx.training.setup import compiler_options
-from bounce_mjx.training.trainer import Metrics, Snapshot, iterations_per_block
+from bounce_mjx.training.trainer import Metrics, Snapshot, each_seed, iterations_per_block
 
 _AXIS = "devices"
 
@@ -38,17 +38,18 @@ class PPOTrainer:
         self._config, self._observation_size = config, env.observation_size
         self.mesh = make_mesh(config.num_devices, config.ppo, config.num_seeds)
         trainer = find_algorithm(config.algorithm)(config.ppo, env, episode_steps(config))
-        several = config.num_seeds > 1
-        init, run = population(trainer) if several else (trainer.init, trainer.run)
-        seeds = config.seed + np.arange(config.num_seeds, dtype=np.uint32)
-        self._seeds = seeds if several else seeds[0]
+        init, run, make_key = trainer.init, trainer.run, jax.random.PRNGKey
+        self._seeds = np.uint32(config.seed)
+        if config.num_seeds > 1:
+            init, run = population(trainer)
+            make_key = jax.vmap(make_key)
+            self._seeds = config.seed + np.arange(config.num_seeds, dtype=np.uint32)
         self.state: TrainingState | None = None
         """The current state, on the devices."""
 
         def initial_state(seeds: jax.Array) -> TrainingState:
             """The first training state of one seed [] or of S seeds [S]."""
-            key = jax.random.PRNGKey
-            return init((jax.vmap(key) if several else key)(seeds))
+            return init(make_key(seeds))
 
         def train_block(state: TrainingState) -> tuple[TrainingState, Metrics]:
             return run(state, iterations_per_block(config))
@@ -57,15 +58,12 @@ class PPOTrainer:
         self._initial_state, self._train_block = initial_state, train_block
 
     @functools.cached_property
-    def _shapes(self) -> TrainingState:
+    def state_template(self) -> TrainingState:
         return jax.eval_shape(self._initial_state, self._seeds)
 
-    @property
+    @functools.cached_property
     def _sharding(self) -> TrainingState:
-        return state_sharding(self.mesh, self._shapes, self._config.num_seeds)
-
-    def state_template(self) -> TrainingState:
-        return self._shapes
+        return state_sharding(self.mesh, self.state_template, self._config.num_seeds)
 
     def compile(self, pool: concurrent.futures.Executor) -> concurrent.futures.Future:
         run = jax.jit(
@@ -75,7 +73,7 @@ class PPOTrainer:
             donate_argnums=0,
             compiler_options=compiler_options(tunes_products=True),
         )
-        self._run = pool.submit(run.lower(self._shapes).compile)
+        self._run = pool.submit(run.lower(self.state_template).compile)
         init = jax.jit(
             self._initial_state,
             out_shardings=self._sharding,
@@ -104,10 +102,7 @@ class PPOTrainer:
 
     def snapshot(self) -> Snapshot:
         state = hosts.gather(self.state)
-        seeds = [state]
-        if self._config.num_seeds > 1:
-            count = range(self._config.num_seeds)
-            seeds = [jax.tree.map(lambda x, i=i: x[i], state) for i in count]
+        seeds = each_seed(state, self._config.num_seeds)
         return Snapshot(
             [policy_of(seed, self._observation_size) for seed in seeds],
             state,

@@ -1,12 +1,10 @@
 """`train`, and the run that it leaves."""
 
-import contextlib
 import dataclasses
 import functools
-import os
 import shlex
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -140,28 +138,14 @@ def train(
         start = validate(Start, given, "train")
         base = start.base()
         config, resume = start.settle(changed(base, settings), base), start.run
-    with _jax_set_up(config):
-        console = stdout(quiet=quiet or not hosts.is_leader())
-        seeds = job.train(config, console, resume=resume, callbacks=callbacks)
+    set_up_jax(config.env)
+    console = stdout(quiet=quiet or not hosts.is_leader())
+    seeds = job.train(config, console, resume=resume, callbacks=callbacks)
     best = print_results(seeds, console)
     if report and hosts.is_leader():
         leave_report(best, console)
     run = best.run if len(seeds) == 1 else best.run.parent
     return Run(run, config.task)
-
-
-@contextlib.contextmanager
-def _jax_set_up(config: TrainConfig) -> Iterator[None]:
-    """JAX's settings for this environment. The process's `XLA_FLAGS`, which are a part of a cached
-    program's name, are as before at the end."""
-    flags = os.environ.get("XLA_FLAGS")
-    set_up_jax(config.env)
-    try:
-        yield
-    finally:
-        os.environ.pop("XLA_FLAGS", None)
-        if flags is not None:
-            os.environ["XLA_FLAGS"] = flags
 
 
 def print_results(seeds: Sequence[job.SeedRun], console: Console) -> job.SeedRun:

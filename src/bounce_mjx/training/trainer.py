@@ -3,6 +3,7 @@
 import concurrent.futures
 from typing import Any, NamedTuple, Protocol
 
+import jax
 import numpy as np
 from jax.sharding import Mesh
 
@@ -39,6 +40,13 @@ def in_whole_blocks(config: TrainConfig) -> TrainConfig:
     )
 
 
+def each_seed(tree: Any, num_seeds: int) -> list[Any]:
+    """The trees of S seeds from one whose arrays are [S, ...]; with one seed, the tree itself."""
+    if num_seeds == 1:
+        return [tree]
+    return [jax.tree.map(lambda x, i=i: x[i], tree) for i in range(num_seeds)]
+
+
 class Trainer(Protocol):
     """S independent runs of one algorithm, one for each seed."""
 
@@ -47,8 +55,8 @@ class Trainer(Protocol):
     checked: tuple[str, ...]
     """The quantities that must stay finite, in the order of their computation."""
 
-    def state_template(self) -> Any:
-        """Shapes and types of the state, `jax.ShapeDtypeStruct` as its leaves."""
+    state_template: Any
+    """Shapes and types of the state, `jax.ShapeDtypeStruct` as its leaves."""
 
     def compile(self, pool: concurrent.futures.Executor) -> concurrent.futures.Future:
         """Starts the compilation in a pool; the future is done when training can start."""

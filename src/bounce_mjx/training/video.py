@@ -63,5 +63,4 @@ class EvaluationVideo:
         shape = {"width": width, "height": height, "colorspace": 3}
         image = log.summary.Summary.Image(**shape, encoded_image_string=gif.getvalue())
         value = log.summary.Summary.Value(tag="policy", image=image)
-        log.add(log.summary.Summary(value=[value]), event.steps)
-        log.flush()
+        log.add(event.steps, summary=log.summary.Summary(value=[value]))
