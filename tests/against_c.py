@@ -303,11 +303,8 @@ def assert_same_step(actual: PhysicsState, expected: PhysicsState) -> None:
     assert np.max(np.abs(np.asarray(actual.qpos) - expected.qpos) / fastest) < ONE_STEP * DT + 1e-15
 
 
-def push_by_air(model: mujoco.MjModel, data: mujoco.MjData, drag: float, lift: float) -> None:
+def push_by_air(model: mujoco.MjModel, data: mujoco.MjData, drag: float) -> None:
     """Applies the force of the air on the ball by hand."""
-    ball = model.body("ball_link")
-    rotation = np.zeros(9)
-    mujoco.mju_quat2Mat(rotation, data.qpos[9:13] / np.linalg.norm(data.qpos[9:13]))
-    velocity, spin = data.qvel[6:9], rotation.reshape(3, 3) @ data.qvel[9:12]
-    force = lift * np.cross(spin, velocity) - drag * np.linalg.norm(velocity) * velocity
+    ball, velocity = model.body("ball_link"), data.qvel[6:9]
+    force = -drag * np.linalg.norm(velocity) * velocity
     data.xfrc_applied[ball.id, :3] = ball.mass[0] * force

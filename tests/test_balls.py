@@ -244,8 +244,8 @@ def test_a_world_of_two_balls_sees_each_late():
 
 @pytest.mark.slow
 def test_c_moves_several_balls_as_the_engine_does():
-    """With a push, and with the forces of the air in each physics step."""
-    drawn = {"push_speed": (1.0, 1.0), "air_drag": (0.5, 0.5), "air_lift": (0.02, 0.02)}
+    """With a push, and with the drag of the air in each physics step."""
+    drawn = {"push_speed": (1.0, 1.0), "air_drag": (0.5, 0.5)}
     env = Env(Two.Config(randomization=drawn))
     count, num_steps = 2, env.config.num_substeps
     keys = jax.random.split(jax.random.PRNGKey(0), count)
@@ -255,12 +255,11 @@ def test_c_moves_several_balls_as_the_engine_does():
     spins = [i for ball in find_addresses(env.mj_model).balls for i in ball.qvel[3:]]
     physics = physics._replace(qvel=physics.qvel.at[np.array(spins)].set(30.0))
     push = jnp.arange(6.0).reshape(2, 3, 1) * jnp.ones(count)
-    air = {"air_drag": jnp.full(count, 0.5), "air_lift": jnp.full(count, 0.02)}
-    control = Control(physics.qpos[:6], **air, ball_push=push)
+    control = Control(physics.qpos[:6], air_drag=jnp.full(count, 0.5), ball_push=push)
     targets = jax.vmap(servo_targets, in_axes=(-1, None))(control, num_steps)
     now = now._replace(physics=physics)
     with mujoco.rollout.Rollout(nthread=2) as pool:
-        expected = c_episodes._Physics(env, now, pool).step(control, targets, now)
+        expected = c_episodes._Physics(env, now, pool).step(control, targets)
     step = jax.vmap(lambda s, c: env.engine.step(MODEL, s, c, num_steps), in_axes=-1, out_axes=-1)
     for ours, theirs in zip(step(physics, control), expected, strict=True):
         if theirs is not None:

@@ -328,12 +328,7 @@ def test_c_evaluates_each_episode_in_its_own_world(networks, random_policy):
     config = EnvConfig(
         episode_seconds=0.3,
         ball_init_pos=(0.58856, 0.0, 0.1),
-        randomization={
-            "air_drag": (5.0, 10.0),
-            "air_lift": (0.0, 0.01),
-            "restitution": (0.7, 0.95),
-            "restitution_slope": (0.05, 0.1),
-        },
+        randomization={"air_drag": (5.0, 10.0), "restitution": (0.7, 0.95)},
     )
     key = jax.random.PRNGKey(0)
     env = BounceBall(config, randomize=heavy_and_light)

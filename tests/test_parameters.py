@@ -68,9 +68,9 @@ def test_one_given_number_leaves_the_others_to_the_model(mj_model, field, float6
 @pytest.mark.slow
 @pytest.mark.separate_loops
 def test_mjx_carries_worlds(mj_model, float64):
-    """Free run against C over control steps, in random worlds with friction, spin in air and
+    """Free run against C over control steps, in random worlds with friction, air and
     servos at their limits."""
-    count, num_substeps, air_drag, air_lift = 4, 5, 0.2, 0.05
+    count, num_substeps, air_drag = 4, 5, 0.2
     start = bouncing_states(mj_model, np.random.default_rng(1))
     start.qpos[:, 8] -= 0.03
     state = PhysicsState(*(jnp.asarray(x[:count]) for x in start[:2]))
@@ -85,7 +85,7 @@ def test_mjx_carries_worlds(mj_model, float64):
         data.append((c_model, mujoco.MjData(c_model)))
         data[i][1].qpos[:], data[i][1].qvel[:] = (x[i] for x in state)
     engine = make_engine(mj_model, "mjx")
-    control = partial(Control, air_drag=air_drag, air_lift=air_lift)
+    control = partial(Control, air_drag=air_drag)
     step = jax.jit(jax.vmap(lambda p, s, u: engine.step(p, s, control(u), num_substeps)))
     contacts, flight, touched = 0, [], set()
     for i in range(6):
@@ -94,7 +94,7 @@ def test_mjx_carries_worlds(mj_model, float64):
         for j, (c_model, d) in enumerate(data):
             d.ctrl[:] = ctrl[j]
             for _ in range(num_substeps):
-                push_by_air(c_model, d, air_drag, air_lift)
+                push_by_air(c_model, d, air_drag)
                 mujoco.mj_step(c_model, d)
                 contacts += d.ncon
                 touched |= {j} if d.ncon else set()

@@ -43,7 +43,7 @@ def test_the_shipped_suite_has_every_term() -> None:
     assert len(conditions) >= 100
     ranged = {term for condition in conditions for term in condition.ranges}
     # Version 1 of the suite is older than two terms.
-    assert ranged == {*TERMS, "target_height"} - {"restitution_slope", "air_lift"}
+    assert ranged == {*TERMS, "target_height"}
     assert read_suite(resource_path("configs/robustness.yaml")).version == "v1"
 
 

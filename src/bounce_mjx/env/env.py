@@ -18,7 +18,7 @@ from bounce_mjx.physics import (
     edited_model,
     make_engine,
 )
-from bounce_mjx.physics.parameters import MODEL_PARAMETERS, gives
+from bounce_mjx.physics.parameters import MODEL_PARAMETERS
 from bounce_mjx.robot.balls import BALLS_APART
 from bounce_mjx.robot.model import (
     check_unedited,
@@ -34,7 +34,6 @@ from bounce_mjx.task.task import Start, Step, Task, TaskStep
 from bounce_mjx.world import noise
 from bounce_mjx.world.actuation import Actuation, Actuators, recurs
 from bounce_mjx.world.config import WorldConfig
-from bounce_mjx.world.impact import with_impact
 from bounce_mjx.world.noise import Clock
 from bounce_mjx.world.observation import Kinematics
 from bounce_mjx.world.randomization import TERMS, Ranges, World, physics_parameters, sample_world
@@ -75,8 +74,6 @@ class EnvState(NamedTuple):
     """For a randomised world, or an observation with a history."""
     redraw: Redraw | None = None
     """For commands that change within an episode."""
-    impact: jax.Array | None = None
-    """Speed of the next impact [], m/s, for a restitution that depends on it."""
     actuation: Actuation = Actuation()
     sensing: Sensing | None = None
     """For an observation that differs from the true state of one instant."""
@@ -204,16 +201,9 @@ class Env:
         return self.config.randomization.warmup_steps
 
     def ranges(self, progress: jax.Array | float = 1.0) -> Ranges:
-        """The ranges of the randomisation, and of the commands where they grow too; `progress` []
-        is the share of the warm-up that has passed."""
-        randomization = self.config.randomization
-        ranges, first = randomization.ranges(progress), randomization.first_command_range
-        for name, command in self.config.commands.items() if first < 1.0 else ():
-            middle, half = (command.low + command.high) / 2.0, (command.high - command.low) / 2.0
-            half *= first + (1.0 - first) * progress
-            ends = middle - half, middle + half
-            ranges[name] = tuple(jnp.asarray(end, jnp.float32) for end in ends)
-        return ranges
+        """The ranges of the randomisation; `progress` [] is the share of the warm-up that has
+        passed."""
+        return self.config.randomization.ranges(progress)
 
     def reset(
         self, rng: jax.Array, ranges: Ranges | None = None, share: float | None = None
@@ -263,10 +253,6 @@ class Env:
         truth = self.kinematics(state)
         task = self.task.reset(Start(truth, command, task_draws))
         state = state._replace(task=task, command=self._next_command(task, command))
-        given = gives(own_parameters, "contact_damping", "pair_solref")
-        if "restitution_slope" in world and not given:
-            state = state._replace(impact=jnp.zeros((), draws.dtype))
-            state = with_impact(state, self.mj_model, self.engine, truth)
         if self._sensors.are_needed:
             state = state._replace(sensing=self._sensors.first(self._sensed(state, truth)))
         return State(
@@ -321,8 +307,6 @@ class Env:
             "non_finite": ~(finite & is_number),
             "too_fast": jnp.any(jnp.abs(truth.joint_velocities) > self.config.max_joint_velocity),
         }
-
-        now = with_impact(now, self.mj_model, self.engine, truth)
         if now.sensing is not None:
             now = now._replace(sensing=self._sensors.next(now.sensing, self._sensed(now, truth)))
         dtype = truth.ball_position.dtype
@@ -467,14 +451,11 @@ class Env:
             given = jax.eval_shape(self._randomize, jax.random.PRNGKey(0))
             pairs = zip(given, state.parameters, strict=True)
             own = PhysicsParameters(*(None if x is None else value for x, value in pairs))
-        parameters = self._parameters(world, own, state.impact)
-        return state._replace(world=world, parameters=parameters)
+        return state._replace(world=world, parameters=self._parameters(world, own))
 
-    def _parameters(
-        self, world: World, own: PhysicsParameters, impact: jax.Array | None = None
-    ) -> PhysicsParameters:
+    def _parameters(self, world: World, own: PhysicsParameters) -> PhysicsParameters:
         """The physics of a world, in which the parameters of `randomize` replace its own."""
-        pairs = zip(own, physics_parameters(world, self.mj_model, impact), strict=True)
+        pairs = zip(own, physics_parameters(world, self.mj_model), strict=True)
         return PhysicsParameters(*(sampled if x is None else x for x, sampled in pairs))
 
     def _privileged_metrics(self, world: World, truth: Kinematics) -> dict[str, jax.Array]:

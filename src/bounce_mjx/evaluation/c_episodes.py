@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from mujoco import rollout
-from scipy.spatial.transform import Rotation
 
 from bounce_mjx.env.env import Env, EnvState, State, world_model
 from bounce_mjx.evaluation.episodes import Batch, add_step, begin, reset_episodes
@@ -21,7 +20,6 @@ from bounce_mjx.physics import (
     edited_model,
     servo_targets,
 )
-from bounce_mjx.physics.edited import contact_pairs
 from bounce_mjx.task.shown import Recording
 from bounce_mjx.world.actuation import Actuation
 from bounce_mjx.world.randomization import Ranges
@@ -66,7 +64,7 @@ def make_mujoco_evaluator(
             physics = _Physics(env, now.states.pipeline_state, pool)
             for step in range(env.config.episode_steps):
                 actions, actuation, control, targets = decide(policy, now.states)
-                after = physics.step(control, targets, now.states.pipeline_state)
+                after = physics.step(control, targets)
                 now = finish(now, actions, actuation, after)
                 if step % 100 == 99 and not np.any(now.statistics.running):
                     break
@@ -89,36 +87,28 @@ class _Physics:
         self._states = full_states(env.mj_model, now.physics)
         self._bodies = [ball.body for ball in balls]
         # A state begins with the time and the positions.
-        self._orientations = 1 + np.array([ball.qpos[3:] for ball in balls])
-        velocities = 1 + env.mj_model.nq + np.array([ball.qvel for ball in balls])
-        self._velocities, self._spins = np.split(velocities, 2, axis=1)
+        self._velocities = 1 + env.mj_model.nq + np.array([ball.qvel[:3] for ball in balls])
 
-    def step(self, control: Control, targets: jax.Array, now: EnvState) -> PhysicsState:
+    def step(self, control: Control, targets: jax.Array) -> PhysicsState:
         """The physics [..., N] after one more control step.
 
         Args:
           control: that of the step [..., N].
           targets: its servo targets [N, substeps, nu].
-          now: the states before it; an impact may have changed the contact's damping.
         """
-        damping = None if now.impact is None else now.parameters.contact_damping
-        push, drag, lift, targets, damping = (
+        push, drag, targets = (
             None if x is None else np.asarray(x, np.float64)
-            for x in (control.ball_push, control.air_drag, control.air_lift, targets, damping)
+            for x in (control.ball_push, control.air_drag, targets)
         )
-        if damping is not None:
-            pairs = contact_pairs(self._mj_model)
-            for model, value in zip(self._models, damping, strict=True):
-                model.pair_solref[pairs, 1] = -value
         if push is not None:
             push = push.reshape(-1, len(self._states)).T
             self._states[:, self._velocities.ravel()] += push
-        if drag is None and lift is None:
+        if drag is None:
             self._advance(targets, _CTRL)
         else:
-            # The forces of the air need the velocity in each physics step.
+            # The drag needs the velocity in each physics step.
             for target in np.moveaxis(targets, 1, 0):
-                forces = self._air_forces(drag, lift).reshape(len(target), -1)
+                forces = self._drag_forces(drag).reshape(len(target), -1)
                 self._advance(np.concatenate([target, forces], axis=1)[:, None], _CTRL_AND_FORCE)
         return physics_states(self._mj_model, self._states)
 
@@ -129,20 +119,13 @@ class _Physics:
         )
         self._states = trajectory[:, -1]
 
-    def _air_forces(self, drag: np.ndarray | None, lift: np.ndarray | None) -> np.ndarray:
-        """Forces and torques [N, bodies, 6] on the balls, from those of `Control` [N]."""
+    def _drag_forces(self, drag: np.ndarray) -> np.ndarray:
+        """Forces and torques [N, bodies, 6] on the balls, from `Control.air_drag` [N]."""
         mass = np.array([model.body_mass[self._bodies] for model in self._models])[:, :, None]
-        velocity, states = self._states[:, self._velocities], len(self._states)
-        forces = np.zeros((states, self._mj_model.nbody, 6))
-        if drag is not None:
-            speed = np.linalg.norm(velocity, axis=2, keepdims=True)
-            forces[:, self._bodies, :3] -= drag[:, None, None] * mass * speed * velocity
-        if lift is not None:
-            quaternions = np.roll(self._states[:, self._orientations].reshape(-1, 4), -1, axis=1)
-            spins = self._states[:, self._spins].reshape(-1, 3)
-            turned = Rotation.from_quat(quaternions).apply(spins)
-            across = np.cross(turned.reshape(velocity.shape), velocity)
-            forces[:, self._bodies, :3] += lift[:, None, None] * mass * across
+        velocity = self._states[:, self._velocities]
+        speed = np.linalg.norm(velocity, axis=2, keepdims=True)
+        forces = np.zeros((len(velocity), self._mj_model.nbody, 6))
+        forces[:, self._bodies, :3] = -drag[:, None, None] * mass * speed * velocity
         return forces
 
 

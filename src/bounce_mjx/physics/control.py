@@ -32,8 +32,8 @@ class Control(NamedTuple):
     """Servo targets and disturbances over N physics steps; None leaves a disturbance out.
 
     All engines apply it the same way: `servo_targets` gives the `ctrl` of each physics step, the
-    push changes the ball's velocity before the first step, and every step has the drag and the lift
-    of its velocity and spin.
+    push changes the ball's velocity before the first step, and every step has the drag of its
+    velocity.
     """
 
     ctrl: Any
@@ -50,9 +50,6 @@ class Control(NamedTuple):
     """Time constant [] of the lags in physics steps."""
     air_drag: Any = None
     """Deceleration of a ball by the air divided by its squared speed [], 1/m."""
-    air_lift: Any = None
-    """Acceleration of a ball by the Magnus force divided by the cross product of its spin and
-    velocity []."""
     ball_push: Any = None
     """Velocity [3] added to the ball's before the first step, m/s; [B, 3] with several balls."""
 

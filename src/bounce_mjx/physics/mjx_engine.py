@@ -13,10 +13,9 @@ from mujoco import mjx
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics.control import Control, drag, servo_target
 from bounce_mjx.physics.edited import MIN_FRICTION, edited
-from bounce_mjx.physics.fused.turning import read_turning
 from bounce_mjx.physics.parameters import PhysicsParameters, PhysicsState
 from bounce_mjx.physics.scalars import scalars_of
-from bounce_mjx.robot.model import Addresses, BallAddresses, find_addresses
+from bounce_mjx.robot.model import Addresses, find_addresses
 
 
 class MjxModel(NamedTuple):
@@ -42,12 +41,12 @@ def step(
 ) -> PhysicsState:
     """Advances one environment by `num_substeps` physics steps."""
     balls = constants.addresses.balls
-    in_air = control.air_drag is not None or control.air_lift is not None
 
     def substep(i: jax.Array, data: mjx.Data) -> mjx.Data:
         data = data.replace(ctrl=servo_target(control, i.astype(data.qpos.dtype)))
-        for ball in balls if in_air else ():
-            force = model.body_mass[ball.body] * _by_air(control, ball, data)
+        for ball in () if control.air_drag is None else balls:
+            velocity = data.qvel[np.array(ball.qvel[:3])]
+            force = model.body_mass[ball.body] * jnp.stack(drag(control.air_drag, velocity))
             applied = data.xfrc_applied.at[ball.body, :3].set(force)
             data = data.replace(xfrc_applied=applied)
         return _step(model, data)
@@ -60,18 +59,6 @@ def step(
             data = data.replace(qvel=data.qvel.at[pushed].add(jnp.ravel(control.ball_push)))
         data = jax.lax.fori_loop(0, num_substeps, substep, data)
     return PhysicsState(data.qpos, data.qvel)
-
-
-def _by_air(control: Control, ball: BallAddresses, data: mjx.Data) -> jax.Array:
-    """Acceleration [3] of a ball by the air, m/s^2."""
-    velocity, spin = (data.qvel[np.array(part)] for part in (ball.qvel[:3], ball.qvel[3:]))
-    acceleration = jnp.zeros_like(velocity)
-    if control.air_drag is not None:
-        acceleration += jnp.stack(drag(control.air_drag, velocity))
-    if control.air_lift is not None:
-        spin = jnp.stack(read_turning(tuple(data.qpos[np.array(ball.qpos[3:])]), tuple(spin)).spin)
-        acceleration += control.air_lift * jnp.cross(spin, velocity)
-    return acceleration
 
 
 def _step(model: mjx.Model, data: mjx.Data) -> mjx.Data:

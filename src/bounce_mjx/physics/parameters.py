@@ -72,13 +72,6 @@ MODEL_PARAMETERS = PhysicsParameters()
 """The model's own parameters: no value is replaced."""
 
 
-def gives(parameters: PhysicsParameters, name: str, *fields: str) -> bool:
-    """Whether a parameter is given, or an entry of one of the model's fields."""
-    starts = tuple(f"{field}[" for field in fields)
-    entries = parameters.entries or {}
-    return getattr(parameters, name) is not None or any(x.startswith(starts) for x in entries)
-
-
 def shapes(num_joints: int) -> dict[str, tuple[int, ...]]:
     """Shape of each parameter for one environment, by name; `entries` has none."""
     per_joint = "servo_gain servo_damping force_limit armature damping frictionloss link_mass"

@@ -76,7 +76,7 @@ class Actuators:
         wanted = self._joint_targets(angles, action, before.setpoint)
         control, setpoint = self._command(wanted, before.setpoint)
         control, memory = add_delay(world, before, control, config.control_dt, config.num_substeps)
-        control = control._replace(air_drag=world.get("air_drag"), air_lift=world.get("air_lift"))
+        control = control._replace(air_drag=world.get("air_drag"))
         if "push_speed" in world:
             control = control._replace(ball_push=self._push(world, clock))
         return control, memory._replace(setpoint=setpoint)

@@ -107,11 +107,8 @@ class Term(NamedTuple):
 
 _FACTOR = (1e-3, 1e3)
 
-IMPACT_SPEED = 2.45
-"""Speed of the impact that the restitution is of if it has a slope, m/s."""
-FASTEST_IMPACT, LEAST_RESTITUTION = 4.5, 0.4
-"""Impact speed up to which a restitution with a slope is in the measured range, m/s; and that
-range's lower end."""
+# Keys of earlier runs that are gone, and their values without effect.
+_FORMER = {"restitution_slope": None, "air_lift": None, "first_command_range": 1.0}
 
 
 class RandomizationConfig(StrictModel):
@@ -120,9 +117,6 @@ class RandomizationConfig(StrictModel):
 
     restitution: Annotated[Sampled, Term((), 0.85, (0.6, 0.98), "contact_damping")] = None
     """Restitution of the ball on the paddle, 0.6 to 0.98; the model's is 0.85."""
-    restitution_slope: Annotated[Sampled, Term((), 0.0, (0.0, 0.1))] = None
-    """Drop of the restitution per m/s of impact speed above 2.45 m/s, s/m; needs restitution, of
-    which 0.4 must be left at 4.5 m/s (Hubbard and Stronge 2001, "Bounce of hollow balls")."""
     ball_mass: Annotated[Sampled, Term((), 1.0, _FACTOR, "ball_mass", scale)] = None
     """Factor of the ball's mass."""
     ball_radius: Annotated[Sampled, Term((), 1.0, (0.1, 10.0), "ball_radius", scale)] = None
@@ -130,10 +124,6 @@ class RandomizationConfig(StrictModel):
     air_drag: Annotated[Sampled, Term((), 0.0, (0.0, 10.0))] = None
     """Deceleration of the ball by the air divided by its squared speed, 1/m; about 0.11 for a
     table-tennis ball."""
-    air_lift: Annotated[Sampled, Term((), 0.0, (0.0, 1.0))] = None
-    """Acceleration of the ball by the Magnus force divided by the cross product of its spin and
-    velocity; 0 to 0.0056 for a table-tennis ball (Miyazaki et al. 2017, "Lift crisis of a spinning
-    table tennis ball"). A ball spins where there is contact_friction."""
     contact_friction: Annotated[
         Sampled, Term((), 0.0, (0.0, 10.0), "contact_friction", replace)
     ] = None
@@ -205,13 +195,17 @@ class RandomizationConfig(StrictModel):
     """Probabilities of single terms, by name, in place of `share`."""
     warmup_steps: Annotated[int, pydantic.BeforeValidator(whole_number), Field(ge=0)] = 0
     """Environment steps over which the ranges grow from the nominal values."""
-    first_command_range: UnitInterval = 1.0
-    """Range of the commands at the start of a training, around the middle of their whole range and
-    as a share of it; it grows to the whole range over warmup_steps."""
 
     def __hash__(self) -> int:
         """Configs are keys of compiled programs; pydantic's own hash cannot take `shares`."""
         return hash(self.model_dump_json())
+
+    @pydantic.model_validator(mode="before")
+    @classmethod
+    def _read_former(cls, values: Any) -> Any:
+        if not isinstance(values, dict):
+            return values
+        return {key: x for key, x in values.items() if key not in _FORMER or x != _FORMER[key]}
 
     @pydantic.model_validator(mode="after")
     def _check_ranges(self):
@@ -219,11 +213,8 @@ class RandomizationConfig(StrictModel):
             raise ValueError(
                 f"shares has a probability for {shorten(name)}, which is not a term; remove it"
             )
-        needed = {"restitution_slope": "restitution", "push_interval": "push_speed"}
-        for name, other in (needed | {"first_command_range": "warmup_steps"}).items():
-            default = type(self).model_fields[name].default
-            if getattr(self, name) != default and not getattr(self, other):
-                raise ValueError(f"{name} is given without {other}; give both")
+        if self.push_interval and not self.push_speed:
+            raise ValueError("push_interval is given without push_speed; give both")
         for name in self.terms:
             ends, (size, _, (least, greatest), *_) = getattr(self, name), TERMS[name]
             unit = f" {unit_of(type(self).model_fields[name].description)}".rstrip()
@@ -240,19 +231,6 @@ class RandomizationConfig(StrictModel):
                         f"{name} ({low}, {high}) is not a range within {least:g} to "
                         f"{greatest:g}{unit}; give the lower end first"
                     )
-        return self
-
-    @pydantic.model_validator(mode="after")
-    def _check_slope(self):
-        if self.restitution_slope is None:
-            return self
-        least = LEAST_RESTITUTION + (FASTEST_IMPACT - IMPACT_SPEED) * self.restitution_slope[1]
-        if self.restitution[0] < least - 1e-9:
-            raise ValueError(
-                f"restitution {self.restitution} with restitution_slope {self.restitution_slope} "
-                f"falls below {LEAST_RESTITUTION} in an impact at {FASTEST_IMPACT} m/s; start "
-                f"restitution at {math.ceil(1e3 * least - 1e-6) / 1e3}, or narrow the slope"
-            )
         return self
 
     @property
@@ -322,12 +300,10 @@ def sample_world(
     return world
 
 
-def physics_parameters(
-    world: World, mj_model: mujoco.MjModel, impact_speed: jax.Array | None = None
-) -> PhysicsParameters:
-    """Parameters of the physics for a sampled world; `impact_speed` is of `impact_damping`."""
+def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParameters:
+    """Parameters of the physics for a sampled world."""
     # The engines are not needed to read a config.
-    from bounce_mjx.physics.edited import own_parameters
+    from bounce_mjx.physics.edited import direct_solref, own_parameters
     from bounce_mjx.physics.parameters import PhysicsParameters
 
     terms = {name: term for name, term in TERMS.items() if name in world and term.parameter}
@@ -337,25 +313,12 @@ def physics_parameters(
     for name, (*_, parameter, operation) in terms.items():
         value, own_value = world[name], getattr(own, parameter)
         if operation is None:
-            given[parameter] = impact_damping(world, mj_model, impact_speed)
+            given[parameter] = contact_damping(value, direct_solref(mj_model)[0])
         else:
             if own_value is not None:
                 own_value = jnp.asarray(own_value, value.dtype)
             given[parameter] = operation(own_value, value)
     return PhysicsParameters(**given)
-
-
-def impact_damping(
-    world: World, mj_model: mujoco.MjModel, speed: jax.Array | None = None
-) -> jax.Array:
-    """Damping [] of the contact, 1/s, in an impact at a speed [], m/s; None for a restitution that
-    does not depend on it."""
-    from bounce_mjx.physics.edited import direct_solref
-
-    restitution = world["restitution"]
-    if speed is not None:
-        restitution = restitution - world["restitution_slope"] * (speed - IMPACT_SPEED)
-    return contact_damping(restitution, direct_solref(mj_model)[0])
 
 
 # Damping ratios of the contact, and the measured restitution: the mean of the drops on the held

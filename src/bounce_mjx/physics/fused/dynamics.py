@@ -18,13 +18,12 @@ from bounce_mjx.physics.fused import chain, joint_friction
 from bounce_mjx.physics.fused.model import FusedModel, Servo, read_model
 from bounce_mjx.physics.fused.response import contact_response, paddle_origin
 from bounce_mjx.physics.fused.turning import Turning, advance_turning, read_turning, spin_in_ball
-from bounce_mjx.physics.parameters import PhysicsParameters, PhysicsState, gives
+from bounce_mjx.physics.parameters import PhysicsParameters, PhysicsState
 from bounce_mjx.physics.scalars import (
     ZERO3,
     Scalar,
     Vec,
     add,
-    cross,
     is_constant,
     is_zero,
     mul,
@@ -40,7 +39,7 @@ class Ball(NamedTuple):
     position: Vec
     velocity: Vec
     turning: Turning | None
-    """Spin and orientation; None if the spin is constant and has no effect."""
+    """Spin and orientation; None if the spin is constant."""
 
 
 class Motion(NamedTuple):
@@ -63,12 +62,13 @@ def step(
     Given parameters are inputs of the program; the others fold into it as constants. The loop
     carries the coordinates as scalars. Without friction the contact's force goes through the ball's
     centre and the spin stays constant, so one rotation over the whole interval updates the
-    orientation, unless the spin lifts the ball.
+    orientation.
     """
     at = model.addresses
     qpos, qvel = (_entries(x, range(len(x))) for x in (state.qpos, state.qvel))
-    slides = gives(parameters, "contact_friction", "pair_friction")
-    turns = slides or model.contacts[0].friction is not None or control.air_lift is not None
+    slides = any(name.startswith("pair_friction[") for name in parameters.entries or {})
+    slides = slides or parameters.contact_friction is not None
+    turns = slides or model.contacts[0].friction is not None
     turnings = [
         read_turning(_entries(qpos, x.qpos[3:]), _entries(qvel, x.qvel[3:])) for x in at.balls
     ]
@@ -148,9 +148,8 @@ def _substeps(
     def substeps(*scalars: Scalar) -> tuple[Scalar, ...]:
         control, parameters = given.unflatten(scalars[num_coordinates:])
         world = read_model(model.mj_model, parameters)
-        air = {"air_drag": control.air_drag, "air_lift": control.air_lift}
-        air = {name: value for name, value in air.items() if value is not None}
-        world = dataclasses.replace(world, **air)
+        if control.air_drag is not None:
+            world = dataclasses.replace(world, air_drag=control.air_drag)
         motion = jax.lax.fori_loop(
             0,
             num_substeps,
@@ -257,8 +256,6 @@ def _free_acceleration(model: FusedModel, index: int, ball: Ball) -> Vec:
     free = model.gravity * model.balls[index].weight
     if not is_constant(model.air_drag):
         free = free + drag(model.air_drag, ball.velocity)
-    if not is_constant(model.air_lift):
-        free = free + cross(ball.turning.spin, ball.velocity) * model.air_lift
     return free
 
 

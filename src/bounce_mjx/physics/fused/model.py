@@ -107,9 +107,6 @@ class FusedModel:
     """Whether the integrator is implicit in the joints' damping."""
     air_drag: Scalar = 0.0
     """Deceleration of a ball by the air divided by its squared speed, 1/m."""
-    air_lift: Scalar = 0.0
-    """Acceleration of a ball by the Magnus force divided by the cross product of its spin and
-    velocity."""
 
 
 def read_model(
