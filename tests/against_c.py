@@ -15,9 +15,9 @@ from bounce_mjx.physics import (
     PhysicsParameters,
     PhysicsState,
     edited_model,
-    fused,
     make_engine,
 )
+from bounce_mjx.physics.fused import dynamics
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import find_addresses
 
@@ -191,7 +191,7 @@ def c_models(
 
 def fused_steps(model: mujoco.MjModel, parameters: PhysicsParameters, states: States):
     """One fused step from each state, operation by operation."""
-    step = partial(fused.step, fused.read_model(model), num_substeps=1)
+    step = partial(dynamics.step, dynamics.read_model(model), num_substeps=1)
     axes = jax.tree.map(lambda x: 0 if np.ndim(x) else None, parameters)
     with jax.disable_jit():
         return jax.vmap(step, in_axes=(axes, 0, 0))(

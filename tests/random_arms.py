@@ -115,10 +115,10 @@ def _add_joint(
         target=joint.name,
         trntype=mujoco.mjtTrn.mjTRN_JOINT,
         gear=[gear, 0, 0, 0, 0, 0],
-        gaintype=mujoco.mjtGain.mjGAIN_AFFINE if index == 1 else mujoco.mjtGain.mjGAIN_FIXED,
+        gaintype=mujoco.mjtGain.mjGAIN_FIXED,
         biastype=mujoco.mjtBias.mjBIAS_AFFINE,
     )
-    servo.gainprm[:3] = (kp, 3.0, -2.0)
+    servo.gainprm[0] = kp
     servo.biasprm[:3] = (1.0, -kp, -kv)
     if index % 3 != 1:
         servo.forcelimited = True

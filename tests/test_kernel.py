@@ -13,7 +13,7 @@ from bounce_mjx.gpu import availability, rows
 from bounce_mjx.gpu import elementwise as kernel
 from bounce_mjx.learning import ppo
 from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, fused
+from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState
 from bounce_mjx.physics.fused import dynamics
 from random_worlds import random_parameters
 
@@ -54,8 +54,8 @@ def moving(env: BounceBall, batch: int) -> tuple[PhysicsState, jax.Array]:
 def step(
     env: BounceBall, physics: PhysicsState, ctrl: jax.Array, parameters: PhysicsParameters = MODEL
 ) -> PhysicsState:
-    return fused.step(
-        fused.read_model(env.mj_model), parameters, physics, Control(ctrl), NUM_SUBSTEPS
+    return dynamics.step(
+        dynamics.read_model(env.mj_model), parameters, physics, Control(ctrl), NUM_SUBSTEPS
     )
 
 

@@ -168,11 +168,6 @@ SUPPORTED = {
     "welded body": ('<body name="Link4"', f'{WELDED}{WELDED}</body></body><body name="Link4"'),
     "welded paddle": (PADDLE, f"{WELDED}{PADDLE}</body>"),
     "pedestal": (ARM_BODY, f'<body pos="0.1 0 0.2" euler="0 0.3 0">{ARM_BODY}</body>'),
-    "affine gain": (
-        '<position name="act2" joint="Joint2"/>',
-        '<general name="act2" joint="Joint2" gear="-2" gaintype="affine" gainprm="100 30 -20" '
-        'biastype="affine" biasprm="3 -80 -10" ctrlrange="-0.5 0.5"/>',
-    ),
     "Euler": (
         OPTIONS,
         OPTIONS.replace("implicitfast", "Euler")
@@ -376,12 +371,6 @@ def test_auto_takes_fused_unless_it_lacks_a_feature_which_it_names(mj_model):
 
 MJX_ONLY = {
     # Features that MJX ignores; the fused engine refuses some of these models for another reason.
-    "limited affine gain": (
-        '<position name="act2" joint="Joint2"/>',
-        '<general name="act2" joint="Joint2" gaintype="affine" gainprm="9 3 -2" '
-        'biastype="affine" biasprm="0 -9 -1" ctrlrange="-1 1" ctrllimited="true"/>',
-        "gaintype affine",
-    ),
     "damping without springs": (
         OPTIONS,
         OPTIONS.replace("<flag ", '<flag spring="disable" ').replace(

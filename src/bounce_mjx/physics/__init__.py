@@ -4,13 +4,3 @@ from bounce_mjx.physics.control import Control, servo_targets
 from bounce_mjx.physics.edited import edited_model
 from bounce_mjx.physics.engine import Engine, make_engine
 from bounce_mjx.physics.parameters import PhysicsParameters, PhysicsState
-
-__all__ = [
-    "Control",
-    "Engine",
-    "PhysicsParameters",
-    "PhysicsState",
-    "edited_model",
-    "make_engine",
-    "servo_targets",
-]

@@ -9,8 +9,8 @@ import jax
 import mujoco
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.physics import fused
 from bounce_mjx.physics.control import Control
+from bounce_mjx.physics.fused import dynamics
 from bounce_mjx.physics.parameters import PhysicsParameters, PhysicsState, check_shapes
 from bounce_mjx.physics.support import unsupported_feature
 from bounce_mjx.robot.model import find_addresses
@@ -58,7 +58,7 @@ def make_engine(mj_model: mujoco.MjModel, choice: str) -> Engine:
     if choice == "auto":
         reason = lacking.get("fused", "the model qualifies")
     if name == "fused":
-        implementation = fused
+        implementation = dynamics
     else:
         # MJX takes seconds to import.
         from bounce_mjx.physics import mjx_engine as implementation

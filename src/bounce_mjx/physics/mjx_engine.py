@@ -69,11 +69,8 @@ def _step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     data = mjx.forward(model, data)
     limits, force = jnp.asarray(model.actuator_forcerange), data.actuator_force
     free = (limits[:, 0] < force) & (force < limits[:, 1]) | ~model.actuator_forcelimited
-    damping = {
-        name: jnp.asarray(getattr(model, name)).at[:, 2].multiply(free)
-        for name in ("actuator_biasprm", "actuator_gainprm")
-    }
-    return mjx.implicit(model.tree_replace(damping), data)
+    damping = jnp.asarray(model.actuator_biasprm).at[:, 2].multiply(free)
+    return mjx.implicit(model.tree_replace({"actuator_biasprm": damping}), data)
 
 
 def paddle_position(

@@ -89,10 +89,6 @@ def _mjx(m: mujoco.MjModel) -> Iterator[Feature]:
     # With one of the two disabled, MJX has no passive force at all.
     one = len(flags & {"spring", "damper"}) == 1
     yield "the flag spring or damper disabled alone", one
-    # MuJoCo's C engine differentiates the force of such a servo at the clipped input.
-    affine = (m.actuator_gaintype == mujoco.mjtGain.mjGAIN_AFFINE) & (m.actuator_gainprm[:, 2] != 0)
-    clipped = np.any(affine & m.actuator_ctrllimited.astype(bool))
-    yield "a limited input of a servo with a velocity gain (gaintype affine)", clipped
     try:
         import_mjx().put_model(m)
     except NotImplementedError as error:
@@ -100,7 +96,7 @@ def _mjx(m: mujoco.MjModel) -> Iterator[Feature]:
 
 
 def _fused(m: mujoco.MjModel) -> Iterator[Feature]:
-    at, kinds = find_addresses(m), mujoco.mjtGain
+    at = find_addresses(m)
     lacking = ", ".join(sorted(_flags(m) - _HARMLESS))
     yield f"the flags of the engine ({lacking})", bool(lacking)
     joints, paddle, balls = list(at.arm_joints), at.paddle_geom, at.balls
@@ -119,7 +115,7 @@ def _fused(m: mujoco.MjModel) -> Iterator[Feature]:
     servos = (
         m.nu == len(joints)
         and np.all(m.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE)
-        and np.all(np.isin(m.actuator_gaintype, (kinds.mjGAIN_FIXED, kinds.mjGAIN_AFFINE)))
+        and np.all(m.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED)
         and np.all(m.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE)
     )
     yield "actuators other than one position servo on each joint", not servos

@@ -106,7 +106,27 @@ _FORMER_RESET_KEYS = {
 }
 
 
-class WorldConfig(StrictModel):
+class RobotSettings(StrictModel):
+    """The robot, its sensors and its ball: the settings that a named world may have."""
+
+    robot: RobotConfig = RobotConfig()
+    """Adoption of an arm."""
+    physics_dt: Annotated[Positive, Field(ge=1e-5, le=0.1)] = 0.001
+    """Physics time step, s; at most an eighth of a period of the contact, 2.5 ms by default."""
+    control_dt: Annotated[Positive, Field(ge=1e-5, le=0.1)] = 0.01
+    """Time between two actions, s; a whole number of physics steps."""
+    friction: Friction | None = None
+    """Coefficient of sliding friction between ball and paddle; null for the MJCF's, which is 0 for
+    the project's own robot."""
+    action_scale: Annotated[Positive, Field(le=0.5)] = 0.02
+    """Change of the servo target for an action of 1, rad."""
+    max_joint_velocity: Speed = 2.0 * math.pi
+    """The episode ends when a joint is faster than this, rad/s."""
+    randomization: RandomizationConfig = RandomizationConfig()
+    """The world that each episode samples."""
+
+
+class WorldConfig(RobotSettings):
     """The world of an environment: the robot, the ball, the time steps, the resets, the sensors
     and the randomisation. The config of a task extends it."""
 
@@ -119,19 +139,8 @@ class WorldConfig(StrictModel):
     mjcf: Path | None = None
     """MJCF file to simulate; null for the project's own robot. package:NAME/FILE is a file of an
     installed Python package, and menagerie:NAME a model of MuJoCo Menagerie."""
-    robot: RobotConfig = RobotConfig()
-    """Adoption of an arm."""
-    physics_dt: Annotated[Positive, Field(ge=1e-5, le=0.1)] = 0.001
-    """Physics time step, s; at most an eighth of a period of the contact, 2.5 ms by default."""
-    control_dt: Annotated[Positive, Field(ge=1e-5, le=0.1)] = 0.01
-    """Time between two actions, s; a whole number of physics steps."""
     episode_seconds: Duration = 20.0
     """Length of an episode before it is truncated, s."""
-    friction: Friction | None = None
-    """Coefficient of sliding friction between ball and paddle; null for the MJCF's, which is 0 for
-    the project's own robot."""
-    action_scale: Annotated[Positive, Field(le=0.5)] = 0.02
-    """Change of the servo target for an action of 1, rad."""
     action: ActionConfig = ActionConfig()
     """What an action adds to."""
     default_joint_angles: Annotated[tuple[Finite, ...], Field(min_length=1)] = tuple(
@@ -144,12 +153,8 @@ class WorldConfig(StrictModel):
     """Ball position at a reset, before noise, m; each further ball starts 0.1 m above the last."""
     reset: ResetConfig = ResetConfig()
     """The noise of a reset."""
-    max_joint_velocity: Speed = 2.0 * math.pi
-    """The episode ends when a joint is faster than this, rad/s."""
     observation: ObservationConfig = ObservationConfig()
     """The quantities that the policy sees."""
-    randomization: RandomizationConfig = RandomizationConfig()
-    """The world that each episode samples."""
 
     @pydantic.model_validator(mode="before")
     @classmethod

@@ -11,33 +11,11 @@ from bounce_mjx.config.settings import StrictModel, merged, nested
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import shorten
 from bounce_mjx.lazy import np
-from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.config import RobotSettings
 from bounce_mjx.world.randomization import TERMS, RandomizationConfig
-
-KEYS = (
-    "physics_dt",
-    "control_dt",
-    "friction",
-    "action_scale",
-    "max_joint_velocity",
-    "robot",
-    "randomization",
-)
-"""The settings of `env` that a world may have: those of the robot and its sensors, and none of the
-task or of what the policy sees."""
 
 CURRICULUM = RandomizationConfig.model_fields.keys() - TERMS.keys()
 """Keys of the randomisation that describe the training, not the world."""
-
-WorldSettings = pydantic.create_model(
-    "WorldSettings",
-    __base__=StrictModel,
-    **{
-        name: (field.annotation, field)
-        for name, field in WorldConfig.model_fields.items()
-        if name in KEYS
-    },
-)
 
 
 class NamedWorld(StrictModel):
@@ -46,15 +24,13 @@ class NamedWorld(StrictModel):
     robot: str | None = None
     """Name of a robot in configs/robots/, or its file, relative to the world's folder; null for any
     robot."""
-    env: WorldSettings = WorldSettings()
+    env: RobotSettings = RobotSettings()
     """Settings of the environment. Its randomisation is the whole one: a term that it does not have
     is as in the model."""
     sources: dict[str, str] = {}
     """Where each number comes from, one sentence, by its dotted key in `env` or that of a group."""
     assumed: tuple[str, ...] = ()
     """Keys whose numbers nobody has measured; their source is the reason for the number."""
-    estimates: dict[str, Any] = {}
-    """Ignored; worlds that version 0.1 identified have it."""
 
     @pydantic.model_validator(mode="after")
     def _check_sources(self):

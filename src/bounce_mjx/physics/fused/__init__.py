@@ -5,13 +5,3 @@ pairs of each ball (a sphere) with the paddle (a box) and of the balls with each
 without sliding friction, and the implicitfast integrator. `physics/support.py` names what a
 compiled `mujoco.MjModel` has beyond that; `read_model` reads the constants of one without.
 """
-
-from bounce_mjx.physics.fused.dynamics import paddle_position, step
-from bounce_mjx.physics.fused.model import FusedModel, read_model
-
-__all__ = [
-    "FusedModel",
-    "paddle_position",
-    "read_model",
-    "step",
-]

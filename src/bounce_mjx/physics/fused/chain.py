@@ -24,6 +24,7 @@ from bounce_mjx.physics.scalars import (
     congruence,
     cross,
     is_constant,
+    is_zero,
     mul,
     sine_cosine,
     sub,
@@ -144,21 +145,14 @@ def bias_force(
 def floating_force(links: Sequence[Link], pose: Pose, gravity: Vec) -> list[Scalar]:
     """Joint forces of MuJoCo's gravity compensation, which carries the weight of each link's
     `floating_mass`."""
-    along_joints, upward = [], -gravity
-    mass: Scalar = 0.0
-    world_moment = ZERO3
-    for link, rotation, origin in reversed(
-        list(zip(links, pose.world_rotation, pose.world_origin, strict=True))
-    ):
-        mass = add(mass, link.floating_mass)
-        about_world = origin * link.floating_mass + rotation @ link.floating_moment
-        world_moment = world_moment + about_world
-        axis = rotation @ link.axis
-        if link.slides:
-            along_joints.append(mul(axis @ upward, mass))
-        else:
-            along_joints.append(axis @ cross(world_moment - origin * mass, upward))
-    return along_joints[::-1]
+    if all(is_zero(link.floating_mass) for link in links):
+        return [0.0] * len(links)
+    none = Mat((ZERO3,) * 3)
+    floating = [
+        dataclasses.replace(x, mass=x.floating_mass, first_moment=x.floating_moment, inertia=none)
+        for x in links
+    ]
+    return bias_force(floating, pose, [0.0] * len(links), gravity)
 
 
 def mass_matrix(links: Sequence[Link], pose: Pose) -> SquareMatrix:

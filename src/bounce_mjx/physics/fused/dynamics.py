@@ -25,7 +25,6 @@ from bounce_mjx.physics.scalars import (
     Vec,
     add,
     is_constant,
-    is_zero,
     mul,
     not_inlined,
     scalars_of,
@@ -225,20 +224,16 @@ def substep(model: FusedModel, motion: Motion, targets: tuple[Scalar, ...]) -> M
 
 
 def servo_force(servo: Servo, target: Scalar, q: Scalar, v: Scalar) -> tuple[Scalar, Scalar]:
-    """Force of MuJoCo's affine actuator at its joint (N m, N) for the servo target, and the force's
+    """Force of a servo at its joint (N m, N) for the servo target, and the force's
     derivative with respect to the velocity; the derivative is 0 at the force limit."""
     if servo.ctrl_range is not None:
         target = jnp.clip(target, *servo.ctrl_range)
-    gain, damping = servo.gain, servo.damping
-    if not (is_zero(servo.gain_stiffness) and is_zero(servo.gain_damping)):
-        gain = gain + servo.gain_stiffness * q + servo.gain_damping * v
-        damping = damping + servo.gain_damping * target
-    force = gain * target + servo.stiffness * q + servo.damping * v + servo.bias
+    force = servo.gain * target + servo.stiffness * q + servo.damping * v + servo.bias
     if servo.force_range is None:
-        return force, damping
+        return force, servo.damping
     least, most = servo.force_range
     free = (force > least) & (force < most)
-    return jnp.clip(force, least, most), jnp.where(free, damping, 0.0)
+    return jnp.clip(force, least, most), jnp.where(free, servo.damping, 0.0)
 
 
 def joint_force(servo: Servo, force: Scalar, carried: Scalar) -> Scalar:

@@ -42,10 +42,9 @@ class Frame(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Servo:
-    """An affine servo. On a joint with position q and velocity v it exerts, in N m or N,
+    """A servo. On a joint with position q and velocity v it exerts, in N m or N,
 
-    (gain + gain_stiffness * q + gain_damping * v) * ctrl
-    + bias + stiffness * q + damping * v
+    gain * ctrl + bias + stiffness * q + damping * v
     """
 
     gain: Scalar
@@ -55,8 +54,6 @@ class Servo:
     ctrl_range: tuple[Scalar, Scalar] | None
     force_range: tuple[Scalar, Scalar] | None = None
     """Range of the servo's force at the joint (`forcerange`)."""
-    gain_stiffness: Scalar = 0.0
-    gain_damping: Scalar = 0.0
     joint_range: tuple[float, float] | None = None
     """Range of all forces of actuators at the joint (`actuatorfrcrange`)."""
     carries_weight: bool = False
@@ -287,14 +284,11 @@ def _gravity_compensation(mj_model: mujoco.MjModel) -> np.ndarray:
 def _read_servo(m: EditedModel, actuator: int, joint: int) -> Servo:
     c = m.model
     gear = float(c.actuator_gear[actuator, 0])
-    gain, gain_stiffness, gain_damping = m["actuator_gainprm", actuator, :3]
-    if c.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED:
-        gain_stiffness = gain_damping = 0.0
     bias, stiffness, damping = m["actuator_biasprm", actuator, :3]
     forces = tuple(mul(limit, gear) for limit in m["actuator_forcerange", actuator])
     joint_limited = bool(c.jnt_actfrclimited[joint])
     return Servo(
-        gain=mul(gain, gear),
+        gain=mul(m["actuator_gainprm", actuator, 0], gear),
         bias=mul(bias, gear),
         stiffness=mul(stiffness, gear**2),
         damping=mul(damping, gear**2),
@@ -302,8 +296,6 @@ def _read_servo(m: EditedModel, actuator: int, joint: int) -> Servo:
         force_range=forces[:: 1 if gear > 0.0 else -1]
         if m["actuator_forcelimited", actuator]
         else None,
-        gain_stiffness=mul(gain_stiffness, gear**2),
-        gain_damping=mul(gain_damping, gear**2),
         joint_range=m.peek("jnt_actfrcrange", joint) if joint_limited else None,
         carries_weight=bool(c.jnt_actgravcomp[joint]),
     )

@@ -46,21 +46,17 @@ class Response(NamedTuple):
     """Angular acceleration of each ball in the world, rad/s^2."""
 
 
-class Touch(NamedTuple):
-    """A contact with its r rows: the normal, and with friction the first and second tangent."""
+class Row(NamedTuple):
+    """A row of the contacts' Jacobian: along a normal, or along a tangent of a contact with
+    friction."""
 
-    model: ContactModel
-    distance: jax.Array
-    """Gap between the surfaces, m."""
-    axes: tuple[Vec, ...]
-    """The rows' unit vectors [r] in the world."""
-    levers: dict[int, Scalar]
-    """Distance from the contact point, midway between the surfaces, to each ball's centre, m; only
-    with friction."""
-    torques: dict[int, tuple[Vec, ...]]
-    """Torques on each ball from unit forces along the tangents, m."""
-    rows: list[list[Scalar]]
-    """Jacobian [r, n] of the joints."""
+    contact: ContactModel
+    axis: Vec
+    """Unit vector in the world."""
+    torques: dict[int, Vec]
+    """Torque on each ball from a unit force along a tangent, m."""
+    joints: list[Scalar]
+    """Entries [n] of the joints."""
 
 
 def contact_response(
@@ -82,22 +78,31 @@ def contact_response(
       free_accelerations: the balls' accelerations without the contacts.
     """
     positions, velocities, spins = zip(*balls, strict=True)
-    touches = [
-        _touch(model, pose, pair, keep(contact), positions, keep)
-        for pair, contact in zip(model.contacts, _contacts(model, pose, positions), strict=True)
-    ]
-    halves = [[chain.solve_lower(factor, row) for row in touch.rows] for touch in touches]
+    geometry = [keep(contact) for contact in _contacts(model, pose, positions)]
+    rows, springs, softnesses = [], [], []
+    for pair, contact in zip(model.contacts, geometry, strict=True):
+        own = _rows(model, pose, pair, contact, positions, keep)
+        d = impedance(pair, contact.distance)
+        rows += own
+        springs += [mul(mul(pair.stiffness, d), contact.distance), *[0.0] * (len(own) - 1)]
+        softnesses.append(softness(pair, d))
+    halves = [chain.solve_lower(factor, row.joints) for row in rows]
     halves, half_applied = keep((halves, list(half_applied)))
-    matrix = _matrix(model, touches, halves)
-    impedances = [impedance(touch.model, touch.distance) for touch in touches]
+    matrix = tuple(
+        add(dot(halves[i], halves[j]), _by_balls(model, rows[i], rows[j]))
+        for i in range(len(rows))
+        for j in range(i, len(rows))
+    )
     offsets = []
-    for touch, half, d in zip(touches, halves, impedances, strict=True):
-        velocity = relative(touch.model, velocities), spins, joint_velocity
-        free = relative(touch.model, free_accelerations), half_applied
-        offsets += _offsets(touch, half, d, velocity, free)
+    for row, half, spring in zip(rows, halves, springs, strict=True):
+        speed = row.axis @ relative(row.contact, velocities)
+        for i, torque in row.torques.items():
+            speed = add(speed, torque @ spins[i])
+        speed = add(speed, dot(row.joints, joint_velocity))
+        free = add(row.axis @ relative(row.contact, free_accelerations), dot(half, half_applied))
+        offsets.append(add(add(free, mul(row.contact.damping, speed)), spring))
     matrix, offsets = keep((matrix, tuple(offsets)))
-    softnesses = [softness(t.model, d) for t, d in zip(touches, impedances, strict=True)]
-    touching = [touch.distance < 0.0 for touch in touches]
+    touching = [contact.distance < 0.0 for contact in geometry]
 
     def contact_forces(
         matrix: tuple[Scalar, ...], offsets: tuple[Scalar, ...]
@@ -115,15 +120,15 @@ def contact_response(
         factor,
         joint_velocity,
         half_applied,
-        [row for half in halves for row in half],
+        halves,
         matrix,
         offsets,
         contact_forces,
     )
     forces = keep(forces)
-    columns = zip(*(row for touch in touches for row in touch.rows), strict=True)
+    columns = zip(*(row.joints for row in rows), strict=True)
     torque = [add(dot(c, forces), f) for c, f in zip(columns, dry_friction, strict=True)]
-    return Response(torque, *_ball_accelerations(model, touches, forces))
+    return Response(torque, *_ball_accelerations(model, rows, forces))
 
 
 def paddle_origin(model: FusedModel, pose: chain.Pose) -> Vec:
@@ -147,110 +152,56 @@ def _contacts(model: FusedModel, pose: chain.Pose, positions: Sequence[Vec]) -> 
     return contacts
 
 
-def _touch(
+def _rows(
     model: FusedModel,
     pose: chain.Pose,
     pair: ContactModel,
     contact: Contact,
     positions: Sequence[Vec],
     keep: Keep,
-) -> Touch:
-    """A contact with its rows; `positions` are the balls'."""
-    normal = contact.normal
-    axes, levers, torques = (normal,), {}, {}
+) -> list[Row]:
+    """The rows of a contact: the normal, and with friction the first and second tangent;
+    `positions` are the balls'."""
+    normal, point = contact.normal, positions[pair.balls[0]]
+    axes, torques = [normal], [{}]
     if pair.friction is not None:
         first, second = keep(tangents(normal))
-        axes = normal, first, second
+        # From the contact point, midway between the surfaces, to each ball's centre.
         levers = {i: model.balls[i].radius + 0.5 * contact.distance for i in pair.balls}
-        torques = {i: (second * -lever, first * lever) for i, lever in levers.items()}
-    rows = [[0.0] * len(model.links)] * len(axes)
+        axes += first, second
+        torques.append({i: second * -lever for i, lever in levers.items()})
+        torques.append({i: first * lever for i, lever in levers.items()})
+        point = point - normal * levers[pair.balls[0]]
+    joints = [[0.0] * len(model.links)] * len(axes)
     if len(pair.balls) == 1:
         # A force along the normal has the same torque at the ball's centre.
-        point = positions[pair.balls[0]]
-        for lever in levers.values():
-            point = point - normal * lever
         columns = list(chain.point_velocities(model.links, pose, point))
-        rows = keep([[axis @ column for column in columns] for axis in map(operator.neg, axes)])
-    return Touch(pair, contact.distance, axes, levers, torques, rows)
+        joints = keep([[axis @ column for column in columns] for axis in map(operator.neg, axes)])
+    return [Row(pair, *own) for own in zip(axes, torques, joints, strict=True)]
 
 
-def _matrix(
-    model: FusedModel, touches: Sequence[Touch], halves: Sequence[Sequence[Sequence[Scalar]]]
-) -> tuple[Scalar, ...]:
-    """J M^-1 J^T of all contacts, the upper triangle row by row, 1/kg.
-
-    Args:
-      halves: L^-1 J^T [r, n] of each contact.
-    """
-    components = [(k, a) for k, touch in enumerate(touches) for a in range(len(touch.axes))]
-    return tuple(
-        add(dot(halves[k][a], halves[m][b]), _by_balls(model, (touches[k], a), (touches[m], b)))
-        for i, (k, a) in enumerate(components)
-        for m, b in components[i:]
-    )
-
-
-def _by_balls(model: FusedModel, one: tuple[Touch, int], other: tuple[Touch, int]) -> Scalar:
-    """Share of the balls' inertia in an entry of `_matrix`, of a component of one contact and a
-    component of another."""
-    (first, a), (second, b) = one, other
+def _by_balls(model: FusedModel, a: Row, b: Row) -> Scalar:
+    """Share of the balls' inertia in an entry of J M^-1 J^T, 1/kg."""
     share: Scalar = 0.0
-    for i, sign in shared_balls(first.model, second.model):
-        ball = model.balls[i]
-        if first is not second:
-            share = add(share, mul(first.axes[a] @ second.axes[b], sign / ball.mass))
-            if a > 0 and b > 0:
-                turning = first.torques[i][a - 1] @ second.torques[i][b - 1]
-                share = add(share, turning / ball.inertia)
-        elif a == b:
-            share = add(share, 1.0 / ball.mass)
-            if a > 0:
-                share = add(share, first.levers[i] * first.levers[i] / ball.inertia)
+    if a.contact is b.contact and a is not b:
+        return share
+    for i, sign in shared_balls(a.contact, b.contact):
+        along = 1.0 if a is b else a.axis @ b.axis
+        share = add(share, mul(along, sign / model.balls[i].mass))
+        if a.torques and b.torques:
+            share = add(share, a.torques[i] @ b.torques[i] / model.balls[i].inertia)
     return share
 
 
-def _offsets(
-    touch: Touch,
-    half: Sequence[Sequence[Scalar]],
-    d: Scalar,
-    velocity: tuple[Vec, Sequence[Vec | None], Sequence[Scalar]],
-    free: tuple[Vec, Sequence[Scalar]],
-) -> list[Scalar]:
-    """J a0 - aref [r] of a contact, m/s^2.
-
-    Args:
-      half: L^-1 J^T [r, n].
-      d: impedance.
-      velocity: relative velocity of the balls' centres, spins of the balls, and joint velocities.
-      free: relative acceleration without the contacts, and `half_applied`.
-    """
-    model, (along, spins, joint_velocity) = touch.model, velocity
-    offsets = []
-    for a, axis in enumerate(touch.axes):
-        speed, acceleration = axis @ along, axis @ free[0]
-        if a > 0:
-            for i, torques in touch.torques.items():
-                speed = add(speed, torques[a - 1] @ spins[i])
-        speed = add(speed, dot(touch.rows[a], joint_velocity))
-        acceleration = add(acceleration, dot(half[a], free[1]))
-        offsets.append(add(acceleration, mul(model.damping, speed)))
-    offsets[0] = add(offsets[0], mul(mul(model.stiffness, d), touch.distance))
-    return offsets
-
-
 def _ball_accelerations(
-    model: FusedModel, touches: Sequence[Touch], forces: Sequence[Scalar]
+    model: FusedModel, rows: Sequence[Row], forces: Sequence[Scalar]
 ) -> tuple[list[Vec], list[Vec]]:
     """Accelerations and angular accelerations of the balls by the contacts' forces."""
     along, turning = [ZERO3] * len(model.balls), [ZERO3] * len(model.balls)
-    remaining = iter(forces)
-    for touch in touches:
-        own = [next(remaining) for _ in touch.axes]
-        for i in touch.model.balls:
-            ball = model.balls[i]
-            for axis, force in zip(touch.axes, own, strict=True):
-                push = mul(force, side(touch.model, i) / ball.mass)
-                along[i] = along[i] + axis * push
-            for torque, force in zip(touch.torques.get(i, ()), own[1:], strict=True):
-                turning[i] = turning[i] + torque * mul(force, 1.0 / ball.inertia)
+    for row, force in zip(rows, forces, strict=True):
+        for i in row.contact.balls:
+            push = mul(force, side(row.contact, i) / model.balls[i].mass)
+            along[i] = along[i] + row.axis * push
+        for i, torque in row.torques.items():
+            turning[i] = turning[i] + torque * mul(force, 1.0 / model.balls[i].inertia)
     return along, turning
