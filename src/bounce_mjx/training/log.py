@@ -1,5 +1,6 @@
 """The TensorBoard log of a run."""
 
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -18,9 +19,14 @@ class TensorBoardLog:
 
     def __init__(self, run: Path):
         # Imported here, as the imports take a quarter of a second.
-        from tensorboardX import event_file_writer, summary
-        from tensorboardX.proto import event_pb2
-
+        # TensorboardX imports PyTorch where it is installed, which takes four seconds.
+        is_free = sys.modules.setdefault("torch", None) is None
+        try:
+            from tensorboardX import event_file_writer, summary
+            from tensorboardX.proto import event_pb2
+        finally:
+            if is_free:
+                del sys.modules["torch"]
         self.summary, self._events = summary, event_pb2
         self._new_writer = event_file_writer.EventsWriter
         self._run, self._writer = run, None

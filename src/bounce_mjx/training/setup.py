@@ -62,7 +62,7 @@ def set_up_gpu() -> None:
     # started with it fails.
     os.environ.setdefault("CRC32C_SW_MODE", "auto")
     # Otherwise the address of a Python function is a part of the key of each program with a kernel
-    # (`gpu/elementwise.py`), which no later process finds in the cache.
+    # (`gpu/elementwise.py`) for several devices, and no later process finds it in the cache.
     if "JAX_REMOVE_CUSTOM_PARTITIONING_PTR_FROM_CACHE_KEY" not in os.environ:
         jax.config.update("jax_remove_custom_partitioning_ptr_from_cache_key", True)
     if "JAX_THREEFRY_GPU_KERNEL_LOWERING" not in os.environ:
