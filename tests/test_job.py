@@ -238,6 +238,16 @@ def test_a_training_stops_once_its_results_have_a_margin(tmp_path: Path) -> None
     assert f"{run} has been trained to its end, 256 steps;" in shown.getvalue()
 
 
+def test_settings_that_cannot_be_trained_are_refused_before_a_save(tmp_path: Path) -> None:
+    class Falling(CountingTrainer):
+        def run(self):
+            return super().run() | {"episode/ended": np.full((1, 1), float(BLOCK))}
+
+    with pytest.raises(UserError, match="these settings cannot be trained: an episode lasts 0.01"):
+        train(tmp_path, RETURNS, trainer=Falling)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_callback_sees_blocks_and_evaluations_and_ends_the_training(tmp_path: Path) -> None:
     """The training ends as after its last step: with an evaluation, and results."""
     seen = []

@@ -84,6 +84,7 @@ OF_SITE = [k for k in KEYS if k.startswith("env.robot.") and "limits" not in k]
 NEEDED = {
     "env.action.max_lead": {"action": {"base": "target"}},
     "env.observation.servo_lead": {"action": {"base": "target"}},
+    "env.randomization.first_command_range": {"randomization": {"warmup_steps": 1000}},
     "env.randomization.push_interval": {"randomization": {"push_speed": [0.1, 0.1]}},
     **{f"env.robot.limits.{name}": WITH_LIMITS for name in LIMITS},
     **dict.fromkeys(OF_SITE, ADOPTED),

@@ -111,6 +111,25 @@ def test_ranges_grow_from_the_nominal_values() -> None:
     assert ends(0.0)["camera_rate"] == ends(1.0)["camera_rate"] == [60.0, 120.0]
 
 
+def test_the_range_of_a_command_grows_about_its_middle() -> None:
+    grows = {"first_command_range": 0.2, "warmup_steps": 1000}
+    env = BounceBall(EnvConfig(target_height_range=(0.3, 0.8), randomization=grows))
+
+    def ends(progress: float) -> list[float]:
+        return [float(end) for end in env.ranges(progress)["target_height"]]
+
+    assert ends(0.0) == pytest.approx([0.5, 0.6])
+    assert ends(0.5) == pytest.approx([0.4, 0.7])
+    assert ends(1.0) == pytest.approx([0.3, 0.8])
+    heights = [
+        env.reset(jax.random.key(i), env.ranges(0.0)).pipeline_state.command["target_height"]
+        for i in range(8)
+    ]
+    assert 0.5 <= min(heights) < max(heights) <= 0.6
+    with pytest.raises(ValueError, match="first_command_range is given without warmup_steps"):
+        EnvConfig(randomization={"first_command_range": 0.2})
+
+
 def test_a_training_draws_from_the_grown_ranges() -> None:
     """At each iteration, of a task whose whole state is the end of the range at its reset."""
 

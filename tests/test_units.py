@@ -1,9 +1,10 @@
-"""A setting in a wrong unit or without an effect is refused by name."""
+"""A setting in a wrong unit, without an effect, or that no episode survives is refused by name."""
 
 import re
 from typing import ClassVar
 
 import jax
+import numpy as np
 import pytest
 import yaml
 
@@ -13,6 +14,7 @@ from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.runs.config import train_config
 from bounce_mjx.tasks.registry import find_task
+from bounce_mjx.training.first_block import fault_of
 from bounce_mjx.world.config import Command
 
 WRONG = """
@@ -187,3 +189,47 @@ def test_a_mistyped_name_in_a_task_is_one_sentence(wrong: str, reason: str, monk
 def test_a_task_has_its_own_config() -> None:
     with pytest.raises(UserError, match="the task Other has no Config of its own"):
         type("Other", (Mistyped,), {})
+
+
+def first_block(ended=64.0, too_fast=0.0, non_finite=0.0, height=1.0, fault=0.0) -> dict:
+    """Metrics of two seeds and four iterations of 8 environments and 8 steps."""
+    named = {
+        "episode/ended": ended, "task/too_fast": too_fast, "task/non_finite": non_finite,
+        "reward/height": height, "reward/position": -1.0, "fault": fault,
+    }  # fmt: skip
+    return {name: np.broadcast_to(value, (2, 4)) for name, value in named.items()}
+
+
+FIRST = train_config(find_task("bounce"))(ppo={"num_envs": 8, "rollout_length": 8})
+LATE, NAN = np.array([0.0, 0.0, 3.0, 3.0]), np.array([1.0, 1.0, 1.0, np.nan])
+
+
+@pytest.mark.parametrize(
+    "block, reason",
+    [
+        (first_block(ended=6.0), None),
+        (first_block(ended=0.0, height=0.9e5), None),
+        # The learning diverged, not the settings: an iteration after the fault counts no more.
+        (first_block(ended=0.0, height=NAN, fault=LATE), None),
+        # Another seed learns.
+        (first_block(ended=np.array([[64.0], [1.0]])), None),
+        (first_block(ended=0.0, height=np.array([[np.nan], [1.0]])), None),
+        (first_block(), r"lasts 0\.01 s .* an end of the task bounce;"),
+        (first_block(too_fast=60.0), r"lasts 0\.01 s .* max_joint_velocity;"),
+        (first_block(non_finite=64.0), "the physics, which is not finite"),
+        (first_block(ended=7.0), r"lasts 0\.091 s"),
+        (
+            first_block(ended=0.0, height=-1.1e5),
+            "height is -1.1e.05 on average, not within 10000 after",
+        ),
+        (first_block(ended=0.0, height=NAN), "height is nan on average"),
+    ],
+)
+def test_a_first_block_without_a_chance_is_refused(block: dict, reason: str | None) -> None:
+    found = fault_of(block, FIRST)
+    assert re.search(reason, found) if reason else found is None
+
+
+def test_a_short_time_limit_is_no_fault() -> None:
+    short = FIRST.model_copy(update={"env": config("bounce", episode_seconds=0.05)})
+    assert fault_of(first_block(ended=16.0), short) is None

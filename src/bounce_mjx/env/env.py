@@ -201,9 +201,16 @@ class Env:
         return self.config.randomization.warmup_steps
 
     def ranges(self, progress: jax.Array | float = 1.0) -> Ranges:
-        """The ranges of the randomisation; `progress` [] is the share of the warm-up that has
-        passed."""
-        return self.config.randomization.ranges(progress)
+        """The ranges of the randomisation, and of the commands where they grow too; `progress` []
+        is the share of the warm-up that has passed."""
+        randomization = self.config.randomization
+        ranges, first = randomization.ranges(progress), randomization.first_command_range
+        for name, command in self.config.commands.items() if first < 1.0 else ():
+            middle, half = (command.low + command.high) / 2.0, (command.high - command.low) / 2.0
+            half *= first + (1.0 - first) * progress
+            ends = middle - half, middle + half
+            ranges[name] = tuple(jnp.asarray(end, jnp.float32) for end in ends)
+        return ranges
 
     def reset(
         self, rng: jax.Array, ranges: Ranges | None = None, share: float | None = None

@@ -33,6 +33,7 @@ from bounce_mjx.training import hosts
 from bounce_mjx.training.callbacks import Callback, Event, block_points, call_all, points_of
 from bounce_mjx.training.console import block_line, evaluation_line, say
 from bounce_mjx.training.evaluators import Evaluators
+from bounce_mjx.training.first_block import fault_of
 from bounce_mjx.training.log import TensorBoardLog
 from bounce_mjx.training.ppo_trainer import PPOTrainer
 from bounce_mjx.training.trainer import Snapshot, Trainer, in_whole_blocks, iterations_per_block
@@ -413,6 +414,8 @@ class Job:
             self.say("stopping after this block; the same signal again ends it at once")
         metrics = block.result()
         seconds = time.perf_counter() - started
+        if self.steps == 0 and (wrong := fault_of(metrics, self.config)) is not None:
+            raise UserError(f"these settings cannot be trained: {wrong}")
         faults = metrics.pop("fault")
         self.steps += self.block_steps
         rate = len(faults) * self.block_steps / seconds

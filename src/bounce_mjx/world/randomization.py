@@ -107,8 +107,8 @@ class Term(NamedTuple):
 
 _FACTOR = (1e-3, 1e3)
 
-# Keys of earlier runs that are gone, and their values without effect.
-_FORMER = {"restitution_slope": None, "air_lift": None, "first_command_range": 1.0}
+# Keys of earlier runs that are gone, which had no effect without a value.
+_FORMER = "restitution_slope", "air_lift"
 
 
 class RandomizationConfig(StrictModel):
@@ -195,6 +195,9 @@ class RandomizationConfig(StrictModel):
     """Probabilities of single terms, by name, in place of `share`."""
     warmup_steps: Annotated[int, pydantic.BeforeValidator(whole_number), Field(ge=0)] = 0
     """Environment steps over which the ranges grow from the nominal values."""
+    first_command_range: UnitInterval = 1.0
+    """Range of the commands at the start of a training, around the middle of their whole range and
+    as a share of it; it grows to the whole range over warmup_steps."""
 
     def __hash__(self) -> int:
         """Configs are keys of compiled programs; pydantic's own hash cannot take `shares`."""
@@ -205,7 +208,7 @@ class RandomizationConfig(StrictModel):
     def _read_former(cls, values: Any) -> Any:
         if not isinstance(values, dict):
             return values
-        return {key: x for key, x in values.items() if key not in _FORMER or x != _FORMER[key]}
+        return {key: x for key, x in values.items() if key not in _FORMER or x is not None}
 
     @pydantic.model_validator(mode="after")
     def _check_ranges(self):
@@ -215,6 +218,8 @@ class RandomizationConfig(StrictModel):
             )
         if self.push_interval and not self.push_speed:
             raise ValueError("push_interval is given without push_speed; give both")
+        if self.first_command_range < 1.0 and not self.warmup_steps:
+            raise ValueError("first_command_range is given without warmup_steps; give both")
         for name in self.terms:
             ends, (size, _, (least, greatest), *_) = getattr(self, name), TERMS[name]
             unit = f" {unit_of(type(self).model_fields[name].description)}".rstrip()
