@@ -224,6 +224,7 @@ def after_resting(env: Env, steps: int, key: int = 0):
     return truths, np.array(observations), state
 
 
+@pytest.mark.slow
 def test_a_world_of_two_balls_sees_each_late():
     """Each ball is thrown as the task says, flies freely, and is seen after the latency."""
     env = Env(Two.Config(observation={"ball_position": 2}))

@@ -91,6 +91,7 @@ def test_brax_draws_the_links_where_mujoco_has_them():
     assert sum(map(len, drawn["geoms"].values())) == env.mj_model.ngeom
 
 
+@pytest.mark.slow
 def test_step_keeps_what_wrappers_added(env):
     """A step keeps unknown metrics and info, as every brax environment does."""
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))

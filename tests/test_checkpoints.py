@@ -248,6 +248,7 @@ class Payload:
         return os.mkdir, (str(self.target),)
 
 
+@pytest.mark.slow
 def test_code_in_any_file_is_not_run(written: Path, tmp_path: Path, state: TrainingState) -> None:
     """Also with a valid manifest."""
     target = tmp_path / "ran"

@@ -159,6 +159,7 @@ print(*sorted(set(bounce_mjx.__all__) & set(dir(bounce_mjx))))
     assert done.stdout.splitlines() == ["False", "fused", names], done.stderr
 
 
+@pytest.mark.slow
 def test_a_missing_extra_is_told_in_one_way() -> None:
     """To a program as an ImportError, and to the user of a command as one sentence."""
     script = """

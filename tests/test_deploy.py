@@ -576,6 +576,7 @@ except UserError as error:
     assert "must be exported, for which" in refusal and "bounce-mjx export" in refusal
 
 
+@pytest.mark.slow
 def test_only_the_robust_policy_bounces_with_a_late_camera() -> None:
     """On plain MuJoCo; the defaults of the example."""
     simulate, camera = EXAMPLE["simulate"], EXAMPLE["Camera"]

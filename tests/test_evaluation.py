@@ -120,6 +120,7 @@ def test_settling_takes_two_seconds(env):
     np.testing.assert_array_equal(s.rising_steps, [4])
 
 
+@pytest.mark.slow
 def test_bounces_settle_again_after_a_change_of_the_target(env):
     """Ages after the step, of a target that changed 0.01, 2 and 2.01 s before; and of one that
     never does."""
@@ -367,6 +368,7 @@ def test_mujoco_evaluator_agrees_with_the_fused_one(networks, random_policy):
     assert np.isfinite(broken.episode_return).all() and not np.any(broken.running)
 
 
+@pytest.mark.slow
 def test_worlds_and_commands_are_those_of_the_training_or_of_the_options(monkeypatch):
     """A given command replaces a drawn one, also where the world of the training changes it. A
     nominal evaluation draws no world, and its commands are the task's. The report is judged by the
@@ -402,6 +404,7 @@ def dribbling() -> Env:
     return Env(find_task(DRIBBLE).Config(ball_init_pos=(0.6, 0.0, 0.2)))
 
 
+@pytest.mark.slow
 def test_another_task_is_counted_and_judged_by_itself(dribbling):
     """Three invented episodes of its events, the last of which ends early."""
     start = jax.vmap(dribbling.reset, out_axes=-1)(jax.random.split(jax.random.key(0), 3))

@@ -15,19 +15,14 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 SMALL = ["--num-envs", "3", "--steps"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "example, arguments, libraries, shown",
     [
         # A ball that the arm misses reaches the floor after 0.3 s.
         ("gymnasium_policy.py", ["--steps", "150"], ["onnxruntime"], r"[2-9] bounces in 1\.50 s"),
         ("sb3_ppo.py", [*SMALL, "96", "--judged-steps", "5"], ["stable_baselines3"], "5. stable"),
-        pytest.param(
-            "sbx_ppo.py",
-            [*SMALL, "96"],
-            ["sbx"],
-            lambda names: names["model"].num_timesteps == 96,
-            marks=pytest.mark.slow,
-        ),
+        ("sbx_ppo.py", [*SMALL, "96"], ["sbx"], lambda names: names["model"].num_timesteps == 96),
         ("torchrl_ppo.py", [*SMALL, "96"], ["torchrl"], r"batch=0, reward=-?\d"),
         ("cleanrl_ppo.py", [*SMALL, "192"], ["torch"], r"iteration=\d, episodic_return=-?\d"),
     ],

@@ -104,6 +104,7 @@ def test_import_registers_whichever_comes_first():
         assert done.stdout.split() == [ENV_ID, "False"], done.stderr
 
 
+@pytest.mark.slow
 def test_each_task_of_the_package_has_a_name() -> None:
     own = {
         name for name in registered_tasks() if find_task(name).__module__.startswith("bounce_mjx")

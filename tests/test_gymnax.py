@@ -58,6 +58,7 @@ def test_steps_are_those_of_the_task_until_the_time_limit(env):
     np.testing.assert_allclose(observation, fresh, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_parameters_set_the_time_limit_and_a_fall_terminates(env):
     """In the form of gymnax 1.x, whose steps tell the two ends apart."""
     step = functools.partial(GymnaxBounceBall.step, env)

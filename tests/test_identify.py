@@ -203,6 +203,7 @@ def unseen() -> Identified:
     return Identified(layout, windows, None, *known, errors, errors, errors, 0)
 
 
+@pytest.mark.slow
 def test_the_page_begins_with_the_answer() -> None:
     """What the log leaves open comes last."""
     found = unseen()

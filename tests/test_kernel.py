@@ -127,6 +127,7 @@ def test_one_environment_and_float64_are_compiled_by_xla(env, in_kernel):
         assert "pallas_call" not in str(jax.jit(batched(env)).trace(*doubled).jaxpr)
 
 
+@pytest.mark.slow
 def test_the_kernel_is_lowered_for_a_gpu(env, monkeypatch):
     """This needs no GPU: the program for a GPU contains a kernel, the program for a CPU none."""
     monkeypatch.setattr(kernel, "has_kernels", lambda: True)

@@ -64,6 +64,7 @@ FIELDS = (
 DERIVED = "body_inertia body_invweight0 body_subtreemass dof_M0 geom_rbound".split()
 
 
+@pytest.mark.slow
 def test_models_of_parameters_are_read_back(mj_model, base):
     """The numbers of `edited_model`, given as a randomised model, give the same model again, one
     parameter at a time and all together."""
@@ -86,6 +87,7 @@ def test_models_of_parameters_are_read_back(mj_model, base):
                 )
 
 
+@pytest.mark.slow
 def test_entries_act_as_in_mujoco(mj_model, float64):
     """Random changes of every field that the fused engine reads, in one step against C."""
     count, rng = 48, np.random.default_rng(0)

@@ -164,6 +164,7 @@ def test_keys_act(page) -> None:
     client.press("pause")
 
 
+@pytest.mark.slow
 def test_the_page_shows_the_commands_of_any_task(monkeypatch) -> None:
     env = Env(LeanConfig(physics="fused"))
     leaning = Simulation(env, make_zero_controller(env), 2, seed=0)

@@ -63,6 +63,7 @@ def test_2000_random_action_steps_are_mujocos(mj_model, float64):
     assert contacts >= 1000 and np.max(errors) < 1e-9
 
 
+@pytest.mark.slow
 def test_mjx_multiplies_in_full_precision(mj_model):
     """The default on a GPU, TF32, has three digits, and a policy that bounces elsewhere failed."""
     constants = mjx_engine.read_model(mj_model)
@@ -78,6 +79,7 @@ def test_mjx_multiplies_in_full_precision(mj_model):
     assert all("precision = [HIGHEST, HIGHEST]" in line for line in products)
 
 
+@pytest.mark.slow
 def test_float32_drifts_by_less_than_a_millimetre_in_2_s(mj_model, fused_step):
     """A free run against MuJoCo's float64; every second ball falls beside the paddle."""
     rng = np.random.default_rng(3)

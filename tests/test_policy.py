@@ -104,6 +104,7 @@ def brax_networks(config):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["policy_network", "value_network"])
 def test_networks_equal_brax(which, config, brax_networks, seen):
     """The same key gives the same parameters, by name and value, and the same outputs; brax takes

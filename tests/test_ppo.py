@@ -186,6 +186,7 @@ class Precise(TwoStates):
         return state.replace(reward=-jnp.square(action[0] - 0.3))
 
 
+@pytest.mark.slow
 def test_the_noise_shrinks_to_its_bound():
     """The bounds of the environments have the mean `min_noise_std`; the policy is as precise."""
     config = two_state_config(
@@ -227,6 +228,7 @@ def params(trainer):
     return jax.jit(trainer.init)(jax.random.key(0)).params
 
 
+@pytest.mark.slow
 def test_training_is_a_function_of_its_key(trainer):
     """And changes every parameter."""
     init, run = jax.jit(trainer.init), jax.jit(lambda state: trainer.run(state, 2))

@@ -130,6 +130,7 @@ def test_the_range_of_a_command_grows_about_its_middle() -> None:
         EnvConfig(randomization={"first_command_range": 0.2})
 
 
+@pytest.mark.slow
 def test_a_training_draws_from_the_grown_ranges() -> None:
     """At each iteration, of a task whose whole state is the end of the range at its reset."""
 

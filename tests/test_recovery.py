@@ -86,6 +86,7 @@ def run(half: Path, tmp_path: Path) -> Path:
     return shutil.copytree(half, tmp_path / "run")
 
 
+@pytest.mark.slow
 def test_resumed_training_is_the_same(run: Path, straight: Path) -> None:
     resume(run, "--total-steps", str(STEPS))
     assert_same_training(run, straight)

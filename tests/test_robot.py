@@ -341,6 +341,7 @@ LIFT = link(
 )
 
 
+@pytest.mark.slow
 def test_three_joints_suffice_to_lift_and_tilt(tmp_path, capsys) -> None:
     """Also on a base with a free joint, which is fixed; the observation has 2n + 17 numbers."""
     base = f'<body><freejoint/><geom size="0.1"/>{LIFT}</body>'

@@ -292,6 +292,7 @@ def test_command_writes_its_results(measured, tmp_path: Path, monkeypatch, capsy
     assert json.loads((tmp_path / "other" / "robustness.json").read_text())["outcomes"]
 
 
+@pytest.mark.slow
 def test_a_perturbation_of_one_task_is_skipped_for_others(tmp_path: Path) -> None:
     """The shipped suite runs for a task without its commands, whose own command has its limits."""
     dribble = find_task(DRIBBLE).Config()

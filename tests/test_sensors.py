@@ -153,6 +153,7 @@ def pictures(world: dict, phase: float, w: int):
         yield n, positions[n], velocities[n], now - taken[n]
 
 
+@pytest.mark.slow
 def test_camera_is_that_of_a_simulation(watch) -> None:
     """Rates of 50 to 250 Hz and latencies of 0 to 30 ms, any phase, no noise."""
     seen = watch(ball_latency=(0.0, 0.03))

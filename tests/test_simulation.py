@@ -170,6 +170,7 @@ def test_a_slider_reaches_every_value_that_a_reset_samples() -> None:
     assert spans["restitution"] == (0.6, 0.98)
 
 
+@pytest.mark.slow
 def test_a_moved_slider_changes_the_world_at_once(monkeypatch) -> None:
     """Of the nominal policy, in worlds whose ball mass is drawn."""
     checkpoint = pretrained_checkpoint()

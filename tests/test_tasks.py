@@ -113,6 +113,7 @@ def in_another_process(*lines: str) -> str:
     return done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_a_run_keeps_its_task_which_runs_only_if_the_user_names_it(
     mine: Path, tmp_path: Path
 ) -> None:

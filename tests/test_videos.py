@@ -66,6 +66,7 @@ def read_video(path: Path) -> tuple[float, np.ndarray]:
     return float(stream[3]), np.frombuffer(done.stdout, np.uint8).reshape(-1, height, width, 3)
 
 
+@pytest.mark.slow
 def test_evaluations_are_filmed_for_tensorboard(opengl, tmp_path: Path) -> None:
     """Each evaluated policy is a GIF of the reset and what follows; a block is none."""
     checkpoint = pretrained_checkpoint()

@@ -76,6 +76,7 @@ TILTED = {
 }
 
 
+@pytest.mark.slow
 def test_a_world_with_ranges_of_axes_trains_and_is_doubled(tmp_path: Path) -> None:
     world = written(tmp_path, **TILTED)
     assert read_command(["--world", str(world)]).env.randomization.paddle_tilt == TILT
