@@ -30,9 +30,8 @@ from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.runs.config import TrainConfig, read_preset
-from bounce_mjx.training.ppo_trainer import PPOTrainer
+from bounce_mjx.training.ppo_trainer import PPOTrainer, iterations_per_block
 from bounce_mjx.training.setup import set_up_jax
-from bounce_mjx.training.trainer import iterations_per_block
 
 Count = Annotated[int, Field(ge=1)]
 Counts = tuple[Count, ...]

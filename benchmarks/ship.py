@@ -22,16 +22,17 @@ from bounce_mjx.reports.tables import details_line, results_table
 from bounce_mjx.resources import ARM_POLICIES, POLICIES, PRETRAINED
 from bounce_mjx.runs.config import (
     CONFIG_FILE,
+    ROBOT,
     TrainConfig,
     load_run_config,
     read_preset,
     runs_folder,
 )
-from bounce_mjx.runs.copies import ROBOT, copy_robot
 from bounce_mjx.runs.files import MANIFEST_FILE, to_json, write_atomically
 from bounce_mjx.runs.folders import (
     Checkpoint,
     best_checkpoint,
+    copy_robot,
     find_checkpoint,
     write_config,
 )

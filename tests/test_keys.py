@@ -26,8 +26,7 @@ from bounce_mjx.runs.config import TrainConfig, train_config
 from bounce_mjx.tasks.registry import find_task
 from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.job import Job
-from bounce_mjx.training.ppo_trainer import PPOTrainer, episode_steps
-from bounce_mjx.training.trainer import in_whole_blocks
+from bounce_mjx.training.ppo_trainer import PPOTrainer, episode_steps, in_whole_blocks
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import Term
 from test_ppo import TwoStates

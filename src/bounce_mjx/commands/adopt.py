@@ -1,13 +1,11 @@
 """Writes the config of an unknown arm: `bounce-mjx adopt my_arm.xml`."""
 
-import math
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import yaml
-from rich.console import Console
 
 from bounce_mjx.config.command_line import Flag, parse
 from bounce_mjx.config.settings import StrictModel
@@ -53,7 +51,6 @@ def main(args: Sequence[str]) -> None:
 
     set_up_jax()
     task = find_task(command.task)
-    console = Console(soft_wrap=True, highlight=False)
     given = command.paddle.model_dump(exclude_defaults=True)
     fixed = not {"position", "quaternion"}.isdisjoint(given)
     robot = RobotConfig(site=command.site, joints=command.joints, paddle=command.paddle)
@@ -64,18 +61,18 @@ def main(args: Sequence[str]) -> None:
     config = validate(train_config(task), values, str(command.mjcf))
     env = Env(config.env)
     for line in describe(adoption):
-        console.print(line, markup=False)
-    console.print(f"physics: {env.engine.name} ({env.engine.reason})", markup=False)
+        print(line)
+    print(f"physics: {env.engine.name} ({env.engine.reason})")
     out = command.out or Path(f"{command.mjcf.stem}.yaml")
     head = f"An arm with a paddle: bounce-mjx adopt {command.mjcf} --site {adoption.config.site}"
     text = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)
     write_output(out, f"# {head}\n{text}")
-    console.print(f"config: {out}", markup=False)
+    print(f"config: {out}")
     named = [] if command.task == DEFAULT else ["--task", command.task]
     flags = [*named, "--robot", str(out)]
     shown = shlex.join([*flags, "--actions", "zero"])
-    console.print(f"see it: bounce-mjx view {shown}", markup=False)
-    console.print(f"train it: bounce-mjx train {shlex.join(flags)}", markup=False)
+    print(f"see it: bounce-mjx view {shown}")
+    print(f"train it: bounce-mjx train {shlex.join(flags)}")
 
 
 def env_values(mjcf: Path, adoption: "Adoption", config_class: type[WorldConfig]) -> dict[str, Any]:
@@ -97,24 +94,13 @@ def env_values(mjcf: Path, adoption: "Adoption", config_class: type[WorldConfig]
 
 def describe(adoption: "Adoption") -> list[str]:
     """Lines about an adopted arm: its pose, its servos, and the changes to the user's model."""
-    pose, arm = adoption.pose, adoption.arm
-    x, y, z = (round(coordinate, 6) + 0.0 for coordinate in pose.paddle)
-    strength = f"{pose.acceleration:.0f} m/s^2 upward in addition to holding the arm"
+    x, y, z = (round(coordinate, 6) + 0.0 for coordinate in adoption.pose.paddle)
     is_kept = adoption.config.servo_stiffness is None
     kind = "kept" if is_kept else "made from the reflected inertia"
-    lines = [
-        f"paddle: level at x {x:.3f}, y {y:.3f}, z {z:.3f} m; the reach is {pose.reach:.2f} m",
-        f"manipulability: {pose.manipulability:.3f} (smallest singular value, 0.25 m per radian)",
-        f"strength: {strength if math.isfinite(pose.acceleration) else 'no force limit'}",
-        f"servos ({kind}), action scale {adoption.action_scale:g} rad:",
+    return [
+        f"paddle: level at x {x:.3f}, y {y:.3f}, z {z:.3f} m; the reach is "
+        f"{adoption.pose.reach:.2f} m",
+        f"servos: {kind}; action scale {adoption.action_scale:g} rad",
+        "changes to the model:",
+        *(f"  {change}" for change in adoption.arm.changes),
     ]
-    for name, angle, inertia, servo in zip(
-        arm.joint_names, pose.angles, pose.inertia, adoption.servos, strict=True
-    ):
-        most = servo.force_limit
-        limit = "no force limit" if most is None else f"force limit {most:.4g}"
-        lines.append(
-            f"  {name}: {angle:+.3f} rad, inertia {inertia:.3g}, kp {servo.stiffness:.4g}, "
-            f"kv {servo.damping:.4g}, {limit}"
-        )
-    return [*lines, "changes to the model:", *(f"  {change}" for change in arm.changes)]

@@ -3,7 +3,6 @@
 import importlib.metadata
 import os
 import platform
-import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
@@ -18,7 +17,6 @@ _DISTRIBUTION = "bounce_mjx"
 # Versions on which the results of simulation and training depend.
 _PACKAGES = "jax jaxlib mujoco mujoco-mjx numpy flax optax tensorstore".split()
 _VARIABLES = ("JAX_", "XLA_", "MUJOCO_GL", "CUDA_VISIBLE_DEVICES")
-_REQUIREMENT = re.compile(r"([\w.-]+)(?:\[([\w,-]+)\])?.*?(?:;.*\bextra == ['\"]([\w-]+)['\"].*)?$")
 
 
 class DoctorCommand(StrictModel):
@@ -74,13 +72,13 @@ def extras() -> dict[str, list[str]]:
 
 def _packages(distribution: str, extra: str) -> Iterator[str]:
     """The packages of an installed package's extra, with those of the extras that it includes."""
-    for requirement in importlib.metadata.requires(distribution) or []:
-        name, included, marked = _REQUIREMENT.match(requirement).groups()
-        if marked == extra:
-            yield name
-            if version_of(name) is not None:
-                for inner in included.split(",") if included else ():
-                    yield from _packages(name, inner)
+    from packaging.requirements import Requirement
+
+    for needed in map(Requirement, importlib.metadata.requires(distribution) or []):
+        if needed.marker is not None and needed.marker.evaluate({"extra": extra}):
+            yield needed.name
+            for inner in needed.extras if version_of(needed.name) else ():
+                yield from _packages(needed.name, inner)
 
 
 def _try(describe: Callable[[], str]) -> str:

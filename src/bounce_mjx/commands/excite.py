@@ -3,8 +3,6 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
-
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import Finite, Positive, StrictModel
 from bounce_mjx.errors import exit_on_user_error
@@ -38,7 +36,6 @@ def main(args: Sequence[str]) -> None:
     config = read_preset(Path("default"), command.robot).env
     motion = excite(config, command.seconds, command.max_velocity, command.table_height)
     write_output(command.out, to_csv(motion))
-    console = Console(soft_wrap=True, highlight=False)
     for name, amplitude in zip(motion.joint_names, motion.amplitudes, strict=True):
-        console.print(f"  {name}: up to {amplitude:.3f} rad from the start pose", markup=False)
-    console.print(f"motion: {command.out} ({motion.times[-1]:.0f} s)", markup=False)
+        print(f"  {name}: up to {amplitude:.3f} rad from the start pose")
+    print(f"motion: {command.out} ({motion.times[-1]:.0f} s)")

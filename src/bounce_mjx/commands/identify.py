@@ -2,11 +2,8 @@
 
 import sys
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Annotated
-
-from rich.console import Console
 
 from bounce_mjx.config.command_line import Flag, parse
 from bounce_mjx.config.settings import NonNegative, StrictModel
@@ -63,29 +60,28 @@ def main(args: Sequence[str]) -> None:
         validate(type(config), config.model_dump() | {"randomization": ranges}, str(command.check))
     model = load_model(config.mjcf, config.physics_dt, visual=False, robot=config.robot)
     names = joint_names(model)
-    say = partial(Console(soft_wrap=True, highlight=False).print, markup=False)
     log = join(
         [read_log(path, model, command.topics, command.joint_names) for path in command.logs]
     )
     for warning in log.notes:
-        say(f"warning: {warning}")
+        print(f"warning: {warning}")
     set_up_jax(config)
-    found = identify(config, log, command.camera_rotation, lambda line: say(f"  {line}"))
+    found = identify(config, log, command.camera_rotation, lambda line: print(f"  {line}"))
     for entry in estimates(found, names):
         seen = "" if entry.seen else "  (not shown by the log)"
         interval = f"{entry.low:.5g} to {entry.high:.5g} {entry.unit}".rstrip()
-        say(f"{entry.label}: {entry.value:.5g}, {interval}{seen}")
+        print(f"{entry.label}: {entry.value:.5g}, {interval}{seen}")
     for sensor, error in found.after.items():
         held = found.held_out.get(sensor)
         rest = "" if held is None else f", {held:.2f} in windows held out"
         before = found.before.get(sensor, float("nan"))
-        say(f"{sensor}: error {before:.2f} times the noise before, {error:.2f} after{rest}")
+        print(f"{sensor}: error {before:.2f} times the noise before, {error:.2f} after{rest}")
     for line in sentences(found, names):
-        say(line)
+        print(line)
     if known is not None:
         changed = compare(known, found, names)
         for line in changed or [f"the robot still matches {command.check}"]:
-            say(line)
+            print(line)
         sys.exit(1 if changed else 0)
     robot = None if command.robot is None else str(command.robot)
     files = {
@@ -94,4 +90,4 @@ def main(args: Sequence[str]) -> None:
     }
     for path, content in files.items():
         write_output(path, content)
-        say(str(path))
+        print(str(path))

@@ -2,6 +2,7 @@
 
 import json
 import math
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,10 +11,11 @@ import numpy as np
 
 from bounce_mjx.config.files import flat
 from bounce_mjx.errors import UserError, reason_of, shorten
-from bounce_mjx.runs.config import TrainConfig, load_run_config
-from bounce_mjx.runs.copies import identify_robot, identify_task
+from bounce_mjx.runs.config import ROBOT, TrainConfig, load_run_config
+from bounce_mjx.runs.files import MANIFEST_FILE
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.task.shown import Curve
+from bounce_mjx.tasks.registry import is_file, read_source
 
 # Settings that may differ within a group: the seed, the run's location, its length, its devices.
 _FREE_KEYS = frozenset(("seed", "log_dir", "total_steps", "stop_when_solved", "num_devices"))
@@ -111,11 +113,13 @@ def _settings(run: Path, config: TrainConfig) -> dict[str, Any]:
     """The settings that affect the training, by dotted name."""
     settings = flat(config.model_dump(mode="json", exclude=set(_FREE_KEYS)))
     # The paths of the run's own copies would put every run in a separate group.
-    settings["task"] = identify_task(config.task)
-    settings["algorithm"] = identify_task(config.algorithm)
+    copies = {
+        key: read_source(settings[key]) for key in ("task", "algorithm") if is_file(settings[key])
+    }
     if config.env.mjcf is not None:
-        settings["env.mjcf"] = identify_robot(config.env.mjcf, run)
-    return settings
+        copies["env.mjcf"] = (run / ROBOT / MANIFEST_FILE).read_bytes()
+    checked = {key: f"{Path(settings[key]).name} {zlib.crc32(x):08x}" for key, x in copies.items()}
+    return settings | checked
 
 
 def mean_and_band(curves: Sequence[LoggedCurve]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -4,6 +4,8 @@ import functools
 import importlib.metadata
 import importlib.util
 import os
+import shlex
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -19,8 +21,9 @@ from bounce_mjx.lazy import jax
 from bounce_mjx.learning.config import PPO_NAME, PPOConfig, find_algorithm
 from bounce_mjx.resources import PRETRAINED, resource_path
 from bounce_mjx.robot.config import is_packaged
-from bounce_mjx.runs.copies import check_robot, task_of_run, unnamed_code
+from bounce_mjx.runs.files import check_integrity
 from bounce_mjx.task.task import Task
+from bounce_mjx.tasks import registry
 from bounce_mjx.tasks.registry import (
     DEFAULT,
     find_task,
@@ -35,6 +38,8 @@ from bounce_mjx.world.named import NamedWorld, read_world
 CONFIG_FILE = "config.yaml"
 BASE = "base"
 """Key of a config file with the name of the preset on which it lies, or null for none."""
+ROBOT = "robot"
+"""Folder of a run with a copy of its robot."""
 ROBOTS = "configs/robots"
 """Folder of the package with configs of robots."""
 WORLDS = "configs/worlds"
@@ -163,11 +168,68 @@ def load_run_config(
     values = {"task": DEFAULT} | _read(path)
     values.pop(BASE, None)
     ppo = PPOConfig if algorithm is None else find_algorithm(algorithm).Config
-    its_task = task_of_run(values["task"], run, task)
+    its_task = _task_of_run(values["task"], run, task)
     config = validate(train_config(its_task, ppo=ppo), values, str(path))
     if config.env.mjcf is not None and not is_packaged(config.env.mjcf):
-        check_robot(run)
+        _check_robot(run)
     return config
+
+
+def _check_robot(run: Path) -> None:
+    """Checks that a run's copy of its robot is as it was written.
+
+    Raises:
+      UserError: a file is missing or was edited.
+    """
+    try:
+        check_integrity(run / ROBOT)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(
+            f"{run / ROBOT} is not the robot that {run} was trained with ({reason}); restore that "
+            "folder, or train a new run with --mjcf"
+        ) from error
+
+
+def _task_of_run(name: str, run: Path, given: str | None) -> type[Task]:
+    """The task of a run; its copy of a task's file is not run unless the user has named code with
+    the same content.
+
+    Args:
+      name: name in the run's config.
+      given: name that the user gave, or None. Another file's task is taken with a warning.
+
+    Raises:
+      UserError: the user has not named the file; or the run has another task.
+    """
+    differs = given is not None and not registry.is_same_code(name, given)
+    if not is_file(name):
+        if differs:
+            raise UserError(
+                f"the run {run} was trained with the task {name}, but --task is {given}; leave it "
+                "out"
+            )
+        return find_task(name)
+    if differs:
+        print(
+            f"warning: {given} differs from the task that {run} was trained with; the "
+            f"training's is {name}",
+            file=sys.stderr,
+        )
+    if given is not None:
+        registry.admit(name, find_task(given))
+    task = known_task(name)
+    if task is None:
+        raise unnamed_code(f"the run {run}", "task", name)
+    return task
+
+
+def unnamed_code(source: str, key: str, name: str) -> UserError:
+    """The refusal to run the file of a task or an algorithm that the user has not named."""
+    return UserError(
+        f"{source} has its {key} in a file, which is code; name it to run it: --{key} "
+        f"{shlex.quote(name)}"
+    )
 
 
 def load_config(
@@ -196,16 +258,15 @@ def load_config(
     source = " on ".join(map(shown_file, reversed(files)))
     values = functools.reduce(merged, map(_read, files), {})
     values.pop(BASE, None)
-    defaults = {"task": (task, DEFAULT), "algorithm": (algorithm, PPO_NAME)}
-    for key, (given, default) in defaults.items():
+    for key, given, default in (("task", task, DEFAULT), ("algorithm", algorithm, PPO_NAME)):
         name = values[key] = given or values.get(key, default)
         if given is None and is_file(name):
             raise unnamed_code(source, key, name)
     algorithm = values["algorithm"]
     ppo = PPOConfig if algorithm == PPO_NAME else find_algorithm(algorithm).Config
     config_class = train_config(find_task(values["task"]), ppo=ppo)
-    robot = robot and _named(robot, ROBOTS, "robot")
-    world = world and _named(world, WORLDS, "world")
+    robot = robot and named_file(robot, ROBOTS, "robot")
+    world = world and named_file(world, WORLDS, "world")
     named = None if world is None else read_world(world)
     if named is not None and named.robot is not None:
         if robot is not None:
@@ -233,7 +294,7 @@ def in_world(config: TrainConfig, world: Path) -> tuple[TrainConfig, NamedWorld]
     Raises:
       UserError: the world is wrong, or of another robot than the run.
     """
-    path = _named(world, WORLDS, "world")
+    path = named_file(world, WORLDS, "world")
     named, env = read_world(path), config.env
     values = env.model_dump()
     if named.robot is not None:
@@ -328,7 +389,7 @@ def preset_files(
         own = [_read(file) for file in given if os.path.exists(file)]
         task = next((values["task"] for values in reversed(own) if "task" in values), DEFAULT)
     names = f"configs/{task}"
-    files = [_named(named_file(file, names), "configs", "preset") for file in given]
+    files = [named_file(named_file(file, names), "configs", "preset") for file in given]
     bases = {file: values[BASE] for file in files if BASE in (values := _read(file))}
     if unused := bases.keys() - files[:1]:
         raise UserError(
@@ -359,30 +420,29 @@ def _is_preset(file: Path) -> bool:
     return any(file.resolve().is_relative_to(folder) for folder in folders)
 
 
-def _named(path: Path, folder: str, kind: str) -> Path:
-    """`named_file`, which refuses a word that is neither a file nor a name in the folder."""
-    found = named_file(path, folder)
-    if found == path and str(path) == path.stem and not os.path.exists(path):
-        names = sorted(file.stem for file in resource_path(folder).glob("*.yaml"))
-        names = [name for name in names if not name.startswith("robustness")]
-        raise UserError(
-            f"no {kind} is named {shorten(str(path))}; give one of {', '.join(names)}, or the path "
-            "of a YAML file"
-        )
-    return found
-
-
 def default_preset(accelerator: bool) -> Path:
     """The preset for a machine with an accelerator, or without one; both have the same task."""
     return Path("default" if accelerator else "cpu")
 
 
-def named_file(path: Path, folder: str) -> Path:
-    """The YAML file in a folder of the package that a path names; the path itself if there is none
-    or if the path exists."""
-    named = resource_path(f"{folder}/{path.name}.yaml")
-    is_name = str(path) == path.name and not os.path.exists(path)
-    return named if is_name and os.path.isfile(named) else path
+def named_file(path: Path, folder: str, kind: str | None = None) -> Path:
+    """The YAML file in a folder of the package that a word names; the path itself if there is none
+    or if the path exists.
+
+    Args:
+      kind: kind of the file, to refuse a word that is neither a file nor a name.
+    """
+    if str(path) != path.stem or os.path.exists(path):
+        return path
+    named = resource_path(f"{folder}/{path}.yaml")
+    if kind is None or os.path.isfile(named):
+        return named if os.path.isfile(named) else path
+    names = sorted(file.stem for file in resource_path(folder).glob("*.yaml"))
+    names = [name for name in names if not name.startswith("robustness")]
+    raise UserError(
+        f"no {kind} is named {shorten(str(path))}; give one of {', '.join(names)}, or the path of "
+        "a YAML file"
+    )
 
 
 def has_accelerator() -> bool:

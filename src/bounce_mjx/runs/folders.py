@@ -2,8 +2,8 @@
 
     runs/<task>/<time stamp, UTC>/
         config.yaml                     the resolved config
-        robot/                          a copy of --mjcf and its files (`runs.copies`)
-        task/, algorithm/               copies of the files of own ones (`runs.copies`)
+        robot/                          a copy of --mjcf and its files, with a manifest
+        task/, algorithm/               copies of the files of own ones
         events.out.tfevents.*           TensorBoard scalars
         results.json                    all evaluations, and the time of each activity
         checkpoints/<steps>/            of the newest state, and of the one with the best evaluation
@@ -36,12 +36,12 @@ from rich.console import Console
 import bounce_mjx
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.errors import UserError
+from bounce_mjx.lazy import mujoco
 from bounce_mjx.resources import POLICIES, PRETRAINED, TASK_POLICIES, resource_path
-from bounce_mjx.runs.config import BASE, CONFIG_FILE, TrainConfig, runs_folder
-from bounce_mjx.runs.copies import ROBOT, copy_code, copy_robot
-from bounce_mjx.runs.files import writable, write_atomically
+from bounce_mjx.runs.config import BASE, CONFIG_FILE, ROBOT, TrainConfig, runs_folder
+from bounce_mjx.runs.files import seal, writable, write_atomically
 from bounce_mjx.runs.progress import load_results
-from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file
+from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file, read_source, source_file
 
 POLICY_OF_TASK = {DEFAULT: PRETRAINED} | {task: task for task in TASK_POLICIES}
 """The policy that comes with the package for a task."""
@@ -108,6 +108,64 @@ def save_config(run: Path, config: TrainConfig) -> None:
         env = config.env.model_copy(update={"mjcf": mjcf.relative_to(run.absolute())})
         config = config.model_copy(update={"env": env})
     write_config(run, config)
+
+
+def copy_robot(mjcf: Path, run: Path) -> Path:
+    """Copies an MJCF file with its meshes, textures and included files into a run's folder, sealed
+    by a manifest.
+
+    Args:
+      mjcf: a file that MuJoCo compiles, as for `locate`.
+
+    Returns:
+      The copy of the MJCF file.
+
+    Raises:
+      OSError: a file cannot be read or written.
+      UserError: the file is missing, or names another file by its absolute path.
+    """
+    from bounce_mjx.robot.arm import locate
+
+    mjcf, folder = locate(mjcf), run / ROBOT
+    files = _files_of(mjcf)
+    root = Path(os.path.commonpath([path.parent for path in files]))
+    for path in files:
+        copy = folder / path.relative_to(root)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, copy)
+    seal(folder)
+    copied = folder / Path(os.path.abspath(mjcf)).relative_to(root)
+    # An absolute path in the copy still leads to the original.
+    if outside := set(_files_of(copied)) & set(files):
+        shutil.rmtree(folder)
+        raise UserError(
+            f"the MJCF file {mjcf} names {min(outside)} by an absolute path, so that a run could "
+            f"not keep a copy of the robot; name it relative to the folder of {mjcf.name}"
+        )
+    return copied
+
+
+def _files_of(mjcf: Path) -> list[Path]:
+    """An MJCF file and every file that it names."""
+    return [Path(os.path.abspath(name)) for name in mujoco.mju_getXMLDependencies(str(mjcf))]
+
+
+def copy_code(name: str, run: Path, folder: str) -> str:
+    """Copies the file of a task or an algorithm, FILE.py:CLASS, into a run's folder, unless the run
+    has a copy.
+
+    Returns:
+      The copy's FILE.py:CLASS, relative to the run's folder.
+
+    Raises:
+      OSError: the copy cannot be written.
+      UserError: the file cannot be read.
+    """
+    file = f"{folder}/{source_file(name).name}"
+    if not (run / folder).exists():
+        (run / folder).mkdir()
+        write_atomically(run / file, read_source(name))
+    return f"{file}:{name.rpartition(':')[2]}"
 
 
 def write_config(run: Path, config: TrainConfig) -> None:

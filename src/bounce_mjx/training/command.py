@@ -22,8 +22,8 @@ from bounce_mjx.runs.config import (
     read_preset,
     runs_folder,
     train_config,
+    unnamed_code,
 )
-from bounce_mjx.runs.copies import unnamed_code
 from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file, is_same_code
 from bounce_mjx.world.config import WorldConfig
 

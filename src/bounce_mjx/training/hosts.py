@@ -5,7 +5,6 @@ and writes; the others receive its decisions (`exchange`) and send their shards 
 (`gather`).
 """
 
-import concurrent.futures
 import contextlib
 import itertools
 import json
@@ -65,18 +64,12 @@ def join(
         in_daemon_thread(connect).result(timeout)
         # Waits for the devices of all hosts.
         jax.devices()
-    except concurrent.futures.TimeoutError as error:
-        where = f" at {coordinator_address}" if coordinator_address else ""
-        raise UserError(
-            f"the processes of this training did not find each other{where} within {timeout:g} s; "
-            "check that all of them run, and that they reach the host and port of process 0, or "
-            "give them more time with --host-timeout"
-        ) from error
+    # One that is late is a TimeoutError without a text.
     except Exception as error:
-        reason = reason_of(error)[:200]
         raise UserError(
-            f"the processes of this training cannot be joined ({reason}); start one process per "
-            "host with --coordinator-address HOST:PORT, --num-processes N and --process-id I"
+            f"the processes of this training cannot be joined ({reason_of(error)[:200]}); start "
+            "one process per host with --coordinator-address HOST:PORT, --num-processes N and "
+            "--process-id I, from which process 0 can be reached, or raise --host-timeout"
         ) from error
 
 

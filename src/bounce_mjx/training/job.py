@@ -1,6 +1,6 @@
 """The training job: trains until it is finished or stopped, and evaluates and saves in between.
 
-It is the same for every algorithm (`trainer.Trainer`).
+It is the same for every algorithm that has the interface of `PPOTrainer`.
 """
 
 import concurrent.futures
@@ -35,8 +35,12 @@ from bounce_mjx.training.console import block_line, evaluation_line, say
 from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.first_block import fault_of
 from bounce_mjx.training.log import TensorBoardLog
-from bounce_mjx.training.ppo_trainer import PPOTrainer
-from bounce_mjx.training.trainer import Snapshot, Trainer, in_whole_blocks, iterations_per_block
+from bounce_mjx.training.ppo_trainer import (
+    PPOTrainer,
+    Snapshot,
+    in_whole_blocks,
+    iterations_per_block,
+)
 from bounce_mjx.training.warm_start import read_start
 
 # Imported by name during the compilation, because these imports take half a second each.
@@ -79,7 +83,7 @@ def train(
     *,
     resume: Path | None = None,
     callbacks: Sequence[Callback] = (),
-    make_trainer: Callable[[TrainConfig, Env], Trainer] = PPOTrainer,
+    make_trainer: Callable[[TrainConfig, Env], PPOTrainer] = PPOTrainer,
     make_evaluators: Callable[..., Evaluators] = Evaluators,
 ) -> list[SeedRun]:
     """Trains with a config, and returns its seeds.
@@ -130,7 +134,7 @@ class Job:
         resume: Path | None,
         callbacks: Sequence[Callback],
         stack: contextlib.ExitStack,
-        make_trainer: Callable[[TrainConfig, Env], Trainer],
+        make_trainer: Callable[[TrainConfig, Env], PPOTrainer],
     ):
         """Builds what may refuse the config, before a folder is made."""
         self.config, self.console, self.resume, self.stack = config, console, resume, stack

@@ -7,7 +7,7 @@ statistics. With several seeds each device holds some of them.
 
 import concurrent.futures
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -16,19 +16,63 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig, find_algorithm
-from bounce_mjx.learning.ppo import CHECKED, TrainingState, num_groups, policy_of, population
+from bounce_mjx.learning.policy import Policy
+from bounce_mjx.learning.ppo import (
+    CHECKED,
+    Params,
+    TrainingState,
+    num_groups,
+    policy_of,
+    population,
+)
+from bounce_mjx.learning.statistics import RunningStatistics
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training import hosts
 from bounce_mjx.training.setup import compiler_options
-from bounce_mjx.training.trainer import Metrics, Snapshot, each_seed, iterations_per_block
 
 _AXIS = "devices"
 
+Metrics = dict[str, np.ndarray]
+
+
+class Snapshot(NamedTuple):
+    """The policies and the state of a training run at one moment, as pytrees of NumPy arrays."""
+
+    policies: list[Policy]
+    """The policy of each seed."""
+    state: Any
+    """Everything that is needed to continue the training; numbers of at most 32 bits."""
+    networks: list[dict[str, Any]] | None = None
+    """What another training can start with, for each seed: "params" and "statistics" of both
+    networks."""
+
+
+def iterations_per_block(config: TrainConfig) -> int:
+    """Iterations I in one block."""
+    return max(1, round(config.block_steps / config.ppo.batch_steps))
+
+
+def in_whole_blocks(config: TrainConfig) -> TrainConfig:
+    """The config with the `total_steps` that are trained: the nearest number of whole blocks."""
+    block = iterations_per_block(config) * config.ppo.batch_steps
+    return config.model_copy(
+        update={"total_steps": block * max(1, round(config.total_steps / block))}
+    )
+
+
+def each_seed(tree: Any, num_seeds: int) -> list[Any]:
+    """The trees of S seeds from one whose arrays are [S, ...]; with one seed, the tree itself."""
+    if num_seeds == 1:
+        return [tree]
+    return [jax.tree.map(lambda x, i=i: x[i], tree) for i in range(num_seeds)]
+
 
 class PPOTrainer:
-    """This project's PPO; see `Trainer`."""
+    """S independent runs of one algorithm, one for each seed. The training job runs any other class
+    with its public attributes and methods, too."""
 
     checked = CHECKED
+    """The quantities that must stay finite, in the order of their computation."""
 
     def __init__(self, config: TrainConfig, env: Env):
         """
@@ -37,6 +81,7 @@ class PPOTrainer:
         """
         self._config, self._observation_size = config, env.observation_size
         self.mesh = make_mesh(config.num_devices, config.ppo, config.num_seeds)
+        """The devices on which it trains."""
         trainer = find_algorithm(config.algorithm)(config.ppo, env, episode_steps(config))
         init, run, make_key = trainer.init, trainer.run, jax.random.PRNGKey
         self._seeds = np.uint32(config.seed)
@@ -59,6 +104,7 @@ class PPOTrainer:
 
     @functools.cached_property
     def state_template(self) -> TrainingState:
+        """Shapes and types of the state, `jax.ShapeDtypeStruct` as its leaves."""
         return jax.eval_shape(self._initial_state, self._seeds)
 
     @functools.cached_property
@@ -66,6 +112,7 @@ class PPOTrainer:
         return state_sharding(self.mesh, self.state_template, self._config.num_seeds)
 
     def compile(self, pool: concurrent.futures.Executor) -> concurrent.futures.Future:
+        """Starts the compilation in a pool; the future is done when training can start."""
         run = jax.jit(
             self._train_block,
             in_shardings=(self._sharding,),
@@ -82,7 +129,15 @@ class PPOTrainer:
         self._init = pool.submit(init.lower(self._seeds).compile)
         return self._run
 
-    def start(self, state: Any = None, networks: Any = None) -> None:
+    def start(
+        self, state: Any = None, networks: tuple[Params, RunningStatistics] | None = None
+    ) -> None:
+        """Starts from the seeds, or from the state of a `snapshot`.
+
+        Args:
+          networks: those of an earlier training, which each seed starts with, and the statistics of
+            their inputs.
+        """
         if state is None:
             self.state = jax.block_until_ready(self._init.result()(self._seeds))
         if networks is not None:
@@ -96,11 +151,18 @@ class PPOTrainer:
             self.state = hosts.distribute(state, self._sharding)
 
     def run(self) -> Metrics:
+        """Trains for a block of I iterations.
+
+        Returns:
+          Metrics, each [S, I]. "fault" is the number, from 1, of the first quantity of `checked`
+          that was not finite in an iteration; 0 if all were finite.
+        """
         self.state, metrics = self._run.result()(self.state)
         shape = (self._config.num_seeds, -1)
         return {name: np.asarray(x).reshape(shape) for name, x in metrics.items()}
 
     def snapshot(self) -> Snapshot:
+        """The policies and the whole state."""
         state = hosts.gather(self.state)
         seeds = each_seed(state, self._config.num_seeds)
         return Snapshot(
