@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from identify import hidden_robot, sensor_terms
-from rich.console import Console
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
@@ -33,7 +32,7 @@ from bounce_mjx.world.randomization import RandomizationConfig
 
 def measure(path: Path, seed: int, episodes: int, physics: str) -> Report:
     """The results of a policy in the world of one hidden robot, with the task's default target."""
-    checkpoint = choose_checkpoint(path, Path("runs"), Console(quiet=True))
+    checkpoint = choose_checkpoint(path, Path("runs"))
     config = load_run_config(checkpoint.run)
     world = hidden_robot(seed).world | sensor_terms()
     values = {name: np.asarray(value, float).tolist() for name, value in world.items()}

@@ -18,7 +18,7 @@ import numpy as np
 from tables import device_name, markdown_table, write
 
 from bounce_mjx.commands.run_options import ActorCommand
-from bounce_mjx.config.command_line import Flag, parse, stdout
+from bounce_mjx.config.command_line import Flag, parse
 from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, exit_on_user_error
@@ -83,9 +83,8 @@ def main() -> None:
         command = parse(RankCommand, sys.argv[1:], prog="benchmarks/rank.py", description=doc)
         if not command.policies:
             raise UserError("no policy is given; give one, such as pretrained")
-        console = stdout()
         chosen = {
-            str(path): [command.choose(run, console) for run in runs_of_row(path)]
+            str(path): [command.choose(run) for run in runs_of_row(path)]
             for path in command.policies
         }
         configs = [command.config_of(one) for row in chosen.values() for one in row]

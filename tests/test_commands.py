@@ -9,7 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
 import bounce_mjx
 from bounce_mjx.commands import eval as eval_command
@@ -249,5 +248,5 @@ def test_a_policy_is_named_by_its_run_or_its_checkpoint(trained: Path, monkeypat
         (trained / "checkpoints", best),
         (trained / f"checkpoints/{STEPS}", STEPS),
     ):
-        found = choose_checkpoint(given, log_dir, Console(quiet=True))
+        found = choose_checkpoint(given, log_dir)
         assert found.folder.resolve() == trained / f"checkpoints/{steps}"

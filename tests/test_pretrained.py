@@ -7,7 +7,6 @@ import jax
 import numpy as np
 import pydantic
 import pytest
-from rich.console import Console
 
 from bounce_mjx import BounceBall, load_policy
 from bounce_mjx.commands.train import read_command
@@ -50,11 +49,6 @@ def measured(name: str, episodes: int, world: str | None = None) -> Report:
     return evaluate_policy(policy, config.env, networks_of(config.ppo), options).report
 
 
-@pytest.fixture
-def console() -> Console:
-    return Console(width=200, no_color=True)
-
-
 RELEASES = sorted((Path(__file__).parent / "releases").iterdir())
 
 
@@ -86,7 +80,7 @@ def test_it_meets_the_five_results(shipped: dict) -> None:
 
 
 @pytest.mark.parametrize("task", TASK_POLICIES)
-def test_each_task_has_a_policy(task: str, tmp_path: Path, monkeypatch, console) -> None:
+def test_each_task_has_a_policy(task: str, tmp_path: Path, monkeypatch) -> None:
     """It has met its results, and is found by its task and by its name."""
     folder = resource_path(POLICIES[task])
     report = json.loads((folder / "results.json").read_text(encoding="utf-8"))
@@ -94,7 +88,7 @@ def test_each_task_has_a_policy(task: str, tmp_path: Path, monkeypatch, console)
     assert load_run_config(folder).task == task
     monkeypatch.chdir(tmp_path)
     for path in (None, Path(task)):
-        chosen = choose_checkpoint(path, runs_folder(find_task(task)), console)
+        chosen = choose_checkpoint(path, runs_folder(find_task(task)))
         assert chosen == best_checkpoint(folder)
     assert (folder / f"{task}.onnx").read_bytes() == export_onnx(chosen)
     policy = load_policy(task)
@@ -135,17 +129,17 @@ def test_its_training_command_gives_its_config(shipped: dict, monkeypatch) -> No
     assert shipped["device"]
 
 
-def test_it_is_used_if_there_is_no_run(tmp_path: Path, monkeypatch, console, capsys) -> None:
+def test_it_is_used_if_there_is_no_run(tmp_path: Path, monkeypatch, capsys) -> None:
     with pytest.raises(UserError, match="no run with a checkpoint"):
-        choose_checkpoint(None, tmp_path, console)
+        choose_checkpoint(None, tmp_path)
     monkeypatch.chdir(tmp_path)
-    assert choose_checkpoint(None, LOG_DIR, console) == pretrained_checkpoint()
+    assert choose_checkpoint(None, LOG_DIR) == pretrained_checkpoint()
     assert "comes with the package" in capsys.readouterr().out
     for name in ("2026-01-01", "2026-01-02"):
         folder = LOG_DIR / name / "checkpoints" / "64"
         folder.mkdir(parents=True)
         (LOG_DIR / name / "config.yaml").touch()
-    chosen = choose_checkpoint(None, LOG_DIR, console)
+    chosen = choose_checkpoint(None, LOG_DIR)
     assert chosen.folder.absolute() == folder.absolute()
     assert str(LOG_DIR / "2026-01-02") in capsys.readouterr().out
-    assert choose_checkpoint(FOLDER, LOG_DIR, console) == pretrained_checkpoint()
+    assert choose_checkpoint(FOLDER, LOG_DIR) == pretrained_checkpoint()

@@ -12,7 +12,6 @@ import unittest.mock
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.errors import UserError
@@ -96,7 +95,7 @@ def runs(tmp_path: Path, progress: Progress) -> Path:
 @pytest.mark.parametrize("name", [None, Path("latest")])
 def test_the_newest_run_is_introduced(runs: Path, name: Path | None, capsys) -> None:
     """A result that is not judged counts neither as met nor as missed."""
-    assert choose_checkpoint(name, runs, Console()).run == runs / "2026-01-02"
+    assert choose_checkpoint(name, runs).run == runs / "2026-01-02"
     assert capsys.readouterr().out.splitlines() == [
         f"using the newest run: {runs}/2026-01-02 (0 of 4 judged results met)"
     ]

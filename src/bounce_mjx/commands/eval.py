@@ -54,7 +54,7 @@ def main(args: Sequence[str]) -> None:
 
     check_output(command.json_file, "--json")
     console = stdout()
-    checkpoint = command.choose(command.checkpoint, console)
+    checkpoint = command.choose(command.checkpoint)
     if command.nominal and command.world is not None:
         raise UserError("--nominal and --world cannot be combined; omit one")
     config = command.config_of(checkpoint)
@@ -67,7 +67,7 @@ def main(args: Sequence[str]) -> None:
     set_up_jax(on_engine(config.env, command.physics))
     checkpoint, policy, actor = read_actor(checkpoint, config)
     steps = f" ({checkpoint.steps:,} steps)" if checkpoint.steps else ""
-    console.out(f"checkpoint: {checkpoint.folder}{steps}", highlight=False)
+    print(f"checkpoint: {checkpoint.folder}{steps}")
     options = EvaluationOptions(
         command.episodes, command.seed, command.physics, command.nominal, commands
     )
@@ -80,16 +80,15 @@ def main(args: Sequence[str]) -> None:
             config.env,
             actor,
             options,
-            started=lambda engine: console.out(f"physics: {engine}  {length}", highlight=False),
+            started=lambda engine: print(f"physics: {engine}  {length}"),
             recorded=RECORDED_EPISODES if checks else 0,
         )
     console.print(results_table(report, "the results"))
-    console.print(details_line(report), highlight=False, soft_wrap=True)
+    print(details_line(report))
     found = {}
     for name, measure, describe in checks:
         entries = measure(config.env, report.recording)
-        text = describe(entries, report.recording.running.shape[-1])
-        console.print(text, markup=False, highlight=False, soft_wrap=True)
+        print(describe(entries, report.recording.running.shape[-1]))
         found[name] = [entry._asdict() for entry in entries]
     if command.json_file is not None:
         plain = {"checkpoint": str(checkpoint.folder), "physics": engine, **report.to_dict()}

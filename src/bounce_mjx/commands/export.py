@@ -4,8 +4,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-from rich.console import Console
-
 from bounce_mjx.commands.run_options import RunCommand
 from bounce_mjx.config.command_line import Flag, parse
 from bounce_mjx.errors import UserError, exit_on_user_error
@@ -36,10 +34,9 @@ def main(args: Sequence[str]) -> None:
 
     check_output(command.onnx, "--onnx")
     set_up_jax()
-    console = Console()
-    checkpoint = choose_checkpoint(command.checkpoint, command.folder, console)
-    console.out(f"checkpoint: {checkpoint.folder} ({checkpoint.steps:,} steps)", highlight=False)
+    checkpoint = choose_checkpoint(command.checkpoint, command.folder)
+    print(f"checkpoint: {checkpoint.folder} ({checkpoint.steps:,} steps)")
     command.config(checkpoint.run)
     content = export_onnx(checkpoint)
     write_output(command.onnx, content)
-    console.out(f"written: {command.onnx} ({len(content) / 1000:.0f} kB)", highlight=False)
+    print(f"written: {command.onnx} ({len(content) / 1000:.0f} kB)")

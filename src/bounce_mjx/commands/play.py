@@ -4,8 +4,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from rich.console import Console
-
 from bounce_mjx.commands.run_options import WorldCommand, parse_with_commands
 from bounce_mjx.config.command_line import Flag, stdout
 from bounce_mjx.config.validation import validate
@@ -44,16 +42,15 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.training.setup import set_up_jax
     from bounce_mjx.viewers.show import show
 
-    console = stdout()
-    chosen = [command.choose(path, console) for path in command.checkpoints or (None,)]
+    chosen = [command.choose(path) for path in command.checkpoints or (None,)]
     configs = [_config(checkpoint, command) for checkpoint in chosen]
     (commands, *_) = [given_commands(config.env) for config in configs]
     set_up_jax(*(config.env for config in configs))
     show(
-        [load_shown(*shown, console) for shown in zip(chosen, configs, strict=True)],
+        [load_shown(*shown) for shown in zip(chosen, configs, strict=True)],
         command.viewing,
         commands=commands,
-        console=console,
+        console=stdout(),
     )
 
 
@@ -66,7 +63,7 @@ def _config(checkpoint: "Checkpoint", command: PlayCommand) -> TrainConfig:
     return config.model_copy(update={"env": validate(type(config.env), given, "play")})
 
 
-def load_shown(checkpoint: "Checkpoint", config: TrainConfig, console: Console) -> "Shown":
+def load_shown(checkpoint: "Checkpoint", config: TrainConfig) -> "Shown":
     """The environment and the policy of a checkpoint."""
     from bounce_mjx.reports.tables import count_text
     from bounce_mjx.runs.folders import MIRROR_LAW
@@ -75,7 +72,7 @@ def load_shown(checkpoint: "Checkpoint", config: TrainConfig, console: Console) 
     from bounce_mjx.viewers.simulation import make_policy_controller
 
     checkpoint, policy, actor = read_actor(checkpoint, config)
-    console.out(f"checkpoint: {checkpoint.folder}", highlight=False)
+    print(f"checkpoint: {checkpoint.folder}")
     title = checkpoint.run.name
     if checkpoint is not MIRROR_LAW:
         title += f", {count_text(checkpoint.steps)} steps"

@@ -68,7 +68,7 @@ def main(args: Sequence[str]) -> None:
     if command.assumed and command.world is None:
         raise UserError("--assumed needs a named world; give one with --world, or leave it out")
     console = stdout()
-    checkpoint = command.choose(command.checkpoint, console)
+    checkpoint = command.choose(command.checkpoint)
     config = command.config_of(checkpoint)
     conditions, suite, version = _read_conditions(command, config)
     set_up_jax(*(on_engine(condition.env, command.physics) for condition in conditions))

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import pydantic
 from pydantic import Field
-from rich.console import Console
 
 from bounce_mjx.config.command_line import Flag, flag_of, flags_of, parse
 from bounce_mjx.config.settings import StrictModel
@@ -59,7 +58,7 @@ class ActorCommand(RunCommand):
     robot: Path | None = None
     """Robot of the mirror law; a policy has that of its training."""
 
-    def choose(self, path: Path | None, console: Console) -> "Checkpoint":
+    def choose(self, path: Path | None) -> "Checkpoint":
         """`choose_checkpoint`, or `MIRROR_LAW` for the word mirror.
 
         Raises:
@@ -74,7 +73,7 @@ class ActorCommand(RunCommand):
                 "--robot is for the mirror law, and a policy has the robot that it was trained "
                 "with; omit it, or give mirror instead of a checkpoint"
             )
-        return choose_checkpoint(path, self.folder, console)
+        return choose_checkpoint(path, self.folder)
 
     def config_of(self, checkpoint: "Checkpoint") -> TrainConfig:
         """The config of a checkpoint's run, or that of the mirror law: the task's preset.

@@ -30,7 +30,7 @@ def main(args: Sequence[str]) -> None:
             # CUDA starts during the imports; JAX reports an error where it needs the devices.
             in_daemon_thread(jax.devices)
         from bounce_mjx.training import hosts
-        from bounce_mjx.training.console import say
+        from bounce_mjx.training.callbacks import say
         from bounce_mjx.training.job import TrainingStopped, named_task
         from bounce_mjx.training.run import train
 

@@ -31,8 +31,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rich.console import Console
-
 import bounce_mjx
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.errors import UserError
@@ -289,7 +287,7 @@ def pretrained_checkpoint(name: str = PRETRAINED) -> Checkpoint:
     return best_checkpoint(resource_path(POLICIES[name]))
 
 
-def choose_checkpoint(path: Path | None, log_dir: Path, console: Console) -> Checkpoint:
+def choose_checkpoint(path: Path | None, log_dir: Path) -> Checkpoint:
     """Checkpoint to show or to evaluate; prints the choice if the user made none.
 
     Args:
@@ -305,12 +303,12 @@ def choose_checkpoint(path: Path | None, log_dir: Path, console: Console) -> Che
         folders = {runs_folder(find_task(t)): policy for t, policy in POLICY_OF_TASK.items()}
         if path is not None or log_dir not in folders:
             raise
-        console.out(f"no run in {log_dir}: using the policy that comes with the package")
+        print(f"no run in {log_dir}: using the policy that comes with the package")
         return pretrained_checkpoint(folders[log_dir])
     if run != path:
         results = load_results(_best_seed(run))
         known = results.best.summary if results else "not evaluated"
-        console.out(f"using the newest run: {run} ({known})", highlight=False)
+        print(f"using the newest run: {run} ({known})")
     return find_checkpoint(run)
 
 

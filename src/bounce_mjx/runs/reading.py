@@ -21,14 +21,17 @@ from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.learning.policy import Actor, Policy, make_networks, networks_of, untrained_policy
 from bounce_mjx.learning.ppo import Params, names_of_critic_metrics
 from bounce_mjx.learning.statistics import RunningStatistics, init_statistics
-from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
+from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config, runs_folder
 from bounce_mjx.runs.files import MANIFEST_FILE, check_integrity
-from bounce_mjx.runs.folders import MIRROR_LAW, Checkpoint, best_checkpoint
+from bounce_mjx.runs.folders import MIRROR_LAW, Checkpoint, best_checkpoint, choose_checkpoint
 from bounce_mjx.tasks.registry import is_file
 
 POLICY, TRAINING, NETWORKS, RECORD = "policy", "training", "networks", "record"
 """Items of a checkpoint: what acts; what a training continues from; both networks, with which
 another training can start; steps, config and evaluations."""
+
+NETWORK_KEYS = ("hidden_layers", "critic_layers", "shared_critic", "activation")
+"""Keys of `ppo` that shape the networks."""
 
 # Keys that may differ between a checkpoint and the training that resumes from it. All other keys
 # shape the training's state.
@@ -122,6 +125,45 @@ def read_networks(
 
     stored = _read_arrays(checkpoint, items[0], jax.eval_shape(initial))
     return stored["params"], stored["statistics"], names
+
+
+def read_start(config: TrainConfig, env: Env) -> tuple[Params, RunningStatistics]:
+    """The networks with which a training starts, and the statistics of their inputs.
+
+    The value network keeps the critic metrics that both trainings have, by name; to a new one, such
+    as a term that only the new world has, it is blind at first.
+
+    Raises:
+      UserError: the checkpoint is missing, damaged or without a value network, or its observation
+        or hidden layers are not those of the training.
+    """
+    checkpoint = choose_checkpoint(config.warm_start, runs_folder(config.env.task))
+    own = load_run_config(checkpoint.run)
+    networks = [[getattr(ppo, key) for key in NETWORK_KEYS] for ppo in (own.ppo, config.ppo)]
+    same = networks[0] == networks[1] and policy_shapes(own) == policy_shapes(config)
+    if own.env.layout != config.env.layout or not same:
+        raise UserError(
+            f"the policy {config.warm_start} has another observation, other actions or other "
+            "hidden layers than this training; leave out the flags that change them"
+        )
+    params, statistics, names = read_networks(checkpoint, own)
+    wanted = names_of_critic_metrics(config.ppo, env)
+
+    def moved(array: jax.Array, default: float) -> np.ndarray:
+        """The rows of the new inputs; `default` in those of unknown ones."""
+        array = np.asarray(array)
+        size = len(array) - len(names)
+        known = dict(zip(names, array[size:], strict=True))
+        new = (known.get(name, np.full_like(array[0], default)) for name in wanted)
+        return np.stack([*array[:size], *new])
+
+    count, mean, summed_variance, std = statistics
+    seen = RunningStatistics(
+        count, moved(mean, 0.0), moved(summed_variance, float(count)), moved(std, 1.0)
+    )
+    first = params.value["params"]["hidden_0"]
+    first["kernel"] = moved(first["kernel"], 0.0)
+    return params, seen
 
 
 def read_record(checkpoint: Checkpoint) -> Record:

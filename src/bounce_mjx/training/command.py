@@ -83,12 +83,14 @@ class Start(StrictModel):
             raise UserError(
                 "--warm-start and --robot cannot be combined; the policy's own robot is trained on"
             )
-        from bounce_mjx.training.warm_start import NETWORKS, find_start
+        from bounce_mjx.runs.folders import choose_checkpoint
+        from bounce_mjx.runs.reading import NETWORK_KEYS
 
-        checkpoint = find_start(self.warm_start, find_task(self.task or DEFAULT))
+        folder = runs_folder(find_task(self.task or DEFAULT))
+        checkpoint = choose_checkpoint(self.warm_start, folder)
         own = load_run_config(checkpoint.run, self.task)
         base = read_preset(self.config, None, own.task, None, machine, self.algorithm)
-        networks = {key: getattr(own.ppo, key) for key in (*NETWORKS, "critic_metrics")}
+        networks = {key: getattr(own.ppo, key) for key in (*NETWORK_KEYS, "critic_metrics")}
         ppo = base.ppo.model_copy(update=networks)
         start = self.warm_start if str(self.warm_start) in POLICIES else checkpoint.folder
         config = base.model_copy(update={"env": own.env, "ppo": ppo, "warm_start": start})

@@ -30,8 +30,16 @@ from bounce_mjx.runs.files import to_json, writable, write_atomically
 from bounce_mjx.runs.progress import RESULTS_FILE, Progress
 from bounce_mjx.tasks.registry import is_file
 from bounce_mjx.training import hosts
-from bounce_mjx.training.callbacks import Callback, Event, block_points, call_all, points_of
-from bounce_mjx.training.console import block_line, evaluation_line, say
+from bounce_mjx.training.callbacks import (
+    Callback,
+    Event,
+    block_line,
+    block_points,
+    call_all,
+    evaluation_line,
+    points_of,
+    say,
+)
 from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.first_block import fault_of
 from bounce_mjx.training.log import TensorBoardLog
@@ -41,7 +49,6 @@ from bounce_mjx.training.ppo_trainer import (
     in_whole_blocks,
     iterations_per_block,
 )
-from bounce_mjx.training.warm_start import read_start
 
 # Imported by name during the compilation, because these imports take half a second each.
 _SLOW_MODULES = "orbax.checkpoint", "bounce_mjx.reports.page"
@@ -147,7 +154,7 @@ class Job:
         self.env = Env(config.env)
         self.trainer = make_trainer(config, self.env)
         warm = config.warm_start is not None and resume is None
-        self.first = read_start(config, self.env) if warm else None
+        self.first = reading.read_start(config, self.env) if warm else None
         self.state: Any = None
         self.steps = 0
         self.ended = False
