@@ -256,9 +256,9 @@ def test_table_tells_every_figure(report: RobustnessReport) -> None:
     (row,) = [line.split() for line in lines if "1 ms" in line]
     assert row == ["other", "1", "ms", "100.0", "99.0", "98.0", "1.40", "100.0", "pass"]
     (header,) = [line.split() for line in lines if "strength" in line]
-    assert header == ["condition", "strength", "C", "P", "H", "U", "S"]
+    assert header == ["condition", "strength", "A", "B", "C", "D", "E"]
     described = [line.strip() for line in lines]
-    assert "U  upward speed: what upward speed means, m/s" in described
+    assert "D  upward speed: what upward speed means, m/s" in described
 
 
 @pytest.fixture

@@ -59,12 +59,10 @@ def curves_figure(groups: Sequence[Group], columns: int = 3) -> Figure:
     shown = [Curve(RETURN, "", title="return of an episode")]
     for group in groups:
         shown += [curve for curve in group.task_curves if curve.title and curve not in shown]
-    figure, panels = make_panels(len(shown), columns, height=2.4)
-    for axes, curve in zip(panels, shown, strict=True):
-        _draw_curve(axes, groups, curve)
+    figure = _draw_curves(groups, shown, columns, height=2.4)
+    for axes in figure.axes:
         axes.set_ylim(bottom=0.0)
         axes.set_xlabel("environment steps")
-    add_legend(figure)
     return figure
 
 
@@ -72,14 +70,11 @@ def curves_figure(groups: Sequence[Group], columns: int = 3) -> Figure:
 def rewards_figure(groups: Sequence[Group], columns: int = 5) -> Figure:
     """The weighted reward terms over the training, at most `columns` panels side by side."""
     logged = dict.fromkeys(name for group in groups for run in group.runs for name in run.curves)
-    terms = [name for name in logged if name.startswith(_REWARD)]
-    figure, panels = make_panels(len(terms), columns, height=1.6)
-    for axes, name in zip(panels, terms, strict=True):
-        title = name.removeprefix(_REWARD).replace("_", " ")
-        _draw_curve(axes, groups, Curve(name, "", title=title))
+    titles = {x: x.removeprefix(_REWARD).replace("_", " ") for x in logged if x.startswith(_REWARD)}
+    shown = [Curve(name, "", title=title) for name, title in titles.items()]
+    figure = _draw_curves(groups, shown, columns, height=1.6)
     title = "weighted reward terms over environment steps,\nmean of a control step"
     figure.suptitle(title, fontsize=10)
-    add_legend(figure)
     return figure
 
 
@@ -121,6 +116,17 @@ def make_panels(count: int, columns: int, height: float) -> tuple[Figure, list[A
     for axes in grid.flat[count:]:
         axes.remove()
     return figure, [*grid.flat[:count]]
+
+
+def _draw_curves(
+    groups: Sequence[Group], shown: Sequence[Curve], columns: int, height: float
+) -> Figure:
+    """A panel for each curve, of a height in inches, and a legend."""
+    figure, panels = make_panels(len(shown), columns, height)
+    for axes, curve in zip(panels, shown, strict=True):
+        _draw_curve(axes, groups, curve)
+    add_legend(figure)
+    return figure
 
 
 def _draw_curve(axes: Axes, groups: Sequence[Group], shown: Curve) -> None:

@@ -54,10 +54,7 @@ def summary(report: RobustnessReport) -> str:
 def robustness_table(report: RobustnessReport) -> Table:
     """Table of the results in each condition; an asterisk marks a missed bound."""
     letters = result_letters(report)
-    described = [
-        f"{letter}  {name}: {report.measured[name]}" if report.measured else f"{letter}  {name}"
-        for name, letter in letters.items()
-    ]
+    described = [f"{x}  {name}: {report.measured.get(name, '')}" for name, x in letters.items()]
     table = Table(
         title=summary(report),
         title_justify="left",
@@ -87,14 +84,8 @@ def robustness_table(report: RobustnessReport) -> Table:
 
 
 def result_letters(report: RobustnessReport) -> dict[str, str]:
-    """A letter for each result: an initial of its name that no other has, if there is one. The
-    results with the fewest words choose first."""
-    letters = dict.fromkeys(report.outcomes[0].values, "")
-    for name in sorted(letters, key=lambda name: len(name.split())):
-        wanted = [word[0] for word in name.split()] + [*name, *string.ascii_letters]
-        free = [x.upper() for x in wanted if x.isalnum() and x.upper() not in letters.values()]
-        letters[name] = free[0] if free else "?"
-    return letters
+    """A letter for each result."""
+    return dict(zip(report.outcomes[0].values, string.ascii_uppercase, strict=False))
 
 
 @style()
@@ -123,10 +114,8 @@ def robustness_figure(report: RobustnessReport) -> Figure:
             strength = "" if outcome.strength is None else f"{outcome.strength:g}"
             missed = "".join(letters[name] for name in outcome.failed)
             ink = _INK if 0.2 < shade < 0.8 else _PAPER
-            place = dict(ha="center", va="center", color=ink)
-            axes.text(x + 0.5, y + 0.3, strength, fontsize=7.5, **place)
-            size = 6 if missed else 8
-            axes.text(x + 0.5, y + 0.7, missed or _TICK, fontsize=size, **place)
+            text = f"{strength}\n{missed or _TICK}"
+            axes.text(x + 0.5, y + 0.5, text, fontsize=7, ha="center", va="center", color=ink)
     scale = ScalarMappable(_SCALE, _COLOURS)
     bar = figure.colorbar(
         scale, ax=axes, location="bottom", ticks=(0, 50, 75, 90, 100), shrink=0.5, aspect=50
