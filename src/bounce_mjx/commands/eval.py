@@ -73,16 +73,11 @@ def main(args: Sequence[str]) -> None:
     )
     checks = [("contacts", arm_contacts, describe_contacts)] * command.contacts
     checks += [("limits", limit_shares, describe_limits)] * command.limits
-    length = f"{command.episodes:,} episodes of {config.env.episode_seconds:g} s"
+    recorded = RECORDED_EPISODES if checks else 0
     with console.status("evaluating"):
-        report, engine = evaluate_policy(
-            policy,
-            config.env,
-            actor,
-            options,
-            started=lambda engine: print(f"physics: {engine}  {length}"),
-            recorded=RECORDED_EPISODES if checks else 0,
-        )
+        report, engine = evaluate_policy(policy, config.env, actor, options, recorded)
+    length = f"{command.episodes:,} episodes of {config.env.episode_seconds:g} s"
+    print(f"physics: {engine}  {length}")
     console.print(results_table(report, "the results"))
     print(details_line(report))
     found = {}

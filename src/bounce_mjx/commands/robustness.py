@@ -34,9 +34,9 @@ class RobustnessCommand(OneActorCommand):
     numbers is a condition too."""
     assumed: bool = False
     """Only the world itself and twice each of its assumed numbers, without the suite."""
-    suite: Path | None = None
-    """YAML file of the perturbations, or the name of one in configs/; the default is robustness,
-    which is version 1, and robustness_v2 is version 2."""
+    suite: Path = Path("robustness")
+    """YAML file of the perturbations, or the name of one in configs/: robustness is version 1, and
+    robustness_v2 is version 2."""
     episodes: Count = DEFAULT_CONDITION_EPISODES
     """Episodes in each condition."""
     seed: NonNegativeInt = DEFAULT_SEED
@@ -111,9 +111,7 @@ def _read_conditions(
     from bounce_mjx.evaluation.suite import load_suite, read_suite
     from bounce_mjx.runs.config import in_world, named_file
 
-    path = resource_path("configs/robustness.yaml")
-    if command.suite is not None:
-        path = named_file(command.suite, "configs")
+    path = named_file(command.suite, "configs")
     world, assumed = None, {}
     if command.world is not None:
         there, named = in_world(config, command.world)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import pydantic
 from pydantic import Field
 
-from bounce_mjx.config.command_line import Flag, flag_of, flags_of, parse
+from bounce_mjx.config.command_line import Flag, flag_of, parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError
 from bounce_mjx.runs.config import (
@@ -137,26 +137,20 @@ def parse_with_commands(
     Raises:
       UserError: a flag has a bad value, or no task has it.
     """
-    task, known = parse(_FirstFlags, args, prog=prog, is_first=True).task, flags_of(command_class)
-    words = {word.partition("=")[0].replace("_", "-") for word in args if word.startswith("--")}
+    task, fields = parse(_FirstFlags, args, prog=prog, is_first=True).task, {}
     # Without --task, the run may be of any task.
-    names = [task or DEFAULT] if task or words <= {*known, "--help"} else registered_tasks()
-    commands = {
-        name: Annotated[
-            (str if command.names else float) | None,
-            Flag(metavar="|".join(command.names) or command.unit.upper() or None),
-        ]
-        for task in names
-        for name, command in find_task(task).Config().commands.items()
-        if flag_of(name) not in known
-    }
-    about = f"Command of the task {' or '.join(names)}"
-    fields = {name: (kind, Field(None, description=about)) for name, kind in commands.items()}
+    for name in [task] if task else registered_tasks():
+        for key, command in find_task(name).Config().commands.items():
+            kind = (str if command.names else float) | None
+            flag = Flag(metavar="|".join(command.names) or command.unit.upper() or None)
+            about = Field(None, description="Command of the task, if the run's has it.")
+            if key not in command_class.model_fields:
+                fields[key] = Annotated[kind, flag], about
     own_class = pydantic.create_model(
         command_class.__name__, __base__=command_class, __doc__=command_class.__doc__, **fields
     )
     command = parse(own_class, args, prog=prog)
-    given = {name: getattr(command, name) for name in commands}
+    given = {name: getattr(command, name) for name in fields}
     given = {name: value for name, value in given.items() if value is not None}
 
     def values(env: WorldConfig) -> dict[str, float]:

@@ -30,7 +30,6 @@ def evaluate_policy(
     env_config: WorldConfig,
     actor: Callable[[Env], Actor],
     options: EvaluationOptions = DEFAULT_OPTIONS,
-    started: Callable[[str], None] = lambda engine: None,
     recorded: int = 0,
 ) -> PolicyEvaluation:
     """Measures the results of a policy without action noise.
@@ -38,7 +37,6 @@ def evaluate_policy(
     Args:
       env_config: the world and the task of the policy's training.
       actor: what acts with the policy, such as the networks of its training (`networks_of`).
-      started: called with the engine's name before anything is compiled.
       recorded: number of episodes in the report's recording.
 
     Raises:
@@ -47,7 +45,6 @@ def evaluate_policy(
     env, commands, ranges = _prepare(env_config, options)
     on_c = options.physics == "mujoco"
     engine = "mujoco" if on_c else env.engine.name
-    started(engine)
     make = make_mujoco_evaluator if on_c else make_evaluator
     evaluate = make(env, actor(env), options.episodes, recorded)
     measured = evaluate(policy, jax.random.PRNGKey(options.seed), ranges)

@@ -184,11 +184,9 @@ class Job:
             self._read_resumed()
         configs = {self.run: config} | {member.run: member.config for member in self.members}
         for folder, own in configs.items() if hosts.is_leader() else ():
-            # A new run has its own config.
-            if self.resume is not None or folder != self.run:
-                with writable(folder, "make room there or make it writable"):
-                    folder.mkdir(exist_ok=True)
-                    folders.save_config(folder, own)
+            with writable(folder, "make room there or make it writable"):
+                folder.mkdir(exist_ok=True)
+                folders.save_config(folder, own)
         mesh = self.trainer.mesh
         self.device = mesh.devices.flat[0].device_kind
         if mesh.size > 1:
