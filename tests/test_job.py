@@ -34,7 +34,7 @@ from bounce_mjx.runs.folders import (
 )
 from bounce_mjx.runs.reading import policy_shapes, read_policy, read_record
 from bounce_mjx.training import job
-from bounce_mjx.training.callbacks import Event
+from bounce_mjx.training.events import Event
 from bounce_mjx.training.ppo_trainer import Snapshot
 from tiny_runs import contents
 

@@ -22,7 +22,7 @@ from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training import watch as watched
-from bounce_mjx.training.callbacks import Event
+from bounce_mjx.training.events import Event
 from bounce_mjx.training.watch import TrainingPage
 from bounce_mjx.viewers import browser
 from bounce_mjx.viewers.guard import open_server

@@ -28,7 +28,7 @@ from bounce_mjx.runs.folders import save_config
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.task import Curve, term_names
 from bounce_mjx.tasks.bounce import Bounce, BounceReward
-from bounce_mjx.training.callbacks import Event
+from bounce_mjx.training.events import Event
 from bounce_mjx.training.log import TensorBoardLog
 from tiny_runs import TINY
 

@@ -54,12 +54,8 @@ def main(args: Sequence[str]) -> None:
     not, 2 on a mistake."""
     command = parse(RobustnessCommand, args, prog="bounce-mjx robustness")
     from bounce_mjx.evaluation.robustness import RobustnessReport, measure_conditions
+    from bounce_mjx.reports import robustness
     from bounce_mjx.reports.figures import image
-    from bounce_mjx.reports.robustness import (
-        ROBUSTNESS_FILE,
-        robustness_figure,
-        robustness_table,
-    )
     from bounce_mjx.runs.files import to_json, writable, write_output
     from bounce_mjx.runs.folders import MIRROR_LAW
     from bounce_mjx.runs.reading import read_actor
@@ -94,9 +90,9 @@ def main(args: Sequence[str]) -> None:
         measured=outcomes[0].measured,
         outcomes=outcomes,
     )
-    console.print(robustness_table(report))
-    figure = robustness_figure(report)
-    files = {ROBUSTNESS_FILE: to_json(report.model_dump())}
+    console.print(robustness.robustness_table(report))
+    figure = robustness.robustness_figure(report)
+    files = {robustness.ROBUSTNESS_FILE: to_json(report.model_dump())}
     files |= {f"robustness.{suffix}": image(figure, suffix) for suffix in ("png", "svg")}
     for name, content in files.items():
         write_output(out / name, content)

@@ -6,20 +6,14 @@ from collections.abc import Sequence
 from bounce_mjx.config.command_line import stdout
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.interrupt import in_daemon_thread, leave
-from bounce_mjx.runs.config import (
-    default_preset,
-    has_accelerator,
-    has_plugin,
-    preset_files,
-    shown_file,
-)
+from bounce_mjx.runs import config as run_configs
 from bounce_mjx.training.command import read_command
 
 
 def main(args: Sequence[str]) -> None:
     """Runs the command line."""
     with exit_on_user_error():
-        machine = default_preset(has_plugin())
+        machine = run_configs.default_preset(run_configs.has_plugin())
         command = read_command(args, machine)
         import jax
 
@@ -30,7 +24,7 @@ def main(args: Sequence[str]) -> None:
             # CUDA starts during the imports; JAX reports an error where it needs the devices.
             in_daemon_thread(jax.devices)
         from bounce_mjx.training import hosts
-        from bounce_mjx.training.callbacks import say
+        from bounce_mjx.training.events import say
         from bounce_mjx.training.job import TrainingStopped, named_task
         from bounce_mjx.training.run import train
 
@@ -39,7 +33,7 @@ def main(args: Sequence[str]) -> None:
             # JAX must not be asked for its devices before.
             numbers = command.num_processes, command.process_id, command.host_timeout
             hosts.join(command.coordinator_address, *numbers)
-        if command.on_several_hosts or has_plugin() != has_accelerator():
+        if command.on_several_hosts or run_configs.has_plugin() != run_configs.has_accelerator():
             machine = None
             command = read_command(args)
         console, page = stdout(quiet=not hosts.is_leader()), None
@@ -50,8 +44,8 @@ def main(args: Sequence[str]) -> None:
             address = Address(command.watch_host, command.watch_port, command.watch_allow_host)
             page = TrainingPage(command.training, address, console)
         if command.resume is None:
-            files = preset_files(command.config, command.task, machine)
-            say(console, f"config: {' on '.join(map(shown_file, reversed(files)))}")
+            files = run_configs.preset_files(command.config, command.task, machine)
+            say(console, f"config: {' on '.join(map(run_configs.shown_file, reversed(files)))}")
             if command.warm_start is not None:
                 say(console, f"warm start: {command.warm_start}")
         callbacks = [] if page is None else [page]

@@ -16,13 +16,8 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.config import EvaluationOptions
 from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
 from bounce_mjx.evaluation.recording import RECORDED_EPISODES
+from bounce_mjx.reports import figures
 from bounce_mjx.reports.curves import group_runs
-from bounce_mjx.reports.figures import (
-    PANEL_WIDTH,
-    curves_figure,
-    evaluation_figure,
-    rewards_figure,
-)
 from bounce_mjx.reports.html_page import data_url, figures_html, page, table
 from bounce_mjx.reports.robustness import load_robustness, robustness_figure
 from bounce_mjx.reports.tables import details_line, result_cells, robot_name
@@ -37,7 +32,7 @@ from bounce_mjx.viewers.page import replay_first_episode
 REPORT_FILE = "report.html"
 # Panels side by side in a figure that fits a phone, and its width in inches.
 _COLUMNS = 2
-_WIDTH = _COLUMNS * PANEL_WIDTH
+_WIDTH = _COLUMNS * figures.PANEL_WIDTH
 
 
 def record_checkpoint(checkpoint: Checkpoint) -> Recording:
@@ -67,16 +62,16 @@ def write_report(run: Path, recording: Recording | None = None) -> Path:
     env = Env(config.env)
     recording = recording or record_checkpoint(best_checkpoint(run))
     robustness = load_robustness(run)
-    figures = {
-        "Learning curves": curves_figure(groups, _COLUMNS),
-        "The best checkpoint": evaluation_figure(env, recording, _WIDTH),
-        "Reward terms": rewards_figure(groups, _COLUMNS),
+    drawn = {
+        "Learning curves": figures.curves_figure(groups, _COLUMNS),
+        "The best checkpoint": figures.evaluation_figure(env, recording, _WIDTH),
+        "Reward terms": figures.rewards_figure(groups, _COLUMNS),
     }
     if robustness is not None:
-        figures["Perturbed worlds"] = robustness_figure(robustness)
+        drawn["Perturbed worlds"] = robustness_figure(robustness)
     replay = replay_first_episode(env, recording)
     path = run / REPORT_FILE
-    write_output(path, _html(run, config, env.engine.name, results, figures, replay))
+    write_output(path, _html(run, config, env.engine.name, results, drawn, replay))
     return path
 
 
@@ -85,7 +80,7 @@ def _html(
     config: TrainConfig,
     engine: str,
     results: Results,
-    figures: dict[str, Figure],
+    drawn: dict[str, Figure],
     replay: str,
 ) -> str:
     report, evaluated = results.best, len(results.evaluations)
@@ -106,7 +101,7 @@ the robot {html.escape(robot_name(config.env))}. The best of {evaluated} evaluat
 (exploration); points are evaluations, whose actions are not. Errors rise first: the policy tries
 more before it knows how far each action goes, and its sampled actions scatter most at the start.
 </p>
-{figures_html(figures)}
+{figures_html(drawn)}
 <h2>Where the time went</h2>
 {table(["phase", "seconds"], phases)}
 <details><summary>Config</summary><pre>{html.escape(dump_config(config))}</pre></details>"""

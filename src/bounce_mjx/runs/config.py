@@ -24,14 +24,7 @@ from bounce_mjx.robot.config import is_packaged
 from bounce_mjx.runs.files import check_integrity
 from bounce_mjx.task.task import Task
 from bounce_mjx.tasks import registry
-from bounce_mjx.tasks.registry import (
-    DEFAULT,
-    find_task,
-    is_file,
-    known_task,
-    source_file,
-    task_name,
-)
+from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.named import NamedWorld, read_world
 
@@ -97,7 +90,7 @@ class TrainConfig(StrictModel):
     @classmethod
     def _make_absolute(cls, name: str) -> str:
         """A run's config is read from other folders too."""
-        return f"{source_file(name)}:{name.rpartition(':')[2]}" if is_file(name) else name
+        return f"{registry.source_file(name)}:{name.rpartition(':')[2]}" if is_file(name) else name
 
     @pydantic.model_validator(mode="before")
     @classmethod
@@ -114,7 +107,7 @@ class TrainConfig(StrictModel):
             return values
         env = values.get("env")
         if "task" not in values and isinstance(env, WorldConfig) and env.task is not None:
-            values = values | {"task": task_name(env.task)}
+            values = values | {"task": registry.task_name(env.task)}
         task = env.task if isinstance(env, WorldConfig) else find_task(values.get("task", DEFAULT))
         values = {"env": {}, "log_dir": runs_folder(task)} | values
         return values | {"env": task.Config.model_validate(values["env"])}
@@ -132,7 +125,7 @@ def train_config(
       base: `TrainConfig`, or the command line that trains.
       ppo: settings of the algorithm.
     """
-    own = {"task": (str, task_name(task)), "log_dir": (Path, runs_folder(task))}
+    own = {"task": (str, registry.task_name(task)), "log_dir": (Path, runs_folder(task))}
     own |= {"env": (task.Config, task.Config()), "ppo": (ppo, ppo())}
     fields = {}
     for name, (kind, default) in own.items():
@@ -218,7 +211,7 @@ def _task_of_run(name: str, run: Path, given: str | None) -> type[Task]:
         )
     if given is not None:
         registry.admit(name, find_task(given))
-    task = known_task(name)
+    task = registry.known_task(name)
     if task is None:
         raise unnamed_code(f"the run {run}", "task", name)
     return task
@@ -322,7 +315,7 @@ def _robot_for(task: type[Task], robot: Path) -> dict[str, Any]:
     own for an arm with this paddle."""
     values = _read(robot, "robot's config file", f"{ROBOTS}/ur5e.yaml")
     name = values.pop("task", DEFAULT)
-    its_task = known_task(name) if is_file(name) else find_task(name)
+    its_task = registry.known_task(name) if is_file(name) else find_task(name)
     if its_task is None:
         raise UserError(
             f"{robot} is of a task in the file {name}, which is code; adopt the arm again without "

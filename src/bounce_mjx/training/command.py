@@ -15,15 +15,8 @@ from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, suggest
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.resources import POLICIES
-from bounce_mjx.runs.config import (
-    TrainConfig,
-    in_world,
-    load_run_config,
-    read_preset,
-    runs_folder,
-    train_config,
-    unnamed_code,
-)
+from bounce_mjx.runs import config as run_configs
+from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file, is_same_code
 from bounce_mjx.world.config import WorldConfig
 
@@ -75,7 +68,7 @@ class Start(StrictModel):
         if self.warm_start:
             return self._warm(machine)
         start = self.config, self.robot, self.task, self.world, machine, self.algorithm
-        return read_preset(*start)
+        return run_configs.read_preset(*start)
 
     def _warm(self, machine: Path | None) -> TrainConfig:
         """The environment and the networks of a policy, and the other settings of a preset."""
@@ -86,15 +79,15 @@ class Start(StrictModel):
         from bounce_mjx.runs.folders import choose_checkpoint
         from bounce_mjx.runs.reading import NETWORK_KEYS
 
-        folder = runs_folder(find_task(self.task or DEFAULT))
+        folder = run_configs.runs_folder(find_task(self.task or DEFAULT))
         checkpoint = choose_checkpoint(self.warm_start, folder)
-        own = load_run_config(checkpoint.run, self.task)
-        base = read_preset(self.config, None, own.task, None, machine, self.algorithm)
+        own = run_configs.load_run_config(checkpoint.run, self.task)
+        base = run_configs.read_preset(self.config, None, own.task, None, machine, self.algorithm)
         networks = {key: getattr(own.ppo, key) for key in (*NETWORK_KEYS, "critic_metrics")}
         ppo = base.ppo.model_copy(update=networks)
         start = self.warm_start if str(self.warm_start) in POLICIES else checkpoint.folder
         config = base.model_copy(update={"env": own.env, "ppo": ppo, "warm_start": start})
-        return config if self.world is None else in_world(config, self.world)[0]
+        return config if self.world is None else run_configs.in_world(config, self.world)[0]
 
     def _resumed(self) -> TrainConfig:
         for flag in ("config", "robot", "world"):
@@ -103,7 +96,7 @@ class Start(StrictModel):
                     f"--{flag} and --resume cannot be combined; a resumed run has its config"
                 )
         run = self.run
-        base = load_run_config(run, self.task, self.algorithm)
+        base = run_configs.load_run_config(run, self.task, self.algorithm)
         for key in ("task", "algorithm"):
             given, own = getattr(self, key), getattr(base, key)
             if given is not None and not is_same_code(own, given):
@@ -112,7 +105,7 @@ class Start(StrictModel):
                     "it, name the run's copy, or start a new run"
                 )
         if is_file(base.algorithm) and self.algorithm is None:
-            raise unnamed_code(f"the run {run}", "algorithm", base.algorithm)
+            raise run_configs.unnamed_code(f"the run {run}", "algorithm", base.algorithm)
         if self.total_steps is None:
             return base
         from bounce_mjx.runs.folders import runs_of_seeds
@@ -132,7 +125,7 @@ class Start(StrictModel):
         """
         from bounce_mjx.runs.folders import find_run, named_run
 
-        log_dir = self.log_dir or runs_folder(find_task(self.task or DEFAULT))
+        log_dir = self.log_dir or run_configs.runs_folder(find_task(self.task or DEFAULT))
         return self.resume and find_run(named_run(self.resume, log_dir))
 
     def settle(self, config: TrainConfig, base: TrainConfig) -> TrainConfig:
@@ -229,7 +222,7 @@ def read_command(args: Sequence[str], machine: Path | None = None) -> TrainComma
     helps = {"-h", "--help", "--help-all"}.intersection(args)
     start = parse(Start, [word for word in args if word not in helps], prog=PROG, is_first=True)
     base = start.base(machine)
-    own_class = train_config(base.env.task, TrainCommand, type(base.ppo))
+    own_class = run_configs.train_config(base.env.task, TrainCommand, type(base.ppo))
     default = own_class(**dict(base))
     if helps:
         keys, epilog = _SHORT_HELP, "--help-all lists every flag; each key of the config is one."

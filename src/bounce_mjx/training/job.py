@@ -29,26 +29,10 @@ from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.files import to_json, writable, write_atomically
 from bounce_mjx.runs.progress import RESULTS_FILE, Progress
 from bounce_mjx.tasks.registry import is_file
-from bounce_mjx.training import hosts
-from bounce_mjx.training.callbacks import (
-    Callback,
-    Event,
-    block_line,
-    block_points,
-    call_all,
-    evaluation_line,
-    points_of,
-    say,
-)
+from bounce_mjx.training import events, hosts, ppo_trainer
 from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.first_block import fault_of
 from bounce_mjx.training.log import TensorBoardLog
-from bounce_mjx.training.ppo_trainer import (
-    PPOTrainer,
-    Snapshot,
-    in_whole_blocks,
-    iterations_per_block,
-)
 
 # Imported by name during the compilation, because these imports take half a second each.
 _SLOW_MODULES = "orbax.checkpoint", "bounce_mjx.reports.page"
@@ -89,8 +73,8 @@ def train(
     console: Console,
     *,
     resume: Path | None = None,
-    callbacks: Sequence[Callback] = (),
-    make_trainer: Callable[[TrainConfig, Env], PPOTrainer] = PPOTrainer,
+    callbacks: Sequence[events.Callback] = (),
+    make_trainer: Callable[[TrainConfig, Env], ppo_trainer.PPOTrainer] = ppo_trainer.PPOTrainer,
     make_evaluators: Callable[..., Evaluators] = Evaluators,
 ) -> list[SeedRun]:
     """Trains with a config, and returns its seeds.
@@ -110,7 +94,8 @@ def train(
     """
     hosts.agree(config, resume)
     with contextlib.ExitStack() as stack:
-        job = Job(in_whole_blocks(config), console, resume, callbacks, stack, make_trainer)
+        config = ppo_trainer.in_whole_blocks(config)
+        job = Job(config, console, resume, callbacks, stack, make_trainer)
         job.open()
         try:
             job.compile(make_evaluators)
@@ -139,9 +124,9 @@ class Job:
         config: TrainConfig,
         console: Console,
         resume: Path | None,
-        callbacks: Sequence[Callback],
+        callbacks: Sequence[events.Callback],
         stack: contextlib.ExitStack,
-        make_trainer: Callable[[TrainConfig, Env], PPOTrainer],
+        make_trainer: Callable[[TrainConfig, Env], ppo_trainer.PPOTrainer],
     ):
         """Builds what may refuse the config, before a folder is made."""
         self.config, self.console, self.resume, self.stack = config, console, resume, stack
@@ -149,7 +134,7 @@ class Job:
         self.pool = concurrent.futures.ThreadPoolExecutor()
         stack.callback(self.pool.shutdown, wait=False, cancel_futures=True)
         self.seconds, self.lap_started = {}, time.perf_counter()
-        self.block_steps = iterations_per_block(config) * config.ppo.batch_steps
+        self.block_steps = ppo_trainer.iterations_per_block(config) * config.ppo.batch_steps
         self.eval_steps = self.block_steps * max(1, round(config.eval_every / self.block_steps))
         self.env = Env(config.env)
         self.trainer = make_trainer(config, self.env)
@@ -201,7 +186,7 @@ class Job:
 
     def say(self, line: str) -> None:
         """Prints a line."""
-        say(self.console, line)
+        events.say(self.console, line)
 
     def _lap(self, name: str) -> None:
         """Adds the time since the last lap to that of a phase."""
@@ -281,7 +266,7 @@ class Job:
         compiling.result()
         # A callback may refuse the run.
         self.opening.result()
-        self.stack.callback(call_all, self.callbacks, "close")
+        self.stack.callback(events.call_all, self.callbacks, "close")
         if jax.process_count() > 1:
             # A process that finds its programs in the cache waits here for a process that compiles
             # them; otherwise the exchange between devices would time out after 30 s.
@@ -298,12 +283,12 @@ class Job:
             resumed = None if self.resume is None else self.steps
             self.logs[member.run] = TensorBoardLog(member.run)
             self.logs[member.run].start(member.config, resumed)
-            call_all(self.callbacks, "start", member.run, member.config)
+            events.call_all(self.callbacks, "start", member.run, member.config)
 
     def _tell(self, member: SeedRun, metrics: dict[str, float], **evaluation: Any) -> None:
         """Logs an `Event` of a seed, and tells the callbacks."""
         if hosts.is_leader():
-            event = Event(member.run, member.config, self.steps, metrics, **evaluation)
+            event = events.Event(member.run, member.config, self.steps, metrics, **evaluation)
             self.logs[member.run](event)
             answers = [callback(event) for callback in self.callbacks]
             self.ended |= any(answer is False for answer in answers)
@@ -373,9 +358,10 @@ class Job:
             for each in zip(self.members, reports, snapshot.policies, strict=True)
             if each[0].progress.fault is None
         ]
-        self.say(evaluation_line(self.config.num_seeds, self.steps, [x[1] for x in evaluated]))
+        judged = [report for _, report, _ in evaluated]
+        self.say(events.evaluation_line(self.config.num_seeds, self.steps, judged))
         for member, report, policy in evaluated:
-            self._tell(member, points_of(report), report=report, policy=policy)
+            self._tell(member, events.points_of(report), report=report, policy=policy)
         seconds, scores = sum(self.seconds.values()), {}
         self._end_save()
         for member, report, policy in evaluated:
@@ -429,11 +415,11 @@ class Job:
         self.steps += self.block_steps
         rate = len(faults) * self.block_steps / seconds
         metrics["speed/steps_per_second"] = np.full((len(faults), 1), rate)
-        points = block_points(metrics)
+        points = events.block_points(metrics)
         # At the mean speed so far with its evaluations.
         share = (self.config.total_steps - self.steps) / (self.steps - self.first_step)
         left = share * (time.monotonic() - self.started)
-        self.say(block_line(self.config, self.steps, seconds, left, points))
+        self.say(events.block_line(self.config, self.steps, seconds, left, points))
         if total := int(sum(point["task/non_finite"] for point in points)):
             self.say(f"states that were not finite, whose environments were reset: {total:,}")
         for member, own in zip(self.members, points, strict=True):
@@ -489,7 +475,7 @@ class Job:
                 member.recall_best()
         self._lap("save")
 
-    def _save(self, snapshot: Snapshot, scores: dict[Path, tuple[float, ...]]) -> None:
+    def _save(self, snapshot: ppo_trainer.Snapshot, scores: dict[Path, tuple[float, ...]]) -> None:
         """Starts to save the state, and with several seeds the policies of some of them.
 
         Args:

@@ -7,7 +7,7 @@ from typing import Any
 
 from bounce_mjx.config.files import dump_config, flat
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.training.callbacks import Event
+from bounce_mjx.training.events import Event
 
 
 class TensorBoardLog:

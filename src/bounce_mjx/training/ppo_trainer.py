@@ -15,16 +15,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
+from bounce_mjx.learning import ppo
 from bounce_mjx.learning.config import PPOConfig, find_algorithm
 from bounce_mjx.learning.policy import Policy
-from bounce_mjx.learning.ppo import (
-    CHECKED,
-    Params,
-    TrainingState,
-    num_groups,
-    policy_of,
-    population,
-)
 from bounce_mjx.learning.statistics import RunningStatistics
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training import hosts
@@ -71,7 +64,7 @@ class PPOTrainer:
     """S independent runs of one algorithm, one for each seed. The training job runs any other class
     with its public attributes and methods, too."""
 
-    checked = CHECKED
+    checked = ppo.CHECKED
     """The quantities that must stay finite, in the order of their computation."""
 
     def __init__(self, config: TrainConfig, env: Env):
@@ -86,29 +79,29 @@ class PPOTrainer:
         init, run, make_key = trainer.init, trainer.run, jax.random.PRNGKey
         self._seeds = np.uint32(config.seed)
         if config.num_seeds > 1:
-            init, run = population(trainer)
+            init, run = ppo.population(trainer)
             make_key = jax.vmap(make_key)
             self._seeds = config.seed + np.arange(config.num_seeds, dtype=np.uint32)
-        self.state: TrainingState | None = None
+        self.state: ppo.TrainingState | None = None
         """The current state, on the devices."""
 
-        def initial_state(seeds: jax.Array) -> TrainingState:
+        def initial_state(seeds: jax.Array) -> ppo.TrainingState:
             """The first training state of one seed [] or of S seeds [S]."""
             return init(make_key(seeds))
 
-        def train_block(state: TrainingState) -> tuple[TrainingState, Metrics]:
+        def train_block(state: ppo.TrainingState) -> tuple[ppo.TrainingState, Metrics]:
             return run(state, iterations_per_block(config))
 
         # One object each, not methods, so that JAX traces them only once.
         self._initial_state, self._train_block = initial_state, train_block
 
     @functools.cached_property
-    def state_template(self) -> TrainingState:
+    def state_template(self) -> ppo.TrainingState:
         """Shapes and types of the state, `jax.ShapeDtypeStruct` as its leaves."""
         return jax.eval_shape(self._initial_state, self._seeds)
 
     @functools.cached_property
-    def _sharding(self) -> TrainingState:
+    def _sharding(self) -> ppo.TrainingState:
         return state_sharding(self.mesh, self.state_template, self._config.num_seeds)
 
     def compile(self, pool: concurrent.futures.Executor) -> concurrent.futures.Future:
@@ -130,7 +123,7 @@ class PPOTrainer:
         return self._run
 
     def start(
-        self, state: Any = None, networks: tuple[Params, RunningStatistics] | None = None
+        self, state: Any = None, networks: tuple[ppo.Params, RunningStatistics] | None = None
     ) -> None:
         """Starts from the seeds, or from the state of a `snapshot`.
 
@@ -166,7 +159,7 @@ class PPOTrainer:
         state = hosts.gather(self.state)
         seeds = each_seed(state, self._config.num_seeds)
         return Snapshot(
-            [policy_of(seed, self._observation_size) for seed in seeds],
+            [ppo.policy_of(seed, self._observation_size) for seed in seeds],
             state,
             [{"params": seed.params, "statistics": seed.statistics} for seed in seeds],
         )
@@ -203,7 +196,7 @@ def make_mesh(num_devices: int | None, config: PPOConfig, num_seeds: int = 1) ->
     if num_seeds > 1:
         shared, name, advice = num_seeds, f"num_seeds {num_seeds}", f"a multiple of {num_devices}"
     else:
-        shared, name = num_groups(config), f"num_envs {config.num_envs}"
+        shared, name = ppo.num_groups(config), f"num_envs {config.num_envs}"
         multiple = f"a multiple of {num_devices} * num_minibatches as num_envs"
         advice = f"a power of two as num_devices, and {multiple}"
     if shared % num_devices:
@@ -211,7 +204,7 @@ def make_mesh(num_devices: int | None, config: PPOConfig, num_seeds: int = 1) ->
     return Mesh(devices[:num_devices], (_AXIS,))
 
 
-def state_sharding(mesh: Mesh, state: TrainingState, num_seeds: int = 1) -> TrainingState:
+def state_sharding(mesh: Mesh, state: ppo.TrainingState, num_seeds: int = 1) -> ppo.TrainingState:
     """Shardings of a training state. With several seeds each device holds some of them; with one
     seed each device holds some environments and everything else.
 

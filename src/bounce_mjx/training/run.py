@@ -24,8 +24,8 @@ from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.reading import read_actor
 from bounce_mjx.training import hosts, job
-from bounce_mjx.training.callbacks import Callback, say
 from bounce_mjx.training.command import Start, changed
+from bounce_mjx.training.events import Callback, say
 from bounce_mjx.training.setup import set_up_jax
 
 

@@ -8,7 +8,7 @@ from PIL import Image
 from bounce_mjx.env.env import Env
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.training.callbacks import Event
+from bounce_mjx.training.events import Event
 from bounce_mjx.training.log import TensorBoardLog
 from bounce_mjx.viewers.offscreen import choose_opengl
 from bounce_mjx.viewers.simulation import Simulation, make_policy_controller, resample
