@@ -1,7 +1,7 @@
 """JAX's settings in a command."""
 
+import contextlib
 import os
-import sys
 from pathlib import Path
 
 import jax
@@ -29,23 +29,15 @@ def cache_compilations() -> None:
     folder that the user chose (`JAX_COMPILATION_CACHE_DIR`) has priority. JAX's default is to cache
     only programs that take a second to compile.
 
-    A user without a home, such as a number without a name in a container, has no cache.
+    A user without a home, such as a number without a name in a container, has no cache. JAX warns
+    where it cannot write.
     """
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     if jax.config.jax_compilation_cache_dir is None:
-        try:
+        with contextlib.suppress(RuntimeError):
             caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-            folder = caches / "bounce_mjx" / "jax"
-            folder.mkdir(parents=True, exist_ok=True)
-            jax.config.update("jax_compilation_cache_dir", str(folder))
-        # Without a home, it is a RuntimeError.
-        except (OSError, RuntimeError) as error:
-            print(
-                f"warning: compiled programs are not cached ({error}); set "
-                "JAX_COMPILATION_CACHE_DIR to a folder of yours",
-                file=sys.stderr,
-            )
+            jax.config.update("jax_compilation_cache_dir", str(caches / "bounce_mjx/jax"))
 
 
 def set_up_gpu() -> None:
