@@ -9,21 +9,15 @@ from bounce_mjx.commands.run_options import OneActorCommand, WorldCommand, parse
 from bounce_mjx.config.command_line import Flag, stdout
 from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.evaluation.config import (
-    DEFAULT_EPISODES,
-    DEFAULT_SEED,
-    EvaluationOptions,
-    Physics,
-    on_engine,
-)
+from bounce_mjx.evaluation import config as evaluation
 
 
 class EvalCommand(WorldCommand, OneActorCommand):
     """Measures the results of a trained policy."""
 
-    episodes: Count = DEFAULT_EPISODES
+    episodes: Count = evaluation.DEFAULT_EPISODES
     """Episodes, each from its own reset."""
-    seed: NonNegativeInt = DEFAULT_SEED
+    seed: NonNegativeInt = evaluation.DEFAULT_SEED
     """Seed of the resets."""
     nominal: bool = False
     """Evaluate without domain randomisation; else each episode samples a world, as in training."""
@@ -33,7 +27,7 @@ class EvalCommand(WorldCommand, OneActorCommand):
     limits: bool = False
     """Also show how much of the arm's own limits of velocity, acceleration and jerk its commands at
     1 kHz use, in the first 32 episodes."""
-    physics: Physics = "config"
+    physics: evaluation.Physics = "config"
     """Physics engine: mujoco is MuJoCo's C engine; config is the engine used in training."""
     json_file: Annotated[Path | None, Flag(name="json")] = None
     """File to write the results to."""
@@ -64,11 +58,11 @@ def main(args: Sequence[str]) -> None:
             "give a run with an arm that has them, such as --robot ur5e"
         )
     commands = given_commands(config.env)
-    set_up_jax(on_engine(config.env, command.physics))
+    set_up_jax(evaluation.on_engine(config.env, command.physics))
     checkpoint, policy, actor = read_actor(checkpoint, config)
     steps = f" ({checkpoint.steps:,} steps)" if checkpoint.steps else ""
     print(f"checkpoint: {checkpoint.folder}{steps}")
-    options = EvaluationOptions(
+    options = evaluation.EvaluationOptions(
         command.episodes, command.seed, command.physics, command.nominal, commands
     )
     checks = [("contacts", arm_contacts, describe_contacts)] * command.contacts

@@ -11,13 +11,7 @@ from bounce_mjx.commands.run_options import OneActorCommand
 from bounce_mjx.config.command_line import parse, stdout
 from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.evaluation.config import (
-    DEFAULT_CONDITION_EPISODES,
-    DEFAULT_SEED,
-    EvaluationOptions,
-    Physics,
-    on_engine,
-)
+from bounce_mjx.evaluation import config as evaluation
 from bounce_mjx.resources import POLICIES, resource_path
 from bounce_mjx.runs.config import TrainConfig
 
@@ -37,11 +31,11 @@ class RobustnessCommand(OneActorCommand):
     suite: Path = Path("robustness")
     """YAML file of the perturbations, or the name of one in configs/: robustness is version 1, and
     robustness_v2 is version 2."""
-    episodes: Count = DEFAULT_CONDITION_EPISODES
+    episodes: Count = evaluation.DEFAULT_CONDITION_EPISODES
     """Episodes in each condition."""
-    seed: NonNegativeInt = DEFAULT_SEED
+    seed: NonNegativeInt = evaluation.DEFAULT_SEED
     """Seed of the resets."""
-    physics: Physics = "config"
+    physics: evaluation.Physics = "config"
     """Engine: mujoco is MuJoCo's C engine; config is the engine used in training."""
     out: Path | None = None
     """Folder for robustness.json and the pictures. The default is the run's folder, or robustness
@@ -67,14 +61,14 @@ def main(args: Sequence[str]) -> None:
     checkpoint = command.choose(command.checkpoint)
     config = command.config_of(checkpoint)
     conditions, suite, version = _read_conditions(command, config)
-    set_up_jax(*(on_engine(condition.env, command.physics) for condition in conditions))
+    set_up_jax(*(evaluation.on_engine(condition.env, command.physics) for condition in conditions))
     checkpoint, policy, actor = read_actor(checkpoint, config)
     no_run = checkpoint.run in {MIRROR_LAW.run, *map(resource_path, POLICIES.values())}
     out = command.out or (Path("robustness") if no_run else checkpoint.run)
     # Fails before the measurement if its results could not be written.
     with writable(out, "choose another folder with --out"):
         out.mkdir(parents=True, exist_ok=True)
-    options = EvaluationOptions(command.episodes, command.seed, command.physics)
+    options = evaluation.EvaluationOptions(command.episodes, command.seed, command.physics)
     with Progress(console=console, transient=True) as bar:
         task = bar.add_task("conditions", total=len(conditions))
         outcomes = measure_conditions(

@@ -11,13 +11,8 @@ from pydantic import Field
 from bounce_mjx.config.command_line import Flag, flag_of, parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError
-from bounce_mjx.runs.config import (
-    TrainConfig,
-    in_world,
-    load_run_config,
-    read_preset,
-    runs_folder,
-)
+from bounce_mjx.runs import config as run_configs
+from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.tasks.registry import DEFAULT, find_task, registered_tasks
 from bounce_mjx.world.config import WorldConfig
 
@@ -41,7 +36,7 @@ class RunCommand(StrictModel):
     @property
     def folder(self) -> Path:
         """Folder in which to look for the newest run."""
-        return self.log_dir or runs_folder(find_task(self.task or DEFAULT))
+        return self.log_dir or run_configs.runs_folder(find_task(self.task or DEFAULT))
 
     def config(self, run: Path) -> TrainConfig:
         """The config of a run.
@@ -49,7 +44,7 @@ class RunCommand(StrictModel):
         Raises:
           UserError: as `load_run_config`.
         """
-        return load_run_config(run, self.task)
+        return run_configs.load_run_config(run, self.task)
 
 
 class ActorCommand(RunCommand):
@@ -86,7 +81,7 @@ class ActorCommand(RunCommand):
 
         if checkpoint is not MIRROR_LAW:
             return self.config(checkpoint.run)
-        config = read_preset(Path("default"), self.robot, self.task)
+        config = run_configs.read_preset(Path("default"), self.robot, self.task)
         return config.model_copy(update={"env": observing(config.env)})
 
 
@@ -114,7 +109,7 @@ class WorldCommand(ActorCommand):
           UserError: as `ActorCommand.config_of` and `in_world`.
         """
         config = super().config_of(checkpoint)
-        return config if self.world is None else in_world(config, self.world)[0]
+        return config if self.world is None else run_configs.in_world(config, self.world)[0]
 
 
 class _FirstFlags(StrictModel):

@@ -46,17 +46,13 @@ def main(args: Sequence[str]) -> None:
     command = parse(own_class, args, prog="bounce-mjx view", default=own_class(env=env))
     from bounce_mjx.baselines.mirror import MirrorLaw, observing
     from bounce_mjx.training.setup import set_up_jax
+    from bounce_mjx.viewers import simulation
     from bounce_mjx.viewers.show import Shown, show
-    from bounce_mjx.viewers.simulation import (
-        make_policy_controller,
-        make_random_controller,
-        make_zero_controller,
-    )
 
     make_controller = {
-        "random": make_random_controller,
-        "zero": make_zero_controller,
-        "mirror": lambda env: make_policy_controller(MirrorLaw(env)),
+        "random": simulation.make_random_controller,
+        "zero": simulation.make_zero_controller,
+        "mirror": lambda env: simulation.make_policy_controller(MirrorLaw(env)),
     }
     env = observing(command.env) if command.actions == "mirror" else command.env
     set_up_jax(env)

@@ -142,8 +142,7 @@ def gather(tree: Tree) -> Tree:
 def distribute(tree: Tree, shardings: Any) -> Tree:
     """Arrays that are whole and equal in every process, as arrays on the devices."""
 
-    def put(x, sharding: Sharding) -> jax.Array:
-        x = np.asarray(x)
+    def put(x: np.ndarray, sharding: Sharding) -> jax.Array:
         return jax.make_array_from_callback(x.shape, sharding, lambda index: x[index])
 
-    return jax.tree.map(put, tree, shardings)
+    return jax.tree.map(put, jax.tree.map(np.asarray, tree), shardings)

@@ -11,12 +11,10 @@ from rich.console import Console
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import reason_of
-from bounce_mjx.evaluation.results import Report
 from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.learning.policy import make_networks, untrained_policy
-from bounce_mjx.reports.tables import figure_text
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.training.events import Event, say
+from bounce_mjx.training.events import Event, evaluation_line, say
 from bounce_mjx.viewers.browser import LivePage, free_port
 from bounce_mjx.viewers.guard import open_server
 from bounce_mjx.viewers.options import Address, PageStart
@@ -104,25 +102,13 @@ def add_panel(
         if event is None:
             progress.content = _text("<b>Training has ended</b>")
         elif event.report is not None:
-            results.content = results_list(event.report, event.steps)
+            results.content = _text(html.escape(evaluation_line(1, event.steps, [event.report])))
         else:
             done = f"{event.steps:,} of {config.total_steps:,} steps"
             rate = event.metrics["speed/steps_per_second"]
             progress.content = _text(f"<b>{done}</b><br>{rate:,.0f} steps/s")
 
     return show
-
-
-def results_list(report: Report, steps: int) -> str:
-    """The results as HTML, after a number of environment steps."""
-    marks = {True: "&#10003;", False: "&#10007;", None: "-"}
-    kind = "screening" if report.screening else "evaluation"
-    lines = [f"{kind} at {steps:,} steps:", f"<b>{html.escape(report.summary)}</b>"]
-    for x in report.results:
-        bound = x.bound.partition(" (")[0]
-        line = f"{x.name} {figure_text(x.value)} ({bound})"
-        lines.append(f"{marks[x.passed]} {html.escape(line)}")
-    return _text("<br>".join(lines))
 
 
 def _text(content: str) -> str:
