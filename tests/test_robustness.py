@@ -34,7 +34,8 @@ def suite(tmp_path: Path, *perturbations: object, trained: EnvConfig | None = No
     path = tmp_path / "suite.yaml"
     path.write_text(yaml.safe_dump({"perturbations": list(perturbations)}), encoding="utf-8")
     nominal, *others = load_suite(path, trained or EnvConfig())
-    assert (nominal.perturbation.name, nominal.ranges, nominal.trained) == ("nominal", {}, True)
+    assert (nominal.perturbation.name, nominal.trained) == ("nominal", True)
+    assert nominal.ranges.keys() == nominal.env.commands.keys()
     return others
 
 

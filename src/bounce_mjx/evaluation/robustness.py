@@ -171,15 +171,10 @@ def _outcome(
 
 def _spanning_config(conditions: Sequence[Condition], physics: Physics) -> WorldConfig:
     """Config with all terms of the conditions active, in ranges that contain all their ranges."""
-    env = conditions[0].env
-    spans = {}
-    for name in sorted({name for condition in conditions for name in condition.ranges}):
-        if name in TERMS:
-            ranges = [condition.range(name) for condition in conditions]
-            spans[name] = (
-                min(float(np.min(low)) for low, _ in ranges),
-                max(float(np.max(high)) for _, high in ranges),
-            )
+    env, spans = conditions[0].env, {}
+    for name in sorted(TERMS.keys() & {name for each in conditions for name in each.ranges}):
+        lows, highs = zip(*(condition.range(name) for condition in conditions), strict=True)
+        spans[name] = float(np.min(lows)), float(np.max(highs))
     # A program spans what its conditions, which are within the limits, do not: a term that one of
     # them lacks.
     sampled = RandomizationConfig().model_copy(update=spans)

@@ -77,22 +77,19 @@ class Condition(NamedTuple):
     env: WorldConfig
     """World and task of the policy, without randomisation."""
     ranges: dict[str, Bounds]
-    """Lower and upper ends of the perturbed terms' and commands' ranges, in the shapes of the
-    terms."""
+    """Lower and upper ends of the ranges of all commands and of the perturbed terms, in the shapes
+    of the terms."""
     trained: bool
     """Whether the training ranges of the policy contain the condition."""
 
     def range(self, name: str) -> Bounds:
-        """Range of a term or of a command; neutral if it is not perturbed."""
+        """Range of a command, or of a term; neutral if it is not perturbed."""
         return self.ranges.get(name) or neutral_range(name, self.env)
 
     @property
     def commands(self) -> dict[str, tuple[float, float]]:
         """Range of each command."""
-        return {
-            name: tuple(map(float, self.ranges.get(name, ends)))
-            for name, ends in neutral_commands(self.env).items()
-        }
+        return {name: tuple(map(float, self.ranges[name])) for name in self.env.commands}
 
 
 def read_suite(path: Path) -> Suite:
@@ -147,13 +144,9 @@ def load_suite(
 
 
 def neutral_range(name: str, env: WorldConfig) -> Bounds | None:
-    """Range of a term without effect on the world, None if the term has no such value; or that of
-    a command in a world without randomisation (`neutral_commands`)."""
-    if name in env.commands:
-        low, high = neutral_commands(env)[name]
-    else:
-        low = high = _INTERVALS.get(name, TERMS[name].nominal)
-    return None if low is None else _broadcast(name, env.num_joints, low, high)
+    """Range of a term without effect on the world; None if the term has no such value."""
+    value = _INTERVALS.get(name, TERMS[name].nominal)
+    return None if value is None else _broadcast(name, env.num_joints, value, value)
 
 
 def neutral_commands(env: WorldConfig) -> dict[str, tuple[float, float]]:
@@ -188,11 +181,12 @@ def _condition(
     without = {"randomization": RandomizationConfig()}
     plain = world.model_copy(update=without)
     env = _with_changes(plain, _fill_in(perturbation.settings, value), source)
+    commands = neutral_commands(env)
     if perturbation.trained_ranges:
         sampled, commands = trained.randomization, {n: c[:2] for n, c in trained.commands.items()}
     else:
         ends = {term: _ends(x, source) for term, x in _fill_in(perturbation.terms, value).items()}
-        commands = {
+        commands |= {
             name: tuple(env.commands[name].checked(x, f"{source}: {name}") for x in ends.pop(name))
             for name in ends.keys() & env.commands.keys()
         }
