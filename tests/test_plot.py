@@ -184,7 +184,7 @@ def test_training_leaves_a_report(trained: Path) -> None:
     height = load_results(trained).best.results[2]
     assert (height.value, height.passed) == (None, False)
     assert ">-</td>" in re.search(r"<td[^>]*>height</td>.*", page)[0]
-    assert "apex error -, " in page
+    assert "apex error - m, " in page
     # The log has no point either, which a curve would show as a perfect value.
     log = EventAccumulator(str(trained)).Reload().Tags()["scalars"]
     assert "results/stable" in log and "results/mean_return" in log

@@ -1,6 +1,6 @@
 """The results of an evaluation as tables and lines of text."""
 
-import math
+import re
 
 import numpy as np
 from rich.markup import escape
@@ -9,16 +9,8 @@ from rich.table import Column, Table
 from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.world.config import WorldConfig
 
-# Ends of the names of figures, the units that are shown, and the factors to them.
-_UNITS = {
-    "_m_s": ("m/s", 1.0),
-    "_rad_s": ("rad/s", 1.0),
-    "_m": ("cm", 100.0),
-    "_s": ("s", 1.0),
-    "_rad": ("deg", math.degrees(1.0)),
-    "_kg": ("kg", 1.0),
-    "_N": ("N", 1.0),
-}
+# A figure's name, and the unit at its end.
+_NAME = re.compile("(.+?)(?:_((?:m|rad)_s|m|s|rad|kg|N))?")
 
 
 def robot_name(env: WorldConfig) -> str:
@@ -101,10 +93,8 @@ def details_line(report: Report) -> str:
     """The other figures of an evaluation, in one line."""
     parts = []
     for name, value in report.details.items():
-        end = next((end for end in _UNITS if name.endswith(end)), "")
-        unit, factor = _UNITS.get(end, ("", 1.0))
-        title = name.removesuffix(end).replace("_", " ")
-        text = "-" if value is None else f"{short_text(factor * value)} {unit}".rstrip()
+        title, unit = (part.replace("_", " ") for part in _NAME.fullmatch(name).groups(""))
+        unit = unit.replace(" ", "/")
         if name != "episodes":
-            parts.append(f"{title} {text}")
+            parts.append(f"{title} {figure_text(value, '.4g')} {unit}".rstrip())
     return f"{report.details['episodes']:.0f} episodes: {', '.join(parts)}"
