@@ -248,10 +248,10 @@ def test_a_full_disk_costs_points(tmp_path: Path, monkeypatch) -> None:
     def fail(_: object) -> None:
         raise OSError(errno.ENOSPC, "no space")
 
-    log = TensorBoardLog(tmp_path)
-    log.start(TrainConfig(), None)
+    log = TensorBoardLog()
+    log.start(tmp_path, TrainConfig())
     (lost,) = tmp_path.glob("events*")
-    monkeypatch.setattr(log._writer, "write_event", fail)
+    monkeypatch.setattr(log._writers[tmp_path], "write_event", fail)
     log(Event(tmp_path, TrainConfig(), 64, {"episode/return": 2.5}))
     log(Event(tmp_path, TrainConfig(), 128, {"episode/return": 3.5}))
     lost.unlink()

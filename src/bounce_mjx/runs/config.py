@@ -419,13 +419,13 @@ def default_preset(accelerator: bool) -> Path:
 
 
 def named_file(path: Path, folder: str, kind: str | None = None) -> Path:
-    """The YAML file in a folder of the package that a word names; the path itself if there is none
-    or if the path exists.
+    """The YAML file in a folder of the package that a word names; the path itself if there is none,
+    or if it is a file.
 
     Args:
       kind: kind of the file, to refuse a word that is neither a file nor a name.
     """
-    if str(path) != path.stem or os.path.exists(path):
+    if str(path) != path.stem or os.path.isfile(path):
         return path
     named = resource_path(f"{folder}/{path}.yaml")
     if kind is None or os.path.isfile(named):

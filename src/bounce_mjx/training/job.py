@@ -143,7 +143,6 @@ class Job:
         self.state: Any = None
         self.steps = 0
         self.ended = False
-        self.logs: dict[Path, TensorBoardLog] = {}
         self.opening = self.saving = self.pool.submit(lambda: None)
 
     def open(self) -> None:
@@ -278,20 +277,18 @@ class Job:
         self.started, self.first_step = time.monotonic(), self.steps
 
     def _open_logs(self) -> None:
-        """Opens a log for each seed, and tells the callbacks; not where nothing is written."""
-        for member in self.members if hosts.is_leader() else ():
+        """Opens the log, where it is written, and tells the callbacks of each seed."""
+        if hosts.is_leader():
             resumed = None if self.resume is None else self.steps
-            self.logs[member.run] = TensorBoardLog(member.run)
-            self.logs[member.run].start(member.config, resumed)
+            self.callbacks = [TensorBoardLog(resumed), *self.callbacks]
+        for member in self.members:
             events.call_all(self.callbacks, "start", member.run, member.config)
 
     def _tell(self, member: SeedRun, metrics: dict[str, float], **evaluation: Any) -> None:
-        """Logs an `Event` of a seed, and tells the callbacks."""
-        if hosts.is_leader():
-            event = events.Event(member.run, member.config, self.steps, metrics, **evaluation)
-            self.logs[member.run](event)
-            answers = [callback(event) for callback in self.callbacks]
-            self.ended |= any(answer is False for answer in answers)
+        """Tells the callbacks an `Event` of a seed."""
+        event = events.Event(member.run, member.config, self.steps, metrics, **evaluation)
+        answers = [callback(event) for callback in self.callbacks]
+        self.ended |= any(answer is False for answer in answers)
 
     def train(self) -> None:
         """Trains until the last step, or until a stop is requested."""
@@ -353,11 +350,8 @@ class Job:
         reports = self._wait_for_reports(self.evaluators.select, snapshot.policies)
         if reports is None:
             return False
-        evaluated = [
-            each
-            for each in zip(self.members, reports, snapshot.policies, strict=True)
-            if each[0].progress.fault is None
-        ]
+        each = zip(self.members, reports, snapshot.policies, strict=True)
+        evaluated = [one for one in each if one[0].progress.fault is None]
         judged = [report for _, report, _ in evaluated]
         self.say(events.evaluation_line(self.config.num_seeds, self.steps, judged))
         for member, report, policy in evaluated:
@@ -446,11 +440,10 @@ class Job:
                 self.say(f"seed {member.config.seed} diverged: {member.progress.fault}")
         if self._healthy():
             return
-        latest = self._latest()
-        kept = f"the last good checkpoint is {latest}" if latest else "no checkpoint was saved yet"
         raise UserError(
-            f"training stopped because it diverged: {self.members[-1].progress.fault}; {kept}; "
-            "start a new run with a lower learning rate or other rewards"
+            f"training stopped because it diverged: {self.members[-1].progress.fault}; the last "
+            f"good checkpoint is {self._latest() or 'none'}; start a new run with a lower learning "
+            "rate or other rewards"
         )
 
     def _end_save(self, is_last: bool = False) -> None:

@@ -30,7 +30,7 @@ class EvaluationVideo:
         """
         self._seconds, self._size, self._fps = seconds, size, fps
         self._simulation: Simulation | None = None
-        self._logs: dict[Path, TensorBoardLog] = {}
+        self._log = TensorBoardLog()
 
     def start(self, run: Path, config: TrainConfig) -> None:
         """
@@ -38,8 +38,6 @@ class EvaluationVideo:
           UserError: no OpenGL library works.
         """
         choose_opengl()
-        # TensorBoard stops reading a file once its folder has a newer one.
-        self._logs[run] = TensorBoardLog(run / "video")
 
     def __call__(self, event: Event) -> None:
         if event.policy is None:
@@ -58,9 +56,9 @@ class EvaluationVideo:
         gif = io.BytesIO()
         duration = 1000 / self._fps
         first.save(gif, "GIF", save_all=True, append_images=others, duration=duration, loop=0)
-        log = self._logs[event.run]
-        width, height = self._size
+        kind, (width, height) = self._log.summary.Summary, self._size
         shape = {"width": width, "height": height, "colorspace": 3}
-        image = log.summary.Summary.Image(**shape, encoded_image_string=gif.getvalue())
-        value = log.summary.Summary.Value(tag="policy", image=image)
-        log.add(event.steps, summary=log.summary.Summary(value=[value]))
+        image = kind.Image(**shape, encoded_image_string=gif.getvalue())
+        summary = kind(value=[kind.Value(tag="policy", image=image)])
+        # In its own folder, as TensorBoard stops reading a file once its folder has a newer one.
+        self._log.add(event.run / "video", event.steps, summary=summary)
