@@ -4,7 +4,7 @@ learn with show there."""
 import numpy as np
 
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.training.trainer import Metrics
+from bounce_mjx.training.ppo_trainer import Metrics
 
 MIN_SECONDS = 0.1
 """Shortest mean time to the end of an episode, s; after a reset a ball flies for longer."""
