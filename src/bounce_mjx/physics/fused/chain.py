@@ -23,6 +23,7 @@ from bounce_mjx.physics.scalars import (
     axis_rotation,
     congruence,
     cross,
+    dot,
     is_constant,
     is_zero,
     mul,
@@ -197,40 +198,30 @@ def cholesky(matrix: SquareMatrix) -> tuple[SquareMatrix, list[Scalar]]:
     triangle: SquareMatrix = [[0.0] * n for _ in range(n)]
     inverse_diagonal = []
     for j in range(n):
-        pivot = matrix[j][j]
-        for k in range(j):
-            pivot = sub(pivot, mul(triangle[j][k], triangle[j][k]))
+        row = triangle[j][:j]
+        pivot = sub(matrix[j][j], dot(row, row))
         root = 1.0 / math.sqrt(pivot) if is_constant(pivot) else jax.lax.rsqrt(pivot)
         inverse_diagonal.append(root)
         for i in range(j + 1, n):
-            entry = matrix[i][j]
-            for k in range(j):
-                entry = sub(entry, mul(triangle[i][k], triangle[j][k]))
-            triangle[i][j] = mul(entry, inverse_diagonal[j])
+            triangle[i][j] = mul(sub(matrix[i][j], dot(triangle[i][:j], row)), root)
     return triangle, inverse_diagonal
 
 
 def solve_lower(factor: tuple[SquareMatrix, list[Scalar]], b: Sequence[Scalar]) -> list[Scalar]:
     """L^-1 b for the factor L of `cholesky`."""
-    triangle, inverse_diagonal = factor
     x: list[Scalar] = []
-    for i, entry in enumerate(b):
-        for k in range(i):
-            entry = sub(entry, mul(triangle[i][k], x[k]))
-        x.append(mul(entry, inverse_diagonal[i]))
+    for row, inverse, entry in zip(*factor, b, strict=True):
+        x.append(mul(sub(entry, dot(row[: len(x)], x)), inverse))
     return x
 
 
 def solve_upper(factor: tuple[SquareMatrix, list[Scalar]], b: Sequence[Scalar]) -> list[Scalar]:
     """L^-T b for the factor L of `cholesky`."""
     triangle, inverse_diagonal = factor
-    n = len(b)
-    x: list[Scalar] = [0.0] * n
-    for i in reversed(range(n)):
-        entry = b[i]
-        for k in range(i + 1, n):
-            entry = sub(entry, mul(triangle[k][i], x[k]))
-        x[i] = mul(entry, inverse_diagonal[i])
+    x = list(b)
+    for i in reversed(range(len(b))):
+        column = [row[i] for row in triangle[i + 1 :]]
+        x[i] = mul(sub(x[i], dot(column, x[i + 1 :])), inverse_diagonal[i])
     return x
 
 

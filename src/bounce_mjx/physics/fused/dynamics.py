@@ -4,10 +4,9 @@ Under `jax.vmap` each scalar becomes one array over the batch. XLA fuses a physi
 loops; on a GPU one kernel computes all physics steps of a control step (`gpu/elementwise.py`).
 """
 
-import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +23,6 @@ from bounce_mjx.physics.scalars import (
     Scalar,
     Vec,
     add,
-    is_constant,
     mul,
     not_inlined,
     scalars_of,
@@ -147,12 +145,10 @@ def _substeps(
     def substeps(*scalars: Scalar) -> tuple[Scalar, ...]:
         control, parameters = given.unflatten(scalars[num_coordinates:])
         world = read_model(model.mj_model, parameters)
-        if control.air_drag is not None:
-            world = dataclasses.replace(world, air_drag=control.air_drag)
         motion = jax.lax.fori_loop(
             0,
             num_substeps,
-            lambda i, motion: substep(world, motion, _targets(control, i)),
+            lambda i, motion: substep(world, motion, _targets(control, i), control.air_drag),
             coordinates.unflatten(scalars[:num_coordinates]),
         )
         return tuple(jax.tree.leaves(motion))
@@ -189,38 +185,50 @@ def _paddle_position(
     return jax.jit(position, inline=True)
 
 
-def substep(model: FusedModel, motion: Motion, targets: tuple[Scalar, ...]) -> Motion:
-    """One physics step: the equivalent of `mj_step`."""
-    keep = _keep(model, motion)
-    pose = keep(chain.forward_kinematics(model.links, motion.q))
-    bias = keep(chain.bias_force(model.links, pose, motion.v, model.gravity))
-    inertia = keep(chain.mass_matrix(model.links, pose))
-    floating = chain.floating_force(model.links, pose, model.gravity)
-    applied, servo_damping = [], []
-    for link, servo, target, q, v, b, carried in zip(
-        model.links, model.servos, targets, motion.q, motion.v, bias, floating, strict=True
+def substep(
+    model: FusedModel, motion: Motion, targets: tuple[Scalar, ...], air_drag: Scalar | None = None
+) -> Motion:
+    """One physics step: the equivalent of `mj_step` with the integrators implicitfast and Euler:
+    semi-implicit Euler, implicit in the velocity-dependent forces of joint damping and, with
+    implicitfast, of servos (documentation, "Computation", numerical integration)."""
+    dt, links, balls = model.dt, model.links, motion.balls
+    frictional = balls[0].turning is not None or any(map(joint_friction.has_friction, links))
+    # The programs of models with friction are long.
+    keep = not_inlined if frictional else lambda values: values
+    pose = keep(chain.forward_kinematics(links, motion.q))
+    bias = keep(chain.bias_force(links, pose, motion.v, model.gravity))
+    inertia = keep(chain.mass_matrix(links, pose))
+    floating = chain.floating_force(links, pose, model.gravity)
+    applied, implicit = [], [list(row) for row in inertia]
+    for i, (link, servo, target, q, v) in enumerate(
+        zip(links, model.servos, targets, motion.q, motion.v, strict=True)
     ):
         force, derivative = servo_force(servo, target, q, v)
         spring = mul(link.stiffness, sub(q, link.spring_position))
-        applied.append(joint_force(servo, force, carried) - link.damping * v - add(b, spring))
-        servo_damping.append(derivative)
+        force = joint_force(servo, force, floating[i])
+        applied.append(force - link.damping * v - add(bias[i], spring))
+        damping = link.damping if model.implicit_damping else 0.0
+        if model.implicit_servos:
+            damping = damping - derivative
+        implicit[i][i] = add(implicit[i][i], dt * damping)
     factor = keep(chain.cholesky(inertia))
-    free = [_free_acceleration(model, i, ball) for i, ball in enumerate(motion.balls)]
-    balls = [
-        (ball.position, ball.velocity, ball.turning and ball.turning.spin) for ball in motion.balls
-    ]
+    free = [model.gravity * ball.weight for ball in model.balls]
+    if air_drag is not None:
+        free = [a + drag(air_drag, ball.velocity) for a, ball in zip(free, balls, strict=True)]
     response = contact_response(
         model, pose, factor, motion.v, chain.solve_lower(factor, applied), balls, free, keep
     )
-    return integrate(
-        model,
-        motion,
-        inertia,
-        servo_damping,
-        list(map(add, applied, response.joint_torque)),
-        [a + b for a, b in zip(free, response.ball_accelerations, strict=True)],
-        response.spin_accelerations,
-    )
+    factor = keep(chain.cholesky(implicit))
+    torque = chain.solve_lower(factor, list(map(add, applied, response.joint_torque)))
+    acceleration = chain.solve_upper(factor, torque)
+    v = Vec(a + dt * b for a, b in zip(motion.v, acceleration, strict=True))
+    q = Vec(a + dt * b for a, b in zip(motion.q, v, strict=True))
+    moved = []
+    for ball, *accelerations in zip(balls, free, *response[1:], strict=True):
+        velocity = ball.velocity + (accelerations[0] + accelerations[1]) * dt
+        turning = ball.turning and advance_turning(ball.turning, accelerations[2], dt)
+        moved.append(Ball(ball.position + velocity * dt, velocity, turning))
+    return Motion(q, v, tuple(moved))
 
 
 def servo_force(servo: Servo, target: Scalar, q: Scalar, v: Scalar) -> tuple[Scalar, Scalar]:
@@ -244,56 +252,3 @@ def joint_force(servo: Servo, force: Scalar, carried: Scalar) -> Scalar:
     if servo.carries_weight:
         return jnp.clip(add(force, carried), *servo.joint_range)
     return add(jnp.clip(force, *servo.joint_range), carried)
-
-
-def _free_acceleration(model: FusedModel, index: int, ball: Ball) -> Vec:
-    """Acceleration of a ball without contacts, m/s^2."""
-    free = model.gravity * model.balls[index].weight
-    if not is_constant(model.air_drag):
-        free = free + drag(model.air_drag, ball.velocity)
-    return free
-
-
-def integrate(
-    model: FusedModel,
-    motion: Motion,
-    inertia: chain.SquareMatrix,
-    servo_damping: Sequence[Scalar],
-    torque: list[Scalar],
-    ball_accelerations: Sequence[Vec],
-    spin_accelerations: Sequence[Vec],
-) -> Motion:
-    """MuJoCo's integrators implicitfast and Euler: semi-implicit Euler, implicit in the
-    velocity-dependent forces of joint damping and, with implicitfast, of servos (documentation,
-    "Computation", numerical integration)."""
-    dt = model.dt
-    implicit = [list(row) for row in inertia]
-    for i, (link, derivative) in enumerate(zip(model.links, servo_damping, strict=True)):
-        damping = link.damping if model.implicit_damping else 0.0
-        if model.implicit_servos:
-            damping = damping - derivative
-        implicit[i][i] = add(implicit[i][i], dt * damping)
-    factor = _keep(model, motion)(chain.cholesky(implicit))
-    acceleration = chain.solve_upper(factor, chain.solve_lower(factor, torque))
-    v = Vec(a + dt * b for a, b in zip(motion.v, acceleration, strict=True))
-    q = Vec(a + dt * b for a, b in zip(motion.q, v, strict=True))
-    accelerations = zip(motion.balls, ball_accelerations, spin_accelerations, strict=True)
-    return Motion(q, v, tuple(_move_ball(*ball, dt) for ball in accelerations))
-
-
-def _move_ball(ball: Ball, acceleration: Vec, spin_acceleration: Vec, dt: float) -> Ball:
-    """The ball one step later."""
-    velocity = ball.velocity + acceleration * dt
-    position = ball.position + velocity * dt
-    turning = ball.turning
-    if turning is not None:
-        turning = advance_turning(turning, spin_acceleration, dt)
-    return Ball(position, velocity, turning)
-
-
-def _keep(model: FusedModel, motion: Motion) -> Callable[[Any], Any]:
-    """`not_inlined` in the long programs of models with friction, else the identity."""
-    frictional = motion.balls[0].turning is not None or any(
-        map(joint_friction.has_friction, model.links)
-    )
-    return not_inlined if frictional else lambda values: values

@@ -97,41 +97,36 @@ def contact_and_friction(
     matrix = [[dot(a, b) for b in half] for a in half]
     for i, j in enumerate(joints):
         matrix[i][i] = add(matrix[i][i], links[j].friction_softness)
-    problem = DryFrictionProblem(
-        matrix=matrix,
-        inverse_diagonal=[1.0 / matrix[i][i] for i in range(len(joints))],
-        offset=[
-            add(dot(column, half_applied), mul(links[j].friction_damping, joint_velocity[j]))
-            for j, column in zip(joints, half, strict=True)
-        ],
-        coupling=[[dot(row, column) for column in half] for row in half_rows],
-        contact_matrix=contact_matrix,
-        contact_offset=contact_offset,
+    problem = not_inlined(
+        DryFrictionProblem(
+            matrix=matrix,
+            inverse_diagonal=[1.0 / matrix[i][i] for i in range(len(joints))],
+            offset=[
+                add(dot(column, half_applied), mul(links[j].friction_damping, joint_velocity[j]))
+                for j, column in zip(joints, half, strict=True)
+            ],
+            coupling=[[dot(row, column) for column in half] for row in half_rows],
+            contact_matrix=contact_matrix,
+            contact_offset=contact_offset,
+        )
     )
     limits = [links[j].frictionloss for j in joints]
-    contact, solved = _solve(not_inlined(problem), limits, contact_force)
-    for j, force in zip(joints, solved, strict=True):
-        friction[j] = force
-    return contact, friction
-
-
-def _solve(
-    problem: DryFrictionProblem, limits: Scalars, contact_force: ContactForce
-) -> tuple[tuple[Scalar, ...], tuple[Scalar, ...]]:
-    """Force of the contact, and dry friction of the k joints."""
 
     def one_round(_, forces):
-        contact, friction = forces
+        contact, solved = forces
         for _ in range(_SWEEPS):
-            friction = not_inlined(_sweep(problem, limits, contact, friction))
+            solved = not_inlined(_sweep(problem, limits, contact, solved))
             if len(contact) == 1:
                 # Without sliding friction the contact's force costs next to nothing.
-                contact = contact_force(problem.contact_matrix, _contact_offset(problem, friction))
-        return not_inlined(_eliminate_sticking(problem, limits, friction, contact_force))
+                contact = contact_force(problem.contact_matrix, _contact_offset(problem, solved))
+        return not_inlined(_eliminate_sticking(problem, limits, solved, contact_force))
 
     none = tuple(map(zero_like, problem.offset))
     start = contact_force(problem.contact_matrix, problem.contact_offset), none
-    return lax.fori_loop(0, _ROUNDS, one_round, start)
+    contact, solved = lax.fori_loop(0, _ROUNDS, one_round, start)
+    for j, force in zip(joints, solved, strict=True):
+        friction[j] = force
+    return contact, friction
 
 
 def _sweep(

@@ -102,8 +102,6 @@ class FusedModel:
     """Whether the integrator is implicit in the servos' damping (implicitfast), or not (Euler)."""
     implicit_damping: bool = True
     """Whether the integrator is implicit in the joints' damping."""
-    air_drag: Scalar = 0.0
-    """Deceleration of a ball by the air divided by its squared speed, 1/m."""
 
 
 def read_model(
@@ -167,11 +165,7 @@ def exact(rotation: Sequence[Sequence[Scalar]]) -> Mat:
 
 def _rotation(quaternion: Sequence[Scalar]) -> Mat:
     """Rotation matrix of a unit quaternion [w, x, y, z]."""
-    if not all(map(is_constant, quaternion)):
-        return quaternion_matrix(quaternion)
-    matrix = np.zeros(9)
-    mujoco.mju_quat2Mat(matrix, quaternion)
-    return exact(matrix.reshape(3, 3))
+    return exact(quaternion_matrix(quaternion))
 
 
 def _read_links(m: EditedModel) -> tuple[list[chain.Link], dict[int, Frame]]:
@@ -185,7 +179,7 @@ def _read_links(m: EditedModel) -> tuple[list[chain.Link], dict[int, Frame]]:
             continue
         parent, link_of[body] = (x[int(c.body_parentid[body])] for x in (frames, link_of))
         origin = parent.origin + parent.rotation @ m["body_pos", body]
-        rotation = exact(parent.rotation @ _rotation(c.body_quat[body]))
+        rotation = exact(parent.rotation @ _rotation(c.body_quat[body].tolist()))
         frame = Frame(origin, rotation)
         for joint in range(c.body_jntadr[body], c.body_jntadr[body] + c.body_jntnum[body]):
             slides = c.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
@@ -252,7 +246,7 @@ def _with_body(m: EditedModel, link: chain.Link, body: int, frame: Frame) -> cha
 
 def _inertial_frame(m: EditedModel, body: int) -> Frame:
     """Inertial frame of a body in the body's frame."""
-    frame = Frame(m.peek("body_ipos", body), _rotation(m.model.body_iquat[body]))
+    frame = Frame(m.peek("body_ipos", body), _rotation(m.model.body_iquat[body].tolist()))
     return _apply_flag(m.model.body_sameframe[body], frame, frame)
 
 

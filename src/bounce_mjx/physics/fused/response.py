@@ -65,7 +65,7 @@ def contact_response(
     factor: tuple[chain.SquareMatrix, list[jax.Array]],
     joint_velocity: Sequence[Scalar],
     half_applied: Sequence[Scalar],
-    balls: Sequence[tuple[Vec, Vec, Vec | None]],
+    balls: Sequence[Any],
     free_accelerations: Sequence[Vec],
     keep: Keep,
 ) -> Response:
@@ -74,10 +74,10 @@ def contact_response(
     Args:
       factor: Cholesky factor L of the arm's inertia matrix.
       half_applied: L^-1 times the joint torques without the contacts and dry friction.
-      balls: position, velocity and spin of each in the world; a spin may be None without friction.
+      balls: `dynamics.Ball` of each.
       free_accelerations: the balls' accelerations without the contacts.
     """
-    positions, velocities, spins = zip(*balls, strict=True)
+    positions, velocities, turnings = zip(*balls, strict=True)
     geometry = [keep(contact) for contact in _contacts(model, pose, positions)]
     rows, springs, softnesses = [], [], []
     for pair, contact in zip(model.contacts, geometry, strict=True):
@@ -97,7 +97,7 @@ def contact_response(
     for row, half, spring in zip(rows, halves, springs, strict=True):
         speed = row.axis @ relative(row.contact, velocities)
         for i, torque in row.torques.items():
-            speed = add(speed, torque @ spins[i])
+            speed = add(speed, torque @ turnings[i].spin)
         speed = add(speed, dot(row.joints, joint_velocity))
         free = add(row.axis @ relative(row.contact, free_accelerations), dot(half, half_applied))
         offsets.append(add(add(free, mul(row.contact.damping, speed)), spring))
