@@ -320,11 +320,9 @@ UNSUPPORTED = {
         '<tendon><fixed><joint joint="Joint2" coef="1"/></fixed></tendon><actuator>',
         "ntendon",
     ),
-    "actuator dynamics": ("<position ", '<position timeconst="0.01" ', "position servo"),
     "actuator delay": ("<position ", '<position delay="0.005" nsample="9" ', "delay"),
     "actuator damping": ("<position ", '<position damping="1" ', "damping"),
     "actuator armature": ("<position ", '<position armature="0.1" ', "armature"),
-    "motor": ('<position name="act2"', '<motor name="act2"', "position servo"),
     "another actuator": (
         "</actuator>",
         '<motor site="paddle_home" gear="0 0 1 0 0 0"/></actuator>',

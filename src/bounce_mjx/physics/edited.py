@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.physics.parameters import Array, PhysicsParameters, check_shapes
+from bounce_mjx.physics.parameters import Array, PhysicsParameters
 from bounce_mjx.physics.scalars import Scalar, Vec, add, mul
 from bounce_mjx.robot.arm import raise_solver_limits
 from bounce_mjx.robot.model import find_addresses, to_direct_solref
@@ -232,7 +232,7 @@ def edited_model(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> muj
     Raises:
       UserError: an array does not have the shape of its field.
     """
-    check_shapes(parameters, len(find_addresses(mj_model).arm_joints))
+    check_shapes(mj_model, parameters)
     numbers = jax.tree.map(lambda x: np.asarray(x, np.float64).tolist(), parameters)
     m, model = edited(mj_model, numbers), copy.copy(mj_model)
     for field in m.fields:
@@ -255,6 +255,23 @@ def own_parameters(mj_model: mujoco.MjModel) -> PhysicsParameters:
     own |= {name: own[name][0] for name in ("ball_mass", "ball_radius")}
     own |= dict.fromkeys(("contact_stiffness", "contact_damping", "contact_friction"))
     return PhysicsParameters(**own)
+
+
+def check_shapes(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> None:
+    """Checks the shapes of one environment's parameters.
+
+    Raises:
+      UserError: an array does not have the shape of the model's own.
+    """
+    own, entries = own_parameters(mj_model)._asdict(), dict(parameters.entries or {})
+    given = parameters._asdict() | entries | {"entries": None}
+    for name, value in given.items():
+        if value is not None and jnp.shape(value) != np.shape(own.get(name)):
+            raise UserError(
+                f"the physics parameter {name} has the shape {jnp.shape(value)}; give an array of "
+                f"the shape {np.shape(own.get(name))} for one environment, and batch environments "
+                "with jax.vmap"
+            )
 
 
 def link_bodies(mj_model: mujoco.MjModel) -> tuple[np.ndarray, ...]:

@@ -10,10 +10,10 @@ import mujoco
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics.control import Control
+from bounce_mjx.physics.edited import check_shapes
 from bounce_mjx.physics.fused import dynamics
-from bounce_mjx.physics.parameters import PhysicsParameters, PhysicsState, check_shapes
+from bounce_mjx.physics.parameters import PhysicsParameters, PhysicsState
 from bounce_mjx.physics.support import unsupported_feature
-from bounce_mjx.robot.model import find_addresses
 
 
 class Engine(NamedTuple):
@@ -63,12 +63,11 @@ def make_engine(mj_model: mujoco.MjModel, choice: str) -> Engine:
         # MJX takes seconds to import.
         from bounce_mjx.physics import mjx_engine as implementation
     constants = implementation.read_model(mj_model)
-    num_joints = len(find_addresses(mj_model).arm_joints)
 
     def step(
         parameters: PhysicsParameters, state: PhysicsState, control: Control, num_substeps: int
     ) -> PhysicsState:
-        check_shapes(parameters, num_joints)
+        check_shapes(mj_model, parameters)
         return implementation.step(constants, parameters, state, control, num_substeps)
 
     return Engine(name, reason, step, functools.partial(implementation.paddle_position, constants))

@@ -5,10 +5,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-
-from bounce_mjx.errors import UserError
 
 Array = np.ndarray | jax.Array
 
@@ -70,29 +67,3 @@ class PhysicsParameters(NamedTuple):
 
 MODEL_PARAMETERS = PhysicsParameters()
 """The model's own parameters: no value is replaced."""
-
-
-def shapes(num_joints: int) -> dict[str, tuple[int, ...]]:
-    """Shape of each parameter for one environment, by name; `entries` has none."""
-    per_joint = "servo_gain servo_damping force_limit armature damping frictionloss link_mass"
-    sizes = dict.fromkeys(per_joint.split(), num_joints)
-    sizes |= {"paddle_position": 3, "paddle_rotation": 4, "gravity": 3}
-    names = [name for name in PhysicsParameters._fields if name != "entries"]
-    return {name: (sizes[name],) if name in sizes else () for name in names}
-
-
-def check_shapes(parameters: PhysicsParameters, num_joints: int) -> None:
-    """Checks the shapes of one environment's parameters.
-
-    Raises:
-      UserError: an array does not have the shape of its field.
-    """
-    entries = parameters.entries or {}
-    given = parameters._asdict() | dict(entries)
-    for name, shape in (shapes(num_joints) | dict.fromkeys(entries, ())).items():
-        if given[name] is not None and jnp.shape(given[name]) != shape:
-            raise UserError(
-                f"the physics parameter {name} has the shape {jnp.shape(given[name])}; give an "
-                f"array of the shape {shape} for one environment, and batch environments with "
-                "jax.vmap"
-            )

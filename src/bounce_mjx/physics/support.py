@@ -112,13 +112,7 @@ def _fused(m: mujoco.MjModel) -> Iterator[Feature]:
     yield "a paddle that is not a box", m.geom_type[paddle] != mujoco.mjtGeom.mjGEOM_BOX
     plain = all(_is_plain(m, ball) for ball in balls)
     yield "a ball that is not one free homogeneous sphere", not plain
-    servos = (
-        m.nu == len(joints)
-        and np.all(m.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE)
-        and np.all(m.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED)
-        and np.all(m.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE)
-    )
-    yield "actuators other than one position servo on each joint", not servos
+    yield "actuators other than one position servo on each joint", m.nu != len(joints)
     pairs = [frozenset(map(int, pair)) for pair in zip(m.pair_geom1, m.pair_geom2, strict=True)]
     geoms = [ball.geom for ball in balls]
     with_paddle = {frozenset((paddle, geom)) for geom in geoms}

@@ -412,16 +412,17 @@ class _Builder:
     def _replace_servos(self, scene: mujoco.MjSpec, names: tuple[str, ...]) -> None:
         """Replaces the actuators if the config has servos."""
         config = self._config
-        if config.servo_stiffness is None:
+        settings = config.servo_stiffness, config.servo_damping, config.servo_force_limit
+        if not any(settings):
             return
-        if len(config.servo_stiffness) != len(names):
+        counts = [len(numbers or ()) for numbers in settings]
+        if set(counts) != {len(names)}:
             raise UserError(
-                f"{len(names)} acting joints ({_list(names)}), but servo_stiffness has "
-                f"{len(config.servo_stiffness)} numbers; give one for each joint"
+                f"{len(names)} acting joints ({_list(names)}), but servo_stiffness, servo_damping "
+                f"and servo_force_limit have {counts} numbers; give one of each for each joint"
             )
         for actuator in list(scene.actuators):
             scene.delete(actuator)
-        settings = config.servo_stiffness, config.servo_damping, config.servo_force_limit
         for name, stiffness, damping, limit in zip(names, *settings, strict=True):
             joint = mujoco.mjtTrn.mjTRN_JOINT
             actuator = scene.add_actuator(name=f"servo/{name}", target=name, trntype=joint)

@@ -99,16 +99,6 @@ class RobotConfig(StrictModel):
     limits: LimitsConfig = LimitsConfig()
     """The arm's own limits, as its manufacturer states them."""
 
-    @pydantic.model_validator(mode="after")
-    def _check_servos(self):
-        servos = (self.servo_stiffness, self.servo_damping, self.servo_force_limit)
-        if len({None if numbers is None else len(numbers) for numbers in servos}) > 1:
-            raise ValueError(
-                "servo_stiffness, servo_damping and servo_force_limit differ in length; give one "
-                "number of each for each acting joint, or none of the three"
-            )
-        return self
-
 
 OF_SITE = RobotConfig.model_fields.keys() - {"site", "limits"}
 """Settings that change nothing without a site."""

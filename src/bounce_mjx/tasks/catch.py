@@ -27,7 +27,6 @@ CATCH_SECONDS, MIN_CAUGHT = 2.0, 0.95
 """A caught ball is at rest within this time of the first contact, s; least share of caught ones."""
 LOST_DEPTH, FLOOR = 0.05, 0.02
 """The episode ends when the ball is farther below the paddle, or the paddle nearer the floor, m."""
-GRAVITY = 9.81
 
 
 class Rewards(task.StrictModel):
@@ -111,7 +110,7 @@ class Catch(task.Task):
         speed = SPEEDS[0] + (jnp.minimum(SPEEDS[1], fastest) - SPEEDS[0]) * draws[3]
         outward = jnp.arctan2(home[1], home[0]) + MAX_DIRECTION * (2.0 * draws[4] - 1.0)
         velocity = -speed * _direction(outward)
-        rising = jnp.array([0.0, 0.0, 0.5 * GRAVITY]) * seconds
+        rising = jnp.array([0.0, 0.0, 0.5 * task.GRAVITY]) * seconds
         return home + offset - seconds * velocity, velocity + rising
 
     def reset(self, start: task.Start) -> CatchState:
@@ -125,13 +124,13 @@ class Catch(task.Task):
         # The mean of the step, in which the servos' speed rises and falls.
         velocity = (offset - state.offset) / dt
         # A ball that touches nothing falls freely.
-        touches = truth.ball_velocity[2] - state.fall > -0.5 * GRAVITY * dt
+        touches = truth.ball_velocity[2] - state.fall > -0.5 * task.GRAVITY * dt
         resting = touches & (task.length(velocity) < REST_SPEED)
         contact = jnp.where(touches | (state.contact > 0.0), state.contact + dt, 0.0)
         rest = jnp.where(resting, state.rest + dt, 0.0)
         in_time = contact < CATCH_SECONDS + 0.5 * dt
         caught = state.caught | (in_time & (rest > REST_SECONDS - 0.5 * dt))
-        drop = 2.0 * GRAVITY * jnp.maximum(offset[2] - REST_HEIGHT, 0.0)
+        drop = 2.0 * task.GRAVITY * jnp.maximum(offset[2] - REST_HEIGHT, 0.0)
         values = {
             "centre": task.length(offset[:2]),
             "fall": task.safe_sqrt(jnp.sum(jnp.square(velocity)) + drop),

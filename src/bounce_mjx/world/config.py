@@ -130,6 +130,7 @@ class WorldConfig(RobotSettings):
     """The world of an environment: the robot, the ball, the time steps, the resets, the sensors
     and the randomisation. The config of a task extends it."""
 
+    former = {"estimator": ...}
     task: ClassVar[Any] = None
     """The class of the task that these settings are of (`task.Task`)."""
 
@@ -159,13 +160,12 @@ class WorldConfig(RobotSettings):
     @pydantic.model_validator(mode="before")
     @classmethod
     def _read_former(cls, values: Any) -> Any:
-        """The configs of 0.1 have the constants of a Kalman filter, and those of 0.1.0 the noise of
-        a reset among the other settings."""
-        if not isinstance(values, dict):
+        """The configs of 0.1.0 have the noise of a reset among the other settings."""
+        if not (isinstance(values, dict) and values.keys() & _FORMER_RESET_KEYS):
             return values
-        kept = {key: value for key, value in values.items() if key != "estimator"}
+        kept = dict(values)
         moved = {now: kept.pop(key) for key, now in _FORMER_RESET_KEYS.items() if key in kept}
-        return kept | ({"reset": moved | dict(kept.get("reset", {}))} if moved else {})
+        return kept | {"reset": moved | dict(kept.get("reset", {}))}
 
     @pydantic.model_validator(mode="after")
     def _check_times(self):
@@ -174,11 +174,6 @@ class WorldConfig(RobotSettings):
             raise ValueError(
                 f"control_dt {self.control_dt} is not a whole number of physics steps of "
                 f"{self.physics_dt} s; choose a multiple of physics_dt"
-            )
-        if self.episode_seconds < self.control_dt:
-            raise ValueError(
-                f"episode_seconds {self.episode_seconds} is shorter than one control step of "
-                f"{self.control_dt} s; choose a longer episode"
             )
         return self
 
@@ -295,5 +290,5 @@ class WorldConfig(RobotSettings):
 
     @property
     def episode_steps(self) -> int:
-        """Control steps in one episode."""
-        return round(self.episode_seconds / self.control_dt)
+        """Control steps in one episode, at least one."""
+        return max(1, round(self.episode_seconds / self.control_dt))

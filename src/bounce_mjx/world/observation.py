@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
-import pydantic
 from pydantic import Field
 
 from bounce_mjx.config.settings import StrictModel
@@ -58,6 +57,8 @@ class ObservationConfig(StrictModel):
     """The quantities that the policy sees, and how many values of each: 0 for none, 1 for the
     newest, N for the last N, the newest first."""
 
+    former = {"position": "measured"}
+
     joint_angles: Annotated[History, Quantity(None, "rad", "state")] = 1
     """Measured positions of the acting joints."""
     ball_position: Annotated[History, Quantity(3, "m", "state", True)] = 1
@@ -81,19 +82,6 @@ class ObservationConfig(StrictModel):
     """Time since the camera picture of the ball was taken."""
     velocity: Literal["measured", "differences"] = "measured"
     """Source of ball_velocity: a sensor, or the differences between camera pictures."""
-
-    @pydantic.model_validator(mode="before")
-    @classmethod
-    def _read_former(cls, values: Any) -> Any:
-        """The configs of 0.1 have a source of ball_position, and a Kalman filter as a source."""
-        if not isinstance(values, dict):
-            return values
-        if "filter" in (values.get("position"), values.get("velocity")):
-            raise ValueError(
-                "the Kalman filter is gone; set velocity to differences and leave position out, "
-                "or use bounce-mjx 0.1.0"
-            )
-        return {name: x for name, x in values.items() if (name, x) != ("position", "measured")}
 
     @classmethod
     def quantities(cls) -> dict[str, Quantity]:

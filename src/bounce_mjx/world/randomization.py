@@ -107,13 +107,12 @@ class Term(NamedTuple):
 
 _FACTOR = (1e-3, 1e3)
 
-# Keys of earlier runs that are gone, which had no effect without a value.
-_FORMER = "restitution_slope", "air_lift"
-
 
 class RandomizationConfig(StrictModel):
     """The world that each episode samples: a range for each term, null for off. In a file, a term
     of several joints or axes may have a range for each: two lists, of lower and of upper ends."""
+
+    former = {"restitution_slope": None, "air_lift": None}
 
     restitution: Annotated[Sampled, Term((), 0.85, (0.6, 0.98), "contact_damping")] = None
     """Restitution of the ball on the paddle, 0.6 to 0.98; the model's is 0.85."""
@@ -202,13 +201,6 @@ class RandomizationConfig(StrictModel):
     def __hash__(self) -> int:
         """Configs are keys of compiled programs; pydantic's own hash cannot take `shares`."""
         return hash(self.model_dump_json())
-
-    @pydantic.model_validator(mode="before")
-    @classmethod
-    def _read_former(cls, values: Any) -> Any:
-        if not isinstance(values, dict):
-            return values
-        return {key: x for key, x in values.items() if key not in _FORMER or x is not None}
 
     @pydantic.model_validator(mode="after")
     def _check_ranges(self):

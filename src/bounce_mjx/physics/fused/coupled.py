@@ -12,7 +12,6 @@ the steps across zones short enough. Every state runs the same operations, so th
 GPU kernel do not diverge.
 """
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -24,10 +23,11 @@ from bounce_mjx.physics.fused import chain
 from bounce_mjx.physics.fused.contact import ContactModel
 from bounce_mjx.physics.fused.pyramid import edge_regulariser
 from bounce_mjx.physics.scalars import (
+    ZERO3,
     Scalar,
+    Vec,
     add,
     dot,
-    is_constant,
     mul,
     not_inlined,
     sub,
@@ -40,8 +40,7 @@ from bounce_mjx.physics.scalars import (
 # to 0.99999, all reach rounding error; with 16 and 6 steps, 373 do not.
 _NEWTON_STEPS = 24
 _SEARCH_STEPS = 10
-_ROOT = math.sqrt(2.0)
-Scalars = tuple[Scalar, ...]
+_EDGES = tuple(map(Vec, ((1.0, 1.0, 0.0), (1.0, -1.0, 0.0), (1.0, 0.0, 1.0), (1.0, 0.0, -1.0))))
 
 
 class Cone(NamedTuple):
@@ -161,36 +160,17 @@ def _ahead(start: list[Scalar], length: Scalar, step: list[Scalar]) -> list[Scal
 
 def _response(
     cones: Sequence[Cone], y: Sequence[Scalar]
-) -> tuple[list[Scalar], list[tuple[Scalars, ...]]]:
-    """f(y) [3 k], and for each contact the three columns of L."""
+) -> tuple[list[Scalar], list[tuple[Vec, ...]]]:
+    """f(y) [3 k], and for each contact the columns of L, one for each edge of its pyramid."""
     forces, factors = [], []
     for k, cone in enumerate(cones):
-        force, factor = _pyramid_response(cone, tuple(y[3 * k : 3 * k + 3]))
-        forces += [jnp.where(cone.touches, f, 0.0) for f in force]
-        factors.append(
-            tuple(
-                tuple(x if is_constant(x) else jnp.where(cone.touches, x, 0.0) for x in column)
-                for column in factor
-            )
-        )
+        own, columns, root = Vec(y[3 * k : 3 * k + 3]), [], lax.rsqrt(cone.regulariser)
+        force = ZERO3
+        for edge in _EDGES:
+            pull = edge @ own
+            column = edge * jnp.where(cone.touches & (pull < 0.0), root, 0.0)
+            force = force - column * (pull * root)
+            columns.append(column)
+        forces += force
+        factors.append(tuple(columns))
     return forces, factors
-
-
-def _pyramid_response(cone: Cone, y: Scalars) -> tuple[Scalars, tuple[Scalars, ...]]:
-    pull, *tangential = y
-    root = lax.rsqrt(cone.regulariser)
-    normal, forces, columns, both = 0.0, [], [], []
-    for a in tangential:
-        plus, minus = (jnp.maximum(-x, 0.0) * (root * root) for x in (pull + a, pull - a))
-        normal = add(normal, plus + minus)
-        forces.append(plus - minus)
-        p, m = (jnp.where(x > 0.0, 1.0, 0.0) for x in (plus, minus))
-        both.append(p * m)
-        columns.append(((p - m) * root, (p + m - (2.0 - _ROOT) * p * m) * root))
-    first, second = both
-    together = _ROOT * (first + second) - (2.0 * _ROOT - 2.0) * first * second
-    return (normal, *forces), (
-        (columns[0][0], columns[0][1], 0.0),
-        (columns[1][0], 0.0, columns[1][1]),
-        (together * root, 0.0, 0.0),
-    )
