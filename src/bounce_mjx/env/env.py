@@ -10,25 +10,11 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.physics import (
-    Control,
-    Engine,
-    PhysicsParameters,
-    PhysicsState,
-    edited_model,
-    make_engine,
-)
+from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, edited_model
+from bounce_mjx.physics.engine import Engine, make_engine
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
+from bounce_mjx.robot import model as robot_model
 from bounce_mjx.robot.balls import BALLS_APART
-from bounce_mjx.robot.model import (
-    check_unedited,
-    data_at,
-    find_addresses,
-    fingerprint,
-    joint_names,
-    joint_ranges,
-    load_model,
-)
 from bounce_mjx.task.rewards import check_names
 from bounce_mjx.task.task import Start, Step, Task, TaskStep
 from bounce_mjx.world import noise
@@ -134,12 +120,12 @@ class Env:
         self.mj_model: mujoco.MjModel = world_model(config)
         self.engine: Engine = make_engine(self.mj_model, config.physics)
         self.layout = config.layout
-        self.addresses = find_addresses(self.mj_model)
+        self.addresses = robot_model.find_addresses(self.mj_model)
         self._check_start()
         self._actuators = Actuators(config, self.mj_model)
         self._sensors = Sensors(config, self.mj_model, self.engine, self.task)
         self._randomize = randomize
-        self._fingerprint = fingerprint(self.mj_model)
+        self._fingerprint = robot_model.fingerprint(self.mj_model)
 
     def __reduce__(self) -> tuple:
         """Pickled as its settings; a copy is built again."""
@@ -147,8 +133,8 @@ class Env:
 
     def _check_start(self) -> None:
         """Checks that the joint angles of a reset, and the heights over the paddle, fit the arm."""
-        config, model, acting = self.config, self.mj_model, joint_names(self.mj_model)
-        angles, ranges = config.default_joint_angles, joint_ranges(model)
+        config, model, acting = self.config, self.mj_model, robot_model.joint_names(self.mj_model)
+        angles, ranges = config.default_joint_angles, robot_model.joint_ranges(model)
         if len(angles) != len(acting):
             name = f"the MJCF file {config.mjcf}" if config.mjcf else "the model"
             raise UserError(
@@ -162,7 +148,7 @@ class Env:
                     f"default_joint_angles has {angle:g} for {name}, whose range is {low:.4g} to "
                     f"{high:.4g}; give radians, or metres for a slide, within the range"
                 )
-        paddle = data_at(model, angles).geom_xpos[self.addresses.paddle_geom, 2]
+        paddle = robot_model.data_at(model, angles).geom_xpos[self.addresses.paddle_geom, 2]
         for name, height in config.heights.items():
             if height <= paddle:
                 raise UserError(
@@ -223,7 +209,7 @@ class Env:
             The queues of delayed actions and pictures are only as long as the config's ranges need.
           share: probability that each term is sampled; by default, the config's.
         """
-        check_unedited(self.mj_model, self._fingerprint)
+        robot_model.check_unedited(self.mj_model, self._fingerprint)
         given = self.ranges() if ranges is None else ranges
         rng, world, clock = self._sample_world(rng, given, share)
         own_parameters = MODEL_PARAMETERS
@@ -273,7 +259,7 @@ class Env:
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one control step under the action [n], clipped to [-1, 1]. A NaN action ends the
         episode and acts as 0."""
-        check_unedited(self.mj_model, self._fingerprint)
+        robot_model.check_unedited(self.mj_model, self._fingerprint)
         now = state.pipeline_state
         control, actuation = self.control(now, action)
         physics = self.engine.step(now.parameters, now.physics, control, self.config.num_substeps)
@@ -482,7 +468,7 @@ class Env:
 
 def world_model(config: WorldConfig, visual: bool = True) -> mujoco.MjModel:
     """Compiles the model of a world; `visual` and the errors are those of `load_model`."""
-    mj_model = load_model(
+    mj_model = robot_model.load_model(
         config.mjcf, config.physics_dt, visual, config.robot, num_balls=config.num_balls
     )
     if config.friction is None:

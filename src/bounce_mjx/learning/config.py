@@ -5,15 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import pydantic
 from pydantic import Field
 
-from bounce_mjx.config.settings import (
-    Count,
-    Duration,
-    NonNegative,
-    Positive,
-    Steps,
-    StrictModel,
-    UnitInterval,
-)
+from bounce_mjx.config import settings
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.tasks.registry import class_in_file, is_file
 
@@ -25,56 +17,56 @@ PPO_NAME = "ppo"
 """Name of the algorithm of this package."""
 
 
-class PPOConfig(StrictModel):
+class PPOConfig(settings.StrictModel):
     """Proximal policy optimisation (Schulman et al. 2017) with a KL-adaptive learning rate."""
 
-    num_envs: Count = 4096
+    num_envs: settings.Count = 4096
     """Environments that run in parallel."""
-    rollout_length: Count = 32
+    rollout_length: settings.Count = 32
     """Control steps of each environment in one iteration."""
-    training_episode_seconds: Duration | None = None
+    training_episode_seconds: settings.Duration | None = None
     """Time limit of training episodes, s; null for the environment's limit. A shorter one shows
     more resets and worlds; a time-out is bootstrapped."""
-    num_epochs: Count = 4
+    num_epochs: settings.Count = 4
     """Passes over the data of one iteration."""
-    num_minibatches: Count = 8
+    num_minibatches: settings.Count = 8
     """Minibatches in one epoch; must divide num_envs * rollout_length."""
-    learning_rate: Positive = 3e-4
+    learning_rate: settings.Positive = 3e-4
     """Learning rate at the start."""
-    min_learning_rate: Positive = 1e-5
+    min_learning_rate: settings.Positive = 1e-5
     """Lower limit of the learning rate."""
-    max_learning_rate: Positive = 3e-3
+    max_learning_rate: settings.Positive = 3e-3
     """Upper limit of the learning rate at the start of training."""
-    final_max_learning_rate: Positive = 1e-4
+    final_max_learning_rate: settings.Positive = 1e-4
     """Upper limit of the learning rate from decay_steps on."""
-    decay_steps: Steps = 20_000_000
+    decay_steps: settings.Steps = 20_000_000
     """Environment steps over which the upper limit decays exponentially."""
-    target_kl: NonNegative = 0.01
+    target_kl: settings.NonNegative = 0.01
     """Target KL divergence of one update, to which the learning rate adapts; 0 keeps the rate
     constant."""
-    discount: UnitInterval = 0.98
+    discount: settings.UnitInterval = 0.98
     """Discount factor of a control step."""
-    gae_lambda: UnitInterval = 0.95
+    gae_lambda: settings.UnitInterval = 0.95
     """Lambda of the generalised advantage estimation."""
-    clip_epsilon: Positive = 0.2
+    clip_epsilon: settings.Positive = 0.2
     """Clipping range of the probability ratio."""
-    entropy_cost: NonNegative = 0.0
+    entropy_cost: settings.NonNegative = 0.0
     """Weight of the entropy bonus."""
-    value_cost: NonNegative = 0.5
+    value_cost: settings.NonNegative = 0.5
     """Weight of the squared value error."""
-    max_grad_norm: Positive = 1.0
+    max_grad_norm: settings.Positive = 1.0
     """Global norm to which a gradient is clipped."""
-    reward_scale: Positive = 0.1
+    reward_scale: settings.Positive = 0.1
     """Factor by which the trainer scales the reward."""
-    init_noise_std: Positive = 0.4
+    init_noise_std: settings.Positive = 0.4
     """Standard deviation of the action noise at the start."""
-    min_noise_std: NonNegative = 0.0
+    min_noise_std: settings.NonNegative = 0.0
     """Lower bound of that standard deviation, averaged over the environments, whose bounds lie
     evenly between 0 and twice this; 0 for none. Without it a long training forgets how to
     recover."""
-    hidden_layers: Annotated[tuple[Count, ...], Field(min_length=1)] = (128, 128)
+    hidden_layers: Annotated[tuple[settings.Count, ...], Field(min_length=1)] = (128, 128)
     """Widths of the hidden layers of the policy, and of the value network by default."""
-    critic_layers: Annotated[tuple[Count, ...], Field(min_length=1)] | None = None
+    critic_layers: Annotated[tuple[settings.Count, ...], Field(min_length=1)] | None = None
     """Widths of the hidden layers of the value network; null for those of the policy, or for none
     on top of a shared part."""
     shared_critic: bool = False

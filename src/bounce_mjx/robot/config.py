@@ -7,21 +7,14 @@ from typing import Annotated
 import pydantic
 from pydantic import Field
 
-from bounce_mjx.config.settings import (
-    Coordinate,
-    Finite,
-    NonNegative,
-    Positive,
-    Speed,
-    StrictModel,
-)
+from bounce_mjx.config import settings
 
-Vector = tuple[Coordinate, Coordinate, Coordinate]
-HalfSize = Annotated[Positive, Field(le=1.0)]
-Quaternion = tuple[Finite, Finite, Finite, Finite]
+Vector = tuple[settings.Coordinate, settings.Coordinate, settings.Coordinate]
+HalfSize = Annotated[settings.Positive, Field(le=1.0)]
+Quaternion = tuple[settings.Finite, settings.Finite, settings.Finite, settings.Finite]
 
 
-class PaddleConfig(StrictModel):
+class PaddleConfig(settings.StrictModel):
     """The paddle: a box on a handle."""
 
     half_size: tuple[HalfSize, HalfSize, HalfSize] = (0.05, 0.065, 0.0035)
@@ -31,16 +24,16 @@ class PaddleConfig(StrictModel):
     """Centre of the blade in the frame of the site, m; the handle runs to it from the site."""
     quaternion: Quaternion = (0.7071067811865476, 0.0, -0.7071067811865476, 0.0)
     """Orientation of the blade in the frame of the site: w, x, y, z."""
-    mass: Annotated[Positive, Field(le=20.0)] = 0.1
+    mass: Annotated[settings.Positive, Field(le=20.0)] = 0.1
     """Mass of the blade, kg; the handle has none."""
 
 
-class BallConfig(StrictModel):
+class BallConfig(settings.StrictModel):
     """The ball."""
 
-    radius: Annotated[Positive, Field(le=1.0)] = 0.019
+    radius: Annotated[settings.Positive, Field(le=1.0)] = 0.019
     """Radius, m."""
-    mass: Positive = 0.0027
+    mass: settings.Positive = 0.0027
     """Mass, kg."""
 
     @pydantic.model_validator(mode="after")
@@ -55,17 +48,17 @@ class BallConfig(StrictModel):
         return self
 
 
-class LimitsConfig(StrictModel):
+class LimitsConfig(settings.StrictModel):
     """The arm's own limits, one number for each acting joint. Between two actions the servo targets
     then move within the first three (`robot.setpoints`); without them they jump."""
 
-    velocity: tuple[Speed, ...] | None = None
+    velocity: tuple[settings.Speed, ...] | None = None
     """Largest velocity of a joint's command, rad/s; null for no limits of the command."""
-    acceleration: tuple[Annotated[Positive, Field(le=1e4)], ...] | None = None
+    acceleration: tuple[Annotated[settings.Positive, Field(le=1e4)], ...] | None = None
     """Largest acceleration of a joint's command, rad/s^2; needed with velocity."""
-    jerk: tuple[Annotated[Positive, Field(le=1e6)], ...] | None = None
+    jerk: tuple[Annotated[settings.Positive, Field(le=1e6)], ...] | None = None
     """Largest jerk of a joint's command, rad/s^3; null for none."""
-    torque: tuple[Annotated[Positive, Field(le=1e5)], ...] | None = None
+    torque: tuple[Annotated[settings.Positive, Field(le=1e5)], ...] | None = None
     """Largest torque of each servo, N m; null for those of the servos."""
 
     @pydantic.model_validator(mode="after")
@@ -77,7 +70,7 @@ class LimitsConfig(StrictModel):
         return self
 
 
-class RobotConfig(StrictModel):
+class RobotConfig(settings.StrictModel):
     """Adoption of an arm whose MJCF has no paddle and no ball."""
 
     site: str | None = None
@@ -88,12 +81,12 @@ class RobotConfig(StrictModel):
     """The paddle of an adopted arm."""
     ball: BallConfig = BallConfig()
     """The ball of an adopted arm."""
-    servo_stiffness: tuple[Positive, ...] | None = None
+    servo_stiffness: tuple[settings.Positive, ...] | None = None
     """Stiffness of the position servo that replaces the actuator of each acting joint, N m/rad or
     N/m; null keeps the MJCF's servos."""
-    servo_damping: tuple[NonNegative, ...] | None = None
+    servo_damping: tuple[settings.NonNegative, ...] | None = None
     """Damping of each replaced servo, N m s/rad or N s/m."""
-    servo_force_limit: tuple[Positive | None, ...] | None = None
+    servo_force_limit: tuple[settings.Positive | None, ...] | None = None
     """Force limit of each replaced servo, N m or N; null for a servo without one."""
 
     limits: LimitsConfig = LimitsConfig()

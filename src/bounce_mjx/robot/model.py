@@ -13,16 +13,7 @@ import numpy as np
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
-from bounce_mjx.robot.arm import (
-    BALL_BODY_NAME,
-    PADDLE_GEOM_NAME,
-    build_arm,
-    compile_spec,
-    is_position_servo,
-    joint_name,
-    locate,
-    read_spec,
-)
+from bounce_mjx.robot import arm
 from bounce_mjx.robot.balls import MAX_BALLS, add_balls, ball_name
 from bounce_mjx.robot.config import RobotConfig
 
@@ -70,11 +61,11 @@ def scene_spec(mjcf: Path | None, robot: RobotConfig) -> tuple[mujoco.MjSpec, Pa
     Raises:
       UserError: the file is missing, is no MJCF, or holds no arm that can do the task.
     """
-    path = resource_path("mjcf/bounce_ball.xml") if mjcf is None else locate(mjcf)
+    path = resource_path("mjcf/bounce_ball.xml") if mjcf is None else arm.locate(mjcf)
     if robot.site is None:
-        return read_spec(path), path
+        return arm.read_spec(path), path
     try:
-        return build_arm(path, robot).spec, path
+        return arm.build_arm(path, robot).spec, path
     except UserError as error:
         raise name_file(path, error) from error
 
@@ -112,7 +103,7 @@ def load_model(
     from_geoms = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     if not visual and spec.compiler.inertiafromgeom != from_geoms:
         spec.compiler.discardvisual = True
-    mj_model = compile_spec(spec, path)
+    mj_model = arm.compile_spec(spec, path)
     try:
         addresses = find_addresses(mj_model)
         _check_servos(mj_model, addresses)
@@ -138,7 +129,7 @@ def paddle_home(
       UserError: as `load_model`.
     """
     mj_model = load_model(mjcf, 0.001, visual=False, robot=robot)
-    paddle = data_at(mj_model, joint_angles).geom(PADDLE_GEOM_NAME).xpos
+    paddle = data_at(mj_model, joint_angles).geom(arm.PADDLE_GEOM_NAME).xpos
     x, y, z = (round(float(c), 4) for c in paddle)
     return x, y, z
 
@@ -229,8 +220,8 @@ def _check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
         raise UserError("an actuator with several controls; drive each joint by a <position>")
     for joint, actuator in zip(addresses.arm_joints, addresses.actuators, strict=True):
         direct = mj_model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_NONE
-        if not (direct and is_position_servo(mj_model, actuator)):
-            name = joint_name(mj_model, joint)
+        if not (direct and arm.is_position_servo(mj_model, actuator)):
+            name = arm.joint_name(mj_model, joint)
             raise UserError(
                 f"an actuator on {name} that is not a position servo; drive it by "
                 f'<position joint="{name}"/>, without a timeconst (env.randomization.servo_lag '
@@ -245,12 +236,12 @@ def find_addresses(mj_model: mujoco.MjModel) -> Addresses:
       UserError: a needed name is missing; the text starts with the missing part.
     """
     body = mujoco.mjtObj.mjOBJ_BODY
-    balls = [_find_ball(mj_model, BALL_BODY_NAME)]
+    balls = [_find_ball(mj_model, arm.BALL_BODY_NAME)]
     for name in map(ball_name, range(1, MAX_BALLS)):
         if mujoco.mj_name2id(mj_model, body, name) < 0:
             break
         balls.append(_find_ball(mj_model, name))
-    paddle_geom = _find(mj_model, mujoco.mjtObj.mjOBJ_GEOM, PADDLE_GEOM_NAME)
+    paddle_geom = _find(mj_model, mujoco.mjtObj.mjOBJ_GEOM, arm.PADDLE_GEOM_NAME)
     servos = _servos(mj_model)
     joints = tuple(servos)
     return Addresses(
@@ -284,7 +275,7 @@ def _find_ball(mj_model: mujoco.MjModel, name: str) -> BallAddresses:
 
 def joint_names(mj_model: mujoco.MjModel) -> tuple[str, ...]:
     """Names of the acting joints."""
-    return tuple(joint_name(mj_model, j) for j in find_addresses(mj_model).arm_joints)
+    return tuple(arm.joint_name(mj_model, j) for j in find_addresses(mj_model).arm_joints)
 
 
 def _servos(mj_model: mujoco.MjModel) -> dict[int, int]:
@@ -298,7 +289,7 @@ def _servos(mj_model: mujoco.MjModel) -> dict[int, int]:
         if int(mj_model.jnt_type[joint]) not in acting:
             continue
         if joint in servos:
-            name = joint_name(mj_model, joint)
+            name = arm.joint_name(mj_model, joint)
             raise UserError(f"several actuators on {name}; give it exactly one position servo")
         servos[joint] = actuator
     if not servos:
@@ -333,6 +324,6 @@ def _find(mj_model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:
     index = mujoco.mj_name2id(mj_model, kind, name)
     if index < 0:
         noun = kind.name.removeprefix("mjOBJ_").lower()
-        needed = f"{BALL_BODY_NAME} and {PADDLE_GEOM_NAME}"
+        needed = f"{arm.BALL_BODY_NAME} and {arm.PADDLE_GEOM_NAME}"
         raise UserError(f"no {noun} named {name}; the task needs the names {needed}")
     return index

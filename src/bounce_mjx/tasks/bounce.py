@@ -12,14 +12,7 @@ import pydantic
 from pydantic import Field
 
 from bounce_mjx import task
-from bounce_mjx.config.settings import (
-    Ascending,
-    Coordinate,
-    Distance,
-    Length,
-    NonNegative,
-    Positive,
-)
+from bounce_mjx.config import settings
 from bounce_mjx.lazy import jax, jnp
 from bounce_mjx.tasks.bounce_rewards import BounceReward, RewardInputs
 
@@ -74,19 +67,22 @@ class BounceObservation(task.ObservationConfig):
 class BounceConfig(task.WorldConfig):
     """The world, and the task of bouncing: target heights, bounces, ends and reward."""
 
-    target_height_range: Annotated[tuple[Length, Length], Ascending] = (0.4, 0.6)
+    target_height_range: Annotated[tuple[settings.Length, settings.Length], settings.Ascending] = (
+        0.4,
+        0.6,
+    )
     """Range of the target height, m; equal ends fix it."""
-    bounce_min_velocity: Annotated[NonNegative, Field(le=10.0)] = 0.01
+    bounce_min_velocity: Annotated[settings.NonNegative, Field(le=10.0)] = 0.01
     """Vertical velocity above which the ball counts as rising, m/s."""
-    bounce_max_distance: Annotated[Positive, Field(le=1.0)] = 0.12
+    bounce_max_distance: Annotated[settings.Positive, Field(le=1.0)] = 0.12
     """Vertical distance between ball and paddle within which a reversal is a bounce, m."""
-    apex_tolerance: Distance = 0.1
+    apex_tolerance: settings.Distance = 0.1
     """Distance below the target up to which an apex continues the bounce count, m."""
-    min_ball_height: Coordinate = 0.05
+    min_ball_height: settings.Coordinate = 0.05
     """The episode ends when the ball is below this height, m."""
-    max_height_above_target: Length = 1.0
+    max_height_above_target: settings.Length = 1.0
     """The episode ends when the ball is higher than this above the target height, m."""
-    max_horizontal_distance: Annotated[Positive, Field(le=20.0)] = 1.5
+    max_horizontal_distance: Annotated[settings.Positive, Field(le=20.0)] = 1.5
     """The episode ends when |x| or |y| of the ball exceeds this, m."""
     observation: BounceObservation = BounceObservation()
     """The quantities that the policy sees."""

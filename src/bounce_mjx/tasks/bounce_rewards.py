@@ -9,17 +9,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from bounce_mjx.config.settings import (
-    Coordinate,
-    Distance,
-    Finite,
-    Length,
-    NonNegative,
-    Positive,
-    Speed,
-    StrictModel,
-    Velocity,
-)
+from bounce_mjx.config import settings
 from bounce_mjx.lazy import jax, jnp
 from bounce_mjx.task import RewardTerm, gaussian, horizontal_distance, safe_sqrt
 
@@ -79,13 +69,13 @@ class PositionReward(RewardTerm):
     """Horizontal position: keep the ball above the target point, especially when it is near the
     paddle."""
 
-    weight: Finite = 2.0
+    weight: settings.Finite = 2.0
     """Weight of the term."""
-    vertical_scale: Length = 0.15
+    vertical_scale: settings.Length = 0.15
     """Decay of the proximity weight with the vertical distance between ball and paddle, m."""
-    base_scale: Length = 0.1
+    base_scale: settings.Length = 0.1
     """Width of the Gaussian far from the paddle, m."""
-    proximity_gain: NonNegative = 3.0
+    proximity_gain: settings.NonNegative = 3.0
     """Factor by which the Gaussian is wider at the paddle."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
@@ -96,11 +86,11 @@ class PositionReward(RewardTerm):
 class OutOfPositionReward(RewardTerm):
     """Out of position: a smooth penalty for a large horizontal error."""
 
-    magnitude: NonNegative = 2.0
+    magnitude: settings.NonNegative = 2.0
     """Largest penalty."""
-    threshold: Distance = 0.05
+    threshold: settings.Distance = 0.05
     """Horizontal error at half the penalty, m."""
-    scale: Length = 0.03
+    scale: settings.Length = 0.03
     """Width of the sigmoid, m."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
@@ -110,19 +100,19 @@ class OutOfPositionReward(RewardTerm):
 class VelocityMatchingReward(RewardTerm):
     """Velocity matching: pass the target height at the desired speed."""
 
-    weight: Finite = 2.0
+    weight: settings.Finite = 2.0
     """Weight of the term."""
-    desired_velocity: Velocity = 0.5
+    desired_velocity: settings.Velocity = 0.5
     """Vertical velocity wanted at the target height, m/s."""
-    near_distance: Length = 0.05
+    near_distance: settings.Length = 0.05
     """Height error below which the current velocity is used, m."""
-    rising_scale: Speed = 0.2
+    rising_scale: settings.Speed = 0.2
     """Width of the sigmoid between falling and rising, m/s."""
-    below_scale: Length = 0.02
+    below_scale: settings.Length = 0.02
     """Width of the sigmoid between above and below the target, m."""
-    near_scale: Length = 0.01
+    near_scale: settings.Length = 0.01
     """Width of the Gaussian around the target height, m."""
-    error_scale: Speed = 0.8
+    error_scale: settings.Speed = 0.8
     """Width of the Gaussian of the velocity error, m/s."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
@@ -148,9 +138,9 @@ class VelocityMatchingReward(RewardTerm):
 class HeightReward(RewardTerm):
     """Height: be near the target height."""
 
-    weight: Finite = 4.5
+    weight: settings.Finite = 4.5
     """Weight of the term."""
-    scale: Length = 0.15
+    scale: settings.Length = 0.15
     """Width of the Gaussian of the height error, m."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
@@ -160,9 +150,9 @@ class HeightReward(RewardTerm):
 class HeightProgressReward(RewardTerm):
     """Height progress: get the ball high at all, so that the policy discovers hitting early."""
 
-    base_height: Coordinate = 0.2
+    base_height: settings.Coordinate = 0.2
     """Ball height above which the term grows, m."""
-    gain: NonNegative = 2.0
+    gain: settings.NonNegative = 2.0
     """Reward for each metre above the base height, 1/m."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
@@ -172,19 +162,19 @@ class HeightProgressReward(RewardTerm):
 class ControlledUpwardReward(RewardTerm):
     """Controlled upward velocity: rise at the speed that reaches the target, in position."""
 
-    weight: Finite = 1.5
+    weight: settings.Finite = 1.5
     """Weight of the term."""
-    position_scale: Length = 0.02
+    position_scale: settings.Length = 0.02
     """Width of the Gaussian of the horizontal error, m."""
-    min_ideal_velocity: Annotated[NonNegative, Field(le=100.0)] = 0.5
+    min_ideal_velocity: Annotated[settings.NonNegative, Field(le=100.0)] = 0.5
     """Lower limit of the ideal launch velocity, m/s."""
-    max_ideal_velocity: Annotated[NonNegative, Field(le=100.0)] = 3.0
+    max_ideal_velocity: Annotated[settings.NonNegative, Field(le=100.0)] = 3.0
     """Upper limit of the ideal launch velocity, m/s."""
-    velocity_scale: Speed = 0.5
+    velocity_scale: settings.Speed = 0.5
     """Width of the Gaussian of the velocity error, m/s."""
-    rising_scale: Speed = 0.1
+    rising_scale: settings.Speed = 0.1
     """Width of the sigmoid between falling and rising, m/s."""
-    velocity_limit: Speed = 1.5
+    velocity_limit: settings.Speed = 1.5
     """Upward velocity above which the term no longer grows, m/s."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
@@ -199,11 +189,11 @@ class ControlledUpwardReward(RewardTerm):
 class ConsecutiveBouncesReward(RewardTerm):
     """Consecutive bounces: the logarithm of the count, in position."""
 
-    weight: Finite = 0.8
+    weight: settings.Finite = 0.8
     """Weight of the term."""
-    gain: NonNegative = 0.5
+    gain: settings.NonNegative = 0.5
     """Factor of the logarithm."""
-    position_scale: Length = 0.05
+    position_scale: settings.Length = 0.05
     """Width of the Gaussian of the horizontal error, m."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
@@ -216,15 +206,15 @@ class ConsecutiveBouncesReward(RewardTerm):
 class HighBounceCountReward(RewardTerm):
     """High bounce count: proportional to the count once it passes the threshold, in position."""
 
-    weight: Finite = 0.3
+    weight: settings.Finite = 0.3
     """Weight of the term."""
-    gain: NonNegative = 0.15
+    gain: settings.NonNegative = 0.15
     """Reward per bounce."""
-    position_scale: Length = 0.05
+    position_scale: settings.Length = 0.05
     """Width of the Gaussian of the horizontal error, m."""
-    threshold: Finite = 2.0
+    threshold: settings.Finite = 2.0
     """Number of bounces at half the activation."""
-    scale: Positive = 0.5
+    scale: settings.Positive = 0.5
     """Width of the sigmoid, bounces."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
@@ -235,17 +225,17 @@ class HighBounceCountReward(RewardTerm):
 class AlignmentReward(RewardTerm):
     """Alignment: keep the paddle under the ball, especially when it hits the ball."""
 
-    weight: Finite = 0.6
+    weight: settings.Finite = 0.6
     """Weight of the term."""
-    vertical_scale: Length = 0.1
+    vertical_scale: settings.Length = 0.1
     """Decay of the proximity weight with the vertical distance between ball and paddle, m."""
-    scale: Length = 0.03
+    scale: settings.Length = 0.03
     """Width of the Gaussian of the horizontal distance between ball and paddle, m."""
-    proximity_gain: NonNegative = 2.0
+    proximity_gain: settings.NonNegative = 2.0
     """Factor of the proximity weight."""
-    bounce_boost: NonNegative = 3.0
+    bounce_boost: settings.NonNegative = 3.0
     """Factor on the step of a bounce."""
-    gain: NonNegative = 0.3
+    gain: settings.NonNegative = 0.3
     """Overall factor."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
@@ -258,15 +248,15 @@ class AlignmentReward(RewardTerm):
 class PaddleHomeReward(RewardTerm):
     """Paddle home: return to the home height while the ball is away."""
 
-    weight: Finite = 1.5
+    weight: settings.Finite = 1.5
     """Weight of the term."""
-    scale: Length = 0.05
+    scale: settings.Length = 0.05
     """Width of the Gaussian of the paddle's height error, m."""
-    distance_gain: NonNegative = 0.5
+    distance_gain: settings.NonNegative = 0.5
     """Extra reward while the ball is far."""
-    distance_threshold: Coordinate = 0.15
+    distance_threshold: settings.Coordinate = 0.15
     """Vertical distance between ball and paddle at half the extra reward, m."""
-    distance_scale: Length = 0.03
+    distance_scale: settings.Length = 0.03
     """Width of the sigmoid, m."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
@@ -277,11 +267,11 @@ class PaddleHomeReward(RewardTerm):
 class ExcessiveUpwardReward(RewardTerm):
     """Excessive upward velocity: a smooth penalty for a ball hit too hard."""
 
-    magnitude: NonNegative = 1.0
+    magnitude: settings.NonNegative = 1.0
     """Largest penalty."""
-    threshold: Velocity = 3.5
+    threshold: settings.Velocity = 3.5
     """Upward velocity at half the penalty, m/s."""
-    scale: Speed = 0.3
+    scale: settings.Speed = 0.3
     """Width of the sigmoid, m/s."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
@@ -292,15 +282,15 @@ class DownwardVelocityReward(RewardTerm):
     """Downward velocity: positive for a falling ball, according to the specification's formula. The
     specification's text calls the term a penalty; a negative weight makes it one."""
 
-    weight: Finite = 1.0
+    weight: settings.Finite = 1.0
     """Weight of the term; its sign chooses between the specification's formula and its text."""
-    gain: NonNegative = 0.3
+    gain: settings.NonNegative = 0.3
     """Slope of the clipped factor, s/m."""
-    limit: NonNegative = 0.5
+    limit: settings.NonNegative = 0.5
     """Upper limit of the clipped factor."""
-    threshold: Velocity = 0.2
+    threshold: settings.Velocity = 0.2
     """Downward speed at half the activation, m/s."""
-    scale: Speed = 0.2
+    scale: settings.Speed = 0.2
     """Width of the sigmoid, m/s."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
@@ -311,9 +301,9 @@ class DownwardVelocityReward(RewardTerm):
 class PaddleHeightViolationReward(RewardTerm):
     """Paddle height violation: a linear penalty beyond the tolerance around home."""
 
-    gain: NonNegative = 20.0
+    gain: settings.NonNegative = 20.0
     """Penalty for each metre beyond the tolerance, 1/m."""
-    tolerance: Distance = 0.1
+    tolerance: settings.Distance = 0.1
     """Height error of the paddle that costs nothing, m."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
@@ -323,7 +313,7 @@ class PaddleHeightViolationReward(RewardTerm):
 class ActionRateReward(RewardTerm):
     """Action rate: minus the squared change of the action."""
 
-    weight: Finite = 1e-4
+    weight: settings.Finite = 1e-4
     """Weight of the term."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
@@ -333,23 +323,23 @@ class ActionRateReward(RewardTerm):
 class JointVelocityReward(RewardTerm):
     """Joint velocity: minus the sum of the squared joint velocities."""
 
-    weight: Finite = 1e-4
+    weight: settings.Finite = 1e-4
     """Weight of the term."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
         return -jnp.sum(jnp.square(inputs.joint_velocity))
 
 
-class BounceReward(StrictModel):
+class BounceReward(settings.StrictModel):
     """The reward terms: each has a weight and the constants of its formula."""
 
-    target_x: Coordinate = 0.58856
+    target_x: settings.Coordinate = 0.58856
     """Target point of the ball, x, m."""
-    target_y: Coordinate = 0.0
+    target_y: settings.Coordinate = 0.0
     """Target point of the ball, y, m."""
-    paddle_home_height: Coordinate = 0.05
+    paddle_home_height: settings.Coordinate = 0.05
     """Home height of the paddle, m."""
-    gravity: Annotated[Positive, Field(le=100.0)] = 9.81
+    gravity: Annotated[settings.Positive, Field(le=100.0)] = 9.81
     """Gravity in the ballistic formulas, m/s^2 (the simulated gravity is the MJCF's)."""
     position: PositionReward = PositionReward()
     out_of_position: OutOfPositionReward = OutOfPositionReward()

@@ -8,19 +8,9 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 import pydantic
 from pydantic import Field
 
-from bounce_mjx.config.settings import (
-    Coordinate,
-    Duration,
-    Finite,
-    Friction,
-    NonNegative,
-    Positive,
-    Speed,
-    StrictModel,
-    whole_number,
-)
+from bounce_mjx.config import settings
 from bounce_mjx.errors import UserError, shorten
-from bounce_mjx.robot.config import OF_SITE, RobotConfig, is_packaged
+from bounce_mjx.robot.config import OF_SITE, RobotConfig, Vector, is_packaged
 from bounce_mjx.world.observation import ObservationConfig, ObservationLayout
 from bounce_mjx.world.randomization import TERMS, RandomizationConfig
 
@@ -28,7 +18,7 @@ PADDLE_HOME = (0.59356, 0.0, 0.0498)
 """Centre of the paddle of the project's own arm at a reset, m."""
 
 
-NumBalls = Annotated[int, pydantic.BeforeValidator(whole_number), Field(ge=1, le=3)]
+NumBalls = Annotated[int, pydantic.BeforeValidator(settings.whole_number), Field(ge=1, le=3)]
 """Number of balls."""
 
 
@@ -77,25 +67,25 @@ class Command(NamedTuple):
         raise UserError(f"{label} is {shorten(repr(value))}, but must be {wanted}{unit}")
 
 
-class ActionConfig(StrictModel):
+class ActionConfig(settings.StrictModel):
     """What an action adds to."""
 
     base: Literal["measured", "target"] = "measured"
     """measured: the measured joint angle. target: the last servo target, with which a joint reaches
     its full speed despite latency."""
-    max_lead: Annotated[Positive, Field(le=3.0)] = 0.15
+    max_lead: Annotated[settings.Positive, Field(le=3.0)] = 0.15
     """Largest distance of the last target from the measured angle, rad; for the base target."""
 
 
-class ResetConfig(StrictModel):
+class ResetConfig(settings.StrictModel):
     """The noise of a reset, to which the terms `joint_start` and `ball_start` of the randomisation
     add."""
 
-    joint_angles: Annotated[NonNegative, Field(le=3.0)] = 0.1
+    joint_angles: Annotated[settings.NonNegative, Field(le=3.0)] = 0.1
     """Half-width of the uniform noise of the joint angles, rad."""
-    joint_velocities: Annotated[NonNegative, Field(le=10.0)] = 0.01
+    joint_velocities: Annotated[settings.NonNegative, Field(le=10.0)] = 0.01
     """Half-width of the uniform noise of the joint velocities, rad/s."""
-    ball_position: Annotated[NonNegative, Field(le=1.0)] = 0.01
+    ball_position: Annotated[settings.NonNegative, Field(le=1.0)] = 0.01
     """Half-width of the uniform noise of each ball coordinate, m."""
 
 
@@ -106,21 +96,21 @@ _FORMER_RESET_KEYS = {
 }
 
 
-class RobotSettings(StrictModel):
+class RobotSettings(settings.StrictModel):
     """The robot, its sensors and its ball: the settings that a named world may have."""
 
     robot: RobotConfig = RobotConfig()
     """Adoption of an arm."""
-    physics_dt: Annotated[Positive, Field(ge=1e-5, le=0.1)] = 0.001
+    physics_dt: Annotated[settings.Positive, Field(ge=1e-5, le=0.1)] = 0.001
     """Physics time step, s; at most an eighth of a period of the contact, 2.5 ms by default."""
-    control_dt: Annotated[Positive, Field(ge=1e-5, le=0.1)] = 0.01
+    control_dt: Annotated[settings.Positive, Field(ge=1e-5, le=0.1)] = 0.01
     """Time between two actions, s; a whole number of physics steps."""
-    friction: Friction | None = None
+    friction: settings.Friction | None = None
     """Coefficient of sliding friction between ball and paddle; null for the MJCF's, which is 0 for
     the project's own robot."""
-    action_scale: Annotated[Positive, Field(le=0.5)] = 0.02
+    action_scale: Annotated[settings.Positive, Field(le=0.5)] = 0.02
     """Change of the servo target for an action of 1, rad."""
-    max_joint_velocity: Speed = 2.0 * math.pi
+    max_joint_velocity: settings.Speed = 2.0 * math.pi
     """The episode ends when a joint is faster than this, rad/s."""
     randomization: RandomizationConfig = RandomizationConfig()
     """The world that each episode samples."""
@@ -140,17 +130,21 @@ class WorldConfig(RobotSettings):
     mjcf: Path | None = None
     """MJCF file to simulate; null for the project's own robot. package:NAME/FILE is a file of an
     installed Python package, and menagerie:NAME a model of MuJoCo Menagerie."""
-    episode_seconds: Duration = 20.0
+    episode_seconds: settings.Duration = 20.0
     """Length of an episode before it is truncated, s."""
     action: ActionConfig = ActionConfig()
     """What an action adds to."""
-    default_joint_angles: Annotated[tuple[Finite, ...], Field(min_length=1)] = tuple(
+    default_joint_angles: Annotated[tuple[settings.Finite, ...], Field(min_length=1)] = tuple(
         math.radians(a) for a in (0, 40, 110, 0, -60, 0)
     )
     """Position of each acting joint at a reset, before noise, rad."""
     num_balls: NumBalls = 1
     """Number of balls; those that the MJCF lacks are copies of its first one."""
-    ball_init_pos: tuple[Coordinate, Coordinate, Coordinate] = (0.58856, 0.0, 0.45)
+    ball_init_pos: Vector = (
+        0.58856,
+        0.0,
+        0.45,
+    )
     """Ball position at a reset, before noise, m; each further ball starts 0.1 m above the last."""
     reset: ResetConfig = ResetConfig()
     """The noise of a reset."""
