@@ -86,7 +86,7 @@ def watching(camera: bool, velocity: str):
             physics = PhysicsState(jnp.asarray(qpos[0]), jnp.asarray(qvel[0]))
             pipeline = start.pipeline_state._replace(physics=physics)
             # The first memory must also have the ball of the trajectory.
-            memory = env._sensors.first(env._sensed(pipeline, env.kinematics(pipeline)))
+            memory = env._sensors.first(pipeline, env.kinematics(pipeline))
             pipeline = pipeline._replace(sensing=memory)
             start = start.replace(pipeline_state=pipeline, obs=env.observe(pipeline))
 

@@ -23,7 +23,7 @@ from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.noise import Clock
 from bounce_mjx.world.observation import Kinematics
 from bounce_mjx.world.randomization import TERMS, Ranges, World, physics_parameters, sample_world
-from bounce_mjx.world.sensing import Sensed, Sensing, Sensors
+from bounce_mjx.world.sensing import Sensing, Sensors
 
 # MuJoCo's mjMAXVAL: a coordinate beyond it has diverged and counts as non-finite.
 _MAX_COORDINATE = 1e10
@@ -247,7 +247,7 @@ class Env:
         task = self.task.reset(Start(truth, command, task_draws))
         state = state._replace(task=task, command=self._next_command(task, command))
         if self._sensors.are_needed:
-            state = state._replace(sensing=self._sensors.first(self._sensed(state, truth)))
+            state = state._replace(sensing=self._sensors.first(state, truth))
         return State(
             pipeline_state=state,
             obs=self.observe(state, truth),
@@ -301,7 +301,7 @@ class Env:
             "too_fast": jnp.any(jnp.abs(truth.joint_velocities) > self.config.max_joint_velocity),
         }
         if now.sensing is not None:
-            now = now._replace(sensing=self._sensors.next(now.sensing, self._sensed(now, truth)))
+            now = now._replace(sensing=self._sensors.next(now, truth))
         dtype = truth.ball_position.dtype
         metrics = _metrics(done, dtype) | {name: end.astype(dtype) for name, end in ends.items()}
         return state.replace(
@@ -398,10 +398,6 @@ class Env:
         check_names(named, "command", following, command)
         return following
 
-    def _sensed(self, state: EnvState, truth: Kinematics) -> Sensed:
-        known = _entries(state.command) | {"action": state.last_action}
-        return Sensed(truth, state.world, state.clock, known, state.actuation.setpoint)
-
     def kinematics(self, state: EnvState) -> Kinematics:
         """True positions and velocities of one environment's state, read from its physics."""
         addresses, (qpos, qvel) = self.addresses, (state.physics.qpos, state.physics.qvel)
@@ -426,7 +422,7 @@ class Env:
         Args:
           truth: `kinematics(state)`, if it has already been computed.
         """
-        command = _entries(state.command)
+        command = {name: value[None] for name, value in state.command.items()}
         if state.sensing is None:
             truth = self.kinematics(state) if truth is None else truth
             values = truth._asdict() | command
@@ -500,8 +496,3 @@ def _metrics(done: TaskStep, dtype: jnp.dtype) -> dict[str, jax.Array]:
     """The metrics of a task's step, each []."""
     numbers = {name: jnp.asarray(value, dtype) for name, value in done.metrics.items()}
     return {f"reward/{name}": value for name, value in done.reward.items()} | numbers
-
-
-def _entries(command: dict[str, jax.Array]) -> dict[str, jax.Array]:
-    """Commands as quantities of the observation, each [1]."""
-    return {name: value[None] for name, value in command.items()}

@@ -7,18 +7,9 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.robot.arm import (
-    BALL_BODY_NAME,
-    BODY_FIELDS,
-    PADDLE_BODY_NAME,
-    Arm,
-    ServoSettings,
-    build_arm,
-    compile_spec,
-    locate,
-)
+from bounce_mjx.robot import arm as arms
 from bounce_mjx.robot.config import RobotConfig
-from bounce_mjx.robot.model import find_addresses, name_file
+from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.robot.pose import PaddlePose, find_pose, mounts
 
 # Velocity of a joint that the action 1 commands: rad/s of a hinge, m/s of a slide. The Peitian
@@ -41,8 +32,8 @@ class Adoption(NamedTuple):
     action_scale: float
     """Change of the servo target for an action of 1, rad; of a slide, m."""
     pose: PaddlePose
-    arm: Arm
-    servos: tuple[ServoSettings, ...]
+    arm: arms.Arm
+    servos: tuple[arms.ServoSettings, ...]
     """The servo of each acting joint."""
 
 
@@ -59,31 +50,31 @@ def adopt(mjcf: Path, config: RobotConfig, control_dt: float, is_mount_given: bo
     Raises:
       UserError: the arm cannot do the task.
     """
-    path = locate(mjcf)
-    config = config.model_copy(update={f"servo_{name}": None for name in ServoSettings._fields})
-    try:
-        arm = build_arm(path, config)
+    path = arms.locate(mjcf)
+    config = config.model_copy(
+        update={f"servo_{name}": None for name in arms.ServoSettings._fields}
+    )
+    with arms.naming(path):
+        arm = arms.build_arm(path, config)
         arm.spec.compiler.discardvisual = True
         # So every body stays: the search turns the paddle's.
         arm.spec.compiler.fusestatic = False
-        model = compile_spec(arm.spec, path)
+        model = arms.compile_spec(arm.spec, path)
         check_as_alone(arm, model)
         choices = [config.paddle] if is_mount_given else mounts(config.paddle)
         pose = find_pose(model, [servo.force_limit for servo in arm.servos], choices)
         servos, scale = _servos(model, arm, pose, control_dt)
         update = {"paddle": pose.mount}
         if servos is not arm.servos:
-            columns = zip(ServoSettings._fields, zip(*servos, strict=True), strict=True)
+            columns = zip(arms.ServoSettings._fields, zip(*servos, strict=True), strict=True)
             update |= {f"servo_{name}": column for name, column in columns}
         adopted = RobotConfig.model_validate(config.model_copy(update=update).model_dump())
-        return Adoption(adopted, scale, pose, build_arm(path, adopted), servos)
-    except UserError as error:
-        raise name_file(path, error) from error
+        return Adoption(adopted, scale, pose, arms.build_arm(path, adopted), servos)
 
 
 def _servos(
-    model: mujoco.MjModel, arm: Arm, pose: PaddlePose, control_dt: float
-) -> tuple[tuple[ServoSettings, ...], float]:
+    model: mujoco.MjModel, arm: arms.Arm, pose: PaddlePose, control_dt: float
+) -> tuple[tuple[arms.ServoSettings, ...], float]:
     """The servos, which are the MJCF's own if these suit, and the action scale."""
     addresses = find_addresses(model)
     joints = list(addresses.arm_joints)
@@ -110,11 +101,13 @@ def _servos(
     damping = 2.0 * frequency * pose.inertia
     stiffness = damping * speed / scale
     made = zip(stiffness, damping, limits, strict=True)
-    servos = tuple(ServoSettings(_four_digits(k), _four_digits(d), limit) for k, d, limit in made)
+    servos = tuple(
+        arms.ServoSettings(_four_digits(k), _four_digits(d), limit) for k, d, limit in made
+    )
     return servos, _four_digits(scale)
 
 
-def check_as_alone(arm: Arm, model: mujoco.MjModel) -> None:
+def check_as_alone(arm: arms.Arm, model: mujoco.MjModel) -> None:
     """Compares the bodies of an arm in the task's scene to those of its file compiled alone.
 
     Args:
@@ -123,11 +116,11 @@ def check_as_alone(arm: Arm, model: mujoco.MjModel) -> None:
     Raises:
       UserError: a body's pose, mass or inertia differs, or a joint's axis.
     """
-    added = (BALL_BODY_NAME, PADDLE_BODY_NAME)
+    added = (arms.BALL_BODY_NAME, arms.PADDLE_BODY_NAME)
     bodies = [b for b in range(1, model.nbody) if model.body(b).name not in added]
     joints = list(find_addresses(model).arm_joints)
     for field, expected in arm.alone.items():
-        here = getattr(model, field)[bodies if field in BODY_FIELDS else joints]
+        here = getattr(model, field)[bodies if field in arms.BODY_FIELDS else joints]
         error = np.max(np.abs(here - expected))
         if error > _EQUAL * np.max(np.abs(expected)):
             raise UserError(

@@ -160,6 +160,16 @@ def _compiling(path: Path) -> Iterator[None]:
         mujoco.set_mju_user_warning(earlier)
 
 
+@contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Names an MJCF file in a `UserError` about its content, if the name is missing."""
+    try:
+        yield
+    except UserError as error:
+        named = str(path) in str(error)
+        raise error if named else UserError(f"the MJCF file {path} has {error}") from error
+
+
 def find_site(model: mujoco.MjModel, config: RobotConfig) -> tuple[int, np.ndarray, np.ndarray]:
     """The body that holds the paddle, and the site's position [3] and quaternion [4] in it.
 

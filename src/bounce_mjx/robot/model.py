@@ -64,15 +64,8 @@ def scene_spec(mjcf: Path | None, robot: RobotConfig) -> tuple[mujoco.MjSpec, Pa
     path = resource_path("mjcf/bounce_ball.xml") if mjcf is None else arm.locate(mjcf)
     if robot.site is None:
         return arm.read_spec(path), path
-    try:
+    with arm.naming(path):
         return arm.build_arm(path, robot).spec, path
-    except UserError as error:
-        raise name_file(path, error) from error
-
-
-def name_file(path: Path, error: UserError) -> UserError:
-    """The error with the file's name, if it is missing."""
-    return error if str(path) in str(error) else UserError(f"the MJCF file {path} has {error}")
 
 
 def load_model(
@@ -104,14 +97,12 @@ def load_model(
     if not visual and spec.compiler.inertiafromgeom != from_geoms:
         spec.compiler.discardvisual = True
     mj_model = arm.compile_spec(spec, path)
-    try:
+    with arm.naming(path):
         addresses = find_addresses(mj_model)
         _check_servos(mj_model, addresses)
         if (present := len(addresses.balls)) != num_balls:
             raise UserError(f"{present} balls, but num_balls is {num_balls}; set it to {present}")
         _limit_torques(mj_model, addresses, robot or RobotConfig())
-    except UserError as error:
-        raise name_file(path, error) from error
     mj_model.opt.timestep = physics_dt
     _check_step(mj_model)
     return mj_model

@@ -11,11 +11,9 @@ import mujoco
 from bounce_mjx.physics import Engine
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
 from bounce_mjx.robot.model import find_addresses, scatter
-from bounce_mjx.robot.setpoints import Setpoint
 from bounce_mjx.world import noise
 from bounce_mjx.world.actuation import entry_at
 from bounce_mjx.world.config import WorldConfig
-from bounce_mjx.world.noise import Clock
 from bounce_mjx.world.observation import Kinematics
 from bounce_mjx.world.randomization import World
 
@@ -59,22 +57,9 @@ class Sensing(NamedTuple):
     """What the task remembers of the measurements."""
 
 
-class Sensed(NamedTuple):
-    """What the sensors see of a control step."""
-
-    truth: Kinematics
-    """After the step."""
-    world: World
-    clock: Clock
-    """After the step."""
-    known: dict[str, jax.Array]
-    """Values [size] of the quantities that need no sensor: the commands and the action."""
-    setpoint: Setpoint | None
-    """The joints' commands at the end of the step, if an action adds to them."""
-
-
 class Sensors:
-    """The sensors of a world."""
+    """The sensors of a world; `now` is the state (`env.EnvState`) after a reset or a control step,
+    and `truth` its kinematics."""
 
     def __init__(self, config: WorldConfig, mj_model: mujoco.MjModel, engine: Engine, task: Any):
         """Chooses what has to be simulated.
@@ -90,10 +75,10 @@ class Sensors:
         sees_paddle = observation.paddle_position or observation.lengths("task")
         self._misjudges_paddle = bool(sees_paddle and _PADDLE_TERMS & terms)
 
-    def first(self, now: Sensed) -> Sensing:
+    def first(self, now: Any, truth: Kinematics) -> Sensing:
         """Memory at a reset: the histories repeat the first measurements, and the ball has rested
         until then."""
-        config, truth, ball = self._config, now.truth, _position_and_velocity(now.truth)
+        config, ball = self._config, _position_and_velocity(truth)
         latency = (config.randomization.ball_latency or (0.0, 0.0))[1]
         rate = config.randomization.camera_rate
         # The greatest age of the last picture if none is lost.
@@ -104,7 +89,7 @@ class Sensors:
         before = Picture(
             truth.ball_position, truth.ball_velocity, zero + _LONG_AGO, zero - _LONG_AGO
         )
-        picture, measured = self._measure(now, balls, before)
+        picture, measured = self._measure(now, truth, balls, before)
         task, own = self._task.first_quantities(measured)
         values = measured | own
         histories = {
@@ -113,10 +98,11 @@ class Sensors:
         }
         return Sensing(balls, picture, histories, task)
 
-    def next(self, before: Sensing, now: Sensed) -> Sensing:
-        """Memory after a control step."""
-        balls = jnp.concatenate([_position_and_velocity(now.truth)[None], before.balls[:-1]])
-        picture, measured = self._measure(now, balls, before.picture)
+    def next(self, now: Any, truth: Kinematics) -> Sensing:
+        """Memory after a control step; that of the state is the one before it."""
+        before = now.sensing
+        balls = jnp.concatenate([_position_and_velocity(truth)[None], before.balls[:-1]])
+        picture, measured = self._measure(now, truth, balls, before.picture)
         own, histories = {}, {}
         for name, past in before.histories.items():
             if name in measured:
@@ -127,14 +113,15 @@ class Sensors:
         return Sensing(balls, picture, histories | own, task)
 
     def _measure(
-        self, now: Sensed, balls: jax.Array, last: Picture
+        self, now: Any, truth: Kinematics, balls: jax.Array, last: Picture
     ) -> tuple[Picture, dict[str, jax.Array]]:
         """The last picture that has arrived, and the measured value [size] of each quantity of the
         world and of each command."""
         world, picture = now.world, take_picture(self._config, now, balls, last)
-        angles, velocities = measured_joints(world, now.clock.counter, now.truth)
-        measured = now.truth._asdict() | now.known
+        angles, velocities = measured_joints(world, now.clock.counter, truth)
+        measured = truth._asdict() | {name: value[None] for name, value in now.command.items()}
         measured |= {
+            "action": now.last_action,
             "joint_angles": angles,
             "joint_velocities": velocities,
             "ball_position": picture.position,
@@ -142,9 +129,9 @@ class Sensors:
             "ball_age": picture.age[None],
             "ball_picture": picture.position,
         }
-        if now.setpoint is not None:
+        if now.actuation.setpoint is not None:
             # The servo shares the offset of the encoder's zero.
-            lead = now.setpoint.position - (angles - world.get("encoder_bias", 0.0))
+            lead = now.actuation.setpoint.position - (angles - world.get("encoder_bias", 0.0))
             measured["servo_lead"] = lead
         if self._misjudges_paddle:
             qpos = scatter(self._qpos, self._arm, angles)
@@ -157,7 +144,7 @@ def _position_and_velocity(truth: Kinematics) -> jax.Array:
     return jnp.concatenate([truth.ball_position, truth.ball_velocity], axis=-1)
 
 
-def take_picture(config: WorldConfig, now: Sensed, balls: jax.Array, last: Picture) -> Picture:
+def take_picture(config: WorldConfig, now: Any, balls: jax.Array, last: Picture) -> Picture:
     """Last picture that has arrived at a control step.
 
     A camera takes pictures at its own rate, independent of the control steps. Between two control

@@ -13,18 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from bounce_mjx.physics.fused import chain, joint_friction
-from bounce_mjx.physics.fused.contact import (
-    Contact,
-    ContactModel,
-    impedance,
-    relative,
-    shared_balls,
-    side,
-    softness,
-    sphere_box,
-    sphere_sphere,
-    tangents,
-)
+from bounce_mjx.physics.fused import contact as geometry
 from bounce_mjx.physics.fused.coupled import coupled_forces
 from bounce_mjx.physics.fused.model import FusedModel
 from bounce_mjx.physics.fused.normals import normal_forces
@@ -50,7 +39,7 @@ class Row(NamedTuple):
     """A row of the contacts' Jacobian: along a normal, or along a tangent of a contact with
     friction."""
 
-    contact: ContactModel
+    contact: geometry.ContactModel
     axis: Vec
     """Unit vector in the world."""
     torques: dict[int, Vec]
@@ -78,14 +67,14 @@ def contact_response(
       free_accelerations: the balls' accelerations without the contacts.
     """
     positions, velocities, turnings = zip(*balls, strict=True)
-    geometry = [keep(contact) for contact in _contacts(model, pose, positions)]
+    contacts = [keep(contact) for contact in _contacts(model, pose, positions)]
     rows, springs, softnesses = [], [], []
-    for pair, contact in zip(model.contacts, geometry, strict=True):
+    for pair, contact in zip(model.contacts, contacts, strict=True):
         own = _rows(model, pose, pair, contact, positions, keep)
-        d = impedance(pair, contact.distance)
+        d = geometry.impedance(pair, contact.distance)
         rows += own
         springs += [mul(mul(pair.stiffness, d), contact.distance), *[0.0] * (len(own) - 1)]
-        softnesses.append(softness(pair, d))
+        softnesses.append(geometry.softness(pair, d))
     halves = [chain.solve_lower(factor, row.joints) for row in rows]
     halves, half_applied = keep((halves, list(half_applied)))
     matrix = tuple(
@@ -95,14 +84,16 @@ def contact_response(
     )
     offsets = []
     for row, half, spring in zip(rows, halves, springs, strict=True):
-        speed = row.axis @ relative(row.contact, velocities)
+        speed = row.axis @ geometry.relative(row.contact, velocities)
         for i, torque in row.torques.items():
             speed = add(speed, torque @ turnings[i].spin)
         speed = add(speed, dot(row.joints, joint_velocity))
-        free = add(row.axis @ relative(row.contact, free_accelerations), dot(half, half_applied))
+        free = add(
+            row.axis @ geometry.relative(row.contact, free_accelerations), dot(half, half_applied)
+        )
         offsets.append(add(add(free, mul(row.contact.damping, speed)), spring))
     matrix, offsets = keep((matrix, tuple(offsets)))
-    touching = [contact.distance < 0.0 for contact in geometry]
+    touching = [contact.distance < 0.0 for contact in contacts]
 
     def contact_forces(
         matrix: tuple[Scalar, ...], offsets: tuple[Scalar, ...]
@@ -136,7 +127,9 @@ def paddle_origin(model: FusedModel, pose: chain.Pose) -> Vec:
     return pose.world_origin[-1] + pose.world_rotation[-1] @ model.paddle_origin
 
 
-def _contacts(model: FusedModel, pose: chain.Pose, positions: Sequence[Vec]) -> list[Contact]:
+def _contacts(
+    model: FusedModel, pose: chain.Pose, positions: Sequence[Vec]
+) -> list[geometry.Contact]:
     """Geometry of each of `FusedModel.contacts`; `positions` are the balls'."""
     origin = paddle_origin(model, pose)
     rotation = pose.world_rotation[-1] @ model.paddle_rotation
@@ -145,9 +138,9 @@ def _contacts(model: FusedModel, pose: chain.Pose, positions: Sequence[Vec]) -> 
         centres = [positions[i] for i in pair.balls]
         radii = [model.balls[i].radius for i in pair.balls]
         contacts.append(
-            sphere_box(*radii, *centres, model.paddle_half_size, origin, rotation)
+            geometry.sphere_box(*radii, *centres, model.paddle_half_size, origin, rotation)
             if len(pair.balls) == 1
-            else sphere_sphere(*radii, *centres)
+            else geometry.sphere_sphere(*radii, *centres)
         )
     return contacts
 
@@ -155,8 +148,8 @@ def _contacts(model: FusedModel, pose: chain.Pose, positions: Sequence[Vec]) -> 
 def _rows(
     model: FusedModel,
     pose: chain.Pose,
-    pair: ContactModel,
-    contact: Contact,
+    pair: geometry.ContactModel,
+    contact: geometry.Contact,
     positions: Sequence[Vec],
     keep: Keep,
 ) -> list[Row]:
@@ -165,7 +158,7 @@ def _rows(
     normal, point = contact.normal, positions[pair.balls[0]]
     axes, torques = [normal], [{}]
     if pair.friction is not None:
-        first, second = keep(tangents(normal))
+        first, second = keep(geometry.tangents(normal))
         # From the contact point, midway between the surfaces, to each ball's centre.
         levers = {i: model.balls[i].radius + 0.5 * contact.distance for i in pair.balls}
         axes += first, second
@@ -185,7 +178,7 @@ def _by_balls(model: FusedModel, a: Row, b: Row) -> Scalar:
     share: Scalar = 0.0
     if a.contact is b.contact and a is not b:
         return share
-    for i, sign in shared_balls(a.contact, b.contact):
+    for i, sign in geometry.shared_balls(a.contact, b.contact):
         along = 1.0 if a is b else a.axis @ b.axis
         share = add(share, mul(along, sign / model.balls[i].mass))
         if a.torques and b.torques:
@@ -200,7 +193,7 @@ def _ball_accelerations(
     along, turning = [ZERO3] * len(model.balls), [ZERO3] * len(model.balls)
     for row, force in zip(rows, forces, strict=True):
         for i in row.contact.balls:
-            push = mul(force, side(row.contact, i) / model.balls[i].mass)
+            push = mul(force, geometry.side(row.contact, i) / model.balls[i].mass)
             along[i] = along[i] + row.axis * push
         for i, torque in row.torques.items():
             turning[i] = turning[i] + torque * mul(force, 1.0 / model.balls[i].inertia)
