@@ -348,17 +348,14 @@ class Env:
         angles = angles + config.reset.joint_angles * draws[:n] + world.get("joint_start", 0.0)
         positions = positions + world.get("ball_start", 0.0)
 
-        qpos = [jnp.asarray(coordinate, dtype) for coordinate in model.qpos0]
-        qvel = [jnp.zeros((), dtype)] * model.nv
-        for i, (angle, rate) in enumerate(zip(addresses.arm_qpos, addresses.arm_qvel, strict=True)):
-            qpos[angle] = angles[i]
-            qvel[rate] = config.reset.joint_velocities * draws[n + i]
+        rates = config.reset.joint_velocities * draws[n : 2 * n]
+        scatter = robot_model.scatter
+        qpos = scatter(model.qpos0, addresses.arm_qpos, angles)
+        qvel = scatter(np.zeros(model.nv), addresses.arm_qvel, rates)
         for ball, position, velocity in zip(addresses.balls, positions, velocities, strict=True):
-            for i, coordinate in enumerate((*position, 1.0, 0.0, 0.0, 0.0)):
-                qpos[ball.qpos[i]] = jnp.asarray(coordinate, dtype)
-            for i in range(3):
-                qvel[ball.qvel[i]] = velocity[i]
-        return PhysicsState(jnp.stack(qpos), jnp.stack(qvel))
+            pose = jnp.concatenate([position, jnp.array([1.0, 0.0, 0.0, 0.0], dtype)])
+            qpos, qvel = scatter(qpos, ball.qpos, pose), scatter(qvel, ball.qvel[:3], velocity)
+        return PhysicsState(qpos, qvel)
 
     def _first_metrics(self, state: EnvState, truth: Kinematics) -> dict[str, jax.Array]:
         """The metrics of a reset, which are zero except for the privileged ones."""

@@ -34,17 +34,12 @@ def add_balls(spec: mujoco.MjSpec, num_balls: int) -> None:
         if spec.body(ball_name(i)) is None:
             frame = spec.worldbody.add_frame(pos=[0.0, 0.0, BALLS_APART * i])
             frame.attach_body(spec.body(BALL_BODY_NAME), "", str(i + 1))
-    geoms_of = [{geom.name for geom in spec.body(ball_name(i)).geoms} for i in range(num_balls)]
-    pairs = {frozenset((pair.geomname1, pair.geomname2)): pair for pair in spec.pairs}
-    with_paddle = {
-        geom: pair
-        for geoms, pair in pairs.items()
-        for geom in geoms - {PADDLE_GEOM_NAME}
-        if PADDLE_GEOM_NAME in geoms
-    }
-    touching = [geom for geoms in geoms_of for geom in sorted(geoms & with_paddle.keys())[:1]]
+    pairs, touching = {frozenset((x.geomname1, x.geomname2)): x for x in spec.pairs}, []
+    for i in range(num_balls):
+        geoms = sorted(geom.name for geom in spec.body(ball_name(i)).geoms)
+        touching += [geom for geom in geoms if frozenset((geom, PADDLE_GEOM_NAME)) in pairs][:1]
     for first, second in itertools.combinations(touching, 2):
         if frozenset((first, second)) not in pairs:
-            like = with_paddle[second]
+            like = pairs[frozenset((second, PADDLE_GEOM_NAME))]
             settings = {name: getattr(like, name) for name in _PAIR_SETTINGS}
             spec.add_pair(geomname1=first, geomname2=second, **settings)

@@ -111,9 +111,8 @@ class Actuators:
         after = next_setpoint(self._limits, last, wanted, self._config.control_dt, jnp)
         if smoothing is not None:
             # An actuator of no joint has a target of zero, whatever the time.
-            times = np.ones(self._nu)
-            times[[*self._addresses.actuators]] = smoothing / substep
-            smoothing = jnp.asarray(times, wanted.dtype)
+            times = jnp.asarray(smoothing / substep, wanted.dtype)
+            smoothing = scatter(np.ones(self._nu), self._addresses.actuators, times)
         moving = Moving(
             velocity=self._ctrl(last.velocity * substep),
             acceleration=self._ctrl(after.acceleration * substep**2),

@@ -65,12 +65,8 @@ def tilt_vector(own: jax.Array, angles: jax.Array) -> jax.Array:
 
 def _rotation_xy(angles: jax.Array) -> Quaternion:
     """Quaternion [w, x, y, z] of a rotation about x by angles[0], then about the new y."""
-    from bounce_mjx.physics.scalars import quaternion_product
-
-    a, b = 0.5 * angles[0], 0.5 * angles[1]
-    about_x = (jnp.cos(a), jnp.sin(a), 0.0, 0.0)
-    about_y = (jnp.cos(b), 0.0, jnp.sin(b), 0.0)
-    return quaternion_product(about_x, about_y)
+    (cos_a, cos_b), (sin_a, sin_b) = jnp.cos(0.5 * angles), jnp.sin(0.5 * angles)
+    return cos_a * cos_b, sin_a * cos_b, cos_a * sin_b, sin_a * sin_b
 
 
 # The operations of terms, on the model's own value and the sampled one.

@@ -13,7 +13,6 @@ GPU kernel do not diverge.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -43,13 +42,8 @@ _SEARCH_STEPS = 10
 _EDGES = tuple(map(Vec, ((1.0, 1.0, 0.0), (1.0, -1.0, 0.0), (1.0, 0.0, 1.0), (1.0, 0.0, -1.0))))
 
 
-class Cone(NamedTuple):
-    """One contact in the units of its cone."""
-
-    touches: jax.Array
-    """Whether there is a contact."""
-    regulariser: Scalar
-    """Regulariser of each edge of the pyramid, 1/kg."""
+Cone = tuple[jax.Array, Scalar]
+"""Whether a contact exists, and the regulariser of each edge of its pyramid, 1/kg."""
 
 
 def coupled_forces(
@@ -76,7 +70,7 @@ def coupled_forces(
     ]
     c = list(map(mul, offsets, units))
     cones = [
-        Cone(touches, edge_regulariser(model, softness))
+        (touches, edge_regulariser(model, softness))
         for model, touches, softness in zip(models, touching, softnesses, strict=True)
     ]
     q, c = not_inlined((q, c))
@@ -163,12 +157,12 @@ def _response(
 ) -> tuple[list[Scalar], list[tuple[Vec, ...]]]:
     """f(y) [3 k], and for each contact the columns of L, one for each edge of its pyramid."""
     forces, factors = [], []
-    for k, cone in enumerate(cones):
-        own, columns, root = Vec(y[3 * k : 3 * k + 3]), [], lax.rsqrt(cone.regulariser)
+    for k, (touches, regulariser) in enumerate(cones):
+        own, columns, root = Vec(y[3 * k : 3 * k + 3]), [], lax.rsqrt(regulariser)
         force = ZERO3
         for edge in _EDGES:
             pull = edge @ own
-            column = edge * jnp.where(cone.touches & (pull < 0.0), root, 0.0)
+            column = edge * jnp.where(touches & (pull < 0.0), root, 0.0)
             force = force - column * (pull * root)
             columns.append(column)
         forces += force

@@ -16,18 +16,31 @@ from bounce_mjx.physics.control import Control, drag, servo_target
 from bounce_mjx.physics.fused import chain, joint_friction
 from bounce_mjx.physics.fused.model import FusedModel, Servo, read_model
 from bounce_mjx.physics.fused.response import contact_response, paddle_origin
-from bounce_mjx.physics.fused.turning import Turning, advance_turning, read_turning, spin_in_ball
 from bounce_mjx.physics.parameters import PhysicsParameters, PhysicsState
 from bounce_mjx.physics.scalars import (
     ZERO3,
+    Quaternion,
     Scalar,
     Vec,
     add,
     mul,
     not_inlined,
+    quaternion_matrix,
+    quaternion_product,
     scalars_of,
+    sine_cosine,
     sub,
 )
+
+
+class Turning(NamedTuple):
+    """Spin and orientation of the ball."""
+
+    spin: Vec
+    """Angular velocity in the world, rad/s. Without a torque it is constant for a sphere, both in
+    the world and in the ball's frame."""
+    orientation: Quaternion
+    """Unit quaternion w, x, y, z."""
 
 
 class Ball(NamedTuple):
@@ -215,16 +228,16 @@ def substep(
     free = [model.gravity * ball.weight for ball in model.balls]
     if air_drag is not None:
         free = [a + drag(air_drag, ball.velocity) for a, ball in zip(free, balls, strict=True)]
-    response = contact_response(
+    torque, *pushes = contact_response(
         model, pose, factor, motion.v, chain.solve_lower(factor, applied), balls, free, keep
     )
     factor = keep(chain.cholesky(implicit))
-    torque = chain.solve_lower(factor, list(map(add, applied, response.joint_torque)))
-    acceleration = chain.solve_upper(factor, torque)
+    half = chain.solve_lower(factor, list(map(add, applied, torque)))
+    acceleration = chain.solve_upper(factor, half)
     v = Vec(a + dt * b for a, b in zip(motion.v, acceleration, strict=True))
     q = Vec(a + dt * b for a, b in zip(motion.q, v, strict=True))
     moved = []
-    for ball, *accelerations in zip(balls, free, *response[1:], strict=True):
+    for ball, *accelerations in zip(balls, free, *pushes, strict=True):
         velocity = ball.velocity + (accelerations[0] + accelerations[1]) * dt
         turning = ball.turning and advance_turning(ball.turning, accelerations[2], dt)
         moved.append(Ball(ball.position + velocity * dt, velocity, turning))
@@ -252,3 +265,31 @@ def joint_force(servo: Servo, force: Scalar, carried: Scalar) -> Scalar:
     if servo.carries_weight:
         return jnp.clip(add(force, carried), *servo.joint_range)
     return add(jnp.clip(force, *servo.joint_range), carried)
+
+
+def read_turning(quaternion: Quaternion, spin: Vec) -> Turning:
+    """Spin in the world and normalised orientation from MuJoCo's coordinates."""
+    orientation = _normalise(quaternion)
+    return Turning(quaternion_matrix(orientation) @ spin, orientation)
+
+
+def spin_in_ball(turning: Turning) -> Vec:
+    """Spin in the ball's frame, MuJoCo's coordinates."""
+    return quaternion_matrix(turning.orientation).T @ turning.spin
+
+
+def advance_turning(turning: Turning, acceleration: Vec, dt: float) -> Turning:
+    """Spin and orientation after a time dt, in which the new spin turns the orientation."""
+    spin = turning.spin + acceleration * dt
+    squared = spin @ spin
+    still = squared < float(jnp.finfo(squared.dtype).tiny)
+    inverse_speed = jax.lax.rsqrt(jnp.where(still, 1.0, squared))
+    sine, cosine = sine_cosine(0.5 * dt * (squared * inverse_speed))
+    rotation = (cosine, *(spin * (sine * inverse_speed)))
+    return Turning(spin, quaternion_product(rotation, turning.orientation))
+
+
+def _normalise(quaternion: Quaternion) -> Quaternion:
+    w, x, y, z = quaternion
+    inverse_norm = jax.lax.rsqrt(w * w + x * x + y * y + z * z)
+    return w * inverse_norm, x * inverse_norm, y * inverse_norm, z * inverse_norm

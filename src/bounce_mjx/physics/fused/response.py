@@ -24,17 +24,6 @@ Keep = Callable[[Any], Any]
 """`not_inlined`, or the identity."""
 
 
-class Response(NamedTuple):
-    """Effect of the contacts' forces and of dry friction on the joints and the balls."""
-
-    joint_torque: list[Scalar]
-    """Joint torques of both, N m."""
-    ball_accelerations: list[Vec]
-    """Acceleration of each ball by the contacts alone, m/s^2."""
-    spin_accelerations: list[Vec]
-    """Angular acceleration of each ball in the world, rad/s^2."""
-
-
 class Row(NamedTuple):
     """A row of the contacts' Jacobian: along a normal, or along a tangent of a contact with
     friction."""
@@ -57,8 +46,10 @@ def contact_response(
     balls: Sequence[Any],
     free_accelerations: Sequence[Vec],
     keep: Keep,
-) -> Response:
-    """Effect of the contacts' forces and of dry friction on the joints and the balls.
+) -> tuple[list[Scalar], list[Vec], list[Vec]]:
+    """Effect of the contacts' forces and of dry friction: torques of the joints (N m), and by the
+    contacts alone, accelerations (m/s^2) and angular accelerations (rad/s^2) of the balls in the
+    world.
 
     Args:
       factor: Cholesky factor L of the arm's inertia matrix.
@@ -119,7 +110,7 @@ def contact_response(
     forces = keep(forces)
     columns = zip(*(row.joints for row in rows), strict=True)
     torque = [add(dot(c, forces), f) for c, f in zip(columns, dry_friction, strict=True)]
-    return Response(torque, *_ball_accelerations(model, rows, forces))
+    return torque, *_ball_accelerations(model, rows, forces)
 
 
 def paddle_origin(model: FusedModel, pose: chain.Pose) -> Vec:
