@@ -126,6 +126,14 @@ class Env:
         self._sensors = Sensors(config, self.mj_model, self.engine, self.task)
         self._randomize = randomize
         self._fingerprint = robot_model.fingerprint(self.mj_model)
+        self.dt = config.control_dt
+        """Time of one control step, s."""
+        self.observation_size, self.action_size = self.layout.size, config.num_joints
+        """Lengths of the observation vector and of the action vector."""
+        self.backend = self.engine.name
+        """Name of the physics engine."""
+        self.warmup_steps = config.randomization.warmup_steps
+        """Environment steps of a training run over which the ranges grow (`ranges`)."""
 
     def __reduce__(self) -> tuple:
         """Pickled as its settings; a copy is built again."""
@@ -157,34 +165,9 @@ class Env:
                 )
 
     @property
-    def dt(self) -> float:
-        """Time of one control step, s."""
-        return self.config.control_dt
-
-    @property
-    def observation_size(self) -> int:
-        """Length of the observation vector."""
-        return self.layout.size
-
-    @property
-    def action_size(self) -> int:
-        """Length of the action vector."""
-        return self.config.num_joints
-
-    @property
-    def backend(self) -> str:
-        """Name of the physics engine."""
-        return self.engine.name
-
-    @property
     def unwrapped(self) -> "Env":
         """The environment itself, as there is no wrapper around it."""
         return self
-
-    @property
-    def warmup_steps(self) -> int:
-        """Environment steps of a training run over which the ranges grow (`ranges`)."""
-        return self.config.randomization.warmup_steps
 
     def ranges(self, progress: jax.Array | float = 1.0) -> Ranges:
         """The ranges of the randomisation, and of the commands where they grow too; `progress` []

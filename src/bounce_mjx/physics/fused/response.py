@@ -14,10 +14,9 @@ import jax.numpy as jnp
 
 from bounce_mjx.physics.fused import chain, joint_friction
 from bounce_mjx.physics.fused import contact as geometry
-from bounce_mjx.physics.fused.coupled import coupled_forces
+from bounce_mjx.physics.fused.friction import coupled_forces, pyramid_force
 from bounce_mjx.physics.fused.model import FusedModel
 from bounce_mjx.physics.fused.normals import normal_forces
-from bounce_mjx.physics.fused.pyramid import pyramid_force
 from bounce_mjx.physics.scalars import ZERO3, Scalar, Vec, add, dot, mul
 
 Keep = Callable[[Any], Any]
