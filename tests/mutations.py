@@ -102,7 +102,7 @@ FAULTS = [
     ("the variance is measured from the old mean", STATISTICS,
      "jnp.sum(from_old_mean * (batch - mean)", "jnp.sum(from_old_mean * from_old_mean", "test_policy.py -k statistics_equal"),
     ("the ball moves with the velocity before the step", DYNAMICS,
-     "position = ball.position + velocity * dt", "position = ball.position + ball.velocity * dt", "test_physics.py -k random_states"),
+     "Ball(ball.position + velocity * dt", "Ball(ball.position + ball.velocity * dt", "test_physics.py -k random_states"),
     ("a contact pulls", NORMALS, "return [jnp.maximum(first / pivot, 0.0)]", "return [first / pivot]", "test_physics.py -k random_states"),
     ("an exported policy has a wrong normaliser", EXPORT,
      "networks.act(policy, jnp",

@@ -228,7 +228,10 @@ class Env:
         )
         truth = self.kinematics(state)
         task = self.task.reset(Start(truth, command, task_draws))
-        state = state._replace(task=task, command=self._next_command(task, command))
+        following = self.task.next_command(task, command)
+        named = f"next_command of the task {type(self.task).__name__}"
+        check_names(named, "command", following, command)
+        state = state._replace(task=task, command=following)
         if self._sensors.are_needed:
             state = state._replace(sensing=self._sensors.first(state, truth))
         return State(
@@ -278,7 +281,8 @@ class Env:
         truth = self.kinematics(now)
 
         done = self.task.step(before.task, Step(truth, now.command, action, before.last_action))
-        now = now._replace(task=done.state, command=self._next_command(done.state, now.command))
+        command = self.task.next_command(done.state, now.command)
+        now = now._replace(task=done.state, command=command)
         ends = {
             "non_finite": ~(finite & is_number),
             "too_fast": jnp.any(jnp.abs(truth.joint_velocities) > self.config.max_joint_velocity),
@@ -370,13 +374,6 @@ class Env:
             command[name] = jnp.where(now, low + (high - low) * shares[i], state.command[name])
         redraw = Redraw(jnp.where(now, 0.0, age) + self.dt, ranges)
         return state._replace(clock=clock, command=command, redraw=redraw)
-
-    def _next_command(self, state: Any, command: dict[str, jax.Array]) -> dict[str, jax.Array]:
-        """The commands that the task moves on."""
-        following = self.task.next_command(state, command)
-        named = f"next_command of the task {type(self.task).__name__}"
-        check_names(named, "command", following, command)
-        return following
 
     def kinematics(self, state: EnvState) -> Kinematics:
         """True positions and velocities of one environment's state, read from its physics."""

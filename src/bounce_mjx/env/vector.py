@@ -20,13 +20,10 @@ class AnyEnv(Protocol):
     task: Task | type[Task]
     """The task, of which a training run reads `curves` and `critic_metrics`."""
 
-    @property
-    def observation_size(self) -> int:
-        """Length of the observation vector."""
-
-    @property
-    def action_size(self) -> int:
-        """Length of the action vector."""
+    observation_size: int
+    """Length of the observation vector."""
+    action_size: int
+    """Length of the action vector."""
 
     def reset(self, rng: jax.Array) -> State:
         """Starts an episode; consumes the key `rng`."""

@@ -16,10 +16,6 @@ def has_kernels() -> bool:
     """Whether JAX's default device runs the kernels."""
     if jax.default_backend() != "gpu" or os.environ.get(_SWITCH) == "off":
         return False
-    try:
-        from jax.experimental.pallas import mosaic_gpu  # noqa: F401
-    except ImportError:
-        return False
     # For AMD's GPUs this is a name, such as gfx90a.
     capabilities = [str(device.compute_capability) for device in jax.local_devices(backend="gpu")]
     return all(

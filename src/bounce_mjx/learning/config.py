@@ -1,6 +1,6 @@
 """Settings of the trainer."""
 
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import pydantic
 from pydantic import Field
@@ -8,10 +8,6 @@ from pydantic import Field
 from bounce_mjx.config import settings
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.tasks.registry import class_in_file, is_file
-
-if TYPE_CHECKING:
-    from bounce_mjx.learning.ppo import PPO
-
 
 PPO_NAME = "ppo"
 """Name of the algorithm of this package."""
@@ -103,7 +99,7 @@ class PPOConfig(settings.StrictModel):
         return self.num_envs * self.rollout_length
 
 
-def find_algorithm(name: str) -> "type[PPO]":
+def find_algorithm(name: str) -> type:
     """The algorithm of a name, ppo or FILE.py:CLASS.
 
     Raises:

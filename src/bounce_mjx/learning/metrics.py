@@ -23,16 +23,13 @@ def matching_metrics(patterns: Sequence[str], known: Iterable[str]) -> tuple[str
       UserError: a pattern matches none.
     """
     known = tuple(known)
-    names: dict[str, None] = {}
     for pattern in patterns:
-        matching = fnmatch.filter(known, pattern)
-        if not matching and "*" not in pattern:
+        if "*" not in pattern and pattern not in known:
             raise UserError(
                 f"critic_metrics names {pattern}, which the environment does not have; choose from "
                 f"{', '.join(known)}"
             )
-        names |= dict.fromkeys(matching)
-    return tuple(names)
+    return tuple(dict.fromkeys(n for p in patterns for n in fnmatch.filter(known, p)))
 
 
 def step_metrics(result: vector.VectorStep, groups: int, curves: Sequence[Curve]) -> Metrics:

@@ -126,16 +126,11 @@ def _fused(m: mujoco.MjModel) -> Iterator[Feature]:
 def _is_plain(m: mujoco.MjModel, ball: BallAddresses) -> bool:
     """Whether a ball is one free homogeneous sphere."""
     inertia, dofs = m.body_inertia[ball.body], list(ball.qvel)
-    moved_or_held = (
-        m.body_ipos[ball.body],
-        m.geom_pos[ball.geom],
-        m.dof_damping[dofs],
-        m.dof_armature[dofs],
-        m.dof_frictionloss[dofs],
-        m.jnt_stiffness[m.body_jntadr[ball.body]],
-    )
+    held = [getattr(m, f"dof_{name}")[dofs] for name in ("damping", "armature", "frictionloss")]
+    held.append(m.jnt_stiffness[m.body_jntadr[ball.body]])
+    moved = m.body_ipos[ball.body], m.geom_pos[ball.geom]
     return bool(
         m.geom_type[ball.geom] == mujoco.mjtGeom.mjGEOM_SPHERE
         and np.allclose(inertia, inertia[0], rtol=1e-9, atol=0.0)
-        and not any(map(np.any, moved_or_held))
+        and not any(map(np.any, (*moved, *held)))
     )

@@ -63,10 +63,9 @@ class LimitsConfig(settings.StrictModel):
 
     @pydantic.model_validator(mode="after")
     def _check_together(self):
-        if (self.velocity is None) != (self.acceleration is None):
-            raise ValueError("velocity or acceleration is missing; give both or neither")
-        if self.jerk is not None and self.acceleration is None:
-            raise ValueError("jerk is given without velocity and acceleration; give all three")
+        velocity, acceleration, jerk, _ = (x is not None for _, x in self)
+        if velocity != acceleration or jerk > acceleration:
+            raise ValueError("give velocity and acceleration together, and jerk with both")
         return self
 
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
-if TYPE_CHECKING:
-    import jax
-    import numpy as np
+from bounce_mjx.lazy import jax, np
 
 
 class Marker(NamedTuple):

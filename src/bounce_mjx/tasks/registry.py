@@ -45,7 +45,7 @@ def find_task(name: str) -> type[Task]:
     if is_file(name):
         return class_in_file(name, Task)
     # Without a look at the installed packages, which takes 10 ms.
-    known = _OWN if name in _OWN else _registered()
+    known = _OWN if name in _OWN else registered_tasks()
     if name not in known:
         advice = suggest(name, known) or "give FILE.py:CLASS or a known name"
         raise UserError(
@@ -58,7 +58,7 @@ def find_task(name: str) -> type[Task]:
 def task_name(task: type[Task]) -> str:
     """The name under which `find_task` finds a task: its registered name, or FILE.py:CLASS."""
     place = f"{task.__module__}:{task.__qualname__}"
-    names = [name for name, value in _registered().items() if value == place]
+    names = [name for name, value in registered_tasks().items() if value == place]
     return names[0] if names else f"{inspect.getsourcefile(task)}:{task.__qualname__}"
 
 
@@ -114,15 +114,10 @@ def admit(name: str, task: type[Task]) -> None:
     _named[name] = task
 
 
-def registered_tasks() -> tuple[str, ...]:
-    """Names of the tasks of the package and of installed packages."""
-    return tuple(sorted(_registered()))
-
-
-def _registered() -> dict[str, str]:
-    """MODULE:CLASS by name."""
+def registered_tasks() -> dict[str, str]:
+    """MODULE:CLASS of the tasks of the package and of installed packages, by name."""
     entries = importlib.metadata.entry_points(group=GROUP)
-    return {entry.name: entry.value for entry in entries} | _OWN
+    return dict(sorted(({entry.name: entry.value for entry in entries} | _OWN).items()))
 
 
 def class_in_file(name: str, base: type[Kind]) -> type[Kind]:

@@ -162,17 +162,13 @@ class WorldConfig(RobotSettings):
         return kept | {"reset": moved | dict(kept.get("reset", {}))}
 
     @pydantic.model_validator(mode="after")
-    def _check_times(self):
+    def _check_numbers(self):
         substeps = self.control_dt / self.physics_dt
         if round(substeps) < 1 or not math.isclose(substeps, round(substeps), rel_tol=1e-6):
             raise ValueError(
                 f"control_dt {self.control_dt} is not a whole number of physics steps of "
                 f"{self.physics_dt} s; choose a multiple of physics_dt"
             )
-        return self
-
-    @pydantic.model_validator(mode="after")
-    def _check_limits(self):
         limits, terms = self.robot.limits, self.randomization
         counts = {f"robot.limits.{name}": len(x) for name, x in limits if x is not None}
         for name in terms.terms:

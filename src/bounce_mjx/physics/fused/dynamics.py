@@ -216,9 +216,8 @@ def substep(
     for i, (link, servo, target, q, v) in enumerate(
         zip(links, model.servos, targets, motion.q, motion.v, strict=True)
     ):
-        force, derivative = servo_force(servo, target, q, v)
+        force, derivative = servo_force(servo, target, q, v, floating[i])
         spring = mul(link.stiffness, sub(q, link.spring_position))
-        force = joint_force(servo, force, floating[i])
         applied.append(force - link.damping * v - add(bias[i], spring))
         damping = link.damping if model.implicit_damping else 0.0
         if model.implicit_servos:
@@ -244,27 +243,29 @@ def substep(
     return Motion(q, v, tuple(moved))
 
 
-def servo_force(servo: Servo, target: Scalar, q: Scalar, v: Scalar) -> tuple[Scalar, Scalar]:
-    """Force of a servo at its joint (N m, N) for the servo target, and the force's
-    derivative with respect to the velocity; the derivative is 0 at the force limit."""
+def servo_force(
+    servo: Servo, target: Scalar, q: Scalar, v: Scalar, carried: Scalar
+) -> tuple[Scalar, Scalar]:
+    """Force of a servo and of gravity compensation at a joint (N m, N) for the servo target, and
+    the servo's derivative with respect to the velocity, which is 0 at the servo's force limit. The
+    limit of the joint does not change MuJoCo's derivative.
+
+    Args:
+      carried: force of the gravity compensation.
+    """
     if servo.ctrl_range is not None:
         target = jnp.clip(target, *servo.ctrl_range)
     force = servo.gain * target + servo.stiffness * q + servo.damping * v + servo.bias
-    if servo.force_range is None:
-        return force, servo.damping
-    least, most = servo.force_range
-    free = (force > least) & (force < most)
-    return jnp.clip(force, least, most), jnp.where(free, servo.damping, 0.0)
-
-
-def joint_force(servo: Servo, force: Scalar, carried: Scalar) -> Scalar:
-    """Force of the servo and of gravity compensation on the joint. The limit of the joint does not
-    change MuJoCo's derivative of the force."""
-    if servo.joint_range is None:
-        return add(force, carried)
+    derivative = servo.damping
+    if servo.force_range is not None:
+        least, most = servo.force_range
+        derivative = jnp.where((force > least) & (force < most), derivative, 0.0)
+        force = jnp.clip(force, least, most)
     if servo.carries_weight:
-        return jnp.clip(add(force, carried), *servo.joint_range)
-    return add(jnp.clip(force, *servo.joint_range), carried)
+        force, carried = add(force, carried), 0.0
+    if servo.joint_range is not None:
+        force = jnp.clip(force, *servo.joint_range)
+    return add(force, carried), derivative
 
 
 def read_turning(quaternion: Quaternion, spin: Vec) -> Turning:

@@ -69,6 +69,10 @@ def pyramid_force(
 ) -> Scalars:
     """Force [normal, first and second tangent] of a contact, N.
 
+    The first tangent's two edges have four active sets. Each is eliminated in turn, and the second
+    tangent's pair of edges is solved in closed form; the solution is the active set with the right
+    signs. Sums and differences of the coefficients of a pair avoid cancellation at small friction.
+
     Args:
       matrix: J M^-1 J^T, the upper triangle row by row, 1/kg.
       offsets: J a0 - aref, m/s^2.
@@ -77,20 +81,9 @@ def pyramid_force(
     units = (1.0, *model.friction)
     pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
     q = [mul(entry, mul(units[i], units[j])) for entry, (i, j) in zip(matrix, pairs, strict=True)]
-    x = in_pyramidal_cone(q, list(map(mul, offsets, units)), edge_regulariser(model, softness))
-    return tuple(map(mul, x, units))
-
-
-def in_pyramidal_cone(q: Sequence[Scalar], c: Sequence[Scalar], regulariser: Scalar) -> Scalars:
-    """Minimum x of 1/2 x.Q x + c.x over nonnegative combinations of the four edges, each with a
-    regulariser; q is the upper triangle of Q, row by row.
-
-    The first tangent's two edges have four active sets. Each is eliminated in turn, and the second
-    tangent's pair of edges is solved in closed form; the solution is the active set with the right
-    signs. Sums and differences of the coefficients of a pair avoid cancellation at small friction.
-    """
+    regulariser = edge_regulariser(model, softness)
     q00, q01, q02, q11, q12, q22 = q
-    c0, c1, c2 = c
+    c0, c1, c2 = map(mul, offsets, units)
     h = 0.5 * regulariser
 
     # Neither edge of the first pair is active.
@@ -135,7 +128,8 @@ def in_pyramidal_cone(q: Sequence[Scalar], c: Sequence[Scalar], regulariser: Sca
         other = (c0 + q00 * n + q_01 * f + q02 * t2) - (c_1 + q_01 * n + q11 * f + q_12 * t2)
         return _better(best, ((n, sign * f, t2), jnp.minimum(-lack, other)))
 
-    return lax.fori_loop(0, 2, one, _better(none, both))[0]
+    x, _ = lax.fori_loop(0, 2, one, _better(none, both))
+    return tuple(map(mul, x, units))
 
 
 def _better(
