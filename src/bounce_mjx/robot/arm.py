@@ -203,7 +203,9 @@ class _Builder:
     def build(self) -> Arm:
         model = self._model
         end, position, quaternion = find_site(model, self._config)
-        chain = _chain(model, end)
+        chain = [end]
+        while parent := int(model.body_parentid[chain[0]]):
+            chain.insert(0, parent)
         joints = self._acting_joints(chain)
         actuators = self._actuators(joints)
         servos = tuple(_servo(model, j, actuators[j]) for j in joints)
@@ -548,14 +550,6 @@ def _force_limit(model: mujoco.MjModel, joint: int, actuator: int) -> float | No
         if limited:
             limit = min(limit, float(min(-low, high) * abs(factor)))
     return limit if np.isfinite(limit) else None
-
-
-def _chain(model: mujoco.MjModel, end: int) -> list[int]:
-    """Bodies from the base to `end`."""
-    chain = [end]
-    while parent := model.body_parentid[chain[-1]]:
-        chain.append(int(parent))
-    return chain[::-1]
 
 
 def is_below(model: mujoco.MjModel, body: int, ancestors: list[int]) -> bool:

@@ -341,9 +341,8 @@ class Bounce(task.Task):
 
     def details(self, episodes: task.Episodes) -> dict[str, task.Figure]:
         """The mean bounce count and apex error."""
-        error, _ = task.mean_and_margin(
-            episodes.sums["apex_error"], episodes.sums["settled_bounces"]
-        )
+        sums = episodes.sums
+        error, _ = task.mean_and_margin(sums["apex_error"], sums["settled_bounces"])
         return {
             "mean_consecutive_bounces": float(episodes.maxima["n_bounces"].mean()),
             "mean_apex_error_m": error,

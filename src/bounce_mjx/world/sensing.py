@@ -118,12 +118,18 @@ class Sensors:
         """The last picture that has arrived, and the measured value [size] of each quantity of the
         world and of each command."""
         world, picture = now.world, take_picture(self._config, now, balls, last)
-        angles, velocities = measured_joints(world, now.clock.counter, truth)
+        dtype, angles = truth.joint_angles.dtype, truth.joint_angles
+        angle_noise, velocity_noise = noise.joints(now.clock.counter, len(angles), dtype)
+        if "joint_angle_noise" in world:
+            angles = angles + world["joint_angle_noise"] * angle_noise
+        if "encoder_bias" in world:
+            angles = angles + world["encoder_bias"]
+        velocities = truth.joint_velocities
         measured = truth._asdict() | {name: value[None] for name, value in now.command.items()}
         measured |= {
             "action": now.last_action,
             "joint_angles": angles,
-            "joint_velocities": velocities,
+            "joint_velocities": _add_errors(world, "joint_velocity", velocities, velocity_noise),
             "ball_position": picture.position,
             "ball_velocity": picture.velocity,
             "ball_age": picture.age[None],
@@ -215,16 +221,3 @@ def _add_errors(world: World, name: str, value: jax.Array, noises: jax.Array) ->
     if f"{name}_noise" in world:
         value = value + world[f"{name}_noise"] * noises
     return value
-
-
-def measured_joints(
-    world: World, counter: jax.Array, truth: Kinematics
-) -> tuple[jax.Array, jax.Array]:
-    """Measured joint angles [n] (rad) and joint velocities [n] (rad/s)."""
-    angles = truth.joint_angles
-    angle_noise, velocity_noise = noise.joints(counter, len(angles), angles.dtype)
-    if "joint_angle_noise" in world:
-        angles = angles + world["joint_angle_noise"] * angle_noise
-    if "encoder_bias" in world:
-        angles = angles + world["encoder_bias"]
-    return angles, _add_errors(world, "joint_velocity", truth.joint_velocities, velocity_noise)

@@ -127,11 +127,6 @@ def impedance(model: ContactModel, distance: jax.Array) -> jax.Array:
     return dmin + y * (dmax - dmin)
 
 
-def softness(model: ContactModel, d: jax.Array) -> jax.Array:
-    """Regulariser (1/kg) of the normal force at the impedance d."""
-    return (1.0 - d) / d * (model.inverse_weights[0] + model.inverse_weights[1])
-
-
 def tangents(normal: Vec) -> tuple[Vec, Vec]:
     """Tangents of MuJoCo's contact frame (mju_makeFrame), the second up to its sign. The first
     tangent is y, or z if the normal is close to y, made orthogonal to the normal."""

@@ -105,7 +105,7 @@ def step(
         _put(qpos, x.qpos, (*ball.position, *after.orientation))
         _put(qvel, x.qvel[:3], ball.velocity)
         if turns:
-            _put(qvel, x.qvel[3:], spin_in_ball(after))
+            _put(qvel, x.qvel[3:], quaternion_matrix(after.orientation).T @ after.spin)
     return PhysicsState(jnp.stack(qpos), jnp.stack(qvel))
 
 
@@ -270,13 +270,9 @@ def servo_force(
 
 def read_turning(quaternion: Quaternion, spin: Vec) -> Turning:
     """Spin in the world and normalised orientation from MuJoCo's coordinates."""
-    orientation = _normalise(quaternion)
+    q = Vec(quaternion)
+    orientation = tuple(q * jax.lax.rsqrt(q @ q))
     return Turning(quaternion_matrix(orientation) @ spin, orientation)
-
-
-def spin_in_ball(turning: Turning) -> Vec:
-    """Spin in the ball's frame, MuJoCo's coordinates."""
-    return quaternion_matrix(turning.orientation).T @ turning.spin
 
 
 def advance_turning(turning: Turning, acceleration: Vec, dt: float) -> Turning:
@@ -288,9 +284,3 @@ def advance_turning(turning: Turning, acceleration: Vec, dt: float) -> Turning:
     sine, cosine = sine_cosine(0.5 * dt * (squared * inverse_speed))
     rotation = (cosine, *(spin * (sine * inverse_speed)))
     return Turning(spin, quaternion_product(rotation, turning.orientation))
-
-
-def _normalise(quaternion: Quaternion) -> Quaternion:
-    w, x, y, z = quaternion
-    inverse_norm = jax.lax.rsqrt(w * w + x * x + y * y + z * z)
-    return w * inverse_norm, x * inverse_norm, y * inverse_norm, z * inverse_norm

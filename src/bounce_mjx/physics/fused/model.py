@@ -30,7 +30,7 @@ from bounce_mjx.physics.scalars import (
     symmetric,
 )
 from bounce_mjx.physics.support import unsupported_friction
-from bounce_mjx.robot.model import Addresses, BallAddresses, fingerprint, to_direct_solref
+from bounce_mjx.robot.model import Addresses, fingerprint, to_direct_solref
 
 
 class Frame(NamedTuple):
@@ -120,8 +120,9 @@ def read_model(
     m = edited(mj_model, parameters)
     c, addresses = m.model, m.addresses
     links, frames = _read_links(m)
-    body = frames[int(c.geom_bodyid[addresses.paddle_geom])]
-    paddle = _geom_frame(m, addresses.paddle_geom)
+    geom, holder = addresses.paddle_geom, int(c.geom_bodyid[addresses.paddle_geom])
+    body, paddle = frames[holder], Frame(m["geom_pos", geom], _rotation(m["geom_quat", geom]))
+    paddle = _apply_flag(m["geom_sameframe", geom], paddle, _inertial_frame(m, holder))
     implicit = c.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     explicit_damping = c.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     model = FusedModel(
@@ -134,8 +135,17 @@ def read_model(
         ),
         paddle_origin=body.origin + body.rotation @ paddle.origin,
         paddle_rotation=exact(body.rotation @ paddle.rotation),
-        paddle_half_size=m["geom_size", addresses.paddle_geom],
-        balls=tuple(_read_ball(m, ball) for ball in addresses.balls),
+        paddle_half_size=m["geom_size", geom],
+        balls=tuple(
+            BallModel(
+                radius=m["geom_size", ball.geom, 0],
+                mass=m["body_mass", ball.body],
+                # Not recorded: a ball stays homogeneous, so that its inertia is not edited alone.
+                inertia=m.peek("body_inertia", ball.body, 0),
+                weight=1.0 - _gravity_compensation(c)[ball.body].item(),
+            )
+            for ball in addresses.balls
+        ),
         contacts=_read_contacts(m),
         addresses=addresses,
         mj_model=c,
@@ -250,13 +260,6 @@ def _inertial_frame(m: EditedModel, body: int) -> Frame:
     return _apply_flag(m.model.body_sameframe[body], frame, frame)
 
 
-def _geom_frame(m: EditedModel, geom: int) -> Frame:
-    """Frame of a geom in its body's frame."""
-    frame = Frame(m["geom_pos", geom], _rotation(m["geom_quat", geom]))
-    inertial = _inertial_frame(m, int(m.model.geom_bodyid[geom]))
-    return _apply_flag(m["geom_sameframe", geom], frame, inertial)
-
-
 def _apply_flag(same: int, frame: Frame, inertial: Frame) -> Frame:
     """A frame in its body's frame. Where it is almost the same as that one, or as the body's
     inertial one, MuJoCo has a flag and computes as if they were the same."""
@@ -292,16 +295,6 @@ def _read_servo(m: EditedModel, actuator: int, joint: int) -> Servo:
         else None,
         joint_range=m.peek("jnt_actfrcrange", joint) if joint_limited else None,
         carries_weight=bool(c.jnt_actgravcomp[joint]),
-    )
-
-
-def _read_ball(m: EditedModel, ball: BallAddresses) -> BallModel:
-    return BallModel(
-        radius=m["geom_size", ball.geom, 0],
-        mass=m["body_mass", ball.body],
-        # Not recorded: the ball stays homogeneous, so that its inertia cannot be edited alone.
-        inertia=m.peek("body_inertia", ball.body, 0),
-        weight=1.0 - _gravity_compensation(m.model)[ball.body].item(),
     )
 
 

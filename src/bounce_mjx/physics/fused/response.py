@@ -64,7 +64,8 @@ def contact_response(
         d = geometry.impedance(pair, contact.distance)
         rows += own
         springs += [mul(mul(pair.stiffness, d), contact.distance), *[0.0] * (len(own) - 1)]
-        softnesses.append(geometry.softness(pair, d))
+        # Regularisers of the normal forces.
+        softnesses.append((1.0 - d) / d * add(*pair.inverse_weights))
     halves = [chain.solve_lower(factor, row.joints) for row in rows]
     halves, half_applied = keep((halves, list(half_applied)))
     matrix = tuple(
