@@ -21,8 +21,7 @@ class PlayCommand(WorldCommand):
     """Shows a trained policy, or several side by side."""
 
     checkpoints: Annotated[
-        tuple[Path, ...],
-        Flag(metavar="[CHECKPOINT ...]", is_positional=True),
+        tuple[Path, ...], Flag(metavar="[CHECKPOINT ...]", is_positional=True)
     ] = ()
     """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, or a
     policy that comes with the package: pretrained, robust, robust_small, or the name of a task or

@@ -14,10 +14,7 @@ from bounce_mjx.errors import exit_on_user_error
 class PlotCommand(RunCommand):
     """Draws the learning curves of runs, and the evaluation of a checkpoint."""
 
-    runs: Annotated[
-        tuple[Path, ...],
-        Flag(metavar="[RUN ...]", is_positional=True),
-    ] = ()
+    runs: Annotated[tuple[Path, ...], Flag(metavar="[RUN ...]", is_positional=True)] = ()
     """Folders of runs; latest, the default, is the newest run. Runs that differ only in the seed
     become one curve with a band, as do the seeds of one run. For a run of one seed, or one
     checkpoint in it, the evaluation is drawn too."""

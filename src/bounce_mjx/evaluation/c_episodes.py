@@ -13,13 +13,7 @@ from bounce_mjx.env.env import Env, EnvState, State, world_model
 from bounce_mjx.evaluation.episodes import Batch, add_step, begin, reset_episodes
 from bounce_mjx.evaluation.statistics import Statistics
 from bounce_mjx.learning.policy import Actor, Policy
-from bounce_mjx.physics import (
-    Control,
-    PhysicsParameters,
-    PhysicsState,
-    edited_model,
-    servo_targets,
-)
+from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, edited_model, servo_targets
 from bounce_mjx.task.shown import Recording
 from bounce_mjx.world.actuation import Actuation
 from bounce_mjx.world.randomization import Ranges

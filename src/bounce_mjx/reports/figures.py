@@ -211,11 +211,7 @@ def _draw_hits(axes: Axes, env: Env, plot: Hits, points: np.ndarray) -> None:
     half_x, half_y = 100.0 * outline
     axes.add_patch(
         Rectangle(
-            (-half_y, -half_x),
-            2.0 * half_y,
-            2.0 * half_x,
-            facecolor="#f6ebe0",
-            edgecolor="C1",
+            (-half_y, -half_x), 2.0 * half_y, 2.0 * half_x, facecolor="#f6ebe0", edgecolor="C1"
         )
     )
     axes.plot([0], [0], "+", color=_GREY)
