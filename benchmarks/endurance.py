@@ -27,9 +27,9 @@ from bounce_mjx.evaluation.results import judge
 from bounce_mjx.evaluation.statistics import accumulate, empty_statistics
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.reports.tables import figure_text
+from bounce_mjx.runs.checkpoints import read_policy
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import find_checkpoint, named_run
-from bounce_mjx.runs.reading import read_policy
 
 # Minimum share of environments that keep the ball up throughout.
 MIN_SHARE = 0.99

@@ -23,9 +23,9 @@ from bounce_mjx.evaluation.config import DEFAULT_EPISODES, DEFAULT_SEED
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import Report, judge
 from bounce_mjx.evaluation.suite import neutral_commands
+from bounce_mjx.runs.checkpoints import read_actor
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import choose_checkpoint
-from bounce_mjx.runs.reading import read_actor
 from bounce_mjx.training.setup import set_up_jax
 from bounce_mjx.world.randomization import RandomizationConfig
 

@@ -34,8 +34,8 @@ from bounce_mjx.evaluation.robustness import ConditionOutcome, measure_condition
 from bounce_mjx.evaluation.suite import load_suite, neutral_commands
 from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.resources import resource_path
+from bounce_mjx.runs.checkpoints import read_actor
 from bounce_mjx.runs.folders import Checkpoint, runs_in, runs_of_seeds
-from bounce_mjx.runs.reading import read_actor
 from bounce_mjx.task import Episodes, Task, mean_and_margin
 from bounce_mjx.tasks.bounce import Bounce
 from bounce_mjx.tasks.track import Track

@@ -8,10 +8,16 @@ import jax
 import numpy as np
 
 from bounce_mjx.resources import POLICIES, resource_path
+from bounce_mjx.runs.checkpoints import (
+    NETWORKS,
+    POLICY,
+    read_networks,
+    read_policy,
+    read_record,
+    save_checkpoint,
+)
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import CHECKPOINTS, best_checkpoint, write_config
-from bounce_mjx.runs.reading import NETWORKS, POLICY, read_networks, read_policy, read_record
-from bounce_mjx.runs.writing import save_checkpoint
 
 
 def main() -> None:

@@ -20,6 +20,13 @@ from bounce_mjx.evaluation.policy_evaluation import PolicyEvaluation, evaluate_p
 from bounce_mjx.learning.policy import networks_of
 from bounce_mjx.reports.tables import details_line, results_table
 from bounce_mjx.resources import ARM_POLICIES, POLICIES, PRETRAINED
+from bounce_mjx.runs.checkpoints import (
+    NETWORKS,
+    POLICY,
+    read_networks,
+    read_policy,
+    save_checkpoint,
+)
 from bounce_mjx.runs.config import (
     CONFIG_FILE,
     ROBOT,
@@ -37,8 +44,6 @@ from bounce_mjx.runs.folders import (
     write_config,
 )
 from bounce_mjx.runs.progress import RESULTS_FILE, load_results
-from bounce_mjx.runs.reading import NETWORKS, POLICY, read_networks, read_policy
-from bounce_mjx.runs.writing import save_checkpoint
 from bounce_mjx.training.setup import set_up_jax
 
 

@@ -25,9 +25,9 @@ from bounce_mjx.env.env import Env, State
 from bounce_mjx.evaluation.episodes import reset_episodes
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.resources import POLICIES, resource_path
+from bounce_mjx.runs.checkpoints import read_policy
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import find_checkpoint
-from bounce_mjx.runs.reading import read_policy
 from bounce_mjx.training.setup import set_up_jax
 from bounce_mjx.world import sensing
 

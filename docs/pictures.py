@@ -183,9 +183,9 @@ def rollout(observation=None, randomization=None, seconds=3.0, target=0.5):
 
     from bounce_mjx import BounceBall
     from bounce_mjx.learning.policy import make_networks
+    from bounce_mjx.runs.checkpoints import read_policy
     from bounce_mjx.runs.config import load_run_config
     from bounce_mjx.runs.folders import pretrained_checkpoint
-    from bounce_mjx.runs.reading import read_policy
     from bounce_mjx.tasks.bounce import BounceConfig as EnvConfig
 
     checkpoint = pretrained_checkpoint()

@@ -20,6 +20,7 @@ from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.learning.ppo import PPO, TrainingState, policy_of
 from bounce_mjx.runs import files
+from bounce_mjx.runs.checkpoints import read_policy, read_training, save_checkpoint
 from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config
 from bounce_mjx.runs.folders import (
     best_checkpoint,
@@ -28,8 +29,6 @@ from bounce_mjx.runs.folders import (
     latest_checkpoint,
     stored_checkpoints,
 )
-from bounce_mjx.runs.reading import read_policy, read_training
-from bounce_mjx.runs.writing import save_checkpoint
 from bounce_mjx.tasks.bounce import BounceConfig
 from bounce_mjx.tasks.bounce_ball import BounceBall
 

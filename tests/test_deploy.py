@@ -27,10 +27,10 @@ from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.learning.statistics import Normalizer
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import load_model
-from bounce_mjx.runs import reading
+from bounce_mjx.runs import checkpoints
+from bounce_mjx.runs.checkpoints import save_checkpoint
 from bounce_mjx.runs.config import TrainConfig, load_run_config, train_config
 from bounce_mjx.runs.folders import find_checkpoint, save_config
-from bounce_mjx.runs.writing import save_checkpoint
 from bounce_mjx.tasks.registry import find_task
 from bounce_mjx.world.sensing import Sensing
 
@@ -138,7 +138,7 @@ def draw_inputs(name: str, runs: dict[str, Path]) -> tuple[dict, np.ndarray]:
     """1,000 inputs of a policy's network by the names of the quantities, and the actions of JAX."""
     checkpoint = find_checkpoint(runs[name])
     config = load_run_config(checkpoint.run)
-    policy = reading.read_policy(checkpoint, config)
+    policy = checkpoints.read_policy(checkpoint, config)
     layout, counts = config.env.layout, config.env.observation.lengths()
     rng = np.random.default_rng(3)
     # Some observations are beyond the clipping range of the normaliser.

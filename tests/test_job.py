@@ -22,7 +22,8 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.interrupt import Interrupted
 from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.runs import writing
+from bounce_mjx.runs import checkpoints
+from bounce_mjx.runs.checkpoints import policy_shapes, read_policy, read_record
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import (
     Checkpoint,
@@ -32,7 +33,6 @@ from bounce_mjx.runs.folders import (
     lock_run,
     named_run,
 )
-from bounce_mjx.runs.reading import policy_shapes, read_policy, read_record
 from bounce_mjx.training import job
 from bounce_mjx.training.events import Event
 from bounce_mjx.training.ppo_trainer import Snapshot
@@ -158,14 +158,14 @@ def iterations_of(checkpoint: Checkpoint) -> int:
 
 def fail(monkeypatch: pytest.MonkeyPatch, *saves: int) -> None:
     """Lets some saves, by number from 1, find a full disk."""
-    save, count = writing.save_checkpoint, itertools.count(1)
+    save, count = checkpoints.save_checkpoint, itertools.count(1)
 
     def full(*args) -> None:
         if next(count) in saves:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         save(*args)
 
-    monkeypatch.setattr(writing, "save_checkpoint", full)
+    monkeypatch.setattr(checkpoints, "save_checkpoint", full)
 
 
 def test_a_resumed_training_knows_the_best_policy(tmp_path: Path) -> None:

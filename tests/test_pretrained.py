@@ -17,6 +17,7 @@ from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import make_networks, networks_of
 from bounce_mjx.resources import ARM_POLICIES, POLICIES, TASK_POLICIES, resource_path
+from bounce_mjx.runs.checkpoints import read_policy
 from bounce_mjx.runs.config import (
     TrainConfig,
     in_world,
@@ -27,7 +28,6 @@ from bounce_mjx.runs.config import (
 )
 from bounce_mjx.runs.folders import best_checkpoint, choose_checkpoint, pretrained_checkpoint
 from bounce_mjx.runs.progress import load_results
-from bounce_mjx.runs.reading import read_policy
 from bounce_mjx.tasks.registry import find_task
 
 FOLDER = resource_path("pretrained")

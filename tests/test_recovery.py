@@ -28,6 +28,7 @@ from bounce_mjx.commands import train as train_command
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import judge
 from bounce_mjx.learning.policy import make_networks
+from bounce_mjx.runs.checkpoints import read_actor, read_policy, read_record, save_checkpoint
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import (
     best_checkpoint,
@@ -35,8 +36,6 @@ from bounce_mjx.runs.folders import (
     latest_checkpoint,
     stored_checkpoints,
 )
-from bounce_mjx.runs.reading import read_actor, read_policy, read_record
-from bounce_mjx.runs.writing import save_checkpoint
 from bounce_mjx.tasks.bounce_ball import BounceBall
 from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.ppo_trainer import PPOTrainer, make_mesh

@@ -14,9 +14,9 @@ from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.resources import resource_path
+from bounce_mjx.runs.checkpoints import read_policy
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import pretrained_checkpoint
-from bounce_mjx.runs.reading import read_policy
 from bounce_mjx.tasks.bounce import BounceConfig
 from bounce_mjx.tasks.bounce_rewards import BounceReward
 from bounce_mjx.viewers import show

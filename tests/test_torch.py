@@ -25,9 +25,9 @@ from bounce_mjx.adapters.torch.skrl_env import SkrlEnv
 from bounce_mjx.env import vector
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.policy import Policy, make_networks
+from bounce_mjx.runs.checkpoints import read_policy
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import find_checkpoint, runs_in
-from bounce_mjx.runs.reading import read_policy
 
 # Threads that wait for a busy core slow tiny networks down a hundredfold.
 torch.set_num_threads(1)

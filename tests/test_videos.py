@@ -18,9 +18,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from bounce_mjx.commands import play
 from bounce_mjx.errors import UserError
+from bounce_mjx.runs.checkpoints import read_policy
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import pretrained_checkpoint
-from bounce_mjx.runs.reading import read_policy
 from bounce_mjx.training.events import Event
 from bounce_mjx.training.video import EvaluationVideo
 from bounce_mjx.viewers import offscreen, show

@@ -14,9 +14,9 @@ from bounce_mjx.env.env import Env
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.learning.ppo import names_of_critic_metrics
 from bounce_mjx.learning.statistics import normalize
+from bounce_mjx.runs.checkpoints import read_networks, read_policy, read_start
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import best_checkpoint, pretrained_checkpoint
-from bounce_mjx.runs.reading import read_networks, read_policy, read_start
 from tiny_runs import STEPS, TINY
 
 CRITIC = {"n_bounces", "world/restitution", "world/air_drag"}

@@ -65,8 +65,8 @@ def _config(checkpoint: "Checkpoint", command: PlayCommand) -> TrainConfig:
 def load_shown(checkpoint: "Checkpoint", config: TrainConfig) -> "Shown":
     """The environment and the policy of a checkpoint."""
     from bounce_mjx.reports.tables import count_text
+    from bounce_mjx.runs.checkpoints import read_actor
     from bounce_mjx.runs.folders import MIRROR_LAW
-    from bounce_mjx.runs.reading import read_actor
     from bounce_mjx.viewers.show import Shown
     from bounce_mjx.viewers.simulation import make_policy_controller
 

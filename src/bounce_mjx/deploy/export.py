@@ -31,9 +31,9 @@ from bounce_mjx.errors import UserError, needed
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.robot.arm import joint_name
 from bounce_mjx.robot.model import find_addresses, joint_names, load_model
+from bounce_mjx.runs.checkpoints import read_actor
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import Checkpoint
-from bounce_mjx.runs.reading import read_actor
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.observation import ObservationConfig
 from bounce_mjx.world.randomization import entries

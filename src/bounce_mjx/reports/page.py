@@ -21,11 +21,11 @@ from bounce_mjx.reports.curves import group_runs
 from bounce_mjx.reports.html_page import data_url, figures_html, page, table
 from bounce_mjx.reports.robustness import load_robustness, robustness_figure
 from bounce_mjx.reports.tables import details_line, result_cells, robot_name
+from bounce_mjx.runs.checkpoints import read_actor
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.files import write_output
 from bounce_mjx.runs.folders import Checkpoint, best_checkpoint
 from bounce_mjx.runs.progress import Results, load_results
-from bounce_mjx.runs.reading import read_actor
 from bounce_mjx.task.shown import Recording
 from bounce_mjx.viewers.page import replay_first_episode
 

@@ -76,8 +76,8 @@ class Start(StrictModel):
             raise UserError(
                 "--warm-start and --robot cannot be combined; the policy's own robot is trained on"
             )
+        from bounce_mjx.runs.checkpoints import NETWORK_KEYS
         from bounce_mjx.runs.folders import choose_checkpoint
-        from bounce_mjx.runs.reading import NETWORK_KEYS
 
         folder = run_configs.runs_folder(find_task(self.task or DEFAULT))
         checkpoint = choose_checkpoint(self.warm_start, folder)
@@ -138,7 +138,7 @@ class Start(StrictModel):
         config = config.model_copy(update={"task": base.task, "algorithm": base.algorithm})
         if not self.resume:
             return config.model_copy(update={"warm_start": base.warm_start})
-        from bounce_mjx.runs.reading import RESUMABLE_KEYS
+        from bounce_mjx.runs.checkpoints import RESUMABLE_KEYS
 
         if changed := differing_keys(base, config) - RESUMABLE_KEYS:
             raise UserError(

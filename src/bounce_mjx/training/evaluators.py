@@ -16,8 +16,8 @@ from bounce_mjx.evaluation.episodes import run_episodes
 from bounce_mjx.evaluation.recording import RECORDED_EPISODES
 from bounce_mjx.evaluation.results import Report, judge
 from bounce_mjx.learning.policy import Policy, make_networks
+from bounce_mjx.runs.checkpoints import policy_shapes
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.reading import policy_shapes
 from bounce_mjx.training import hosts
 from bounce_mjx.training.ppo_trainer import each_seed
 from bounce_mjx.training.setup import compiler_options

@@ -24,7 +24,7 @@ from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.interrupt import Interrupted, StopRequest
 from bounce_mjx.learning.policy import Policy
-from bounce_mjx.runs import folders, reading, writing
+from bounce_mjx.runs import checkpoints, folders
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.files import to_json, writable, write_atomically
 from bounce_mjx.runs.progress import RESULTS_FILE, Progress
@@ -58,9 +58,9 @@ class SeedRun:
         self.best_policy, self.progress.best, self.progress.best_steps = None, None, 0
         with contextlib.suppress(UserError):
             best = folders.best_checkpoint(self.run)
-            stored = Progress.model_validate(reading.read_record(best).progress)
+            stored = Progress.model_validate(checkpoints.read_record(best).progress)
             if stored.best is not None:
-                self.best_policy = reading.read_policy(best, self.config)
+                self.best_policy = checkpoints.read_policy(best, self.config)
                 self.progress.best, self.progress.best_steps = stored.best, stored.best_steps
 
 
@@ -139,7 +139,7 @@ class Job:
         self.env = Env(config.env)
         self.trainer = make_trainer(config, self.env)
         warm = config.warm_start is not None and resume is None
-        self.first = reading.read_start(config, self.env) if warm else None
+        self.first = checkpoints.read_start(config, self.env) if warm else None
         self.state: Any = None
         self.steps = 0
         self.ended = False
@@ -232,7 +232,7 @@ class Job:
 
     def _read_resumed(self) -> None:
         latest = folders.latest_checkpoint(self.run)
-        self.state, record = reading.read_training(latest, self.trainer.state_template)
+        self.state, record = checkpoints.read_training(latest, self.trainer.state_template)
         self.steps = record.steps
         evaluated = record.progress.get("seeds", [record.progress])
         for member, plain in zip(self.members, evaluated, strict=True):
@@ -478,14 +478,15 @@ class Job:
         if hosts.is_leader():
             # A copy, because the training reuses its buffers meanwhile.
             policies, state, networks = jax.tree.map(np.array, snapshot)
-            training, is_alone = {reading.TRAINING: state}, len(self.members) == 1
+            training, is_alone = {checkpoints.TRAINING: state}, len(self.members) == 1
             saves, records = [], [member.progress.model_dump() for member in self.members]
-            for i, (member, record) in enumerate(zip(self.members, records, strict=True)):
-                items = {reading.POLICY: policies[i], reading.NETWORKS: networks and networks[i]}
+            for i, member in enumerate(self.members):
+                items = training.copy() if is_alone else {}
+                items[checkpoints.POLICY] = policies[i]
+                items[checkpoints.NETWORKS] = networks and networks[i]
                 score = scores.get(member.run, ())
                 if is_alone or score:
-                    items |= training if is_alone else {}
-                    saves.append((member.run, member.config, self.steps, items, record, score))
+                    saves.append((member.run, member.config, self.steps, items, records[i], score))
             if not is_alone:
                 # Last, as it refers to the best policies of the seeds.
                 saves.append((self.run, self.config, self.steps, training, {"seeds": records}))
@@ -503,8 +504,8 @@ class Job:
         }
 
 
-def _write(checkpoints: list[tuple[Any, ...]], results: dict[Path, str]) -> None:
-    for arguments in checkpoints:
-        writing.save_checkpoint(*arguments)
+def _write(saves: list[tuple[Any, ...]], results: dict[Path, str]) -> None:
+    for arguments in saves:
+        checkpoints.save_checkpoint(*arguments)
     for path, content in results.items():
         write_atomically(path, content)

@@ -20,9 +20,9 @@ from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.reports.tables import details_line, results_table, seeds_table
 from bounce_mjx.runs import folders
+from bounce_mjx.runs.checkpoints import read_actor
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.progress import load_results
-from bounce_mjx.runs.reading import read_actor
 from bounce_mjx.training import hosts, job
 from bounce_mjx.training.command import Start, changed
 from bounce_mjx.training.events import Callback, say

@@ -13,9 +13,9 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.learning.statistics import Normalizer
-from bounce_mjx.runs import writing
+from bounce_mjx.runs import checkpoints
+from bounce_mjx.runs.checkpoints import policy_shapes
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.reading import policy_shapes
 
 
 def to_policy(
@@ -76,7 +76,7 @@ def write_run(log_dir: Path, env: Env, policy: Policy, steps: int, seed: int = 0
             f"the policy's arrays have the shapes {shapes}, but the environment's policies have "
             f"{expected}; give the environment of the training"
         )
-    return writing.write_run(config, steps, policy)
+    return checkpoints.write_run(config, steps, policy)
 
 
 def _array(tensor: torch.Tensor) -> jax.Array:

@@ -1,12 +1,16 @@
-"""Reading of checkpoints with orbax; one sentence refuses a damaged one.
+"""Checkpoints, which orbax reads and writes; one sentence refuses a damaged one.
 
 Arrays are numbers in OCDBT and zarr, and the rest is JSON: nothing in a checkpoint is executable.
-Every function raises a `UserError` if the checkpoint is damaged or its config differs
+Every function that reads raises a `UserError` if the checkpoint is damaged or its config differs
 from the run's.
 """
 
+import logging
+import os
+import re
+import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +25,14 @@ from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.learning.policy import Actor, Policy, make_networks, networks_of, untrained_policy
 from bounce_mjx.learning.ppo import Params, names_of_critic_metrics
 from bounce_mjx.learning.statistics import RunningStatistics, init_statistics
+from bounce_mjx.runs import folders
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config, runs_folder
-from bounce_mjx.runs.files import MANIFEST_FILE, check_integrity
-from bounce_mjx.runs.folders import MIRROR_LAW, Checkpoint, best_checkpoint, choose_checkpoint
+from bounce_mjx.runs.files import MANIFEST_FILE, check_integrity, seal, to_plain, writable
+from bounce_mjx.runs.folders import MIRROR_LAW, Checkpoint, best_checkpoint
 from bounce_mjx.tasks.registry import is_file
 
+# Where orbax moves the checkpoints that are not kept any more.
+_REPLACED = "replaced"
 POLICY, TRAINING, NETWORKS, RECORD = "policy", "training", "networks", "record"
 """Items of a checkpoint: what acts; what a training continues from; both networks, with which
 another training can start; steps, config and evaluations."""
@@ -137,7 +144,7 @@ def read_start(config: TrainConfig, env: Env) -> tuple[Params, RunningStatistics
       UserError: the checkpoint is missing, damaged or without a value network, or its observation
         or hidden layers are not those of the training.
     """
-    checkpoint = choose_checkpoint(config.warm_start, runs_folder(config.env.task))
+    checkpoint = folders.choose_checkpoint(config.warm_start, runs_folder(config.env.task))
     own = load_run_config(checkpoint.run)
     networks = [[getattr(ppo, key) for key in NETWORK_KEYS] for ppo in (own.ppo, config.ppo)]
     same = networks[0] == networks[1] and policy_shapes(own) == policy_shapes(config)
@@ -238,3 +245,96 @@ def _damaged(checkpoint: Checkpoint, error: Exception) -> UserError:
         f"the checkpoint {checkpoint.folder} is damaged or of another version "
         f"({shorten(reason_of(error), 200)}); give another checkpoint"
     )
+
+
+def write_run(config: TrainConfig, steps: int, policy: Policy) -> Path:
+    """Writes a new run whose checkpoint holds only a policy; its folder.
+
+    Args:
+      steps: environment steps trained.
+
+    Raises:
+      UserError: the folder cannot be written.
+    """
+    run = folders.create_run(config)
+    with writable(run, "choose another folder"):
+        save_checkpoint(run, config, steps, {POLICY: policy})
+    return run
+
+
+def save_checkpoint(
+    run: Path,
+    config: TrainConfig,
+    steps: int,
+    items: dict[str, Any],
+    progress: dict[str, Any] | None = None,
+    score: Sequence[float] = (),
+) -> None:
+    """Writes a checkpoint; of the others, orbax keeps the best one. A process that is killed at any
+    moment leaves the others as they were.
+
+    Its number is that of its steps, or the next one if it was saved before without an evaluation.
+
+    Args:
+      run: the run's folder.
+      config: the run's config.
+      steps: environment steps trained.
+      items: pytrees of arrays by their names above.
+      progress: the evaluations so far, plain data.
+      score: quality of the policy (`Report.score`); empty if it was not evaluated.
+
+    Raises:
+      OSError: the checkpoint could not be written.
+    """
+    import orbax.checkpoint as ocp
+    from orbax.checkpoint.checkpoint_managers import preservation_policy as keep
+
+    folder = (run / folders.CHECKPOINTS).absolute()
+    folder.mkdir(exist_ok=True)
+    alone = {jax.process_index()}
+    options = ocp.CheckpointManagerOptions(
+        # Without it, orbax writes no metrics.
+        best_fn=_score_in,
+        preservation_policy=keep.AnyPreservationPolicy(
+            [
+                keep.LatestN(1),
+                keep.BestN(get_metric_fn=_score_in, n=1, keep_checkpoints_without_metrics=False),
+            ]
+        ),
+        create=False,
+        cleanup_tmp_directories=True,
+        enable_async_checkpointing=False,
+        todelete_subdir=_REPLACED,
+        multiprocessing_options=ocp.options.MultiprocessingOptions(
+            primary_host=jax.process_index(), active_processes=alone, barrier_sync_key_prefix="run"
+        ),
+    )
+    items = jax.tree.map(np.asarray, items)
+    given = {name: tree for name, tree in items.items() if jax.tree.leaves(tree)}
+    arguments = {name: ocp.args.StandardSave(tree) for name, tree in given.items()}
+    record = {"steps": steps, "config": config.model_dump(mode="json"), "progress": progress or {}}
+    arguments[RECORD] = ocp.args.JsonSave(to_plain(record))
+    # After an error, orbax would log a traceback.
+    log = logging.getLogger("absl")
+    log.disabled = True
+    try:
+        # A new manager each time: one that failed would take the checkpoint for written.
+        with ocp.CheckpointManager(folder, options=options) as manager:
+            latest = manager.latest_step()
+            number = steps if latest is None else max(steps, latest + 1)
+            metrics = {"score": list(score)}
+            manager.save(number, args=ocp.args.Composite(**arguments), metrics=metrics)
+        seal(folder / str(number))
+    except Exception as error:
+        # tensorstore reports a full disk as a ValueError.
+        code = re.search(r"os_error_code='(\d+)'", str(error))
+        if code is None:
+            raise
+        raise OSError(int(code[1]), os.strerror(int(code[1]))) from error
+    finally:
+        log.disabled = False
+        shutil.rmtree(folder / _REPLACED, ignore_errors=True)
+
+
+def _score_in(metrics: dict[str, Any]) -> tuple[float, ...]:
+    return tuple(metrics["score"])
