@@ -241,7 +241,7 @@ def test_tensorboard_reads_everything_back(trained: Path) -> None:
     # results.json measures the best policy once more, on fresh resets.
     logged_values = {event.step: event.value for event in log.Scalars("results/stable")}
     evaluations = load_results(trained).evaluations
-    assert logged_values == {e.steps: pytest.approx(e.model_extra["stable"]) for e in evaluations}
+    assert logged_values == {e["steps"]: pytest.approx(e["stable"]) for e in evaluations}
 
 
 def test_a_full_disk_costs_points(tmp_path: Path, monkeypatch) -> None:

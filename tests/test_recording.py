@@ -10,8 +10,7 @@ import pytest
 
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.evaluation.episodes import make_evaluator
-from bounce_mjx.evaluation.recording import paddle_points
-from bounce_mjx.evaluation.statistics import accumulate, empty_statistics
+from bounce_mjx.evaluation.statistics import accumulate, empty_statistics, paddle_points
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.learning.statistics import init_normalizer

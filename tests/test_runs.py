@@ -324,7 +324,7 @@ def test_whole_numbers_may_have_an_exponent(tmp_path: Path) -> None:
 def test_results_are_read_as_they_were_written(tmp_path: Path, progress: Progress) -> None:
     (tmp_path / "results.json").write_text(to_json(results_of(progress)))
     results = load_results(tmp_path)
-    assert [evaluation.model_dump() for evaluation in results.evaluations] == [
+    assert results.evaluations == [
         {"steps": 64, "passed": False, "screening": False}
         | dict(zip(NAMES, [1.0, 2.0, None, 4.0, 5.0], strict=True))
     ]

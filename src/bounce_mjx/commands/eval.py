@@ -40,7 +40,7 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.evaluation.contacts import arm_contacts, describe_contacts
     from bounce_mjx.evaluation.limits import describe_limits, limit_shares
     from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
-    from bounce_mjx.evaluation.recording import RECORDED_EPISODES
+    from bounce_mjx.evaluation.statistics import RECORDED_EPISODES
     from bounce_mjx.reports.tables import details_line, results_table
     from bounce_mjx.runs.checkpoints import read_actor
     from bounce_mjx.runs.files import check_output, to_json, write_output

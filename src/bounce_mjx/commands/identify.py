@@ -71,11 +71,6 @@ def main(args: Sequence[str]) -> None:
         seen = "" if entry.seen else "  (not shown by the log)"
         interval = f"{entry.low:.5g} to {entry.high:.5g} {entry.unit}".rstrip()
         print(f"{entry.label}: {entry.value:.5g}, {interval}{seen}")
-    for sensor, error in found.after.items():
-        held = found.held_out.get(sensor)
-        rest = "" if held is None else f", {held:.2f} in windows held out"
-        before = found.before.get(sensor, float("nan"))
-        print(f"{sensor}: error {before:.2f} times the noise before, {error:.2f} after{rest}")
     for line in sentences(found, names):
         print(line)
     if known is not None:
@@ -83,9 +78,8 @@ def main(args: Sequence[str]) -> None:
         for line in changed or [f"the robot still matches {command.check}"]:
             print(line)
         sys.exit(1 if changed else 0)
-    robot = None if command.robot is None else str(command.robot)
     files = {
-        command.out: to_yaml(found, log, names, robot),
+        command.out: to_yaml(found, log, names, command.robot and str(command.robot)),
         page: identification_page(found, log.source, names, command.out),
     }
     for path, content in files.items():

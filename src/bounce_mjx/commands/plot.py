@@ -29,9 +29,7 @@ def main(args: Sequence[str]) -> None:
     """Runs the command line."""
     command = parse(PlotCommand, args, prog="bounce-mjx plot")
     from bounce_mjx.env.env import Env
-    from bounce_mjx.reports import figures
-    from bounce_mjx.reports.curves import group_runs
-    from bounce_mjx.reports.page import record_checkpoint
+    from bounce_mjx.reports import curves, figures, page
     from bounce_mjx.runs.files import writable, write_output
     from bounce_mjx.runs.folders import find_checkpoint, named_run, runs_of_seeds
 
@@ -39,12 +37,12 @@ def main(args: Sequence[str]) -> None:
     seeds = [seed for run in runs for seed in runs_of_seeds(run)]
     checkpoints = [find_checkpoint(seed) for seed in seeds]
     configs = [command.config(checkpoint.run) for checkpoint in checkpoints]
-    groups = group_runs([checkpoint.run for checkpoint in checkpoints])
+    groups = curves.group_runs([checkpoint.run for checkpoint in checkpoints])
     with writable(command.out, "choose another folder with --out"):
         command.out.mkdir(parents=True, exist_ok=True)
     drawn = {"curves": figures.curves_figure(groups), "rewards": figures.rewards_figure(groups)}
     if len(checkpoints) == 1:
-        recording = record_checkpoint(checkpoints[0])
+        recording = page.record_checkpoint(checkpoints[0])
         drawn["evaluation"] = figures.evaluation_figure(Env(configs[0].env), recording)
     for name, figure in drawn.items():
         for suffix in command.formats:

@@ -7,8 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from bounce_mjx.env.env import Env, State
-from bounce_mjx.evaluation.recording import empty_recording, record
-from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
+from bounce_mjx.evaluation import statistics
 from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.task.shown import Recording
 from bounce_mjx.world.randomization import Ranges
@@ -18,7 +17,7 @@ class Batch(NamedTuple):
     """E episodes that are being simulated, batch last."""
 
     states: State
-    statistics: Statistics
+    statistics: statistics.Statistics
     recording: Recording
     step: jax.Array
     """Control steps so far [], int32."""
@@ -26,14 +25,14 @@ class Batch(NamedTuple):
 
 def make_evaluator(
     env: Env, actor: Actor, episodes: int, recorded: int = 0
-) -> Callable[..., tuple[Statistics, Recording]]:
+) -> Callable[..., tuple[statistics.Statistics, Recording]]:
     """A jitted function (policy, key, ranges) -> statistics of `episodes` deterministic episodes,
     each from its own reset (`reset_episodes`), and a recording of the first `recorded`. It stops
     when all episodes have ended or their time limit is reached. The ranges are optional."""
 
     def evaluate(
         policy: Policy, key: jax.Array, ranges: Ranges | None = None
-    ) -> tuple[Statistics, Recording]:
+    ) -> tuple[statistics.Statistics, Recording]:
         states = reset_episodes(env, key, episodes, ranges)
         return run_episodes(env, actor, policy, states, recorded)
 
@@ -42,7 +41,7 @@ def make_evaluator(
 
 def run_episodes(
     env: Env, actor: Actor, policy: Policy, states: State, recorded: int
-) -> tuple[Statistics, Recording]:
+) -> tuple[statistics.Statistics, Recording]:
     """Runs one deterministic episode from each of E initial states (batch last), until all have
     ended or their time limit is reached.
 
@@ -57,8 +56,8 @@ def begin(env: Env, states: State, recorded: int) -> Batch:
     """Episodes before their first step, from initial states (batch last)."""
     return Batch(
         states=states,
-        statistics=empty_statistics(env, states),
-        recording=empty_recording(env, states, min(recorded, states.done.shape[-1])),
+        statistics=statistics.empty_statistics(env, states),
+        recording=statistics.empty_recording(env, states, min(recorded, states.done.shape[-1])),
         step=jnp.int32(0),
     )
 
@@ -85,10 +84,11 @@ def add_step(env: Env, before: Batch, states: State) -> Batch:
     Args:
       states: the states after it.
     """
+    running = before.statistics.running
     return Batch(
         states=states,
-        statistics=accumulate(env, before.statistics, states, before.step),
-        recording=record(env, before.recording, states, before.statistics.running, before.step),
+        statistics=statistics.accumulate(env, before.statistics, states, before.step),
+        recording=statistics.record(env, before.recording, states, running, before.step),
         step=before.step + 1,
     )
 

@@ -4,7 +4,6 @@
 """
 
 import math
-from functools import reduce
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -12,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from bounce_mjx.config.files import differing_keys, read_mapping
-from bounce_mjx.config.settings import Finite, StrictModel, merged
+from bounce_mjx.config.settings import Finite, StrictModel, merged, nested
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.tasks.registry import find_task
@@ -208,8 +207,7 @@ def _with_changes(env: WorldConfig, settings: dict[str, Any], source: str) -> Wo
     for name, value in settings.items():
         if name.partition(".")[0] == "randomization":
             raise UserError(f"{source}: give {shorten(name)} under terms, without its group")
-        nested = reduce(lambda inner, key: {key: inner}, reversed(name.split(".")), value)
-        values = merged(values, nested)
+        values = merged(values, nested(name, value))
     changed = validate(type(env), values, source)
     if changed.layout != env.layout:
         raise UserError(

@@ -17,7 +17,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from bounce_mjx.env.env import Env
-from bounce_mjx.evaluation.recording import paddle_points
+from bounce_mjx.evaluation.statistics import paddle_points
 from bounce_mjx.reports.curves import Group, mean_and_band
 from bounce_mjx.task.shown import Curve, Histogram, Hits, Recording
 

@@ -15,7 +15,7 @@ from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.config import EvaluationOptions
 from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
-from bounce_mjx.evaluation.recording import RECORDED_EPISODES
+from bounce_mjx.evaluation.statistics import RECORDED_EPISODES
 from bounce_mjx.reports import figures
 from bounce_mjx.reports.curves import group_runs
 from bounce_mjx.reports.html_page import data_url, figures_html, page, table

@@ -172,13 +172,8 @@ def write_config(run: Path, config: TrainConfig) -> None:
     write_atomically(run / CONFIG_FILE, head + dump_config(config))
 
 
-def seed_folder(run: Path, seed: int) -> Path:
-    """Folder of a run's seed."""
-    return run / f"seed_{seed:03d}"
-
-
 def runs_of_seeds(run: Path) -> list[Path]:
-    """Existing folders of a run's seeds; the run itself if it has one seed."""
+    """Existing folders of a run's seeds, such as seed_003; the run itself if it has one seed."""
     seeds = (path for path in run.glob("seed_*") if re.fullmatch("seed_[0-9]+", path.name))
     return sorted(path for path in seeds if not path.is_symlink()) or [run]
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import pydantic
 
-from bounce_mjx.evaluation.results import Figure, Report
+from bounce_mjx.evaluation.results import Report
 from bounce_mjx.runs.files import read_stored
 
 RESULTS_FILE = "results.json"
@@ -13,16 +13,6 @@ RESULTS_FILE = "results.json"
 PATIENCE = 1.5
 """Length of a run that waits in vain for a margin, in steps of the first evaluation that met
 all results."""
-
-
-class Evaluation(pydantic.BaseModel, extra="allow"):
-    """One evaluation: the value of each result by its name."""
-
-    __pydantic_extra__: dict[str, Figure]
-    steps: int
-    passed: bool
-    screening: bool = False
-    """Whether the policy failed the screening, so that no full evaluation followed."""
 
 
 class Progress(pydantic.BaseModel):
@@ -40,14 +30,16 @@ class Progress(pydantic.BaseModel):
     margin_steps: int | None = None
     """Steps at the first evaluation that met all with a margin
     (`Report.passed_with_margin`)."""
-    evaluations: list[Evaluation] = []
+    evaluations: list[dict[str, Any]] = []
+    """Of each, the value of each result by its name, its `steps`, whether it `passed`, and whether
+    the policy failed the `screening`, so that no full evaluation followed."""
 
     @property
     def solved(self) -> bool:
         """Whether `stop_when_solved` ends the training."""
         if self.solved_steps is None:
             return False
-        latest = max((evaluation.steps for evaluation in self.evaluations), default=0)
+        latest = max((evaluation["steps"] for evaluation in self.evaluations), default=0)
         return self.margin_steps is not None or latest >= PATIENCE * self.solved_steps
 
     def results(self, **run: Any) -> dict[str, Any]:
@@ -56,7 +48,7 @@ class Progress(pydantic.BaseModel):
 
     def has(self, steps: int) -> bool:
         """Whether the state after this number of steps was evaluated."""
-        return any(evaluation.steps == steps for evaluation in self.evaluations)
+        return any(evaluation["steps"] == steps for evaluation in self.evaluations)
 
     def improves(self, report: Report, steps: int, seconds: float) -> bool:
         """Adds an evaluation; returns whether it is the best so far.
@@ -64,14 +56,9 @@ class Progress(pydantic.BaseModel):
         Args:
           seconds: time from the start of the process, without its imports, to the evaluation's end.
         """
-        # Built without validation, as a non-finite figure is allowed here and stored as null.
-        new = Evaluation.model_construct(
-            steps=steps,
-            passed=report.passed,
-            screening=report.screening,
-            **{result.name: result.value for result in report.results},
-        )
-        self.evaluations.append(new)
+        values = {result.name: result.value for result in report.results}
+        about = {"steps": steps, "passed": report.passed, "screening": report.screening}
+        self.evaluations.append(about | values)
         if report.passed and self.solved_steps is None:
             self.solved_steps, self.solved_seconds = steps, seconds
         if report.passed_with_margin and self.margin_steps is None:

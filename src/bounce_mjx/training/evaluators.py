@@ -13,8 +13,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.episodes import run_episodes
-from bounce_mjx.evaluation.recording import RECORDED_EPISODES
 from bounce_mjx.evaluation.results import Report, judge
+from bounce_mjx.evaluation.statistics import RECORDED_EPISODES
 from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.runs.checkpoints import policy_shapes
 from bounce_mjx.runs.config import TrainConfig

@@ -161,7 +161,7 @@ class Job:
         self.stack.callback(lambda: concurrent.futures.wait([self.saving]))
         self.members = []
         for seed in range(config.seed, config.seed + config.num_seeds):
-            folder = folders.seed_folder(self.run, seed) if config.num_seeds > 1 else self.run
+            folder = self.run / f"seed_{seed:03d}" if config.num_seeds > 1 else self.run
             alone = config.model_copy(update={"seed": seed, "num_seeds": 1})
             self.members.append(SeedRun(folder, alone, self.seconds))
         if self.resume is not None:
