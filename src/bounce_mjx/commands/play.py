@@ -14,7 +14,6 @@ from bounce_mjx.world.randomization import RandomizationConfig
 
 if TYPE_CHECKING:
     from bounce_mjx.runs.folders import Checkpoint
-    from bounce_mjx.viewers.show import Shown
 
 
 class PlayCommand(WorldCommand):
@@ -38,19 +37,27 @@ def main(args: Sequence[str]) -> None:
     command, given_commands = parse_with_commands(PlayCommand, args, prog="bounce-mjx play")
     if len(command.checkpoints) > MAX_ENVS:
         raise UserError(f"{len(command.checkpoints)} policies are given; give at most {MAX_ENVS}")
+    from bounce_mjx.reports.tables import count_text
+    from bounce_mjx.runs.checkpoints import read_actor
+    from bounce_mjx.runs.folders import MIRROR_LAW
     from bounce_mjx.training.setup import set_up_jax
-    from bounce_mjx.viewers.show import show
+    from bounce_mjx.viewers.show import Shown, show
+    from bounce_mjx.viewers.simulation import make_policy_controller
 
     chosen = [command.choose(path) for path in command.checkpoints or (None,)]
     configs = [_config(checkpoint, command) for checkpoint in chosen]
     (commands, *_) = [given_commands(config.env) for config in configs]
     set_up_jax(*(config.env for config in configs))
-    show(
-        [load_shown(*shown) for shown in zip(chosen, configs, strict=True)],
-        command.viewing,
-        commands=commands,
-        console=stdout(),
-    )
+    shown = []
+    for checkpoint, config in zip(chosen, configs, strict=True):
+        checkpoint, policy, actor = read_actor(checkpoint, config)
+        print(f"checkpoint: {checkpoint.folder}")
+        title = checkpoint.run.name
+        if checkpoint is not MIRROR_LAW:
+            title += f", {count_text(checkpoint.steps)} steps"
+        make_controller = lambda env, actor=actor: make_policy_controller(actor(env))  # noqa: E731
+        shown.append(Shown(config.env, make_controller, title, policy))
+    show(shown, command.viewing, commands=commands, console=stdout())
 
 
 def _config(checkpoint: "Checkpoint", command: PlayCommand) -> TrainConfig:
@@ -60,19 +67,3 @@ def _config(checkpoint: "Checkpoint", command: PlayCommand) -> TrainConfig:
         return config
     given = dict(config.env) | {"randomization": command.randomization}
     return config.model_copy(update={"env": validate(type(config.env), given, "play")})
-
-
-def load_shown(checkpoint: "Checkpoint", config: TrainConfig) -> "Shown":
-    """The environment and the policy of a checkpoint."""
-    from bounce_mjx.reports.tables import count_text
-    from bounce_mjx.runs.checkpoints import read_actor
-    from bounce_mjx.runs.folders import MIRROR_LAW
-    from bounce_mjx.viewers.show import Shown
-    from bounce_mjx.viewers.simulation import make_policy_controller
-
-    checkpoint, policy, actor = read_actor(checkpoint, config)
-    print(f"checkpoint: {checkpoint.folder}")
-    title = checkpoint.run.name
-    if checkpoint is not MIRROR_LAW:
-        title += f", {count_text(checkpoint.steps)} steps"
-    return Shown(config.env, lambda env: make_policy_controller(actor(env)), title, policy)

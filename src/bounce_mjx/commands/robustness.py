@@ -3,7 +3,6 @@
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rich.progress import Progress
 
@@ -13,10 +12,7 @@ from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation import config as evaluation
 from bounce_mjx.resources import POLICIES, resource_path
-from bounce_mjx.runs.config import TrainConfig
-
-if TYPE_CHECKING:
-    from bounce_mjx.evaluation.suite import Condition
+from bounce_mjx.runs import config as run_configs
 
 
 class RobustnessCommand(OneActorCommand):
@@ -48,6 +44,7 @@ def main(args: Sequence[str]) -> None:
     not, 2 on a mistake."""
     command = parse(RobustnessCommand, args, prog="bounce-mjx robustness")
     from bounce_mjx.evaluation.robustness import RobustnessReport, measure_conditions
+    from bounce_mjx.evaluation.suite import load_suite, read_suite
     from bounce_mjx.reports import robustness
     from bounce_mjx.reports.figures import image
     from bounce_mjx.runs.checkpoints import read_actor
@@ -60,7 +57,16 @@ def main(args: Sequence[str]) -> None:
     console = stdout()
     checkpoint = command.choose(command.checkpoint)
     config = command.config_of(checkpoint)
-    conditions, suite, version = _read_conditions(command, config)
+    path = run_configs.named_file(command.suite, "configs")
+    suite, version, world, assumed = str(path), read_suite(path).version, None, {}
+    if command.world is not None:
+        there, named = run_configs.in_world(config, command.world)
+        world, assumed = there.env, named.double_assumed()
+    conditions = load_suite(path, config.env, world, assumed)
+    if command.assumed:
+        # The suite's own conditions follow.
+        conditions = conditions[: 1 + len(assumed)]
+        suite, version = f"twice what {command.world} assumes", ""
     set_up_jax(*(evaluation.on_engine(condition.env, command.physics) for condition in conditions))
     checkpoint, policy, actor = read_actor(checkpoint, config)
     no_run = checkpoint.run in {MIRROR_LAW.run, *map(resource_path, POLICIES.values())}
@@ -92,21 +98,3 @@ def main(args: Sequence[str]) -> None:
         write_output(out / name, content)
     print(*(out / name for name in files), sep="\n")
     sys.exit(0 if report.passed else 1)
-
-
-def _read_conditions(
-    command: RobustnessCommand, config: TrainConfig
-) -> tuple[list["Condition"], str, str]:
-    """The conditions of a policy, their suite's name or file, and its version."""
-    from bounce_mjx.evaluation.suite import load_suite, read_suite
-    from bounce_mjx.runs.config import in_world, named_file
-
-    path = named_file(command.suite, "configs")
-    world, assumed = None, {}
-    if command.world is not None:
-        there, named = in_world(config, command.world)
-        world, assumed = there.env, named.double_assumed()
-    conditions = load_suite(path, config.env, world, assumed)
-    if command.assumed:
-        return conditions[: 1 + len(assumed)], f"twice what {command.world} assumes", ""
-    return conditions, str(path), read_suite(path).version
