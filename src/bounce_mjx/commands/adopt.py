@@ -3,7 +3,7 @@
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import yaml
 
@@ -55,9 +55,15 @@ def main(args: Sequence[str]) -> None:
     fixed = not {"position", "quaternion"}.isdisjoint(given)
     robot = RobotConfig(site=command.site, joints=command.joints, paddle=command.paddle)
     adoption = adopt(command.mjcf, robot, WorldConfig().control_dt, fixed)
-    values = {"env": env_values(command.mjcf, adoption, task.Config)}
-    if command.task != DEFAULT:
-        values = {"task": command.task, **values}
+    x, y, z = (round(coordinate, 4) + 0.0 for coordinate in adoption.pose.paddle.tolist())
+    values = {
+        "mjcf": str(WorldConfig(mjcf=command.mjcf).mjcf),
+        "robot": adoption.config.model_dump(mode="json", exclude_defaults=True),
+        "action_scale": adoption.action_scale,
+        "default_joint_angles": [round(angle, 5) for angle in adoption.pose.angles.tolist()],
+        **task.Config.settings_at((x, y, z)),
+    }
+    values = ({} if command.task == DEFAULT else {"task": command.task}) | {"env": values}
     config = validate(train_config(task), values, str(command.mjcf))
     env = Env(config.env)
     for line in describe(adoption):
@@ -73,23 +79,6 @@ def main(args: Sequence[str]) -> None:
     shown = shlex.join([*flags, "--actions", "zero"])
     print(f"see it: bounce-mjx view {shown}")
     print(f"train it: bounce-mjx train {shlex.join(flags)}")
-
-
-def env_values(mjcf: Path, adoption: "Adoption", config_class: type[WorldConfig]) -> dict[str, Any]:
-    """The settings of a task that belong to an adopted arm.
-
-    Args:
-      config_class: the settings' class.
-    """
-    pose = adoption.pose
-    x, y, z = (round(coordinate, 4) + 0.0 for coordinate in pose.paddle.tolist())
-    return {
-        "mjcf": str(WorldConfig(mjcf=mjcf).mjcf),
-        "robot": adoption.config.model_dump(mode="json", exclude_defaults=True),
-        "action_scale": adoption.action_scale,
-        "default_joint_angles": [round(angle, 5) for angle in pose.angles.tolist()],
-        **config_class.settings_at((x, y, z)),
-    }
 
 
 def describe(adoption: "Adoption") -> list[str]:

@@ -14,7 +14,7 @@ from bounce_mjx.evaluation.results import Report, judge
 from bounce_mjx.evaluation.suite import neutral_commands
 from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.world.config import WorldConfig
-from bounce_mjx.world.randomization import RandomizationConfig, Ranges
+from bounce_mjx.world.randomization import RandomizationConfig
 
 
 class PolicyEvaluation(NamedTuple):
@@ -42,30 +42,22 @@ def evaluate_policy(
     Raises:
       UserError: the engine does not support the model.
     """
-    env, commands, ranges = _prepare(env_config, options)
-    on_c = options.physics == "mujoco"
-    engine = "mujoco" if on_c else env.engine.name
-    make = make_mujoco_evaluator if on_c else make_evaluator
-    evaluate = make(env, actor(env), options.episodes, recorded)
-    measured = evaluate(policy, jax.random.PRNGKey(options.seed), ranges)
-    return PolicyEvaluation(judge(env, *measured, commands), engine)
-
-
-def _prepare(
-    config: WorldConfig, options: EvaluationOptions
-) -> tuple[Env, dict[str, tuple[float, float]], Ranges | None]:
-    """The environment in the options' world, the ranges of commands that differ from the config's,
-    and the ranges of its resets."""
     given = {name: (value, value) for name, value in options.commands.items()}
-    neutral = neutral_commands(config) if options.nominal else {}
-    own = {name: (command.low, command.high) for name, command in config.commands.items()}
+    neutral = neutral_commands(env_config) if options.nominal else {}
+    own = {name: (command.low, command.high) for name, command in env_config.commands.items()}
     commands = {name: ends for name, ends in (neutral | given).items() if ends != own[name]}
-    world = config.randomization
+    world = env_config.randomization
     if options.nominal:
         world = RandomizationConfig()
     elif given.keys() >= own.keys():
         # Nothing is left to change within an episode.
         world = world.model_copy(update={"command_interval": None})
-    env = Env(on_engine(config.model_copy(update={"randomization": world}), options.physics))
+    env = Env(on_engine(env_config.model_copy(update={"randomization": world}), options.physics))
     ranges = jax.tree.map(lambda end: jnp.asarray(end, jnp.float32)[None], env.ranges() | commands)
-    return env, commands, ranges if commands else None
+    on_c = options.physics == "mujoco"
+    engine = "mujoco" if on_c else env.engine.name
+    make = make_mujoco_evaluator if on_c else make_evaluator
+    evaluate = make(env, actor(env), options.episodes, recorded)
+    key = jax.random.PRNGKey(options.seed)
+    measured = evaluate(policy, key, ranges if commands else None)
+    return PolicyEvaluation(judge(env, *measured, commands), engine)

@@ -131,7 +131,10 @@ def measure_conditions(
         dry_in_mjx = env.engine.name == "mjx" and "joint_frictionloss" in separate
         on_c = options.physics == "mujoco" or dry_in_mjx
         engine = "mujoco" if on_c else env.engine.name
-        names = _range_names(env, members)
+        own = {name: (command.low, command.high) for name, command in env.config.commands.items()}
+        # Of the commands, those for which a condition has another range than the config.
+        changed = [name for name in own if any(c.commands[name] != own[name] for c in members)]
+        names = [*env.config.randomization.terms, *changed]
         size = _batch_size(len(members), options.episodes, on_c)
         make = make_mujoco_evaluator if on_c else make_evaluator
         evaluate = make(env, actor(env), size * options.episodes)
@@ -142,8 +145,8 @@ def measure_conditions(
             ranges = _stack_ranges(names, padded)
             statistics, _ = evaluate(policy, jax.random.PRNGKey(options.seed), ranges)
             for i, condition in enumerate(batch):
-                own = slice(i * options.episodes, (i + 1) * options.episodes)
-                part = jax.tree.map(lambda x, own=own: x[own], statistics)
+                its = slice(i * options.episodes, (i + 1) * options.episodes)
+                part = jax.tree.map(lambda x, its=its: x[its], statistics)
                 outcomes[indices[start + i]] = _outcome(env, condition, part, engine)
             done += len(batch)
             progress(done)
@@ -180,14 +183,6 @@ def _spanning_config(conditions: Sequence[Condition], physics: Physics) -> World
     sampled = RandomizationConfig().model_copy(update=spans)
     world = env.model_copy(update={"randomization": sampled})
     return on_engine(world, physics)
-
-
-def _range_names(env: Env, conditions: Sequence[Condition]) -> list[str]:
-    """The terms and the commands whose ranges a program takes: a command only if a condition has
-    another range than the config."""
-    own = {name: (command.low, command.high) for name, command in env.config.commands.items()}
-    changed = (n for n in own if any(condition.commands[n] != own[n] for condition in conditions))
-    return [*env.config.randomization.terms, *changed]
 
 
 def _stack_ranges(names: Sequence[str], conditions: Sequence[Condition]) -> Ranges | None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from bounce_mjx.config.files import flat
 from bounce_mjx.errors import UserError, reason_of, shorten
-from bounce_mjx.runs.config import ROBOT, TrainConfig, load_run_config
+from bounce_mjx.runs.config import ROBOT, load_run_config
 from bounce_mjx.runs.files import MANIFEST_FILE
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.task.shown import Curve
@@ -94,7 +94,14 @@ def group_runs(runs: Sequence[Path]) -> list[Group]:
       UserError: a run has no config or no scalars.
     """
     configs = [load_run_config(run) for run in runs]
-    settings = [_settings(run, config) for run, config in zip(runs, configs, strict=True)]
+    # The settings that affect the training, by dotted name.
+    settings = [flat(x.model_dump(mode="json", exclude=set(_FREE_KEYS))) for x in configs]
+    for own, run in zip(settings, runs, strict=True):
+        # The paths of the run's own copies would put every run in a separate group.
+        copies = {key: read_source(own[key]) for key in ("task", "algorithm") if is_file(own[key])}
+        if own["env.mjcf"] is not None:
+            copies["env.mjcf"] = (run / ROBOT / MANIFEST_FILE).read_bytes()
+        own |= {key: f"{Path(own[key]).name} {zlib.crc32(x):08x}" for key, x in copies.items()}
     shown = [name for name in settings[0] if any(x[name] != settings[0][name] for x in settings)]
     groups: dict[str, list[int]] = {}
     for i, each in enumerate(settings):
@@ -107,19 +114,6 @@ def group_runs(runs: Sequence[Path]) -> list[Group]:
         )
         for members in groups.values()
     ]
-
-
-def _settings(run: Path, config: TrainConfig) -> dict[str, Any]:
-    """The settings that affect the training, by dotted name."""
-    settings = flat(config.model_dump(mode="json", exclude=set(_FREE_KEYS)))
-    # The paths of the run's own copies would put every run in a separate group.
-    copies = {
-        key: read_source(settings[key]) for key in ("task", "algorithm") if is_file(settings[key])
-    }
-    if config.env.mjcf is not None:
-        copies["env.mjcf"] = (run / ROBOT / MANIFEST_FILE).read_bytes()
-    checked = {key: f"{Path(settings[key]).name} {zlib.crc32(x):08x}" for key, x in copies.items()}
-    return settings | checked
 
 
 def mean_and_band(curves: Sequence[LoggedCurve]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import jax
 import mujoco
-from matplotlib.figure import Figure
 
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.env.env import Env
@@ -22,10 +21,10 @@ from bounce_mjx.reports.html_page import data_url, figures_html, page, table
 from bounce_mjx.reports.robustness import load_robustness, robustness_figure
 from bounce_mjx.reports.tables import details_line, result_cells, robot_name
 from bounce_mjx.runs.checkpoints import read_actor
-from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.files import write_output
 from bounce_mjx.runs.folders import Checkpoint, best_checkpoint
-from bounce_mjx.runs.progress import Results, load_results
+from bounce_mjx.runs.progress import load_results
 from bounce_mjx.task.shown import Recording
 from bounce_mjx.viewers.page import replay_first_episode
 
@@ -69,31 +68,17 @@ def write_report(run: Path, recording: Recording | None = None) -> Path:
     }
     if robustness is not None:
         drawn["Perturbed worlds"] = robustness_figure(robustness)
-    replay = replay_first_episode(env, recording)
-    path = run / REPORT_FILE
-    write_output(path, _html(run, config, env.engine.name, results, drawn, replay))
-    return path
-
-
-def _html(
-    run: Path,
-    config: TrainConfig,
-    engine: str,
-    results: Results,
-    drawn: dict[str, Figure],
-    replay: str,
-) -> str:
-    report, evaluated = results.best, len(results.evaluations)
+    replay, report = replay_first_episode(env, recording), results.best
     seconds = results.seconds | {"total": sum(results.seconds.values())}
     phases = [[name, f"{value:.1f}"] for name, value in seconds.items()]
     resets = "fresh resets" if results.fresh_resets else "the resets of the selection"
     body = f"""<h1>{report.summary}</h1>
 <p>Run <code>{html.escape(str(run))}</code>, seed {config.seed}, task {html.escape(config.task)} on
-the robot {html.escape(robot_name(config.env))}. The best of {evaluated} evaluations, after
-{results.best_steps:,} of {results.trained_steps:,} environment steps, on {resets}:
+the robot {html.escape(robot_name(config.env))}. The best of {len(results.evaluations)} evaluations,
+after {results.best_steps:,} of {results.trained_steps:,} environment steps, on {resets}:
 {html.escape(details_line(report))}.</p>
 <p>Trained on {html.escape(results.device)} with bounce_mjx {html.escape(results.version or "?")};
-{engine} physics, MuJoCo {mujoco.__version__}, JAX {jax.__version__}.</p>
+{env.engine.name} physics, MuJoCo {mujoco.__version__}, JAX {jax.__version__}.</p>
 {table(["result", "measured", "value", "bound", ""], map(result_cells, report.results))}
 <h2>The policy in its first recorded episode</h2>
 <iframe title="Replay" src="{data_url("text/html", replay.encode())}"></iframe>
@@ -105,4 +90,6 @@ more before it knows how far each action goes, and its sampled actions scatter m
 <h2>Where the time went</h2>
 {table(["phase", "seconds"], phases)}
 <details><summary>Config</summary><pre>{html.escape(dump_config(config))}</pre></details>"""
-    return page(run.name, body)
+    path = run / REPORT_FILE
+    write_output(path, page(run.name, body))
+    return path

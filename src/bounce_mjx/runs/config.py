@@ -164,24 +164,15 @@ def load_run_config(
     its_task = _task_of_run(values["task"], run, task)
     config = validate(train_config(its_task, ppo=ppo), values, str(path))
     if config.env.mjcf is not None and not is_packaged(config.env.mjcf):
-        _check_robot(run)
+        try:
+            check_integrity(run / ROBOT)
+        except (OSError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise UserError(
+                f"{run / ROBOT} is not the robot that {run} was trained with ({reason}); restore "
+                "that folder, or train a new run with --mjcf"
+            ) from error
     return config
-
-
-def _check_robot(run: Path) -> None:
-    """Checks that a run's copy of its robot is as it was written.
-
-    Raises:
-      UserError: a file is missing or was edited.
-    """
-    try:
-        check_integrity(run / ROBOT)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise UserError(
-            f"{run / ROBOT} is not the robot that {run} was trained with ({reason}); restore that "
-            "folder, or train a new run with --mjcf"
-        ) from error
 
 
 def _task_of_run(name: str, run: Path, given: str | None) -> type[Task]:
@@ -389,7 +380,9 @@ def preset_files(
             f"{min(unused)} lies on {files[0]}, so its {BASE} is not used; leave it out, or give "
             "that file first"
         )
-    if files and (_is_preset(files[0]) or bases.get(files[0], "") is None):
+    own = [resource_path(name).resolve() for name in ("configs", PRETRAINED)]
+    is_preset = any(files[0].resolve().is_relative_to(folder) for folder in own if files)
+    if is_preset or (files and bases.get(files[0], "") is None):
         return files
     base = bases[files[0]] if bases else machine or default_preset(has_accelerator())
     presets = [resource_path(f"{folder}/{base}.yaml") for folder in (names, "configs")]
@@ -405,12 +398,6 @@ def shown_file(file: Path) -> str:
     """A config file for the user's eyes: one of the package's without the package's folder."""
     package = resource_path("configs").parent
     return str(file.relative_to(package) if file.is_relative_to(package) else file)
-
-
-def _is_preset(file: Path) -> bool:
-    """Whether a file comes with the package."""
-    folders = (resource_path(name).resolve() for name in ("configs", PRETRAINED))
-    return any(file.resolve().is_relative_to(folder) for folder in folders)
 
 
 def default_preset(accelerator: bool) -> Path:

@@ -98,7 +98,11 @@ def save_config(run: Path, config: TrainConfig) -> None:
     run has them."""
     for key in ("task", "algorithm"):
         if is_file(name := getattr(config, key)):
-            config = config.model_copy(update={key: copy_code(name, run, key)})
+            file = f"{key}/{source_file(name).name}"
+            if not (run / key).exists():
+                (run / key).mkdir()
+                write_atomically(run / file, read_source(name))
+            config = config.model_copy(update={key: f"{file}:{name.rpartition(':')[2]}"})
     if (mjcf := config.env.mjcf) is not None:
         if not mjcf.is_relative_to((run / ROBOT).absolute()):
             mjcf = copy_robot(mjcf, run).absolute()
@@ -146,24 +150,6 @@ def copy_robot(mjcf: Path, run: Path) -> Path:
 def _files_of(mjcf: Path) -> list[Path]:
     """An MJCF file and every file that it names."""
     return [Path(os.path.abspath(name)) for name in mujoco.mju_getXMLDependencies(str(mjcf))]
-
-
-def copy_code(name: str, run: Path, folder: str) -> str:
-    """Copies the file of a task or an algorithm, FILE.py:CLASS, into a run's folder, unless the run
-    has a copy.
-
-    Returns:
-      The copy's FILE.py:CLASS, relative to the run's folder.
-
-    Raises:
-      OSError: the copy cannot be written.
-      UserError: the file cannot be read.
-    """
-    file = f"{folder}/{source_file(name).name}"
-    if not (run / folder).exists():
-        (run / folder).mkdir()
-        write_atomically(run / file, read_source(name))
-    return f"{file}:{name.rpartition(':')[2]}"
 
 
 def write_config(run: Path, config: TrainConfig) -> None:

@@ -102,7 +102,17 @@ class PPOTrainer:
 
     @functools.cached_property
     def _sharding(self) -> ppo.TrainingState:
-        return state_sharding(self.mesh, self.state_template, self._config.num_seeds)
+        """Of the state. With several seeds each device holds some of them; with one seed each
+        device holds some environments and everything else."""
+
+        def shard(x: jax.Array, *axes: str | None) -> NamedSharding:
+            return NamedSharding(self.mesh, PartitionSpec(*axes))
+
+        state = self.state_template
+        if self._config.num_seeds > 1:
+            return jax.tree.map(lambda x: shard(x, _AXIS), state)
+        env = jax.tree.map(lambda x: shard(x, *[None] * (x.ndim - 1), _AXIS), state.env)
+        return jax.tree.map(shard, state)._replace(env=env)
 
     def compile(self, pool: concurrent.futures.Executor) -> concurrent.futures.Future:
         """Starts the compilation in a pool; the future is done when training can start."""
@@ -202,20 +212,3 @@ def make_mesh(num_devices: int | None, config: PPOConfig, num_seeds: int = 1) ->
     if shared % num_devices:
         raise UserError(f"{name} cannot be divided among {num_devices} devices; choose {advice}")
     return Mesh(devices[:num_devices], (_AXIS,))
-
-
-def state_sharding(mesh: Mesh, state: ppo.TrainingState, num_seeds: int = 1) -> ppo.TrainingState:
-    """Shardings of a training state. With several seeds each device holds some of them; with one
-    seed each device holds some environments and everything else.
-
-    Args:
-      state: the state or its shapes; with several seeds, the seeds are the first axis.
-    """
-    if num_seeds > 1:
-        return jax.tree.map(lambda _: NamedSharding(mesh, PartitionSpec(_AXIS)), state)
-    shardings = jax.tree.map(lambda _: NamedSharding(mesh, PartitionSpec()), state)
-
-    def batch_last(x: jax.Array) -> NamedSharding:
-        return NamedSharding(mesh, PartitionSpec(*[None] * (x.ndim - 1), _AXIS))
-
-    return shardings._replace(env=jax.tree.map(batch_last, state.env))
