@@ -3,7 +3,7 @@
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import yaml
 
@@ -15,9 +15,6 @@ from bounce_mjx.robot.config import PaddleConfig, RobotConfig
 from bounce_mjx.runs.config import train_config
 from bounce_mjx.tasks.registry import DEFAULT, find_task
 from bounce_mjx.world.config import WorldConfig
-
-if TYPE_CHECKING:
-    from bounce_mjx.robot.adopt import Adoption
 
 DEFAULT_SITE = "attachment_site"
 
@@ -55,19 +52,22 @@ def main(args: Sequence[str]) -> None:
     fixed = not {"position", "quaternion"}.isdisjoint(given)
     robot = RobotConfig(site=command.site, joints=command.joints, paddle=command.paddle)
     adoption = adopt(command.mjcf, robot, WorldConfig().control_dt, fixed)
-    x, y, z = (round(coordinate, 4) + 0.0 for coordinate in adoption.pose.paddle.tolist())
+    pose = adoption.pose
+    x, y, z = (round(coordinate, 4) + 0.0 for coordinate in pose.paddle.tolist())
     values = {
         "mjcf": str(WorldConfig(mjcf=command.mjcf).mjcf),
         "robot": adoption.config.model_dump(mode="json", exclude_defaults=True),
         "action_scale": adoption.action_scale,
-        "default_joint_angles": [round(angle, 5) for angle in adoption.pose.angles.tolist()],
+        "default_joint_angles": [round(angle, 5) for angle in pose.angles.tolist()],
         **task.Config.settings_at((x, y, z)),
     }
     values = ({} if command.task == DEFAULT else {"task": command.task}) | {"env": values}
     config = validate(train_config(task), values, str(command.mjcf))
     env = Env(config.env)
-    for line in describe(adoption):
-        print(line)
+    print(f"paddle: level at x {x:.3f}, y {y:.3f}, z {z:.3f} m; the reach is {pose.reach:.2f} m")
+    kind = "kept" if adoption.config.servo_stiffness is None else "made from the reflected inertia"
+    print(f"servos: {kind}; action scale {adoption.action_scale:g} rad")
+    print("changes to the model:", *adoption.arm.changes, sep="\n  ")
     print(f"physics: {env.engine.name} ({env.engine.reason})")
     out = command.out or Path(f"{command.mjcf.stem}.yaml")
     head = f"An arm with a paddle: bounce-mjx adopt {command.mjcf} --site {adoption.config.site}"
@@ -79,17 +79,3 @@ def main(args: Sequence[str]) -> None:
     shown = shlex.join([*flags, "--actions", "zero"])
     print(f"see it: bounce-mjx view {shown}")
     print(f"train it: bounce-mjx train {shlex.join(flags)}")
-
-
-def describe(adoption: "Adoption") -> list[str]:
-    """Lines about an adopted arm: its pose, its servos, and the changes to the user's model."""
-    x, y, z = (round(coordinate, 6) + 0.0 for coordinate in adoption.pose.paddle)
-    is_kept = adoption.config.servo_stiffness is None
-    kind = "kept" if is_kept else "made from the reflected inertia"
-    return [
-        f"paddle: level at x {x:.3f}, y {y:.3f}, z {z:.3f} m; the reach is "
-        f"{adoption.pose.reach:.2f} m",
-        f"servos: {kind}; action scale {adoption.action_scale:g} rad",
-        "changes to the model:",
-        *(f"  {change}" for change in adoption.arm.changes),
-    ]

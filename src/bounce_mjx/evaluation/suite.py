@@ -131,7 +131,13 @@ def load_suite(
         if perturbation.name in names:
             raise UserError(f"{source}: the name is taken; give each perturbation its own name")
         names.add(perturbation.name)
-        _check(perturbation, source)
+        given = perturbation.terms, perturbation.settings
+        uses = any(_fill_in(values, 0.0) != values for values in given)
+        if any(given) == perturbation.trained_ranges or uses != bool(perturbation.strengths):
+            raise UserError(
+                f"{source}: give terms or settings, with the word strength in a value if and only "
+                "if it has strengths, or trained_ranges: true"
+            )
         if perturbation.task and not issubclass(trained.task, find_task(perturbation.task)):
             continue
         if perturbation.trained_ranges and not trained.randomization.terms:
@@ -157,16 +163,6 @@ def neutral_commands(env: WorldConfig) -> dict[str, tuple[float, float]]:
         if ranges[name].low <= default.low and default.high <= ranges[name].high:
             ranges[name] = default
     return {name: (command.low, command.high) for name, command in ranges.items()}
-
-
-def _check(p: Perturbation, source: str) -> None:
-    """Checks that a perturbation changes the world, and each strength in another way."""
-    uses = any(_fill_in(values, 0.0) != values for values in (p.terms, p.settings))
-    if bool(p.terms or p.settings) == p.trained_ranges or uses != bool(p.strengths):
-        raise UserError(
-            f"{source}: give terms or settings, with the word strength in a value if and only if "
-            "it has strengths, or trained_ranges: true"
-        )
 
 
 def _condition(

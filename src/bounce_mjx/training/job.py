@@ -6,6 +6,7 @@ It is the same for every algorithm that has the interface of `PPOTrainer`.
 import concurrent.futures
 import contextlib
 import dataclasses
+import functools
 import importlib
 import shlex
 import shutil
@@ -130,6 +131,7 @@ class Job:
     ):
         """Builds what may refuse the config, before a folder is made."""
         self.config, self.console, self.resume, self.stack = config, console, resume, stack
+        self.say = functools.partial(events.say, console)
         self.callbacks = callbacks if hosts.is_leader() else ()
         self.pool = concurrent.futures.ThreadPoolExecutor()
         stack.callback(self.pool.shutdown, wait=False, cancel_futures=True)
@@ -182,10 +184,6 @@ class Job:
         bound = "at most " if config.stop_when_solved else ""
         self.say(f"steps: {bound}{config.total_steps:,}, in blocks of {self.block_steps:,}")
         self._lap("setup")
-
-    def say(self, line: str) -> None:
-        """Prints a line."""
-        events.say(self.console, line)
 
     def _lap(self, name: str) -> None:
         """Adds the time since the last lap to that of a phase."""
