@@ -226,17 +226,11 @@ def test_a_failure_to_draw_does_not_lose_the_training(tmp_path: Path, monkeypatc
 def test_tensorboard_reads_everything_back(trained: Path) -> None:
     log = EventAccumulator(str(trained)).Reload()
     tags = log.Tags()
-    assert tags["tensors"] == ["config/text_summary"]
-    assert log.SummaryMetadata("config/text_summary").plugin_data.plugin_name == "text"
-    assert log.SummaryMetadata("_hparams_/session_start_info").plugin_data.plugin_name == "hparams"
+    settings = log.SummaryMetadata("_hparams_/session_start_info").plugin_data
+    assert settings.plugin_name == "hparams" and b"ppo.num_envs" in settings.content
     assert not any(tags[kind] for kind in ("audio", "histograms", "distributions", "images"))
     groups = {name.partition("/")[0] for name in tags["scalars"]}
     assert groups == {"episode", "loss", "policy", "results", "reward", "speed", "task"}
-
-    (config,) = log.Tensors("config/text_summary")
-    text = config.tensor_proto.string_val[0].decode()
-    plain = yaml.safe_load(re.fullmatch(r"```yaml\n(.*)```", text, re.DOTALL)[1])
-    assert train_config(Bounce).model_validate(plain) == load_config(trained / "config.yaml")
 
     # results.json measures the best policy once more, on fresh resets.
     logged_values = {event.step: event.value for event in log.Scalars("results/stable")}

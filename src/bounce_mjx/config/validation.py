@@ -2,7 +2,7 @@
 
 import difflib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, TypeVar
 
@@ -46,7 +46,14 @@ def describe(
     first = error.errors()[0]
     key = ".".join(part for part in first["loc"] if isinstance(part, str))
     if first["type"] in ("extra_forbidden", "invalid_key"):
-        return f"unknown key {shorten(key)}; {_advice(fields, key)}"
+        group, _, name = key.rpartition(".")
+        near = [other for other in fields if other.rpartition(".")[2] == name]
+        near += difflib.get_close_matches(key, fields, n=1, cutoff=0.8)
+        group = f"{group}." if group else ""
+        here = {x.removeprefix(group).split(".")[0] for x in fields if x.startswith(group)}
+        advice = f"known keys here are {', '.join(sorted(here))}"
+        advice = f"did you mean {near[0]}?" if near else advice
+        return f"unknown key {shorten(key)}; {advice}"
     if first["type"] == "value_error":
         reason = shorten(first["msg"].removeprefix("Value error, "), 500)
         return ": ".join(filter(None, [key.rpartition(".")[2], reason]))
@@ -64,15 +71,3 @@ def unit_of(text: str) -> str:
     addition; empty for a pure number."""
     units = _UNIT.findall(" ".join(text.split()))
     return units[-1] if units else ""
-
-
-def _advice(known: Iterable[str], key: str) -> str:
-    """Advice on an unknown dotted name."""
-    group, _, name = key.rpartition(".")
-    near = [other for other in known if other.rpartition(".")[2] == name]
-    near += difflib.get_close_matches(key, known, n=1, cutoff=0.8)
-    if near:
-        return f"did you mean {near[0]}?"
-    prefix = f"{group}." if group else ""
-    here = {other.removeprefix(prefix).split(".")[0] for other in known if other.startswith(prefix)}
-    return f"known keys here are {', '.join(sorted(here))}"

@@ -63,6 +63,5 @@ def limit_shares(config: WorldConfig, recording: Recording, rate: float = 1000) 
 def describe_limits(shares: Iterable[LimitShare], episodes: int) -> str:
     """Shares in one line."""
     each = [f"{quantity} {100 * share:.1f}% (joint {joint})" for quantity, share, joint in shares]
-    return f"most of the arm's limits that commands at 1 kHz use in {episodes} episodes: " + (
-        ", ".join(each)
-    )
+    largest = ", ".join(each)
+    return f"most of the arm's limits that commands at 1 kHz use in {episodes} episodes: {largest}"

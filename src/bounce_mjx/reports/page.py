@@ -28,7 +28,6 @@ from bounce_mjx.runs.progress import load_results
 from bounce_mjx.task.shown import Recording
 from bounce_mjx.viewers.page import replay_first_episode
 
-REPORT_FILE = "report.html"
 # Panels side by side in a figure that fits a phone, and its width in inches.
 _COLUMNS = 2
 _WIDTH = _COLUMNS * figures.PANEL_WIDTH
@@ -90,6 +89,6 @@ more before it knows how far each action goes, and its sampled actions scatter m
 <h2>Where the time went</h2>
 {table(["phase", "seconds"], phases)}
 <details><summary>Config</summary><pre>{html.escape(dump_config(config))}</pre></details>"""
-    path = run / REPORT_FILE
+    path = run / "report.html"
     write_output(path, page(run.name, body))
     return path

@@ -41,8 +41,6 @@ from bounce_mjx.runs.files import seal, writable, write_atomically
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file, read_source, source_file
 
-POLICY_OF_TASK = {DEFAULT: PRETRAINED} | {task: task for task in TASK_POLICIES}
-"""The policy that comes with the package for a task."""
 LATEST = "latest"
 """Name of the newest run on the command line."""
 CHECKPOINTS = "checkpoints"
@@ -281,7 +279,8 @@ def choose_checkpoint(path: Path | None, log_dir: Path) -> Checkpoint:
     try:
         run = named_run(path, log_dir)
     except UserError:
-        folders = {runs_folder(find_task(t)): policy for t, policy in POLICY_OF_TASK.items()}
+        policies = {DEFAULT: PRETRAINED} | {task: task for task in TASK_POLICIES}
+        folders = {runs_folder(find_task(task)): policy for task, policy in policies.items()}
         if path is not None or log_dir not in folders:
             raise
         print(f"no run in {log_dir}: using the policy that comes with the package")

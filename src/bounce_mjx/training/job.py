@@ -167,7 +167,17 @@ class Job:
             alone = config.model_copy(update={"seed": seed, "num_seeds": 1})
             self.members.append(SeedRun(folder, alone, self.seconds))
         if self.resume is not None:
-            self._read_resumed()
+            latest = folders.latest_checkpoint(self.run)
+            self.state, record = checkpoints.read_training(latest, self.trainer.state_template)
+            self.steps = record.steps
+            evaluated = record.progress.get("seeds", [record.progress])
+            for member, plain in zip(self.members, evaluated, strict=True):
+                member.progress = Progress.model_validate(plain)
+                member.recall_best()
+            solved = self.config.stop_when_solved and self._is_solved()
+            if self._is_done() or solved:
+                met = "has met all results" if solved else "has been trained to its end"
+                self.say(f"{self.run} {met}, {self.steps:,} steps; add --total-steps N to train on")
         configs = {self.run: config} | {member.run: member.config for member in self.members}
         for folder, own in configs.items() if hosts.is_leader() else ():
             with writable(folder, "make room there or make it writable"):
@@ -227,19 +237,6 @@ class Job:
             # A log that is opened later would make the folder again.
             concurrent.futures.wait([self.opening])
             shutil.rmtree(self.run, ignore_errors=True)
-
-    def _read_resumed(self) -> None:
-        latest = folders.latest_checkpoint(self.run)
-        self.state, record = checkpoints.read_training(latest, self.trainer.state_template)
-        self.steps = record.steps
-        evaluated = record.progress.get("seeds", [record.progress])
-        for member, plain in zip(self.members, evaluated, strict=True):
-            member.progress = Progress.model_validate(plain)
-            member.recall_best()
-        solved = self.config.stop_when_solved and self._is_solved()
-        if self._is_done() or solved:
-            met = "has met all results" if solved else "has been trained to its end"
-            self.say(f"{self.run} {met}, {self.steps:,} steps; add --total-steps N to train on")
 
     def compile(self, make_evaluators: Callable[..., Evaluators]) -> None:
         """Compiles the programs that training needs to start. Evaluations are compiled, logs are

@@ -5,7 +5,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from bounce_mjx.config.files import dump_config, flat
+from bounce_mjx.config.files import flat
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training.events import Event
 
@@ -36,12 +36,10 @@ class TensorBoardLog:
         self._resumed, self._writers = resumed, {}
 
     def start(self, run: Path, config: TrainConfig) -> None:
-        """Logs the config, as text and as hyperparameters."""
+        """Logs the config as hyperparameters."""
         if self._resumed is not None:
             start = self._events.SessionLog(status=self._events.SessionLog.START)
             self.add(run, self._resumed + 1, session_log=start)
-        text = f"```yaml\n{dump_config(config)}```"
-        self.add(run, self._resumed or 0, summary=self.summary.text("config", text))
         plain = flat(config.model_dump(mode="json")).items()
         plain = {name: x if isinstance(x, int | float) else str(x) for name, x in plain}
         shown = dict.fromkeys(("results/mean_return", "episode/return"), 0.0)
