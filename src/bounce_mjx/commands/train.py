@@ -36,30 +36,26 @@ def main(args: Sequence[str]) -> None:
         if command.on_several_hosts or run_configs.has_plugin() != run_configs.has_accelerator():
             machine = None
             command = read_command(args)
-        console, page = stdout(quiet=not hosts.is_leader()), None
-        if command.watch and hosts.is_leader():
+        console, callbacks = stdout(quiet=not hosts.is_leader()), []
+        is_watched = command.watch and hosts.is_leader()
+        if is_watched:
             # Only a training run that is watched pays for this import.
             from bounce_mjx.training.watch import Address, TrainingPage
 
             address = Address(command.watch_host, command.watch_port, command.watch_allow_host)
-            page = TrainingPage(command.training, address, console)
+            callbacks.append(TrainingPage(command.training, address, console))
         if command.resume is None:
             files = run_configs.preset_files(command.config, command.task, machine)
             say(console, f"config: {' on '.join(map(run_configs.shown_file, reversed(files)))}")
             if command.warm_start is not None:
                 say(console, f"warm start: {command.warm_start}")
-        callbacks = [] if page is None else [page]
         if command.video:
             from bounce_mjx.training.video import EvaluationVideo
 
             callbacks.append(EvaluationVideo())
         try:
-            run = train(
-                config=command.training,
-                resume=command.resume,
-                callbacks=callbacks,
-                report=command.report,
-            )
+            given = {"resume": command.resume, "callbacks": callbacks, "report": command.report}
+            run = train(config=command.training, **given)
         except TrainingStopped as stop:
             say(console, str(stop))
             # Does not wait for a compilation or an evaluation in another thread.
@@ -67,7 +63,7 @@ def main(args: Sequence[str]) -> None:
         words = shlex.join([str(run.checkpoint.run), *named_task(command.training)])
         say(console, f"measure it: bounce-mjx eval {words}")
         say(console, f"watch it: bounce-mjx play {words}")
-        if page is not None:
-            page.wait()
+        if is_watched:
+            callbacks[0].wait()
             # A thread that simulates cannot be stopped.
             leave(0)

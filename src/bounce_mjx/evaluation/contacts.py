@@ -15,7 +15,6 @@ from bounce_mjx.task.shown import Recording
 from bounce_mjx.world.config import WorldConfig
 
 _MARGIN = 0.002
-_FLOOR = "the floor"
 
 
 class ArmContact(NamedTuple):
@@ -128,5 +127,5 @@ class ContactChecker:
     def name(self, part: int) -> str:
         """A part's name in a message."""
         if part <= 0:
-            return ("the base", _FLOOR, "the table")[-part]
+            return ("the base", "the floor", "the table")[-part]
         return self._model.body(part).name or f"body {part}"

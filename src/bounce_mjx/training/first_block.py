@@ -18,7 +18,7 @@ def fault_of(metrics: Metrics, config: TrainConfig) -> str | None:
     is in every seed.
 
     Args:
-      metrics: each [S, I], as from `Trainer.run`.
+      metrics: each [S, I], as from `PPOTrainer.run`.
     """
     # What follows an iteration that diverged is not due to the settings.
     faults = metrics["fault"] != 0

@@ -48,9 +48,8 @@ def iterations_per_block(config: TrainConfig) -> int:
 def in_whole_blocks(config: TrainConfig) -> TrainConfig:
     """The config with the `total_steps` that are trained: the nearest number of whole blocks."""
     block = iterations_per_block(config) * config.ppo.batch_steps
-    return config.model_copy(
-        update={"total_steps": block * max(1, round(config.total_steps / block))}
-    )
+    steps = block * max(1, round(config.total_steps / block))
+    return config.model_copy(update={"total_steps": steps})
 
 
 def each_seed(tree: Any, num_seeds: int) -> list[Any]:
