@@ -11,7 +11,6 @@ from bounce_mjx.viewers.guard import open_server
 from bounce_mjx.viewers.scene import Scene
 from bounce_mjx.viewers.simulation import EnvFrame, frame_at, resample
 
-SUFFIXES = (".html",)
 _DEFAULT_FPS = 30
 _EPISODE_SECONDS = 10.0
 _VISER_TITLE = "<title>Viser</title>"
@@ -33,7 +32,6 @@ def replay_first_episode(env: Env, recording: Recording) -> str:
         command=episode.command,
         metrics=episode.metrics,
         over=over,
-        lost=over,
     )
     return replay(env, frames)
 
