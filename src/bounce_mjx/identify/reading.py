@@ -48,8 +48,7 @@ def read_log(path: Path, model: mujoco.MjModel, topics: Topics, names: Sequence[
 
 
 def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
-    """Reads a CSV log. Cells are separated by commas, semicolons or tabs, as the header's; beside
-    the last two, a decimal comma is read.
+    """Reads a CSV log.
 
     Args:
       joint_names: the robot's joints, in the order of the result.
@@ -101,12 +100,8 @@ def _read_columns(path: Path) -> dict[str, tuple[str, np.ndarray]]:
     that holds none."""
     try:
         header, *lines = path.read_text("utf-8-sig").splitlines() or [""]
-        delimiter = max(",;\t", key=header.count)
-        titles = next(csv.reader([header], delimiter=delimiter), [])
-        lines = [line.replace('"', "") for line in lines]
-        if delimiter != ",":
-            lines = [line.replace(",", ".") for line in lines]
-        options = dict(delimiter=delimiter, comments=None, ndmin=2)
+        titles = next(csv.reader([header]), [])
+        options = dict(delimiter=",", comments=None, ndmin=2)
         cells = np.genfromtxt(lines, **options) if lines else np.zeros((0, 0))
     except (OSError, ValueError) as error:
         raise UserError(
