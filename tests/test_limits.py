@@ -158,7 +158,7 @@ def test_an_action_adds_to_a_moving_command() -> None:
     "limits, wrong",
     [
         ({"velocity": [1.0] * 6}, "velocity or acceleration is missing"),
-        ({"jerk": [1.0] * 6}, "jerk is given without"),
+        ({"jerk": [1.0] * 6}, "velocity or acceleration is missing"),
         ({"velocity": [1.0] * 6, "acceleration": [1.0] * 5}, "acceleration has 5 numbers"),
         ({"torque": [1.0] * 5}, "has 5 numbers"),
         (

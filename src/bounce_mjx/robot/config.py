@@ -65,7 +65,7 @@ class LimitsConfig(settings.StrictModel):
     def _check_together(self):
         velocity, acceleration, jerk, _ = (x is not None for _, x in self)
         if velocity != acceleration or jerk > acceleration:
-            raise ValueError("give velocity and acceleration together, and jerk with both")
+            raise ValueError("velocity or acceleration is missing; give both, or none of the three")
         return self
 
 
