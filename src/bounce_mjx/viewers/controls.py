@@ -2,7 +2,7 @@
 
 import html
 import queue
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
@@ -27,18 +27,40 @@ _SAMPLED = "sampled at each reset"
 
 
 class _Setting:
-    """A slider for a value that is sampled as long as `sampled` is on."""
+    """A slider, or a choice by names, for a value that is sampled as long as `sampled` is on."""
 
-    def __init__(self, slider: viser.GuiSliderHandle, sampled: viser.GuiCheckboxHandle):
-        self.slider, self.sampled = slider, sampled
-        slider.on_update(self._fix)
+    def __init__(
+        self,
+        handle: viser.GuiSliderHandle | viser.GuiDropdownHandle,
+        sampled: viser.GuiCheckboxHandle,
+        names: Sequence[str] = (),
+    ):
+        self._handle, self.sampled, self._names = handle, sampled, names
+        handle.on_update(self._fix)
 
     def _fix(self, _: object) -> None:
         self.sampled.value = False
 
-    def set(self, value: float) -> None:
-        """Sets a value."""
-        self.sampled.value, self.slider.value = False, value
+    @property
+    def value(self) -> float:
+        """The value; a choice's number."""
+        if not self._names:
+            return _clip(self._handle)
+        name = self._handle.value
+        return float(self._names.index(name)) if name in self._names else 0.0
+
+    def set(self, value: float | str) -> None:
+        """Sets a number, or a choice's name."""
+        self.sampled.value, self._handle.value = False, value
+
+    def move(self, change: float) -> None:
+        """Adds to the value, within the limits."""
+        if self._names:
+            index = int(self.value + np.sign(change)) % len(self._names)
+            self.set(self._names[index])
+        else:
+            ends = self._handle.min, self._handle.max
+            self.set(round(float(np.clip(self.value + change, *ends)), _DECIMALS))
 
 
 class Controls:
@@ -83,9 +105,13 @@ class Controls:
         short = label.split()[-1] + (f", {command.unit}" if command.unit else "")
         with gui.add_folder(label):
             sampled = gui.add_checkbox(_SAMPLED, given is None)
-            low, high = min(start, *ends), max(start, *ends)
-            slider = gui.add_slider(short, low, high, command.step / _STEPS_PER_KEY, start)
-        return _Setting(slider, sampled)
+            if command.names:
+                first = command.names[min(int(start), len(command.names) - 1)]
+                handle = gui.add_dropdown(short, command.names, initial_value=first)
+            else:
+                low, high = min(start, *ends), max(start, *ends)
+                handle = gui.add_slider(short, low, high, command.step / _STEPS_PER_KEY, start)
+        return _Setting(handle, sampled, command.names)
 
     def _add_world(self, gui: viser.GuiApi) -> None:
         """The world's sliders, of those terms that the simulation lets move."""
@@ -133,9 +159,7 @@ class Controls:
 
     def _move(self, name: str, steps: float, _: object) -> None:
         """Moves a command by a number of its steps."""
-        slider, step = self._commands[name].slider, self._simulation.env.config.commands[name].step
-        moved = float(np.clip(_clip(slider) + steps * step, slider.min, slider.max))
-        self._commands[name].set(round(moved, _DECIMALS))
+        self._commands[name].move(steps * self._simulation.env.config.commands[name].step)
 
     def _accelerate(self, change: float) -> None:
         self._speed.value = float(np.clip(round(self._speed.value + change, 1), *_SPEED_RANGE))
@@ -155,12 +179,12 @@ class Controls:
     def apply(self) -> None:
         """Applies the settings and the requests to the simulation."""
         self._simulation.command = {
-            name: _clip(setting.slider)
+            name: setting.value
             for name, setting in self._commands.items()
             if not setting.sampled.value
         }
         if self._world:
-            world = {x.term: x.world_value(_clip(own.slider)) for x, own in self._world.items()}
+            world = {x.term: x.world_value(setting.value) for x, setting in self._world.items()}
             is_sampled = next(iter(self._world.values())).sampled.value
             self._simulation.world = None if is_sampled else world
         while not self._requests.empty():

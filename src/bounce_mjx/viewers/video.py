@@ -47,15 +47,15 @@ def find_ffmpeg() -> str:
     """
     try:
         from imageio_ffmpeg import get_ffmpeg_exe
-
-        return get_ffmpeg_exe()
     except ImportError as error:
-        if found := shutil.which("ffmpeg"):
-            return found
-        raise MissingPackage(
-            "a video needs the program ffmpeg, which is not found; install it, or the extra "
-            f"video: {install_command('bounce_mjx[video]')}"
-        ) from error
+        found = shutil.which("ffmpeg")
+        if found is None:
+            raise MissingPackage(
+                "a video needs the program ffmpeg, which is not found; install it, or the extra "
+                f"video: {install_command('bounce_mjx[video]')}"
+            ) from error
+        return found
+    return get_ffmpeg_exe()
 
 
 def make_video_writer(
