@@ -17,6 +17,7 @@ from brax.training.agents.ppo import checkpoint as brax_checkpoint
 from brax.training.agents.sac import networks as sac_networks
 from brax.training.agents.sac import train as brax_sac
 
+from bounce_mjx import EnvConfig
 from bounce_mjx.adapters.brax import (
     BraxBounceBall,
     device_put_replicated,
@@ -35,9 +36,11 @@ def all_finite(tree) -> bool:
 def test_brax_makes_the_environment():
     env = brax.envs.get_environment("bounce_ball", target_height_range=(0.7, 0.7))
     assert isinstance(env, BraxBounceBall) and isinstance(env.task, brax.envs.Env)
-    settings = {"target_height_range": (0.7, 0.7), "control_dt": 0.02}
-    wrapped = brax.envs.create("bounce_ball", episode_length=5, batch_size=2, **settings)
-    assert wrapped.dt == 0.02
+    config = EnvConfig(target_height_range=(0.7, 0.7), control_dt=0.02)
+    wrapped = brax.envs.create(
+        "bounce_ball", episode_length=5, batch_size=2, config=config, control_dt=0.01
+    )
+    assert wrapped.dt == 0.01
     state = jax.jit(wrapped.reset)(jax.random.PRNGKey(0))
     assert state.obs.shape == (2, 29)
     np.testing.assert_allclose(state.obs[:, 28], 0.7, rtol=1e-6)

@@ -59,7 +59,7 @@ def test_reader_returns_what_was_recorded(tmp_path: Path) -> None:
 def test_recorder_keeps_an_earlier_log(tmp_path: Path) -> None:
     path = recorded(tmp_path / "log.csv")
     before = path.read_bytes()
-    with pytest.raises(UserError, match=r"log\.csv cannot be created \(File exists\); choose"):
+    with pytest.raises(UserError, match=r"the log .+log\.csv exists; choose another name"):
         Recorder(path, JOINTS)
     assert path.read_bytes() == before
 
@@ -411,6 +411,18 @@ def test_excitation_keeps_to_the_limits_of_the_robot() -> None:
         largest = np.max(np.abs(np.diff(motion.targets, order, axis=0)), axis=0)
         assert np.all(largest / config.control_dt**order <= limit)
     assert np.all(np.ptp(motion.targets, axis=0) > 0.01)
+
+
+@pytest.mark.parametrize("separator, point", [(";", ","), ("\t", ".")])
+def test_other_separators_and_decimal_commas_are_read(separator, point, tmp_path: Path) -> None:
+    """And titles without a space before the unit."""
+    good = recorded(tmp_path / "good.csv")
+    path = tmp_path / "log.csv"
+    text = good.read_text().replace(",", separator).replace(" [", "[")
+    head, _, rows = text.partition("\n")
+    path.write_text(f"{head}\n{rows.replace('.', point)}")
+    for one, other in zip(log_of(good)[1:-1], log_of(path)[1:-1], strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_a_ball_in_two_frames_is_refused(tmp_path: Path) -> None:

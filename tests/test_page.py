@@ -187,8 +187,8 @@ def test_the_page_shows_the_commands_of_any_task(monkeypatch) -> None:
         wait_until(lambda: leaning.command == {"lean_angle": 0.2})
         client.set(client.control("pace"), 3.0)
         wait_until(lambda: leaning.command == {"lean_angle": 0.2, "pace": 3.0})
-        client.set(client.control("gait"), "walk")
-        wait_until(lambda: leaning.command.get("gait") == 0.0)
+        client.set(client.control("gait"), "slow run")
+        wait_until(lambda: leaning.command.get("gait") == 1.0)
 
 
 @pytest.fixture

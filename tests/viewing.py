@@ -165,11 +165,7 @@ def served(simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> Iterator[
     while "viewer" not in printed.getvalue():
         assert server.is_alive(), failures
         time.sleep(0.05)
-    client = Client(re.search(r"http://\S+", printed.getvalue())[0])
-    # The last part of the page.
-    while not any("path of the ball" in text for text in client.texts):
-        client.receive()
-    yield client
+    yield Client(re.search(r"http://\S+", printed.getvalue())[0])
     assert server.is_alive(), failures
     ended.set()
     server.join(PATIENCE)

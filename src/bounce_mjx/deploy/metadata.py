@@ -171,14 +171,16 @@ def to_entries(metadata: Metadata) -> dict[str, str]:
 
 
 def from_entries(entries: dict[str, str]) -> Metadata:
-    """Metadata from the entries of `to_entries`; ValueError for another format, and KeyError for a
-    missing entry."""
+    """Metadata from the entries of `to_entries`; ValueError for another format."""
     # A file of another format lacks entries too, but the format is the reason.
     if "format" in entries and (given := json.loads(entries["format"])) != FORMAT:
         raise ValueError(f"its format is {given}, not {FORMAT}")
     if '"filter"' in (entries.get("position"), entries.get("velocity")):
         raise ValueError("it sees the ball through a Kalman filter, for which use bounce-mjx 0.1.0")
     entries = _LATER | entries
+    missing = [name for name in Metadata._fields if name not in entries]
+    if missing:
+        raise ValueError(f"its metadata lacks {missing[0]}")
     values = {name: _with_tuples(json.loads(entries[name])) for name in Metadata._fields}
     limits, commands = values["limits"], values["commands"]
     groups = {

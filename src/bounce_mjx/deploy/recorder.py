@@ -49,9 +49,11 @@ class Recorder(contextlib.AbstractContextManager):
         try:
             # A row reaches the file at once, as a robot's program may end at any time.
             self._file = Path(path).open("x", buffering=1, newline="", encoding="utf-8")
+        except FileExistsError as error:
+            raise UserError(f"the log {path} exists; choose another name") from error
         except OSError as error:
             raise UserError(
-                f"the log {path} cannot be created ({error.strerror}); choose another name"
+                f"the log {path} cannot be created ({error.strerror}); choose another folder"
             ) from error
         self._rows = csv.writer(self._file, lineterminator="\n")
         self._rows.writerow(itertools.chain(*columns.values()))

@@ -48,7 +48,8 @@ def read_log(path: Path, model: mujoco.MjModel, topics: Topics, names: Sequence[
 
 
 def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
-    """Reads a CSV log.
+    """Reads a CSV log. Cells are separated by commas, semicolons or tabs, as the header's; beside
+    the last two, a decimal comma is read.
 
     Args:
       joint_names: the robot's joints, in the order of the result.
@@ -100,8 +101,12 @@ def _read_columns(path: Path) -> dict[str, tuple[str, np.ndarray]]:
     that holds none."""
     try:
         header, *lines = path.read_text("utf-8-sig").splitlines() or [""]
-        titles = next(csv.reader([header]), [])
-        options = dict(delimiter=",", comments=None, ndmin=2)
+        delimiter = max(",;\t", key=header.count)
+        titles = next(csv.reader([header], delimiter=delimiter), [])
+        lines = [line.replace('"', "") for line in lines]
+        if delimiter != ",":
+            lines = [line.replace(",", ".") for line in lines]
+        options = dict(delimiter=delimiter, comments=None, ndmin=2)
         cells = np.genfromtxt(lines, **options) if lines else np.zeros((0, 0))
     except (OSError, ValueError) as error:
         raise UserError(

@@ -25,6 +25,18 @@ _WEAK = 1.5
 _SHARE = 0.35
 _GOOD_FIT = 1.2
 
+# What shows unknowns that a log does not show or separate.
+_MOTIONS = {
+    "bounces in other postures of the arm": "encoder_bias paddle_tilt paddle_offset",
+    "bounces at places far apart": f"ball_position_bias {CAMERA_ROTATION}",
+    "long flights, and a level under the base,": "gravity_tilt",
+    "a known weight on the paddle, or slow motions in other postures,": "link_mass servo_gain",
+    "faster motions (bounce-mjx excite --max-velocity)": "servo_damping servo_lag action_latency",
+    "slow motions there and back (bounce-mjx excite)": "joint_frictionloss",
+    "balls with spin, or thrown from the side,": "contact_friction",
+    "higher flights": "air_drag",
+    "more bounces, at several target heights,": "ball_latency restitution",
+}
 # Deviations of the prior beyond which an estimate is a mistake, and what is likely to be wrong.
 _SURPRISING = 3.0
 _MISTAKES = (
@@ -152,12 +164,12 @@ def _describe_unseen(found: Identified, joint_names: Sequence[str]) -> list[str]
         names = frozenset(owners[i] for i in main)
         if value > _WEAK or not names or names in said:
             continue
-        said[names] = f"The log does not show {labels[main[0]]}: its interval is the prior's."
+        motion = next(x for x, shown in _MOTIONS.items() if names & set(shown.split()))
+        text = f"The log does not show {labels[main[0]]}: its interval is the prior's"
         if len(main) > 1:
             listed = ", ".join(labels[i] for i in main)
-            said[names] = (
-                f"The log does not separate {listed}: their intervals are mostly the prior's."
-            )
+            text = f"The log does not separate {listed}: their intervals are mostly the prior's"
+        said[names] = f"{text}; {motion} would."
     return list(said.values())
 
 

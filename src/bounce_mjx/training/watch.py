@@ -4,7 +4,6 @@ import html
 import queue
 import threading
 from collections.abc import Callable
-from functools import partial
 
 import jax
 import viser
@@ -16,7 +15,7 @@ from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.learning.policy import make_networks, untrained_policy
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training.events import Event, evaluation_line, say
-from bounce_mjx.viewers.browser import free_port, run_page
+from bounce_mjx.viewers.browser import LivePage, free_port
 from bounce_mjx.viewers.guard import open_server
 from bounce_mjx.viewers.options import Address, PageStart
 from bounce_mjx.viewers.simulation import Simulation, make_policy_controller
@@ -65,8 +64,8 @@ class TrainingPage:
                 side = server.gui.add_panel()
                 show = add_panel(server.gui, side, self._config)
                 simulation = _simulate(self._config)
-                told = partial(self._tell, simulation, show)
-                run_page(server, simulation, PageStart("training"), None, told, side)
+                page = LivePage(server, simulation, PageStart("training"), side)
+                page.run(None, lambda: self._tell(simulation, show))
         # The training continues without its page.
         except Exception as error:
             reason = reason_of(error)

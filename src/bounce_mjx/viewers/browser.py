@@ -4,7 +4,7 @@ import collections
 import html
 import socket
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 
 import jax
 import numpy as np
@@ -28,90 +28,103 @@ from bounce_mjx.viewers.simulation import (
 # Plots per second.
 _PLOT_RATE = 8.0
 _PLOT_SECONDS = 4.0
+AXIS = {"stroke": "#444", "grid": {"stroke": "#e3e6ea"}}
+"""Style of the axes of a plot."""
 _REWARD = "reward/"
 
 
-def run_page(
-    server: viser.ViserServer,
-    simulation: Simulation,
-    start: PageStart,
-    seconds: float | None = None,
-    is_over: Callable[[], object] = lambda: False,
-    side: viser.PanelHandle | None = None,
-) -> None:
-    """Steps a simulation in real time, and sends pictures and plots to the pages of a server.
+class LivePage:
+    """A simulation in real time on a server."""
 
-    Args:
-      seconds: simulated time; None for no end.
-      is_over: called between two pictures; whether to stop.
-      side: the left panel, if it has tabs already.
-    """
-    gui, dt = server.gui, simulation.env.dt
-    gui.configure_theme(
-        show_logo=False, show_share_button=False, control_width="medium", brand_color=(230, 95, 20)
-    )
-    gui.set_panel_label("bounce_mjx")
-    gui.main_panel.dock_right()
-    gui.main_panel.set_width(280)
-    controls = Controls(gui, simulation, start)
-    scene = Scene(server, simulation.env, start.num_shown, start.names)
-    side = side or gui.add_panel()
-    side.dock_left()
-    side.set_width(300)
-    with side.add_tab("robot 1" if start.names is None else start.names[0], viser.Icon.CHART_LINE):
-        update_plots = _add_plots(gui, simulation)
-    history: collections.deque[EnvFrame] = collections.deque(maxlen=round(_PLOT_SECONDS / dt))
-    next_plot = 0.0
-    for frames in in_real_time(simulation, seconds, controls.pace):
-        if is_over():
-            break
-        controls.apply()
-        if controls.num_shown != scene.num_envs:
-            scene.show(controls.num_shown)
-        history.extend(frames)
-        scene.update(frames or [simulation.frame])
-        if frames and time.monotonic() >= next_plot:
-            update_plots(list(history))
-            next_plot = time.monotonic() + 1.0 / _PLOT_RATE
-    server.flush()
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        simulation: Simulation,
+        start: PageStart,
+        side: viser.PanelHandle | None = None,
+    ):
+        """
+        Args:
+          side: the left panel, if it has tabs already.
+        """
+        self._server = server
+        self._simulation = simulation
+        gui = server.gui
+        gui.configure_theme(
+            show_logo=False, show_share_button=False, control_width="medium",
+            brand_color=(230, 95, 20),
+        )  # fmt: skip
+        gui.set_panel_label("bounce_mjx")
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(280)
+        self._controls = Controls(gui, simulation, start)
+        self._scene = Scene(server, simulation.env, start.num_shown, start.names)
+        self._history: collections.deque[EnvFrame] = collections.deque(
+            maxlen=round(_PLOT_SECONDS / simulation.env.dt)
+        )
+        side = side or gui.add_panel()
+        side.dock_left()
+        side.set_width(300)
+        self._add_plots(side, "robot 1" if start.names is None else start.names[0])
 
+    def run(self, seconds: float | None, is_over: Callable[[], object] = lambda: False) -> None:
+        """Steps the simulation and sends pictures and plots.
 
-def _add_plots(gui: viser.GuiApi, simulation: Simulation) -> Callable[[Sequence[EnvFrame]], None]:
-    """Adds the plots of the first environment; a function of its last frames, which updates
-    them."""
-    env, frame = simulation.env, simulation.frame
+        Args:
+          seconds: simulated time; None for no end.
+          is_over: called between two pictures; whether to stop.
+        """
+        simulation, controls, scene = self._simulation, self._controls, self._scene
+        next_plot = 0.0
+        for frames in in_real_time(simulation, seconds, controls.pace):
+            if is_over():
+                break
+            controls.apply()
+            if controls.num_shown != scene.num_envs:
+                scene.show(controls.num_shown)
+            self._history.extend(frames)
+            scene.update(frames or [simulation.frame])
+            if frames and time.monotonic() >= next_plot:
+                self._update_plots()
+                next_plot = time.monotonic() + 1.0 / _PLOT_RATE
+        self._server.flush()
 
-    def levels(frame: EnvFrame) -> dict[str, float]:
-        return env.task.levels(at_index(frame.command, 0))
+    def _add_plots(self, side: viser.PanelHandle, title: str) -> None:
+        gui, frame = self._server.gui, self._simulation.frame
+        balls, levels = ["ball"] * frame.balls.shape[1], self._levels(frame)
+        lines = [
+            {"label": "s"},
+            *({"label": name, "stroke": "#e8590c", "width": 2} for name in balls),
+            *({"label": name, "stroke": "#2b8a3e", "dash": [6, 4]} for name in levels),
+            {"label": "paddle", "stroke": "#1c7ed6", "width": 2},
+        ]
+        with side.add_tab(title, viser.Icon.CHART_LINE):
+            gui.add_markdown("height, m, over the last seconds")
+            self._heights = gui.add_uplot(
+                (np.zeros(1),) * len(lines),
+                tuple(lines),
+                axes=({**AXIS, "size": 30}, {**AXIS, "size": 40}),
+                scales={"x": {"time": False}, "y": {"range": (0.0, 1.05)}},
+                legend={"live": False},
+                height=190,
+            )
+            gui.add_markdown("reward, by term")
+            self._terms = gui.add_html(reward_table(_reward_terms(frame)))
+            gui.add_html(_legend(self._simulation.env, frame))
 
-    lines = [
-        {"label": "s"},
-        *({"label": "ball", "stroke": "#e8590c", "width": 2} for _ in range(frame.balls.shape[1])),
-        *({"label": name, "stroke": "#2b8a3e", "dash": [6, 4]} for name in levels(frame)),
-        {"label": "paddle", "stroke": "#1c7ed6", "width": 2},
-    ]
-    gui.add_markdown("height, m, over the last seconds")
-    plot = gui.add_uplot(
-        (np.zeros(1),) * len(lines),
-        tuple(lines),
-        axes=({"size": 30}, {"size": 40}),
-        scales={"x": {"time": False}, "y": {"range": (0.0, 1.05)}},
-        legend={"live": False},
-        height=190,
-    )
-    gui.add_markdown("reward, by term")
-    table = gui.add_html(reward_table(_reward_terms(frame)))
-    gui.add_html(_legend(env, frame))
+    def _levels(self, frame: EnvFrame) -> dict[str, float]:
+        """The task's heights of the first environment."""
+        return self._simulation.env.task.levels(at_index(frame.command, 0))
 
-    def update(frames: Sequence[EnvFrame]) -> None:
-        heights = [(*f.balls[0, :, 2], *levels(f).values(), f.paddle[0, 2]) for f in frames]
+    def _update_plots(self) -> None:
+        env = self._simulation.env
+        frames = list(self._history)
+        heights = [(*f.balls[0, :, 2], *self._levels(f).values(), f.paddle[0, 2]) for f in frames]
         times = np.arange(1 - len(heights), 1) * env.dt
-        plot.data = (times, *np.array(heights).T)
+        self._heights.data = (times, *np.array(heights).T)
         recent = frames[-round(1.0 / _PLOT_RATE / env.dt) :]
         terms = jax.tree.map(lambda *values: np.mean(values), *map(_reward_terms, recent))
-        table.content = reward_table(terms)
-
-    return update
+        self._terms.content = reward_table(terms)
 
 
 def _reward_terms(frame: EnvFrame) -> dict[str, float]:

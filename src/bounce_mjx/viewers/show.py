@@ -99,12 +99,13 @@ def serve(
     console: Console,
 ) -> None:
     """Serves the page of a simulation until Ctrl-C, or for a simulated time (s)."""
-    from bounce_mjx.viewers.browser import run_page
+    from bounce_mjx.viewers.browser import LivePage
     from bounce_mjx.viewers.guard import open_server
 
     with StopRequest() as stop, open_server(*address) as server:
+        page = LivePage(server, simulation, start)
         console.out(f"viewer: {address.url}  (Ctrl-C ends it)", highlight=False)
-        run_page(server, simulation, start, seconds, lambda: stop.requested)
+        page.run(seconds, lambda: stop.requested)
 
 
 def _choose_viewer(options: ViewerOptions, several: bool) -> str:

@@ -32,9 +32,12 @@ _ENCODINGS = {
     ".webp": "-c:v libwebp_anim -q:v 60 -loop 0".split(),
     # One palette, for the moving parts; each picture stores only its changed pixels.
     ".gif": (
-        "-filter_complex split[a][b];[a]palettegen=max_colors=128:stats_mode=diff[p];"
-        "[b][p]paletteuse=dither=bayer:bayer_scale=5:diff_mode=rectangle -loop 0"
-    ).split(),
+        "-filter_complex",
+        "split[a][b];[a]palettegen=max_colors=128:stats_mode=diff[p];"
+        "[b][p]paletteuse=dither=bayer:bayer_scale=5:diff_mode=rectangle",
+        "-loop",
+        "0",
+    ),
 }
 
 

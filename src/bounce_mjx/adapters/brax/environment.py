@@ -1,7 +1,6 @@
 """The environment for brax, with this project's physics."""
 
 import copy
-import functools
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -20,6 +19,7 @@ from bounce_mjx.env.env import Env, EnvState, State
 from bounce_mjx.task.task import Task
 from bounce_mjx.tasks.registry import DEFAULT, task_config
 from bounce_mjx.viewers.offscreen import choose_opengl
+from bounce_mjx.world.config import WorldConfig
 
 ENV_NAME = "bounce_ball"
 
@@ -62,41 +62,53 @@ class PipelineState:
 class BraxBounceBall(brax.envs.Env):
     """One environment with brax's interface; `task` is the `Env` in it."""
 
-    def __init__(self, task: str | type[Task] = DEFAULT, **settings: Any):
+    def __init__(
+        self,
+        config: WorldConfig | None = None,
+        task: str | type[Task] = DEFAULT,
+        **settings: Any,
+    ):
         """Makes the environment.
 
         Args:
-          task: its class, its name, or FILE.py:CLASS.
-          settings: fields of the task's config, such as episode_seconds=30.
+          config: all settings; None for the defaults of the task.
+          task: its class, its name, or FILE.py:CLASS, if there is no config.
+          settings: fields of the task's config, such as episode_seconds=30, which replace fields of
+            `config`.
 
         Raises:
           UserError: a setting is wrong.
         """
-        self.task = Env(validate(task_config(task), settings, ENV_NAME))
+        given = {} if config is None else config.model_dump()
+        kind = task_config(task) if config is None else type(config)
+        self.task = Env(validate(kind, given | settings, ENV_NAME))
         self.dt, self.mj_model = self.task.dt, self.task.mj_model
         """Time of one control step, s, and MuJoCo's model."""
         self._model = _Model(self.mj_model)
+        self._base: brax.base.System | None = None
+        self._sys: brax.base.System | None = None
 
-    @functools.cached_property
-    def _base(self) -> brax.base.System:
-        """brax's system of the model."""
-        with warnings.catch_warnings():
-            # brax warns that it is no longer maintained.
-            warnings.simplefilter("ignore")
-            return mjcf.load_model(_drawable(self.task.mj_model))
-
-    @functools.cached_property
+    @property
     def sys(self) -> brax.base.System:
         """brax's system of the model. The fields of another system, such as `randomization_fn`
         gives, act from the next reset (`adapters/randomization.py`)."""
-        return self._base
+        if self._sys is None:
+            with warnings.catch_warnings():
+                # brax warns that it is no longer maintained.
+                warnings.simplefilter("ignore")
+                self._base = self._sys = mjcf.load_model(_drawable(self.task.mj_model))
+        return self._sys
+
+    @sys.setter
+    def sys(self, system: brax.base.System) -> None:
+        assert self.sys is not None  # the base to compare with
+        self._sys = system
 
     def reset(self, rng: jax.Array) -> State:
         """Starts an episode; consumes the key `rng`."""
         task = self.task
-        # A system that nobody asked for is not loaded.
-        if "sys" in vars(self) and self.sys is not self._base:
-            task = randomized_task(task, self._base.mj_model, self._base, self.sys)
+        if self._sys is not self._base:
+            task = randomized_task(task, self._base.mj_model, self._base, self._sys)
         return self._to_brax(task.reset(rng))
 
     def step(self, state: State, action: jax.Array) -> State:

@@ -100,9 +100,19 @@ class PlaygroundBounceBall(MjxEnv):
             own = self._own_mjx_model
             task = randomized_task(task, self.mj_model, own, self._randomized)
         state = task.reset(rng)
-        dtype = state.pipeline_state.physics.qpos.dtype
-        control, _ = self.task.control(state.pipeline_state, jnp.zeros(self.action_size, dtype))
-        return self._to_playground(state, control.ctrl, jnp.zeros((), dtype))
+        m, physics = self.mj_model, state.pipeline_state.physics
+        dtype = physics.qpos.dtype
+        still = jnp.zeros(self.action_size, dtype)
+        data = TaskData(
+            **physics._asdict(),
+            time=jnp.zeros((), dtype),
+            ctrl=self.task.control(state.pipeline_state, still)[0].ctrl,
+            mocap_pos=jnp.zeros((m.nmocap, 3), dtype),
+            mocap_quat=jnp.zeros((m.nmocap, 4), dtype),
+            xfrc_applied=jnp.zeros((m.nbody, 6), dtype),
+            task=state.pipeline_state._replace(physics=None),
+        )
+        return State(data=data, **_common(state))
 
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one control step under the action [action_size]."""
@@ -111,20 +121,13 @@ class PlaygroundBounceBall(MjxEnv):
         before = core.State(data.task._replace(physics=physics), **_common(state))
         after = self.task.step(before, action)
         control, _ = self.task.control(before.pipeline_state, action)
-        return self._to_playground(after, control.ctrl, data.time + self.task.dt)
-
-    def _to_playground(self, state: core.State, ctrl: jax.Array, time: jax.Array) -> State:
-        m, physics = self.mj_model, state.pipeline_state.physics
-        data = TaskData(
-            **physics._asdict(),
-            time=time,
-            ctrl=ctrl,
-            mocap_pos=jnp.zeros((m.nmocap, 3), time.dtype),
-            mocap_quat=jnp.zeros((m.nmocap, 4), time.dtype),
-            xfrc_applied=jnp.zeros((m.nbody, 6), time.dtype),
-            task=state.pipeline_state._replace(physics=None),
+        data = data.replace(
+            **after.pipeline_state.physics._asdict(),
+            time=data.time + self.task.dt,
+            ctrl=control.ctrl,
+            task=after.pipeline_state._replace(physics=None),
         )
-        return State(data=data, **_common(state))
+        return state.replace(data=data, **_common(after))
 
     @property
     def xml_path(self) -> str:
