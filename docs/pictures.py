@@ -4,7 +4,6 @@ The diagrams need matplotlib only; the others run the policies that come with th
 animations need OpenGL. `bounce-mjx plot` draws curves.svg, rewards.svg and evaluation.svg.
 """
 
-import contextlib
 import re
 import subprocess
 import sys
@@ -413,7 +412,7 @@ def arms():
         qpos, addresses = env.mj_model.qpos0.copy(), env.addresses
         qpos[addresses.arm_qpos,] = config.default_joint_angles
         qpos[addresses.balls[0].qpos[:3],] = config.ball_init_pos
-        with contextlib.closing(Renderer(env, 480, 520)) as renderer:
+        with Renderer(env, 480, 520) as renderer:
             axes.imshow(renderer.render(qpos, {"target_height": 0.5}))
         axes.set_title(title)
         axes.axis("off")
@@ -478,7 +477,7 @@ def simulators():
     for name, title in names.items():
         world = benchmark.WORLDS["60 + 30 ms"]
         _, path = benchmark.evaluate("robust", name, world, 1, seed)
-        with contextlib.closing(Renderer(env, 280, 280, zoom=1.3)) as renderer:
+        with Renderer(env, 280, 280, zoom=1.3) as renderer:
             pictures = [
                 Image.fromarray(renderer.render(qpos, command)) for qpos in path[:steps:every]
             ]

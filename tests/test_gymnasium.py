@@ -177,6 +177,7 @@ def test_wrong_arguments_and_options_give_one_sentence(vectorised):
         ({"max_episode_steps": 3000}, "must be from 1 to the 2000 steps .* episode_seconds makes"),
         ({"num_envs": 0}, "num_envs is 0, but must"),
         ({"target_hight_range": (0, 1)}, "keyword argument 'target_hight_range'; did you mean"),
+        ({"render_mode": "rgb_array", "camera": "top"}, "no camera 'top'; its .* overview, side"),
     ):
         with pytest.raises(UserError, match=sentence):
             gymnasium.make_vec(ENV_ID, **{"num_envs": 2} | arguments)

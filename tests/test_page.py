@@ -175,7 +175,7 @@ def test_the_page_shows_the_commands_of_any_task(monkeypatch) -> None:
         assert client.sliders.keys() == {"speed", "robots", "speed, m/s", *sliders}
         assert client.lines == ["s", "ball", "shelf", "wall", "paddle"]
         (legend,) = {text for text in client.texts if "path of the ball" in text}
-        assert 'rgb(230.0, 26.0, 26.0)">&#9632;</b> high wall<' in legend
+        assert 'rgb(230,26,26)">&#9632;</b> high wall<' in legend
         assert legend.count("dot") == 1
         assert any(">calm<" in text for text in client.texts)
         client.set(client.control("angle, rad"), 0.0)

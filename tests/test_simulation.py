@@ -17,6 +17,7 @@ from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.checkpoints import read_policy
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import pretrained_checkpoint
+from bounce_mjx.tasks.bounce import BounceConfig
 from bounce_mjx.tasks.bounce_rewards import BounceReward
 from bounce_mjx.viewers import show
 from bounce_mjx.viewers.controls import direction
@@ -31,7 +32,7 @@ from bounce_mjx.viewers.simulation import (
     in_real_time,
     make_policy_controller,
 )
-from bounce_mjx.viewers.world import SLIDERS, reset_ranges, with_sliders
+from bounce_mjx.viewers.world import SLIDERS, reset_ranges, sliders_for, with_sliders
 from bounce_mjx.world.randomization import RandomizationConfig
 from viewing import (
     GRAVITY,
@@ -160,6 +161,15 @@ def test_policies_of_different_tasks_are_not_shown_together() -> None:
 NOMINAL = {slider.term: slider.world_value(slider.nominal) for slider in SLIDERS}
 
 
+def test_a_slider_reaches_every_value_that_a_reset_samples() -> None:
+    own = RandomizationConfig(action_latency=(0.0, 0.08), paddle_tilt=((-0.1, 0.0), (0.02, 0.2)))
+    config = with_sliders(BounceConfig(randomization=own))
+    spans = {slider.term: slider.span for slider in sliders_for(config.randomization)}
+    assert spans["action_latency"] == pytest.approx((0.0, 0.08))
+    assert spans["paddle_tilt"] == pytest.approx((-0.1, 0.2))
+    assert spans["restitution"] == (0.6, 0.98)
+
+
 @pytest.mark.slow
 def test_a_moved_slider_changes_the_world_at_once(monkeypatch) -> None:
     """Of the nominal policy, in worlds whose ball mass is drawn."""
@@ -231,6 +241,15 @@ ASPECTS = (0.46, 0.85, 2.0)
 
 
 HOMES = ((0.58856, 0.0, 0.05), (0.67, 0.0, 0.4), (0.0, 0.55, 0.25), (-0.6, 0.0, 0.3))
+
+
+def test_on_a_phone_the_panel_leaves_the_arm_and_the_ball_visible() -> None:
+    """It covers the lower three fifths."""
+    home = np.array(HOMES[0])
+    parts = np.array([(-0.1, 0.0, 0.0), home + (0.05, 0.0, 0.0), home + (0.0, 0.0, 0.8)])
+    points = projected(parts, home, 390 / 844, np.zeros((1, 3)))
+    assert np.all(np.abs(points[:, 0]) < 1.0)
+    assert np.all((points[:, 1] > 0.2) & (points[:, 1] < 1.0))
 
 
 @pytest.mark.parametrize("home", HOMES, ids=["default", "raised", "turned", "behind"])

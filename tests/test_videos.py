@@ -26,7 +26,7 @@ from bounce_mjx.training.video import EvaluationVideo
 from bounce_mjx.viewers import offscreen, show
 from bounce_mjx.viewers.browser import LivePage
 from bounce_mjx.viewers.offscreen import choose_backend
-from bounce_mjx.viewers.video import find_ffmpeg, make_video_writer
+from bounce_mjx.viewers.video import VideoWriter, find_ffmpeg
 
 
 @pytest.fixture(autouse=True)
@@ -42,7 +42,7 @@ def test_a_video_needs_ffmpeg_of_the_extra_or_of_the_system(monkeypatch, tmp_pat
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(UserError, match=r"ffmpeg, which is not found; install it, or the extra"):
-        make_video_writer(tmp_path / "a.mp4", (64, 64), None)
+        VideoWriter(tmp_path / "a.mp4", (64, 64), None)
     (tmp_path / "ffmpeg").touch(mode=0o755)
     assert Path(find_ffmpeg()) == tmp_path / "ffmpeg"
 

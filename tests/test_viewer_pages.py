@@ -151,6 +151,7 @@ def test_live_page_moves_obeys_and_stays_local(watch, served) -> None:
     watched = watch(address)
     page = watched.page
     watched.wait_for_motion(watched.wait_for_arm())
+    assert page.title().startswith("bounce_mjx: pretrained, ")
 
     # The panel shows the reward terms, and they change.
     terms = page.get_by_text("consecutive bounces").locator("xpath=..")

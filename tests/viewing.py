@@ -22,8 +22,7 @@ from bounce_mjx import BounceBall, EnvConfig, task
 from bounce_mjx.baselines.mirror import MirrorLaw
 from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.viewers import show
-from bounce_mjx.viewers.browser import free_port
-from bounce_mjx.viewers.options import Address, PageStart
+from bounce_mjx.viewers.options import PageStart, ViewerOptions
 from bounce_mjx.viewers.simulation import EnvFrame, Simulation, make_policy_controller
 from bounce_mjx.world.config import WorldConfig
 
@@ -145,7 +144,7 @@ def watch(
 def served(simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> Iterator[Client]:
     """A client of a simulation's page."""
     failures, printed, ended = [], io.StringIO(), threading.Event()
-    address = Address("127.0.0.1", free_port("127.0.0.1", 8400))
+    options = ViewerOptions(viewer="browser", port=8400)
 
     def step(simulation) -> None:
         if ended.is_set():
@@ -155,8 +154,7 @@ def served(simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> Iterator[
 
     def serve() -> None:
         try:
-            console = Console(file=printed)
-            show.serve(simulation, PageStart("exp[lr] <b>"), address, None, console)
+            show._page(options, Console(file=printed))(simulation, PageStart("exp[lr] <b>"))
         except BaseException as error:
             failures.append(error)
 

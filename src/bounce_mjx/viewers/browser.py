@@ -2,6 +2,8 @@
 
 import collections
 import html
+import itertools
+import json
 import socket
 import time
 from collections.abc import Callable, Mapping
@@ -14,7 +16,7 @@ import viser.uplot
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.viewers.controls import Controls, words
-from bounce_mjx.viewers.display import TRAIL_RGB
+from bounce_mjx.viewers.display import TRAIL_RGB, TRAIL_SECONDS
 from bounce_mjx.viewers.options import PageStart
 from bounce_mjx.viewers.scene import Scene
 from bounce_mjx.viewers.simulation import (
@@ -30,7 +32,14 @@ _PLOT_RATE = 8.0
 _PLOT_SECONDS = 4.0
 AXIS = {"stroke": "#444", "grid": {"stroke": "#e3e6ea"}}
 """Style of the axes of a plot."""
+_LEVEL_COLOURS = ("#2b8a3e", "#9c36b5", "#0b7285")
 _REWARD = "reward/"
+
+
+def _window_title(title: str) -> str:
+    """HTML that sets the title of the browser's tab, for which viser has no setting."""
+    script = html.escape(f"document.title = {json.dumps(title)}")
+    return f'<img src="data:," alt="" hidden onerror="{script}">'
 
 
 class LivePage:
@@ -57,6 +66,7 @@ class LivePage:
         gui.set_panel_label("bounce_mjx")
         gui.main_panel.dock_right()
         gui.main_panel.set_width(280)
+        gui.add_html(_window_title(f"bounce_mjx: {start.title}"))
         self._controls = Controls(gui, simulation, start)
         self._scene = Scene(server, simulation.env, start.num_shown, start.names)
         self._history: collections.deque[EnvFrame] = collections.deque(
@@ -86,16 +96,22 @@ class LivePage:
             scene.update(frames or [simulation.frame])
             if frames and time.monotonic() >= next_plot:
                 self._update_plots()
+                controls.show_values()
                 next_plot = time.monotonic() + 1.0 / _PLOT_RATE
         self._server.flush()
 
     def _add_plots(self, side: viser.PanelHandle, title: str) -> None:
         gui, frame = self._server.gui, self._simulation.frame
-        balls, levels = ["ball"] * frame.balls.shape[1], self._levels(frame)
+        levels = [
+            {"label": name, "stroke": colour, "width": 2, "dash": [6, 4]}
+            for name, colour in zip(self._levels(frame), itertools.cycle(_LEVEL_COLOURS))
+        ]
+        count = frame.balls.shape[1]
+        balls = ["ball"] if count == 1 else [f"ball {i + 1}" for i in range(count)]
         lines = [
             {"label": "s"},
             *({"label": name, "stroke": "#e8590c", "width": 2} for name in balls),
-            *({"label": name, "stroke": "#2b8a3e", "dash": [6, 4]} for name in levels),
+            *levels,
             {"label": "paddle", "stroke": "#1c7ed6", "width": 2},
         ]
         with side.add_tab(title, viser.Icon.CHART_LINE):
@@ -109,7 +125,7 @@ class LivePage:
                 height=190,
             )
             gui.add_markdown("reward, by term")
-            self._terms = gui.add_html(reward_table(_reward_terms(frame)))
+            self._terms = gui.add_html(reward_bars(dict.fromkeys(_reward_terms(frame), 0.0)))
             gui.add_html(_legend(self._simulation.env, frame))
 
     def _levels(self, frame: EnvFrame) -> dict[str, float]:
@@ -124,7 +140,7 @@ class LivePage:
         self._heights.data = (times, *np.array(heights).T)
         recent = frames[-round(1.0 / _PLOT_RATE / env.dt) :]
         terms = jax.tree.map(lambda *values: np.mean(values), *map(_reward_terms, recent))
-        self._terms.content = reward_table(terms)
+        self._terms.content = reward_bars(terms)
 
 
 def _reward_terms(frame: EnvFrame) -> dict[str, float]:
@@ -140,26 +156,44 @@ def _legend(env: Env, frame: EnvFrame) -> str:
     """HTML that explains the task's markers, the line and the keys."""
     markers = env.task.markers(*environment_pose(frame, 0)[1:])
     # Markers whose names differ by a number are parts of one.
-    colours = {words(x.name.rstrip("_ 0123456789")): 255.0 * np.array(x.rgba[:3]) for x in markers}
-    colours["path of the ball"] = TRAIL_RGB
-    rows = (
-        f'<b style="color:rgb{tuple(rgb.round().tolist())}">&#9632;</b> {html.escape(name)}<br>'
-        for name, rgb in colours.items()
-    )
-    return _small(f"{''.join(rows)}<b>Ctrl-K</b> all keys")
+    rows = {
+        words(marker.name.rstrip("_ 0123456789")): 255.0 * np.array(marker.rgba[:3])
+        for marker in markers
+    }
+    rows[f"path of the ball, {TRAIL_SECONDS} s"] = TRAIL_RGB
+    lines = [
+        f'<b style="color:rgb({",".join(f"{c:.0f}" for c in rgb)})">&#9632;</b> '
+        f"{html.escape(meaning)}<br>"
+        for meaning, rgb in rows.items()
+    ]
+    return f"""<div style="font:11px sans-serif;line-height:1.6;padding:0 12px 8px 12px">
+{"".join(lines)}
+<b>space</b> pause, <b>R</b> reset, <b>Ctrl-K</b> all keys
+</div>"""
 
 
-def reward_table(terms: Mapping[str, float]) -> str:
-    """The weighted reward terms and their sum as HTML."""
-    rows = (
-        f"<tr><td>{html.escape(words(name))}</td><td>{value:.2f}</td></tr>"
-        for name, value in {**terms, "sum": sum(terms.values())}.items()
-    )
-    return _small(f"<table>{''.join(rows)}</table>")
+def reward_bars(terms: Mapping[str, float]) -> str:
+    """A bar chart of the weighted reward terms as HTML, and their sum."""
+    longest = max(5.0, *map(abs, terms.values()))
+    rows = []
+    for name, value in terms.items():
+        width = 50.0 * abs(value) / longest
+        left = 50.0 - width * (value < 0.0)
+        colour = "#2b8a3e" if value >= 0.0 else "#c92a2a"
+        rows.append(
+            f"<tr><td>{html.escape(words(name))}</td>"
+            f'<td style="text-align:right">{_format(value)}</td>'
+            f'<td style="width:36%"><div style="height:9px;margin-left:{left:.1f}%;'
+            f'width:{width:.1f}%;background:{colour}"></div></td></tr>'
+        )
+    total = _format(sum(terms.values()))
+    rows.append(f'<tr><td colspan="3"><b>sum {total}</b> a step</td></tr>')
+    return f'<table style="font:11px sans-serif;padding:0 12px;width:100%">{"".join(rows)}</table>'
 
 
-def _small(content: str) -> str:
-    return f'<div style="font:11px sans-serif;padding:0 12px">{content}</div>'
+def _format(value: float) -> str:
+    """Two decimals, without the sign of a negative zero."""
+    return f"{round(value, 2) + 0.0:.2f}"
 
 
 def free_port(host: str, port: int) -> int:

@@ -3,7 +3,6 @@
 import html
 import queue
 from collections.abc import Callable, Sequence
-from functools import partial
 
 import numpy as np
 import viser
@@ -17,7 +16,6 @@ from bounce_mjx.world.config import Command
 _SPEED_RANGE = (0.1, 4.0)
 _PUSH_RANGE = (0.05, 1.0)
 _DIRECTIONS = ("up", "away", "back", "left", "right")
-_PUSH_KEYS = {"up": "I", "back": "K", "left": "J", "right": "L"}
 _SPEED_STEP = 0.1
 # Steps of a command's slider in a change by a key.
 _STEPS_PER_KEY = 5
@@ -35,11 +33,14 @@ class _Setting:
         sampled: viser.GuiCheckboxHandle,
         names: Sequence[str] = (),
     ):
-        self._handle, self.sampled, self._names = handle, sampled, names
-        handle.on_update(self._fix)
+        self._handle, self.sampled, self._names = handle, sampled, list(names)
+        self._shown: float | None = None
+        handle.on_update(self._take)
 
-    def _fix(self, _: object) -> None:
-        self.sampled.value = False
+    def _take(self, event: viser.GuiEvent) -> None:
+        """What a user sets is not sampled; what `show` sets is."""
+        if event.client is not None:
+            self.sampled.value = False
 
     @property
     def value(self) -> float:
@@ -49,15 +50,26 @@ class _Setting:
         name = self._handle.value
         return float(self._names.index(name)) if name in self._names else 0.0
 
-    def set(self, value: float | str) -> None:
-        """Sets a number, or a choice's name."""
-        self.sampled.value, self._handle.value = False, value
+    def show(self, value: float) -> None:
+        """Shows a sampled value that holds, in the slider's steps."""
+        if self._names:
+            shown = min(int(value), len(self._names) - 1)
+        else:
+            shown = round(round(value / self._handle.step) * self._handle.step, _DECIMALS)
+        # A user may be moving it.
+        if shown != self._shown:
+            self._shown = shown
+            self._handle.value = self._names[shown] if self._names else shown
+
+    def set(self, value: float) -> None:
+        """Sets a value."""
+        self.sampled.value = False
+        self._handle.value = self._names[int(value)] if self._names else value
 
     def move(self, change: float) -> None:
         """Adds to the value, within the limits."""
         if self._names:
-            index = int(self.value + np.sign(change)) % len(self._names)
-            self.set(self._names[index])
+            self.set((self.value + np.sign(change)) % len(self._names))
         else:
             ends = self._handle.min, self._handle.max
             self.set(round(float(np.clip(self.value + change, *ends)), _DECIMALS))
@@ -92,6 +104,7 @@ class Controls:
         # Ctrl-K lists them. The arrows and W, A, S, D, Q and E move viser's camera.
         for label, key, act in self._keys():
             gui.add_command(label, hotkey=key).on_trigger(act)
+        self.show_values()
 
     def _add_command(self, gui: viser.GuiApi, name: str, command: Command) -> _Setting:
         given = self._simulation.command.get(name)
@@ -106,12 +119,14 @@ class Controls:
         with gui.add_folder(label):
             sampled = gui.add_checkbox(_SAMPLED, given is None)
             if command.names:
-                first = command.names[min(int(start), len(command.names) - 1)]
-                handle = gui.add_dropdown(short, command.names, initial_value=first)
+                handle = gui.add_dropdown(short, command.names)
             else:
                 low, high = min(start, *ends), max(start, *ends)
                 handle = gui.add_slider(short, low, high, command.step / _STEPS_PER_KEY, start)
-        return _Setting(handle, sampled, command.names)
+        setting = _Setting(handle, sampled, command.names)
+        if command.names:
+            setting.show(start)
+        return setting
 
     def _add_world(self, gui: viser.GuiApi) -> None:
         """The world's sliders, of those terms that the simulation lets move."""
@@ -126,6 +141,15 @@ class Controls:
                 self._world[slider] = _Setting(handle, sampled)
             gui.add_button("make the world nominal").on_click(self._make_nominal)
 
+    def show_values(self) -> None:
+        """Shows the sampled values that hold in the first environment."""
+        for name, setting in self._commands.items():
+            if setting.sampled.value:
+                setting.show(float(self._simulation.frame.command[name][0]))
+        for slider, setting in self._world.items():
+            if setting.sampled.value:
+                setting.show(self._simulation.world_value(slider.term) / slider.scale)
+
     @property
     def num_shown(self) -> int:
         """Number of robots in the scene."""
@@ -137,19 +161,19 @@ class Controls:
 
     def _keys(self) -> list[tuple[str, str, Callable[[viser.CommandEvent], None]]]:
         """What each key does, the key, and the function of its event."""
-        keys = [
+        name = next(map(words, self._commands), None)
+        return [
             ("pause", "space", self._pause),
             ("reset", "R", self._reset),
+            *([] if name is None else [(f"{name} up", "T", lambda _: self._move(1.0))]),
+            *([] if name is None else [(f"{name} down", "G", lambda _: self._move(-1.0))]),
             ("faster", "M", lambda _: self._accelerate(_SPEED_STEP)),
             ("slower", "N", lambda _: self._accelerate(-_SPEED_STEP)),
+            ("push the ball up", "I", lambda event: self._push("up", event)),
+            ("push the ball back", "K", lambda event: self._push("back", event)),
+            ("push the ball left", "J", lambda event: self._push("left", event)),
+            ("push the ball right", "L", lambda event: self._push("right", event)),
         ]
-        keys += [
-            (f"push the ball {x}", key, partial(self._push, x)) for x, key in _PUSH_KEYS.items()
-        ]
-        for name in [*self._commands][:1]:
-            keys.append((f"{words(name)} up", "T", partial(self._move, name, 1.0)))
-            keys.append((f"{words(name)} down", "G", partial(self._move, name, -1.0)))
-        return keys
 
     def _pause(self, _: object) -> None:
         self._paused.value = not self._paused.value
@@ -157,9 +181,10 @@ class Controls:
     def _reset(self, _: object) -> None:
         self._requests.put(self._simulation.reset)
 
-    def _move(self, name: str, steps: float, _: object) -> None:
-        """Moves a command by a number of its steps."""
-        self._commands[name].move(steps * self._simulation.env.config.commands[name].step)
+    def _move(self, steps: float) -> None:
+        """Moves the first command by a number of its steps."""
+        name, setting = next(iter(self._commands.items()))
+        setting.move(steps * self._simulation.env.config.commands[name].step)
 
     def _accelerate(self, change: float) -> None:
         self._speed.value = float(np.clip(round(self._speed.value + change, 1), *_SPEED_RANGE))

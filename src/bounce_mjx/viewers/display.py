@@ -30,8 +30,11 @@ _VIEW = np.array([1.06, -1.17, 0.42])
 _HIGHEST = 0.85
 FIELD_OF_VIEW = 40.0
 """Vertical angle of the camera's view, degrees."""
-# A picture that is narrower than this needs a more distant camera.
+# A canvas that is narrower than this, such as a phone's, needs a more distant camera.
 _FULL_ASPECT = 0.9
+# On a page that is narrower than this, the panel covers the lower three fifths: the camera moves
+# away by this factor, and down by this share of what it sees.
+_PHONE_ASPECT, _PHONE_DISTANCE, _PHONE_SHIFT = 0.6, 1.25, 0.275
 
 TRAIL_SECONDS = 0.6
 """Age of the end of the line, s."""
@@ -213,4 +216,9 @@ def camera_pose(
     view = extent * max(1.0, _FULL_ASPECT / aspect) * _VIEW
     # What is above the focus stays above it; what is beside it leaves the picture.
     look_at = focus + (look_at - focus) / (zoom**2, zoom**2, zoom)
+    if aspect < _PHONE_ASPECT:
+        view = _PHONE_DISTANCE * view
+        seen = 2.0 * np.linalg.norm(view) * np.tan(np.radians(0.5 * FIELD_OF_VIEW))
+        up = np.cross(view, np.cross((0.0, 0.0, 1.0), view))
+        look_at = look_at - _PHONE_SHIFT * seen * up / np.linalg.norm(up)
     return look_at + view / zoom, look_at

@@ -14,7 +14,6 @@ import socket
 import threading
 from collections.abc import Callable, Collection, Iterator
 from typing import Any
-from unittest.mock import patch
 from urllib.parse import urlsplit
 
 import msgspec
@@ -31,6 +30,8 @@ from bounce_mjx.errors import UserError
 # The longest message of a page, its camera, has 400 bytes.
 _MAX_BYTES = 4096
 _MAX_NUMBER = 1e6
+# viser's `stop` waits up to 6 s for clients that do not answer, such as a page in a debugger.
+_STOP_SECONDS = 1.0
 _REFUSAL = (
     "the page was opened by another website, or under a name that it does not have; open the "
     "address that the command printed, or give the command the name with --allow-host (train: "
@@ -44,6 +45,8 @@ _NO_LOGGER = logging.Logger(__name__, logging.CRITICAL + 1)
 def open_server(host: str, port: int, allowed: Collection[str] = ()) -> Iterator[viser.ViserServer]:
     """A viser server that admits its own page only, and valid messages only. It prints nothing.
 
+    Closing it takes at most a second: a background thread waits for clients that do not answer.
+
     Args:
       port: 0 takes any free port.
       allowed: names of hosts, in addition to the address, at which a browser may open the page.
@@ -51,14 +54,16 @@ def open_server(host: str, port: int, allowed: Collection[str] = ()) -> Iterator
     Raises:
       UserError: this version of viser cannot be guarded.
     """
-    serve, guarded = websockets.asyncio.server.serve, []
+    serve, is_own = websockets.asyncio.server.serve, _make_rule(host, allowed)
+    guarded = False
 
     def guarded_serve(*args: Any, process_request: Callable[..., Any], **options: Any) -> Any:
-        guarded.append(True)
+        nonlocal guarded
+        guarded = True
         asyncio.get_running_loop().set_exception_handler(lambda loop, context: None)
 
         def answer(connection: ServerConnection, request: Request) -> Response | None:
-            if _is_own(request.headers, host, allowed):
+            if is_own(request.headers):
                 return process_request(connection, request)
             return connection.respond(http.HTTPStatus.FORBIDDEN, _REFUSAL)
 
@@ -66,9 +71,12 @@ def open_server(host: str, port: int, allowed: Collection[str] = ()) -> Iterator
         return serve(*args, process_request=answer, **options)
 
     # viser starts its websocket server in its constructor, and has no parameter for a guard.
-    replaced = patch.object(websockets.asyncio.server, "serve", guarded_serve)
-    with _STARTING, _quiet_console(), replaced:
-        server = viser.ViserServer(host=host, port=port, verbose=False)
+    with _STARTING, _quiet_console():
+        websockets.asyncio.server.serve = guarded_serve
+        try:
+            server = viser.ViserServer(host=host, port=port, verbose=False)
+        finally:
+            websockets.asyncio.server.serve = serve
     try:
         if not guarded:
             raise UserError(
@@ -77,35 +85,49 @@ def open_server(host: str, port: int, allowed: Collection[str] = ()) -> Iterator
             )
         yield server
     finally:
-        with _quiet_console():
-            server.stop()
+        stopping = threading.Thread(target=_stop, args=(server,), daemon=True)
+        stopping.start()
+        stopping.join(_STOP_SECONDS)
 
 
-def _quiet_console() -> contextlib.AbstractContextManager:
+@contextlib.contextmanager
+def _quiet_console() -> Iterator[None]:
     """Silences rich's global console, on which viser prints; this package uses others."""
-    return patch.object(rich.get_console(), "quiet", True)
+    console = rich.get_console()
+    console.quiet = True
+    try:
+        yield
+    finally:
+        console.quiet = False
 
 
-def _is_own(headers: Headers, host: str, allowed: Collection[str]) -> bool:
-    """Whether a request is from the page itself, or of no browser.
+def _stop(server: viser.ViserServer) -> None:
+    with _quiet_console():
+        server.stop()
 
-    No website can let an address (a number) point here; and a proxy may replace the name of the
-    host.
-    """
+
+def _make_rule(host: str, allowed: Collection[str]) -> Callable[[Headers], bool]:
+    """A function of a request's headers: whether it is from the page itself, or of no browser."""
     proxies = {name.lower() for name in allowed}
-    own = proxies | {"localhost", host.lower(), socket.gethostname().lower()}
-    hosts = headers.get_all("Host")
-    name = _host_name(f"//{hosts[0]}") if len(hosts) == 1 else ""
-    return (name in own or _is_address(name)) and all(
-        origin.lower().partition("://")[2] == hosts[0].lower() or _host_name(origin) in proxies
-        for origin in headers.get_all("Origin")
-    )
+    names = proxies | {"localhost", host.lower(), socket.gethostname().lower()}
 
+    def is_name(name: str) -> bool:
+        """Whether the page may be opened at a name. No website can let an address point here."""
+        with contextlib.suppress(ValueError):
+            return bool(ipaddress.ip_address(name))
+        return name in names
 
-def _is_address(name: str) -> bool:
-    with contextlib.suppress(ValueError):
-        return bool(ipaddress.ip_address(name))
-    return False
+    def is_own(headers: Headers) -> bool:
+        hosts = headers.get_all("Host")
+        if len(hosts) != 1 or not is_name(_host_name(f"//{hosts[0]}")):
+            return False
+        # A proxy may replace the name of the host.
+        return all(
+            origin.lower().partition("://")[2] == hosts[0].lower() or _host_name(origin) in proxies
+            for origin in headers.get_all("Origin")
+        )
+
+    return is_own
 
 
 class _Connection(ServerConnection):

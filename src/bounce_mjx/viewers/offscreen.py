@@ -1,5 +1,6 @@
 """Rendering without a screen."""
 
+import contextlib
 import functools
 import importlib
 import os
@@ -70,8 +71,8 @@ def choose_opengl() -> None:
     gl_context.GLContext = importlib.import_module(f"mujoco.{choose_backend()}").GLContext
 
 
-class Renderer:
-    """Renders one environment."""
+class Renderer(contextlib.AbstractContextManager):
+    """Renders one environment. A context manager, which frees the GPU's memory."""
 
     def __init__(
         self,
@@ -90,10 +91,16 @@ class Renderer:
           zoom: see `camera_pose`.
 
         Raises:
-          UserError: no OpenGL library works.
+          UserError: the model has no such camera, or no OpenGL library works.
         """
         self._display = Display(env)
         model = self._display.model
+        cameras = [model.camera(i).name for i in range(model.ncam)]
+        if camera is not None and camera not in cameras:
+            raise UserError(
+                f"the model has no camera {camera!r}; its cameras are: "
+                f"{', '.join(cameras) or 'none'}"
+            )
         self._camera = camera or page_camera(env, width / height, zoom)
         model.vis.global_.fovy = FIELD_OF_VIEW
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
@@ -104,6 +111,9 @@ class Renderer:
         choose_opengl()
         self._renderer = mujoco.Renderer(model, height, width)
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = not plain
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def close(self) -> None:
         """Frees the GPU's memory."""

@@ -11,6 +11,7 @@ from bounce_mjx.viewers.guard import open_server
 from bounce_mjx.viewers.scene import Scene
 from bounce_mjx.viewers.simulation import EnvFrame, frame_at, resample
 
+SUFFIXES = (".html",)
 _DEFAULT_FPS = 30
 _EPISODE_SECONDS = 10.0
 _VISER_TITLE = "<title>Viser</title>"
@@ -32,6 +33,7 @@ def replay_first_episode(env: Env, recording: Recording) -> str:
         command=episode.command,
         metrics=episode.metrics,
         over=over,
+        lost=over,
     )
     return replay(env, frames)
 

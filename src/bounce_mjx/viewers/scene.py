@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+import time
 from collections.abc import Sequence
 
 import numpy as np
@@ -22,7 +23,12 @@ _SPACING = np.array([1.3, 0.9, 0.0])
 _LABEL_HEIGHT = 0.74
 # Distance of a label above its target, which the ball may exceed.
 _LABEL_DISTANCE = 0.14
+_ANNOUNCED_SECONDS = 1.5
 _BACKGROUND = np.array([222.0, 228.0, 235.0])
+# Where there are more robots than this, their labels are short.
+_MAX_LONG_LABELS = 4
+# A page lays out its panels within this time, s.
+_LAYOUT_SECONDS = 5.0
 
 
 class Scene:
@@ -44,6 +50,8 @@ class Scene:
         self._names = names
         self._display = Display(env)
         self.show(num_envs)
+        # After the scene is built: a page that is there already is welcomed at once.
+        server.on_client_connect(self._welcome)
 
     def show(self, num_envs: int) -> None:
         """Builds the scene for the first `num_envs` environments of the next frames."""
@@ -82,7 +90,7 @@ class Scene:
             np.repeat(colors, num_lines, axis=1).reshape(-1, 2, 3).astype(np.uint8),
             thickness=0.006,
         )
-        focus = np.array(self._env.task.focus())
+        self._focus = focus = np.array(self._env.task.focus())
         self._label_places = self._offsets + focus * (1.0, 1.0, 0.0)
         self._labels = [
             scene.add_label(
@@ -91,16 +99,16 @@ class Scene:
                 position=place + (0.0, 0.0, _LABEL_HEIGHT),
                 anchor="bottom-center",
                 visible=False,
+                font_screen_scale=1.4 if num_envs == 1 else 1.0 if num_envs <= 4 else 0.8,
             )
             for i, place in enumerate(self._label_places)
         ]
+        self._lost = np.zeros(num_envs, bool)
+        for client in self._server.get_clients().values():
+            self._frame(client)
         initial, (position, gaze) = self._server.initial_camera, camera_pose(self._offsets, focus)
         initial.position, initial.look_at = tuple(position), tuple(gaze)
         initial.up, initial.fov = (0.0, 0.0, 1.0), math.radians(FIELD_OF_VIEW)
-        for client in self._server.get_clients().values():
-            # viser refuses to move a camera that looks at its own place.
-            with contextlib.suppress(ValueError):
-                client.camera.position, client.camera.look_at = position, gaze
 
     def update(self, frames: Sequence[EnvFrame]) -> None:
         """Shows the last of the frames since the last update; the trail uses all of them."""
@@ -109,6 +117,8 @@ class Scene:
         rotations = np.zeros((number, model.nbody, 4))
         for frame in frames:
             self._trail.add(frame)
+            over = frame.over[:number]
+            self._lost = np.where(over, frame.lost[:number], self._lost)
         with self._server.atomic():
             for i, label in enumerate(self._labels):
                 qpos, command, metrics = environment_pose(frame, i)
@@ -128,13 +138,39 @@ class Scene:
             self._line.points = np.stack([path[:-1], path[1:]], axis=3).reshape(-1, 2, 3)
 
     def _label(self, frame: EnvFrame, index: int) -> str:
-        """An environment's name if there are several, and the task's readings."""
+        """An environment's name if there are several, and the task's readings or the loss of its
+        ball."""
         name = "" if self.num_envs == 1 else f"{index + 1}:  "
         if self._names is not None:
             name = f"{self._names[index]}:  "
+        short = self.num_envs > _MAX_LONG_LABELS
+        if self._lost[index] and (frame.over[index] or frame.time[index] < _ANNOUNCED_SECONDS):
+            return f"{name}LOST" if short else f"{name}BALL LOST"
         readings = frame_readings(self._env, frame, index)
+        if short:
+            return name + next(iter(readings.values()), "")
         text = name + "   ".join(f"{word} {value}" for word, value in readings.items())
         return text.strip(": ")
+
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        """Turns the camera of a new page, and once more when its panels have taken their room."""
+        self._frame(client)
+        aspect, until = client.camera.aspect, time.monotonic() + _LAYOUT_SECONDS
+
+        @client.camera.on_update
+        def _(camera: viser.CameraHandle) -> None:
+            nonlocal aspect
+            if time.monotonic() < until and camera.aspect != aspect:
+                aspect = camera.aspect
+                self._frame(client)
+
+    def _frame(self, client: viser.ClientHandle) -> None:
+        """Turns the camera of a page towards the environments."""
+        # A page whose own camera is invalid keeps it.
+        with contextlib.suppress(ValueError, TypeError, AssertionError, ZeroDivisionError):
+            position, gaze = camera_pose(self._offsets, self._focus, client.camera.aspect)
+            if np.all(np.isfinite(position)):
+                client.camera.position, client.camera.look_at = position, gaze
 
 
 def _grid(number: int) -> np.ndarray:
@@ -153,7 +189,9 @@ def _add_floor(scene: viser.SceneApi) -> None:
         width=12.0,
         height=12.0,
         cell_size=0.2,
+        cell_color=(176, 184, 193),
         section_size=1.0,
+        section_color=(140, 150, 162),
         plane_color=(206, 213, 221),
         plane_opacity=1.0,
         shadow_opacity=0.35,

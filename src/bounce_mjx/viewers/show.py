@@ -50,65 +50,27 @@ def show(
     """
     if len({one.config.task for one in shown}) > 1:
         raise UserError("the policies have different tasks; show one at a time")
-    viewer = _choose_viewer(options, several=len(shown) > 1)
-    film, address = None, None
-    if options.video is not None:
-        from bounce_mjx.viewers.video import SUFFIXES, make_video_writer
-
-        check_output(options.video, "--video", SUFFIXES)
-        film = make_video_writer(options.video, options.size, options.fps, options.zoom)
-    if options.html is not None:
-        check_output(options.html, "--html", (".html",))
-    if viewer == "browser":
-        from bounce_mjx.viewers.browser import free_port
-
-        address = Address(options.host, free_port(options.host, options.port), options.allow_host)
+    viewer = _viewer(options, several=len(shown) > 1)
+    present = {"recording": _recording, "native": _window, "browser": _page}[viewer](
+        options, console
+    )
     each = max(1, options.num_envs // len(shown))
     with console.status("compiling"):
         simulation = _simulate(shown, each, options.seed, commands, viewer == "browser")
-    start = PageStart(shown[0].title, None, each)
-    if len(shown) > 1:
+    if len(shown) == 1:
+        present(simulation, PageStart(shown[0].title, None, each))
+    else:
         letters = string.ascii_uppercase[: len(shown)]
         titles = [f"{letter}: {one.title}" for letter, one in zip(letters, shown, strict=True)]
         names = [letter for letter in letters for _ in range(each)]
-        start = PageStart(", ".join(titles), names, len(names))
-    if viewer == "recording":
-        with console.status("recording"):
-            recording = simulation.record(options.seconds or _RECORDED_SECONDS)
-            if options.html is not None:
-                from bounce_mjx.viewers.page import replay
-
-                page = replay(simulation.env, recording, options.fps, start.names)
-                write_output(options.html, page)
-            if film is not None:
-                film(simulation.env, recording)
-        for path in filter(None, (options.video, options.html)):
-            console.out(f"written: {path}", highlight=False)
-    elif viewer == "native":
-        with StopRequest() as stop:
-            show_window(simulation, options.seconds, lambda: stop.requested)
-    else:
-        serve(simulation, start, address, options.seconds, console)
+        present(simulation, PageStart(", ".join(titles), names, len(names)))
 
 
-def serve(
-    simulation: Simulation,
-    start: PageStart,
-    address: Address,
-    seconds: float | None,
-    console: Console,
-) -> None:
-    """Serves the page of a simulation until Ctrl-C, or for a simulated time (s)."""
-    from bounce_mjx.viewers.browser import LivePage
-    from bounce_mjx.viewers.guard import open_server
-
-    with StopRequest() as stop, open_server(*address) as server:
-        page = LivePage(server, simulation, start)
-        console.out(f"viewer: {address.url}  (Ctrl-C ends it)", highlight=False)
-        page.run(seconds, lambda: stop.requested)
+Present = Callable[[Simulation, PageStart], None]
+"""Shows a simulation."""
 
 
-def _choose_viewer(options: ViewerOptions, several: bool) -> str:
+def _viewer(options: ViewerOptions, several: bool) -> str:
     """browser, native or recording."""
     is_recorded = options.video is not None or options.html is not None
     if is_recorded and options.viewer != "auto":
@@ -129,6 +91,61 @@ def _choose_viewer(options: ViewerOptions, several: bool) -> str:
             "use --viewer browser"
         )
     return "browser"
+
+
+def _recording(options: ViewerOptions, console: Console) -> Present:
+    """Writes the files; checks them at once."""
+    film = None
+    if options.video is not None:
+        from bounce_mjx.viewers.video import SUFFIXES, VideoWriter
+
+        check_output(options.video, "--video", SUFFIXES)
+        film = VideoWriter(options.video, options.size, options.fps, options.zoom)
+    if options.html is not None:
+        from bounce_mjx.viewers.page import SUFFIXES, replay
+
+        check_output(options.html, "--html", SUFFIXES)
+
+    def present(simulation: Simulation, start: PageStart) -> None:
+        with console.status("recording"):
+            recording = simulation.record(options.seconds or _RECORDED_SECONDS)
+            if options.html is not None:
+                page = replay(simulation.env, recording, options.fps, start.names)
+                write_output(options.html, page)
+            if film is not None:
+                film.write(simulation.env, recording)
+        for path in (options.video, options.html):
+            if path is not None:
+                console.out(f"written: {path}", highlight=False)
+
+    return present
+
+
+def _window(options: ViewerOptions, console: Console) -> Present:
+    """Opens MuJoCo's window."""
+
+    def present(simulation: Simulation, start: PageStart) -> None:
+        with StopRequest() as stop:
+            show_window(simulation, options.seconds, lambda: stop.requested)
+
+    return present
+
+
+def _page(options: ViewerOptions, console: Console) -> Present:
+    """Serves the page; looks for a port at once."""
+    from bounce_mjx.viewers.browser import LivePage, free_port
+    from bounce_mjx.viewers.guard import open_server
+
+    port = free_port(options.host, options.port)
+    address = Address(options.host, port, options.allow_host)
+
+    def present(simulation: Simulation, start: PageStart) -> None:
+        with StopRequest() as stop, open_server(*address) as server:
+            page = LivePage(server, simulation, start)
+            console.out(f"viewer: {address.url}  (Ctrl-C ends it)", highlight=False)
+            page.run(options.seconds, lambda: stop.requested)
+
+    return present
 
 
 def _simulate(

@@ -57,6 +57,9 @@ class EnvFrame(NamedTuple):
     over: np.ndarray
     """Whether the episode ended or timed out on this step [N]; the next frame then starts a new
     episode."""
+    lost: np.ndarray
+    """Whether the episode ended on this step [N], because the ball was lost or an arm joint was too
+    fast."""
 
 
 class _Changes(NamedTuple):
@@ -126,13 +129,17 @@ class Simulation:
         self._push = np.zeros(3, np.float32)
         nothing = jax.eval_shape(self._fresh_states, self._key)
         self._states = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), nothing)
-        self._steps, over = np.zeros(num_envs, np.int32), np.ones(num_envs, bool)
-        reset = jax.jit(self._restart).lower(self._key, self._states, self._steps, over)
-        step = jax.jit(self._advance).lower(*self._inputs())
+        self._steps = np.zeros(num_envs, np.int32)
+        over = np.ones(num_envs, bool)
+        programs = (
+            jax.jit(self._restart).lower(self._key, self._states, self._steps, over),
+            jax.jit(self._advance).lower(*self._inputs()),
+        )
         # Together, as one compilation does not keep two cores busy.
         with ThreadPoolExecutor() as pool:
-            compiled = pool.map(lambda program: program.compile(), (reset, step))
-            self._reset_program, self._step_program = compiled
+            self._reset_program, self._step_program = pool.map(
+                lambda program: program.compile(), programs
+            )
         self.reset()
 
     @property
@@ -141,6 +148,10 @@ class Simulation:
         frame = self._frame
         given = {name: np.full_like(frame.command[name], x) for name, x in self.command.items()}
         return frame._replace(command=frame.command | given)
+
+    def world_value(self, term: str) -> float:
+        """The first entry of a term of the world in the first environment."""
+        return float(np.ravel(self._states.pipeline_state.world[term][..., 0])[0])
 
     def reset(self) -> None:
         """Starts a new episode in every environment."""
@@ -224,6 +235,10 @@ class SideBySide(Simulation):
         shared = set.intersection(*(set(frame.metrics) for frame in frames))
         frames = [f._replace(metrics={name: f.metrics[name] for name in shared}) for f in frames]
         return jax.tree.map(lambda *values: np.concatenate(values), *frames)
+
+    def world_value(self, term: str) -> float:
+        """See `Simulation.world_value`."""
+        return self._simulations[0].world_value(term)
 
     def reset(self) -> None:
         """See `Simulation.reset`."""
@@ -333,4 +348,5 @@ def _view(env: Env, states: State, steps: jax.Array, over: jax.Array) -> EnvFram
         command=now.command,
         metrics=states.metrics,
         over=over,
+        lost=over & (states.done > 0),
     )

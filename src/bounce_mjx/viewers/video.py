@@ -3,7 +3,7 @@
 import contextlib
 import shutil
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -61,42 +61,47 @@ def find_ffmpeg() -> str:
     return get_ffmpeg_exe()
 
 
-def make_video_writer(
-    path: Path, size: tuple[int, int], fps: int | None, zoom: float = 1.0
-) -> Callable[[Env, EnvFrame], None]:
-    """Chooses the OpenGL library, and checks everything that can be checked in advance.
+class VideoWriter:
+    """Writes recordings as a video; the constructor checks everything that can be checked in
+    advance."""
 
-    Args:
-      size: width and height in pixels.
-      fps: frames per second; None for 60, or 25 for a WebP or a GIF.
-      zoom: see `camera_pose`.
+    def __init__(self, path: Path, size: tuple[int, int], fps: int | None, zoom: float = 1.0):
+        """Chooses the OpenGL library.
 
-    Returns:
-      A function that writes the first environment of a recording. It raises UserError if the file
-      cannot be written, and Interrupted, without a file, at Ctrl-C.
+        Args:
+          size: width and height in pixels.
+          fps: frames per second; None for 60, or 25 for a WebP or a GIF.
+          zoom: see `camera_pose`.
 
-    Raises:
-      UserError: the size or the rate does not fit the format, there is no ffmpeg, or no OpenGL
-        library works.
-    """
-    kind, (width, height) = path.suffix.lower(), size
-    fps = fps or _DEFAULT_FPS[kind]
-    if any(pixels % 2 for pixels in size):
-        raise UserError(f"--size {width} {height} is odd; give even numbers of pixels")
-    if kind == ".gif" and (fps > _MAX_GIF_FPS or 100 % fps):
-        raise UserError(
-            f"--fps {fps} does not suit a GIF, which counts time in 1/100 s; give 10, 20, 25 or 50"
-        )
-    pictures = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {fps} -i -".split()
-    command = [find_ffmpeg(), "-y", "-loglevel", "error", *pictures, *_ENCODINGS[kind]]
-    choose_opengl()
+        Raises:
+          UserError: the size or the rate does not fit the format, there is no ffmpeg, or no
+            OpenGL library works.
+        """
+        self._path, self._size, self._zoom = path, size, zoom
+        self.fps = fps or _DEFAULT_FPS[path.suffix.lower()]
+        if any(pixels % 2 for pixels in size):
+            raise UserError(f"--size {size[0]} {size[1]} is odd; give even numbers of pixels")
+        if path.suffix.lower() == ".gif" and (self.fps > _MAX_GIF_FPS or 100 % self.fps):
+            raise UserError(
+                f"--fps {self.fps} does not suit a GIF, which counts time in 1/100 s; give 10, "
+                "20, 25 or 50"
+            )
+        self._ffmpeg = find_ffmpeg()
+        choose_opengl()
 
-    def write(env: Env, recording: EnvFrame) -> None:
-        shown = draw_frames(env, resample(recording, env.dt, fps), size, fps, zoom)
+    def write(self, env: Env, recording: EnvFrame) -> None:
+        """Writes the first environment of a recording.
+
+        Raises:
+          UserError: the file cannot be written.
+          Interrupted: Ctrl-C came; no file is left.
+        """
+        frames = resample(recording, env.dt, self.fps)
+        shown = draw_frames(env, frames, self._size, self.fps, self._zoom)
         advice = "give another file with --video"
-        with writable(path, advice), new_file(path) as new:
+        with writable(self._path, advice), new_file(self._path) as new:
             encoder = subprocess.Popen(
-                [*command, str(new)], stdin=subprocess.PIPE, stderr=subprocess.PIPE
+                self._command(new), stdin=subprocess.PIPE, stderr=subprocess.PIPE
             )
             try:
                 # A broken pipe means that the encoder failed; it prints the reason.
@@ -108,12 +113,18 @@ def make_video_writer(
                 _, errors = encoder.communicate()
                 if encoder.returncode:
                     reason = " ".join(errors.decode(errors="replace").split())
-                    raise UserError(f"{path} cannot be written ({reason[-200:]}); {advice}")
+                    raise UserError(f"{self._path} cannot be written ({reason[-200:]}); {advice}")
             finally:
                 encoder.kill()
                 encoder.communicate()
 
-    return write
+    def _command(self, path: Path) -> list[str]:
+        """The command line of an encoder that reads pictures from its standard input."""
+        width, height = self._size
+        pictures = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {self.fps} -i -"
+        encoding = _ENCODINGS[path.suffix.lower()]
+        ffmpeg = [self._ffmpeg, "-y", "-loglevel", "error"]
+        return [*ffmpeg, *pictures.split(), *encoding, str(path)]
 
 
 def draw_frames(
@@ -129,7 +140,7 @@ def draw_frames(
       F pictures, each [height, width, 3] (uint8).
     """
     trail = Trail(1.0 / fps)
-    with contextlib.closing(Renderer(env, *size, zoom=zoom)) as renderer:
+    with Renderer(env, *size, zoom=zoom) as renderer:
         for i in range(len(frames.time)):
             frame = frame_at(frames, i)
             trail.add(frame)

@@ -73,10 +73,12 @@ def reset_ranges(config: WorldConfig) -> Ranges:
 
 
 def sliders_for(config: RandomizationConfig) -> tuple[WorldSlider, ...]:
-    """Sliders of the active terms whose ranges contain the sliders'."""
-
-    def is_within(slider: WorldSlider) -> bool:
-        low, high = zip(*entries(getattr(config, slider.term)), strict=True)
-        return max(low) <= slider.span[0] and slider.span[1] <= min(high)
-
-    return tuple(slider for slider in SLIDERS if slider.term in config.terms and is_within(slider))
+    """Sliders of the active terms whose ranges contain the sliders'; each spans the whole range."""
+    found = []
+    for slider in SLIDERS:
+        ends = getattr(config, slider.term)
+        spans = [] if ends is None else entries(ends)
+        if spans and all(low <= slider.span[0] and slider.span[1] <= high for low, high in spans):
+            limits = tuple(round(end / slider.scale, 6) for end in spans[0])
+            found.append(slider._replace(limits=limits))
+    return tuple(found)
