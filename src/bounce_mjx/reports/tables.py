@@ -89,6 +89,19 @@ def result_cells(result: Result) -> list[str]:
     return [result.name, result.measured, figure_text(result.value), result.bound, verdict]
 
 
+def unsolved_line(report: Report) -> str:
+    """What a policy misses, and what may help; empty if it meets all results."""
+    missed = [
+        f"{r.name} {figure_text(r.value)} ({r.bound})" for r in report.results if r.passed is False
+    ]
+    if not missed:
+        return ""
+    return (
+        f"not solved: {', '.join(missed)}; if the return still rises (bounce-mjx plot), train "
+        "longer; if not, the seed is in a local optimum: try --seed or --num-seeds 8"
+    )
+
+
 def details_line(report: Report) -> str:
     """The other figures of an evaluation, in one line."""
     parts = []

@@ -18,7 +18,7 @@ from bounce_mjx.errors import reason_of
 from bounce_mjx.evaluation.config import EvaluationOptions
 from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
 from bounce_mjx.evaluation.results import Report
-from bounce_mjx.reports.tables import details_line, results_table, seeds_table
+from bounce_mjx.reports.tables import details_line, results_table, seeds_table, unsolved_line
 from bounce_mjx.runs import folders
 from bounce_mjx.runs.checkpoints import read_actor
 from bounce_mjx.runs.config import TrainConfig, load_run_config
@@ -157,6 +157,8 @@ def print_results(seeds: Sequence[job.SeedRun], console: Console) -> job.SeedRun
     else:
         console.print(results_table(report, f"best checkpoint, {steps:,} steps"))
         say(console, details_line(report))
+    if unsolved := unsolved_line(report):
+        say(console, unsolved)
     spent = ", ".join(f"{name} {value:.1f} s" for name, value in best.seconds.items())
     say(console, f"time: {spent}")
     label = "run" if len(seeds) == 1 else f"best seed: {best.config.seed}  run"
