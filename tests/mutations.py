@@ -81,6 +81,8 @@ FAULTS = [
     ("the air pushes the ball", CONTROL, "tuple(-air_drag * speed", "tuple(air_drag * speed", "test_randomization.py -k brakes"),
     ("the restitution is clipped", RANDOMIZATION,
      "jnp.interp(restitution, e, ratio)", "jnp.interp(jnp.maximum(restitution, 0.8), e, ratio)", "test_randomization.py -k drops_bounce"),
+    ("the range of a command shrinks", ENV,
+     "first + (1.0 - first) * progress", "1.0 - (1.0 - first) * progress", "test_randomization.py -k about_its_middle"),
     ("the ball is seen a step too late", SENSING,
      "number, age = steps, latency", "number, age = steps, latency + 1.0", "test_sensors.py -k latency_without"),
     ("lost pictures are seen, and seen ones lost", SENSING,
