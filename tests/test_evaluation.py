@@ -429,7 +429,7 @@ def test_another_task_is_counted_and_judged_by_itself(dribbling):
     np.testing.assert_allclose(values, [75.0, 4 / 0.08, 100 * 2 / 3], rtol=1e-5)
     assert [result.passed for result in report.results] == [False, True, False]
     assert report.summary == "1 of 3 results met"
-    assert details_line(report) == "3 episodes: mean return 3.667, mean length 0.04 s"
+    assert details_line(report) == "3 episodes: mean return 3.667, mean length 0.03667 s"
     rows = show(seeds_table({0: report, 1: None})).splitlines()
     assert rows[2].split()[:4] == ["seed", "height", "rate", "stable"]
     assert rows[3].split() == ["0", "75.00", "50.00", "66.67", "FAIL"]
