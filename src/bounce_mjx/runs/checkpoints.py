@@ -208,15 +208,15 @@ def _read_arrays(checkpoint: Checkpoint, item: str, template: Any) -> Any:
         # Imported here, as the import takes half a second.
         import orbax.checkpoint as ocp
 
-        arguments = ocp.args.StandardRestore(template)
-        found = ocp.StandardCheckpointHandler().restore(folder, args=arguments)
-        wanted = jax.tree_util.tree_leaves_with_path(template)
-        # Orbax compares the names.
-        for (path, leaf), array in zip(wanted, jax.tree.leaves(found), strict=True):
-            if array.shape != leaf.shape:
-                name = jax.tree_util.keystr(path, simple=True, separator=".")
-                raise ValueError(f"{item}.{name} is {array.shape}, and should be {leaf.shape}")
-        return found
+        handler = ocp.PyTreeCheckpointHandler()
+        expected, found = _forms(template), _forms(handler.metadata(folder).tree)
+        for name in sorted(expected.keys() | found.keys()):
+            given, wanted = (x.get(name, "missing") for x in (found, expected))
+            if given != wanted:
+                raise ValueError(f"{item}.{name} is {given}, and should be {wanted}")
+        as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), template)
+        arguments = ocp.args.PyTreeRestore(item=template, restore_args=as_numpy)
+        return handler.restore(folder, args=arguments)
     # Damaged files raise exceptions of many types.
     except Exception as error:
         raise _damaged(checkpoint, error) from error
@@ -238,6 +238,14 @@ def _read_old(folder: Path, template: Any) -> Any:
         return tensorstore.open(spec, open=True, read=True).result().read().result()
 
     return jax.tree_util.tree_map_with_path(read, template)
+
+
+def _forms(tree: Any) -> dict[str, str]:
+    """The dtype and the shape of each array, by its path."""
+    return {
+        jax.tree_util.keystr(path, simple=True, separator="."): f"{leaf.dtype}{list(leaf.shape)}"
+        for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
+    }
 
 
 def _damaged(checkpoint: Checkpoint, error: Exception) -> UserError:

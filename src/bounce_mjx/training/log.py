@@ -22,8 +22,8 @@ class TensorBoardLog:
         Args:
           resumed: the step from which a resumed run continues; TensorBoard drops all later points.
         """
-        # Imported here, as the imports take a quarter of a second.
-        # TensorboardX imports PyTorch where it is installed, which takes four seconds.
+        # Imported here, as the imports take a quarter of a second; and without PyTorch, which
+        # tensorboardX imports where it is installed and which takes four seconds.
         is_free = sys.modules.setdefault("torch", None) is None
         try:
             from tensorboardX import event_file_writer, summary
