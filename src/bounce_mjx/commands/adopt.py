@@ -10,7 +10,6 @@ import yaml
 from bounce_mjx.config.command_line import Flag, parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.config.validation import validate
-from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.robot.config import PaddleConfig, RobotConfig
 from bounce_mjx.runs.config import train_config
 from bounce_mjx.tasks.registry import DEFAULT, find_task
@@ -37,7 +36,6 @@ class AdoptCommand(StrictModel):
     """The paddle; a given position or quaternion fixes the mount, which is searched otherwise."""
 
 
-@exit_on_user_error()
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 2 on a mistake."""
     command = parse(AdoptCommand, args, prog="bounce-mjx adopt")

@@ -11,7 +11,7 @@ from pathlib import Path
 import bounce_mjx
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
-from bounce_mjx.errors import exit_on_user_error, install_command, reason_of
+from bounce_mjx.errors import install_command, reason_of
 
 _DISTRIBUTION = "bounce_mjx"
 # Versions on which the results of simulation and training depend.
@@ -23,7 +23,6 @@ class DoctorCommand(StrictModel):
     """Prints versions, devices, the cache, and what each extra lacks, to paste into an issue."""
 
 
-@exit_on_user_error()
 def main(args: Sequence[str]) -> None:
     """Runs the command line."""
     parse(DoctorCommand, args, prog="bounce-mjx doctor")

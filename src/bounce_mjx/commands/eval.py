@@ -8,7 +8,7 @@ from typing import Annotated
 from bounce_mjx.commands.run_options import OneActorCommand, WorldCommand, parse_with_commands
 from bounce_mjx.config.command_line import Flag, stdout
 from bounce_mjx.config.settings import Count, NonNegativeInt
-from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import config as evaluation
 
 
@@ -33,7 +33,6 @@ class EvalCommand(WorldCommand, OneActorCommand):
     """File to write the results to."""
 
 
-@exit_on_user_error()
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 0 if all results pass, 1 if one fails, 2 on a mistake."""
     command, given_commands = parse_with_commands(EvalCommand, args, prog="bounce-mjx eval")

@@ -5,7 +5,6 @@ from pathlib import Path
 
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import Finite, Positive, StrictModel
-from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.runs.config import read_preset
 
 
@@ -26,7 +25,6 @@ class ExciteCommand(StrictModel):
     """Height of a table that the arm must not touch, m; the floor is at 0."""
 
 
-@exit_on_user_error()
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 2 on a mistake."""
     command = parse(ExciteCommand, args, prog="bounce-mjx excite")

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from bounce_mjx.commands.run_options import RunCommand
 from bounce_mjx.config.command_line import Flag, parse
-from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.errors import UserError
 
 
 class ExportCommand(RunCommand):
@@ -21,7 +21,6 @@ class ExportCommand(RunCommand):
     """ONNX file to write: normaliser, network and clipping in one graph, and metadata."""
 
 
-@exit_on_user_error()
 def main(args: Sequence[str]) -> None:
     """Runs the command line."""
     command = parse(ExportCommand, args, prog="bounce-mjx export")

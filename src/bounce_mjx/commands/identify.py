@@ -8,7 +8,7 @@ from typing import Annotated
 from bounce_mjx.config.command_line import Flag, parse
 from bounce_mjx.config.settings import NonNegative, StrictModel
 from bounce_mjx.config.validation import validate
-from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.errors import UserError
 from bounce_mjx.identify import Topics
 from bounce_mjx.runs.config import read_preset
 
@@ -34,7 +34,6 @@ class IdentifyCommand(StrictModel):
     """Topics of a bag."""
 
 
-@exit_on_user_error()
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 1 if --check finds another robot, 2 on a mistake."""
     command = parse(IdentifyCommand, args, prog="bounce-mjx identify")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 from bounce_mjx.commands.run_options import WorldCommand, parse_with_commands
 from bounce_mjx.config.command_line import Flag, stdout
 from bounce_mjx.config.validation import validate
-from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.errors import UserError
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.viewers.options import MAX_ENVS, ViewerOptions
 from bounce_mjx.world.randomization import RandomizationConfig
@@ -31,7 +31,6 @@ class PlayCommand(WorldCommand):
     viewing: ViewerOptions = ViewerOptions()
 
 
-@exit_on_user_error()
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 2 on a mistake."""
     command, given_commands = parse_with_commands(PlayCommand, args, prog="bounce-mjx play")

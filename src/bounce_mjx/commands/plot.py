@@ -8,7 +8,6 @@ from pydantic import Field
 
 from bounce_mjx.commands.run_options import RunCommand
 from bounce_mjx.config.command_line import Flag, parse
-from bounce_mjx.errors import exit_on_user_error
 
 
 class PlotCommand(RunCommand):
@@ -24,7 +23,6 @@ class PlotCommand(RunCommand):
     """File formats of each picture."""
 
 
-@exit_on_user_error()
 def main(args: Sequence[str]) -> None:
     """Runs the command line."""
     command = parse(PlotCommand, args, prog="bounce-mjx plot")

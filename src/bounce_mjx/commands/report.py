@@ -6,7 +6,6 @@ from typing import Annotated
 
 from bounce_mjx.commands.run_options import RunCommand
 from bounce_mjx.config.command_line import Flag, parse
-from bounce_mjx.errors import exit_on_user_error
 
 
 class ReportCommand(RunCommand):
@@ -16,7 +15,6 @@ class ReportCommand(RunCommand):
     """A run's folder; latest, the default, is the newest run."""
 
 
-@exit_on_user_error()
 def main(args: Sequence[str]) -> None:
     """Runs the command line."""
     command = parse(ReportCommand, args, prog="bounce-mjx report")

@@ -9,7 +9,7 @@ from rich.progress import Progress
 from bounce_mjx.commands.run_options import OneActorCommand
 from bounce_mjx.config.command_line import parse, stdout
 from bounce_mjx.config.settings import Count, NonNegativeInt
-from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import config as evaluation
 from bounce_mjx.resources import POLICIES, resource_path
 from bounce_mjx.runs import config as run_configs
@@ -38,7 +38,6 @@ class RobustnessCommand(OneActorCommand):
     for a policy that comes with the package and for the mirror law."""
 
 
-@exit_on_user_error()
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 0 if all conditions meet all judged results, 1 if one does
     not, 2 on a mistake."""

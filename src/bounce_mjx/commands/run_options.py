@@ -112,12 +112,6 @@ class WorldCommand(ActorCommand):
         return config if self.world is None else run_configs.in_world(config, self.world)[0]
 
 
-class _FirstFlags(StrictModel):
-    """The flag that decides which commands there are."""
-
-    task: str | None = None
-
-
 def parse_with_commands(
     command_class: type[CommandT], args: Sequence[str], *, prog: str
 ) -> tuple[CommandT, Callable[[WorldConfig], dict[str, float]]]:
@@ -132,7 +126,7 @@ def parse_with_commands(
     Raises:
       UserError: a flag has a bad value, or no task has it.
     """
-    task, fields = parse(_FirstFlags, args, prog=prog, is_first=True).task, {}
+    task, fields = parse(RunCommand, args, prog=prog, is_first=True).task, {}
     # Without --task, the run may be of any task.
     for name in [task] if task else registered_tasks():
         for key, command in find_task(name).Config().commands.items():

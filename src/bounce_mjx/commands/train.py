@@ -12,21 +12,20 @@ from bounce_mjx.training.command import read_command
 
 def main(args: Sequence[str]) -> None:
     """Runs the command line."""
-    with exit_on_user_error():
-        machine = run_configs.default_preset(run_configs.has_plugin())
-        command = read_command(args, machine)
-        import jax
+    machine = run_configs.default_preset(run_configs.has_plugin())
+    command = read_command(args, machine)
+    import jax
 
-        from bounce_mjx.training.setup import set_up_jax
+    from bounce_mjx.training.setup import set_up_jax
 
-        set_up_jax(command.env)
-        if not command.on_several_hosts:
-            # CUDA starts during the imports; JAX reports an error where it needs the devices.
-            in_daemon_thread(jax.devices)
-        from bounce_mjx.training import hosts
-        from bounce_mjx.training.events import say
-        from bounce_mjx.training.job import TrainingStopped, named_task
-        from bounce_mjx.training.run import train
+    set_up_jax(command.env)
+    if not command.on_several_hosts:
+        # CUDA starts during the imports; JAX reports an error where it needs the devices.
+        in_daemon_thread(jax.devices)
+    from bounce_mjx.training import hosts
+    from bounce_mjx.training.events import say
+    from bounce_mjx.training.job import TrainingStopped, named_task
+    from bounce_mjx.training.run import train
 
     with hosts.leave_at_once(), exit_on_user_error():
         if command.on_several_hosts:

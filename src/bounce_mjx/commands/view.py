@@ -6,20 +6,13 @@ from typing import Literal
 
 import pydantic
 
+from bounce_mjx.commands.run_options import ActorCommand
 from bounce_mjx.config.command_line import parse, stdout
 from bounce_mjx.config.settings import StrictModel
-from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.runs.config import read_preset, train_config
 from bounce_mjx.tasks.registry import DEFAULT
 from bounce_mjx.viewers.options import ViewerOptions
 from bounce_mjx.world.config import WorldConfig
-
-
-class _FirstFlags(StrictModel):
-    """The flags that decide the environment."""
-
-    task: str | None = None
-    robot: Path | None = None
 
 
 class ViewCommand(StrictModel):
@@ -37,10 +30,10 @@ class ViewCommand(StrictModel):
     env: pydantic.SerializeAsAny[WorldConfig]
 
 
-@exit_on_user_error()
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 2 on a mistake."""
-    first = parse(_FirstFlags, args, prog="bounce-mjx view", is_first=True)
+    # The task and the robot decide the other flags.
+    first = parse(ActorCommand, args, prog="bounce-mjx view", is_first=True)
     env = read_preset(Path("default"), first.robot, first.task).env
     own_class = train_config(env.task, ViewCommand)
     command = parse(own_class, args, prog="bounce-mjx view", default=own_class(env=env))
