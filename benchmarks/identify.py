@@ -26,7 +26,7 @@ from bounce_mjx.identify.world import estimates, to_yaml
 from bounce_mjx.physics import edited_model
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import find_addresses, joint_names
-from bounce_mjx.runs.config import load_config
+from bounce_mjx.runs.config import read_preset
 from bounce_mjx.training.setup import set_up_jax
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import RandomizationConfig, physics_parameters, sample_world
@@ -56,7 +56,7 @@ class Hidden(NamedTuple):
 def hidden_robot(seed: int) -> Hidden:
     """Draws a robot: about 30% of the terms of configs/transfer.yaml, and all that a servo differs
     in."""
-    wide = load_config(resource_path("configs/transfer.yaml")).env.randomization
+    wide = read_preset(resource_path("configs/transfer.yaml")).env.randomization
     ranges = {k: v for k, v in wide.ranges().items() if k not in _FIXED}
     key, rare, always = jax.random.split(jax.random.PRNGKey(seed), 3)
     world = sample_world(ranges, rare, np.dtype("float32"), 6, 0.3)
@@ -289,7 +289,7 @@ def main() -> None:
     given = parser.parse_args()
     folder = given.logs or Path(tempfile.mkdtemp())
     folder.mkdir(parents=True, exist_ok=True)
-    config = load_config(resource_path("configs/default.yaml")).env
+    config = read_preset(resource_path("configs/default.yaml")).env
     set_up_jax(config)
     model = world_model(config, visual=False)
     home, names = np.array(config.default_joint_angles), joint_names(model)

@@ -18,7 +18,7 @@ from mujoco import sysid
 from bounce_mjx.identify.reading import read_csv
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import find_addresses, joint_names, load_model, scene_spec
-from bounce_mjx.runs.config import load_config
+from bounce_mjx.runs.config import read_preset
 
 _STARTS = {"servo_gain": 1.0, "servo_damping": 1.0, "joint_frictionloss": 1.0}
 _LIMITS = {
@@ -35,7 +35,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--seconds", type=float, default=20.0)
     given = parser.parse_args()
-    config = load_config(resource_path("configs/default.yaml")).env
+    config = read_preset(resource_path("configs/default.yaml")).env
     spec, _ = scene_spec(config.mjcf, config.robot)
     for pair in list(spec.pairs):
         spec.delete(pair)

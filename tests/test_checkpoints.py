@@ -21,7 +21,7 @@ from bounce_mjx.learning.policy import Policy
 from bounce_mjx.learning.ppo import PPO, TrainingState, policy_of
 from bounce_mjx.runs import files
 from bounce_mjx.runs.checkpoints import read_policy, read_training, save_checkpoint
-from bounce_mjx.runs.config import TrainConfig, load_config, load_run_config
+from bounce_mjx.runs.config import TrainConfig, load_run_config, read_preset
 from bounce_mjx.runs.folders import (
     best_checkpoint,
     create_run,
@@ -230,7 +230,7 @@ def test_damage_is_refused_or_does_no_harm(
 
 
 def test_checkpoint_of_another_run_is_refused(run: Path, state: TrainingState) -> None:
-    config = load_config(run / "config.yaml").model_copy(update={"seed": 3})
+    config = read_preset(run / "config.yaml").model_copy(update={"seed": 3})
     shutil.rmtree(step_of(run))
     save_checkpoint(run, config, 64, items_of(state))
     with pytest.raises(UserError, match="a different config.*differs in seed;.*restore that file"):

@@ -15,7 +15,7 @@ from bounce_mjx.commands import eval as eval_command
 from bounce_mjx.commands.main import main as console_script
 from bounce_mjx.config.command_line import flags_of
 from bounce_mjx.resources import resource_path
-from bounce_mjx.runs.config import TrainConfig, load_config, train_config
+from bounce_mjx.runs.config import TrainConfig, read_preset, train_config
 from bounce_mjx.runs.folders import choose_checkpoint
 from bounce_mjx.tasks.registry import find_task
 from bounce_mjx.training.command import TrainCommand
@@ -193,7 +193,7 @@ def test_the_help_of_a_training_is_one_screen_and_the_whole_help_has_every_flag(
 def test_presets_are_valid() -> None:
     found = resource_path("configs").glob("*.yaml")
     files = {p.stem: p for p in found if not p.stem.startswith("robustness")}
-    presets = {name: load_config(path) for name, path in files.items()}
+    presets = {name: read_preset(path) for name, path in files.items()}
     assert {"default", "cpu", "seed"} <= presets.keys()
     seed = presets["seed"]
     assert seed.total_steps == 50_000_000

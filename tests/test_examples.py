@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from bounce_mjx.runs.config import load_config
+from bounce_mjx.runs.config import read_preset
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 # Three environments, whose compiled step the examples share.
@@ -67,7 +67,7 @@ def test_notebook_shows_two_rewards_and_compares(need, opengl, tmp_path, monkeyp
     video, table, curves = shown
     assert "image/gif" in video and "image/png" in curves
     runs = [next((tmp_path / "runs" / name).iterdir()) for name in ("first", "calm")]
-    configs = [load_config(run / "config.yaml") for run in runs]
+    configs = [read_preset(run / "config.yaml") for run in runs]
     assert [config.env.reward.action_rate.weight for config in configs] == [0.0001, 0.02]
     rows = re.findall(r"^\| (.+) \| .+ \| (.+) \| (.+) \|$", table["text/markdown"], re.MULTILINE)
     for i, run in enumerate(runs):

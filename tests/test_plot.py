@@ -23,7 +23,7 @@ from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.reports import page as report_page
 from bounce_mjx.reports.curves import group_runs, mean_and_band, read_curves
 from bounce_mjx.reports.figures import curves_figure
-from bounce_mjx.runs.config import TrainConfig, load_config, train_config
+from bounce_mjx.runs.config import TrainConfig, read_preset, train_config
 from bounce_mjx.runs.folders import save_config
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.task import Curve, term_names
@@ -137,7 +137,7 @@ def test_the_band_is_one_deviation_around_the_mean(runs: list[Path]) -> None:
 
 def test_plot_of_several_runs(trained: Path, tmp_path: Path) -> None:
     other = shutil.copytree(trained, tmp_path / "other")
-    save_config(other, load_config(trained / "config.yaml").model_copy(update={"seed": 1}))
+    save_config(other, read_preset(trained / "config.yaml").model_copy(update={"seed": 1}))
     (tmp_path / "p").mkdir()
     (tmp_path / "mine").write_text("mine")
     (tmp_path / "p/curves.svg").symlink_to(tmp_path / "mine")
@@ -170,7 +170,7 @@ def check_report(run: Path) -> str:
         assert re.search(rf">{phase}</td><td class=\"\">{seconds:.1f}</td>", page)
     config = re.search(r"<pre>(.*)</pre>", page, re.DOTALL)[1]
     shown = train_config(Bounce).model_validate(yaml.safe_load(config))
-    assert shown == load_config(run / "config.yaml")
+    assert shown == read_preset(run / "config.yaml")
     return page
 
 

@@ -21,7 +21,6 @@ from bounce_mjx.runs.checkpoints import read_policy
 from bounce_mjx.runs.config import (
     TrainConfig,
     in_world,
-    load_config,
     load_run_config,
     read_preset,
     runs_folder,
@@ -124,7 +123,7 @@ def test_its_training_command_gives_its_config(shipped: dict, monkeypatch) -> No
     python, script, *flags = shipped["command"].split()
     assert (python, script) == ("python", "train_jax.py")
     command = read_command(flags)
-    config = load_config(FOLDER / "config.yaml")
+    config = read_preset(FOLDER / "config.yaml")
     assert (command.env, command.ppo, command.seed) == (config.env, config.ppo, shipped["seed"])
     assert shipped["device"]
 

@@ -26,7 +26,7 @@ from bounce_mjx.robot.adopt import adopt, check_as_alone
 from bounce_mjx.robot.arm import build_arm, compile_spec, locate, read_spec
 from bounce_mjx.robot.config import RobotConfig
 from bounce_mjx.robot.model import find_addresses, joint_names
-from bounce_mjx.runs.config import load_config, read_preset
+from bounce_mjx.runs.config import read_preset
 from random_worlds import random_parameters
 
 FINGERS = "".join(
@@ -154,7 +154,7 @@ def written(tmp_path_factory) -> dict[str, Path]:
 
 @pytest.fixture(params=["small", "ur5e"])
 def env(request, written) -> BounceBall:
-    return BounceBall(load_config(written[request.param]).env)
+    return BounceBall(read_preset(written[request.param]).env)
 
 
 def test_the_start_pose_holds_the_paddle_level_at_the_target_point(env) -> None:
@@ -351,7 +351,7 @@ def test_three_joints_suffice_to_lift_and_tilt(tmp_path, capsys) -> None:
         adopt_command.main(line.split())
     said = capsys.readouterr().out
     assert len(re.findall(r": bounce-mjx (?:view|train) --task juggle --robot ", said)) == 2
-    env = BounceBall(load_config(tmp_path / "arm.yaml").env)
+    env = BounceBall(read_preset(tmp_path / "arm.yaml").env)
     state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
     after = jax.eval_shape(env.step, state, jax.ShapeDtypeStruct((3,), np.float32))
     assert after.obs.shape == (env.observation_size,) == (23,)
@@ -364,14 +364,14 @@ def test_three_joints_suffice_to_lift_and_tilt(tmp_path, capsys) -> None:
 
 
 def test_the_config_of_the_packages_arm_has_the_defaults() -> None:
-    assert load_config(resource_path("configs/robots/peitian.yaml")).env == EnvConfig()
+    assert read_preset(resource_path("configs/robots/peitian.yaml")).env == EnvConfig()
 
 
 def test_a_robot_is_read_on_top_of_a_preset(written, tmp_path) -> None:
     preset = tmp_path / "preset.yaml"
     preset.write_text("env: {action_scale: 0.5, episode_seconds: 3.0}\nseed: 4\n")
     config = read_preset(preset, written["small"])
-    own = load_config(written["small"]).env
+    own = read_preset(written["small"]).env
     assert config.env == own.model_copy(update={"episode_seconds": 3.0}) and config.seed == 4
     assert own.action_scale != 0.5
 

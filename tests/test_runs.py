@@ -22,7 +22,6 @@ from bounce_mjx.runs import config as run_configs
 from bounce_mjx.runs import folders
 from bounce_mjx.runs.config import (
     TrainConfig,
-    load_config,
     load_run_config,
     preset_files,
     read_preset,
@@ -164,7 +163,7 @@ def test_a_run_has_a_copy_of_its_robot(robot_run: Path, tmp_path: Path, monkeypa
     save_config(moved, load_run_config(moved))
     assert contents(moved) == before
     # The config is a preset too, for a new run.
-    assert load_config(moved / "config.yaml").env.mjcf == env.mjcf
+    assert read_preset(moved / "config.yaml").env.mjcf == env.mjcf
 
 
 def test_a_robot_of_a_package_is_copied(tmp_path: Path, monkeypatch) -> None:
@@ -174,7 +173,7 @@ def test_a_robot_of_a_package_is_copied(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.syspath_prepend(tmp_path)
     packaged = Path("package:some_robots/bounce_ball.xml")
     (tmp_path / "my.yaml").write_text(f"env: {{mjcf: '{packaged}'}}")
-    config = load_config(tmp_path / "my.yaml")
+    config = read_preset(tmp_path / "my.yaml")
     assert config.env.mjcf == packaged
     run = create_run(config.model_copy(update={"log_dir": tmp_path / "runs"}))
     assert load_run_config(run).env.mjcf == run / "robot/bounce_ball.xml"
@@ -209,7 +208,7 @@ def test_an_edited_copy_of_the_robot_is_refused(robot_run: Path, refused) -> Non
 
 def test_a_preset_has_a_name(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert read_preset(Path("seed")) == load_config(resource_path("configs/seed.yaml"))
+    assert read_preset(Path("seed")) == read_preset(resource_path("configs/seed.yaml"))
     with pytest.raises(UserError, match="no preset is named sead; give one of"):
         read_preset(Path("sead"))
     robots = (
@@ -303,7 +302,7 @@ def test_a_group_given_in_part_keeps_its_other_defaults(tmp_path: Path) -> None:
     file.write_text(
         "task: catch\nenv: {action: {max_lead: 0.2}, reward: {rest: {}, fall: {scale: 0.3}}}"
     )
-    env, default = load_config(file).env, load_config(CATCH).env
+    env, default = read_preset(file).env, read_preset(CATCH).env
     assert env.action.base == "target" and env.action.max_lead == 0.2
     assert env.reward.fall.scale == 0.3 and env.reward.rest == default.reward.rest
     assert default.reward.rest.weight != type(default.reward.rest)().weight
@@ -312,13 +311,13 @@ def test_a_group_given_in_part_keeps_its_other_defaults(tmp_path: Path) -> None:
 def test_whole_numbers_may_have_an_exponent(tmp_path: Path) -> None:
     path = tmp_path / "my.yaml"
     path.write_text("total_steps: 1e6\nppo: {num_envs: 2e2, hidden_layers: [1.6e1, 8]}\nseed: 1e0")
-    config = load_config(path)
+    config = read_preset(path)
     assert (config.total_steps, config.ppo.num_envs, config.seed) == (10**6, 200, 1)
     assert config.ppo.hidden_layers == (16, 8)
     for bad in ("1e-1", "1.5e0", "1e400", "1e13"):
         path.write_text(f"total_steps: {bad}")
         with pytest.raises(UserError, match="total_steps is"):
-            load_config(path)
+            read_preset(path)
 
 
 def test_results_are_read_as_they_were_written(tmp_path: Path, progress: Progress) -> None:

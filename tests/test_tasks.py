@@ -19,7 +19,7 @@ from bounce_mjx.commands.main import main
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
-from bounce_mjx.runs.config import CONFIG_FILE, load_config, load_run_config, read_preset
+from bounce_mjx.runs.config import CONFIG_FILE, load_run_config, read_preset
 from bounce_mjx.runs.folders import create_run
 from bounce_mjx.tasks import registry
 from bounce_mjx.tasks.registry import find_task, task_name
@@ -164,8 +164,8 @@ def test_a_config_file_cannot_name_code(mine: Path, tmp_path: Path) -> None:
     path = tmp_path / "config.yaml"
     path.write_text("task: mine.py:Dribble\nenv: {apex_range: [0.06, 0.07]}\n")
     with pytest.raises(UserError, match=r"which is code; name it to run it: --task "):
-        load_config(path)
-    assert load_config(path, task=f"{mine}:Dribble").env.apex_range == (0.06, 0.07)
+        read_preset(path)
+    assert read_preset(path, task=f"{mine}:Dribble").env.apex_range == (0.06, 0.07)
 
 
 @pytest.mark.parametrize(
@@ -210,7 +210,7 @@ def test_a_package_can_have_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
 def test_a_robot_serves_another_task() -> None:
     """Its arm and its start pose are kept; the heights are those of the task above its paddle."""
     preset, robot = CHECKOUT / "configs/cpu.yaml", CHECKOUT / "configs/robots/ur5e.yaml"
-    config, bounce = load_config(preset, robot, DRIBBLE).env, load_config(preset, robot).env
+    config, bounce = read_preset(preset, robot, DRIBBLE).env, read_preset(preset, robot).env
     assert config.mjcf == bounce.mjcf and config.robot == bounce.robot
     assert config.default_joint_angles == bounce.default_joint_angles
     env = Env(config)

@@ -51,7 +51,7 @@ def read_mapping(path: Path, kind: str, example: str) -> dict[str, Any]:
 
 
 def dump_config(config: StrictModel) -> str:
-    """The whole config as YAML, for `load_config`."""
+    """The whole config as YAML, for `read_preset`."""
     return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
 
 

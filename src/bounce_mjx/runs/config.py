@@ -216,29 +216,32 @@ def unnamed_code(source: str, key: str, name: str) -> UserError:
     )
 
 
-def load_config(
-    path: Path | Sequence[Path],
+def read_preset(
+    path: Path | Sequence[Path] | None,
     robot: Path | None = None,
     task: str | None = None,
     world: Path | None = None,
+    machine: Path | None = None,
     algorithm: str | None = None,
 ) -> TrainConfig:
-    """Reads a run's config from a YAML file, with defaults for missing keys. A relative path of an
-    MJCF file starts at the folder of the YAML file.
+    """Reads the config of the files in `preset_files`, with defaults for missing keys. A relative
+    path of an MJCF file starts at the folder of its YAML file.
 
     Args:
-      path: the file, or several, each of which lies on those before it; `base` is for
-        `preset_files`.
-      robot: config of a robot, whose keys win over those of the file.
-      task: the task as the user names it; by default, the file's.
-      world: file of a named world, which replaces that of the file and may have a robot.
-      algorithm: the algorithm as the user names it; by default, the file's.
+      path: see `preset_files`.
+      robot: config of a robot, whose keys win over the preset's: a YAML file, or the name of a file
+        in configs/robots/.
+      task: the task as the user names it; by default, the files'.
+      world: a named world, which replaces the preset's and may have a robot: a YAML file, or the
+        name of a file in configs/worlds/.
+      machine: see `preset_files`.
+      algorithm: the algorithm as the user names it; by default, the files'.
 
     Raises:
-      UserError: the file is missing, is not a YAML mapping, has an unknown key or a bad value, or
-        its task or algorithm is a file that the user has not named.
+      UserError: a file is missing, is not a YAML mapping, has an unknown key or a bad value, or its
+        task or algorithm is a file that the user has not named.
     """
-    files = [path] if isinstance(path, Path) else path
+    files = preset_files(path, task, machine)
     source = " on ".join(map(shown_file, reversed(files)))
     values = functools.reduce(merged, map(_read, files), {})
     values.pop(BASE, None)
@@ -283,7 +286,7 @@ def in_world(config: TrainConfig, world: Path) -> tuple[TrainConfig, NamedWorld]
     values = env.model_dump()
     if named.robot is not None:
         robot = _robot_of(named, path)
-        own = load_config(resource_path(_EXAMPLE), robot).env
+        own = read_preset(resource_path(_EXAMPLE), robot).env
         files = {(arm.mjcf or Path()).name for arm in (own, env)}
         if len(files) > 1 or own.default_joint_angles != env.default_joint_angles:
             raise UserError(
@@ -321,32 +324,6 @@ def _robot_for(task: type[Task], robot: Path) -> dict[str, Any]:
 
     home = paddle_home(known.mjcf, known.robot, known.default_joint_angles)
     return values | {"env": world_keys | task.Config.settings_at(home)}
-
-
-def read_preset(
-    path: Path | Sequence[Path] | None,
-    robot: Path | None = None,
-    task: str | None = None,
-    world: Path | None = None,
-    machine: Path | None = None,
-    algorithm: str | None = None,
-) -> TrainConfig:
-    """Reads the config of the files in `preset_files`.
-
-    Args:
-      path: see `preset_files`.
-      robot: config of a robot, whose keys win over the preset's: a YAML file, or the name of a file
-        in configs/robots/.
-      task: the task as the user names it; by default, the files'.
-      world: a named world, which replaces the preset's: a YAML file, or the name of a file in
-        configs/worlds/.
-      machine: see `preset_files`.
-      algorithm: the algorithm as the user names it; by default, the files'.
-
-    Raises:
-      UserError: a file is missing or invalid.
-    """
-    return load_config(preset_files(path, task, machine), robot, task, world, algorithm)
 
 
 def preset_files(

@@ -16,7 +16,7 @@ from brax.training.agents.ppo import networks as ppo_networks
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
-from bounce_mjx.runs.config import TrainConfig, load_config
+from bounce_mjx.runs.config import TrainConfig, read_preset
 
 BraxPolicy = Callable[[jax.Array, jax.Array], tuple[jax.Array, dict[str, Any]]]
 """(observation [..., N], key) -> (action [..., A], extras)."""
@@ -58,7 +58,7 @@ def ppo_settings(config: TrainConfig | None = None) -> dict[str, Any]:
 
     brax's trainer lacks `critic_metrics` and the decay of the learning rate.
     """
-    config = config or load_config(resource_path("configs/default.yaml"))
+    config = config or read_preset(resource_path("configs/default.yaml"))
     ppo = config.ppo
     return dict(
         num_timesteps=config.total_steps,
@@ -86,7 +86,7 @@ def ppo_settings(config: TrainConfig | None = None) -> dict[str, Any]:
 
 def network_settings(config: TrainConfig | None = None) -> dict[str, Any]:
     """Keyword arguments of brax's `make_ppo_networks`, from a config or `configs/default.yaml`."""
-    ppo = (config or load_config(resource_path("configs/default.yaml"))).ppo
+    ppo = (config or read_preset(resource_path("configs/default.yaml"))).ppo
     return dict(
         policy_hidden_layer_sizes=ppo.hidden_layers,
         value_hidden_layer_sizes=ppo.hidden_layers,
