@@ -26,7 +26,7 @@ from bounce_mjx.runs.config import TrainConfig, train_config
 from bounce_mjx.tasks.registry import find_task
 from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.job import Job
-from bounce_mjx.training.ppo_trainer import PPOTrainer, episode_steps, in_whole_blocks
+from bounce_mjx.training.ppo_trainer import PPOTrainer, episode_steps
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import Term
 from test_ppo import TwoStates
@@ -176,7 +176,6 @@ def of_run(config: TrainConfig) -> tuple:
     """What a run resolves: its blocks, evaluations, seeds and folder."""
     blocks, measured = [], []
     with contextlib.ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
-        config = in_whole_blocks(config)
         job = Job(config, Console(quiet=True), None, (), stack, PPOTrainer)
         job.open()
 
@@ -184,7 +183,7 @@ def of_run(config: TrainConfig) -> tuple:
             blocks.append(job.steps)
             job.steps += job.block_steps
 
-        answers = {"_stopping": lambda: False, "_is_due": lambda: False, "_is_solved": lambda: True}
+        answers = {"_stopping": lambda: False, "_is_due": lambda: False, "_healthy": list}
         for name, answer in (answers | {"_run_block": run_block}).items():
             patch.setattr(job, name, answer)
         job.train()

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-import pydantic
 from pydantic import Field
 
 from bounce_mjx.config.command_line import Flag, parse
@@ -13,12 +12,10 @@ from bounce_mjx.config.files import differing_keys
 from bounce_mjx.config.settings import Count, NonNegativeInt, Steps, StrictModel, merged
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, suggest
-from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.resources import POLICIES
 from bounce_mjx.runs import config as run_configs
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file, is_same_code
-from bounce_mjx.world.config import WorldConfig
 
 PROG = "bounce-mjx train"
 
@@ -170,8 +167,6 @@ def changed(base: TrainConfig, settings: dict[str, Any]) -> TrainConfig:
 class TrainCommand(TrainConfig, Start):
     """Trains a policy; by default, one that keeps the ball bouncing."""
 
-    env: pydantic.SerializeAsAny[WorldConfig]
-    ppo: pydantic.SerializeAsAny[PPOConfig] = PPOConfig()
     report: bool = True
     """Write report.html into the run's folder after the results are printed."""
     video: bool = False

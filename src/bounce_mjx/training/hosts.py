@@ -37,15 +37,12 @@ _exchanges = itertools.count()
 
 
 def join(
-    coordinator_address: str | None = None,
-    num_processes: int | None = None,
-    process_id: int | None = None,
-    timeout: float = 300.0,
+    coordinator_address: str | None, num_processes: int | None, process_id: int | None, timeout: int
 ) -> None:
     """Joins the processes of one run; it must be called before any other use of JAX. From now on,
     JAX aborts this process if another one has died.
 
-    Without arguments, Slurm, Open MPI or Kubernetes supply them.
+    Slurm, Open MPI or Kubernetes supply what is None.
 
     Args:
       timeout: seconds to wait for the other processes.
@@ -57,7 +54,7 @@ def join(
 
     def connect() -> None:
         # JAX's own time limit ends the process with a stack trace.
-        limit = {"initialization_timeout": int(2 * timeout + 60)}
+        limit = {"initialization_timeout": 2 * timeout + 60}
         jax.distributed.initialize(coordinator_address, num_processes, process_id, **limit)
 
     try:

@@ -95,7 +95,6 @@ def train(
     """
     hosts.agree(config, resume)
     with contextlib.ExitStack() as stack:
-        config = ppo_trainer.in_whole_blocks(config)
         job = Job(config, console, resume, callbacks, stack, make_trainer)
         job.open()
         try:
@@ -130,13 +129,15 @@ class Job:
         make_trainer: Callable[[TrainConfig, Env], ppo_trainer.PPOTrainer],
     ):
         """Builds what may refuse the config, before a folder is made."""
-        self.config, self.console, self.resume, self.stack = config, console, resume, stack
+        self.console, self.resume, self.stack = console, resume, stack
         self.say = functools.partial(events.say, console)
         self.callbacks = callbacks if hosts.is_leader() else ()
         self.pool = concurrent.futures.ThreadPoolExecutor()
         stack.callback(self.pool.shutdown, wait=False, cancel_futures=True)
         self.seconds, self.lap_started = {}, time.perf_counter()
         self.block_steps = ppo_trainer.iterations_per_block(config) * config.ppo.batch_steps
+        blocks = max(1, round(config.total_steps / self.block_steps))
+        self.config = config.model_copy(update={"total_steps": blocks * self.block_steps})
         self.eval_steps = self.block_steps * max(1, round(config.eval_every / self.block_steps))
         self.env = Env(config.env)
         self.trainer = make_trainer(config, self.env)
@@ -174,9 +175,8 @@ class Job:
             for member, plain in zip(self.members, evaluated, strict=True):
                 member.progress = Progress.model_validate(plain)
                 member.recall_best()
-            solved = self.config.stop_when_solved and self._is_solved()
-            if self._is_done() or solved:
-                met = "has met all results" if solved else "has been trained to its end"
+            if self._is_done() or self._is_solved():
+                met = "has met all results" if self._is_solved() else "has been trained to its end"
                 self.say(f"{self.run} {met}, {self.steps:,} steps; add --total-steps N to train on")
         configs = {self.run: config} | {member.run: member.config for member in self.members}
         for folder, own in configs.items() if hosts.is_leader() else ():
@@ -247,8 +247,7 @@ class Job:
             # The longest program is traced first: Python traces one program at a time while XLA
             # compiles others.
             compiling = self.trainer.compile(self.pool)
-            parts = self.config, self.env, self.trainer.mesh
-            self.evaluators = make_evaluators(*parts, self.pool)
+            self.evaluators = make_evaluators(self.config, self.env, self.trainer.mesh, self.pool)
             self.opening = self.pool.submit(self._open_logs)
             self.opening.add_done_callback(lambda _: [*map(importlib.import_module, _SLOW_MODULES)])
             compiling.result()
@@ -290,7 +289,7 @@ class Job:
         while not self._stopping():
             if self._is_due() and not self._evaluate():
                 break
-            if self._is_done() or (self.config.stop_when_solved and self._is_solved()):
+            if self._is_done() or self._is_solved():
                 break
             self._run_block()
             self.ended = hosts.any_of(self.ended)
@@ -322,7 +321,8 @@ class Job:
         return [member for member in self.members if member.progress.fault is None]
 
     def _is_solved(self) -> bool:
-        return all(member.progress.solved for member in self._healthy())
+        solved = all(member.progress.solved for member in self._healthy())
+        return self.config.stop_when_solved and solved
 
     def _is_evaluated(self) -> bool:
         return all(member.progress.has(self.steps) for member in self._healthy())

@@ -45,13 +45,6 @@ def iterations_per_block(config: TrainConfig) -> int:
     return max(1, round(config.block_steps / config.ppo.batch_steps))
 
 
-def in_whole_blocks(config: TrainConfig) -> TrainConfig:
-    """The config with the `total_steps` that are trained: the nearest number of whole blocks."""
-    block = iterations_per_block(config) * config.ppo.batch_steps
-    steps = block * max(1, round(config.total_steps / block))
-    return config.model_copy(update={"total_steps": steps})
-
-
 def each_seed(tree: Any, num_seeds: int) -> list[Any]:
     """The trees of S seeds from one whose arrays are [S, ...]; with one seed, the tree itself."""
     if num_seeds == 1:

@@ -3,7 +3,6 @@
 import html
 import queue
 import threading
-from collections.abc import Callable
 
 import jax
 import viser
@@ -62,22 +61,31 @@ class TrainingPage:
             with cpu, open_server(*self._address) as server:
                 say(self._console, f"watch: {self._address.url}")
                 side = server.gui.add_panel()
-                show = add_panel(server.gui, side, self._config)
+                with side.add_tab("training", viser.Icon.SCHOOL):
+                    self._progress = server.gui.add_html(_text("compiling"))
+                    waiting = _text("no evaluation yet; the arm is untrained")
+                    self._results = server.gui.add_html(waiting)
                 simulation = _simulate(self._config)
                 page = LivePage(server, simulation, PageStart("training"), side)
-                page.run(None, lambda: self._tell(simulation, show))
+                page.run(None, lambda: self._tell(simulation))
         # The training continues without its page.
         except Exception as error:
             reason = reason_of(error)
             say(self._console, f"the page is not served ({reason}); training continues without it")
 
-    def _tell(self, simulation: Simulation, show: Callable[[Event | None], None]) -> None:
-        """Shows the news since the last call."""
+    def _tell(self, simulation: Simulation) -> None:
+        """Shows the news since the last call; None is the end of the training."""
         while not self._news.empty():
             event = self._news.get()
-            show(event)
-            if event is not None and event.policy is not None:
-                simulation.policy = event.policy
+            if event is None:
+                self._progress.content = _text("<b>Training has ended</b>")
+            elif event.report is not None:
+                line = html.escape(evaluation_line(1, event.steps, [event.report]))
+                self._results.content, simulation.policy = _text(line), event.policy
+            else:
+                done = f"{event.steps:,} of {self._config.total_steps:,} steps"
+                rate = event.metrics["speed/steps_per_second"]
+                self._progress.content = _text(f"<b>{done}</b><br>{rate:,.0f} steps/s")
 
 
 def _simulate(config: TrainConfig) -> Simulation:
@@ -87,28 +95,6 @@ def _simulate(config: TrainConfig) -> Simulation:
     policy = jax.device_get(untrained_policy(networks, env.observation_size, key))
     robots = _ROBOTS if env.engine.name == "fused" else 1
     return Simulation(env, make_policy_controller(networks), robots, config.seed, policy=policy)
-
-
-def add_panel(
-    gui: viser.GuiApi, side: viser.PanelHandle, config: TrainConfig
-) -> Callable[[Event | None], None]:
-    """Adds the tab of the training, with its progress and its results. The function that it returns
-    shows a block or an evaluation; None is the end of the training."""
-    with side.add_tab("training", viser.Icon.SCHOOL):
-        progress = gui.add_html(_text("compiling"))
-        results = gui.add_html(_text("no evaluation yet; the arm is untrained"))
-
-    def show(event: Event | None) -> None:
-        if event is None:
-            progress.content = _text("<b>Training has ended</b>")
-        elif event.report is not None:
-            results.content = _text(html.escape(evaluation_line(1, event.steps, [event.report])))
-        else:
-            done = f"{event.steps:,} of {config.total_steps:,} steps"
-            rate = event.metrics["speed/steps_per_second"]
-            progress.content = _text(f"<b>{done}</b><br>{rate:,.0f} steps/s")
-
-    return show
 
 
 def _text(content: str) -> str:
