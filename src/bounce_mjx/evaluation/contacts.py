@@ -14,6 +14,7 @@ from bounce_mjx.robot.model import find_addresses, scene_spec
 from bounce_mjx.task.shown import Recording
 from bounce_mjx.world.config import WorldConfig
 
+# Distance that counts as a contact, m.
 _MARGIN = 0.002
 
 
@@ -27,18 +28,13 @@ class ArmContact(NamedTuple):
     """Number of control steps."""
 
 
-def arm_contacts(
-    config: WorldConfig, recording: Recording, margin: float = _MARGIN
-) -> list[ArmContact]:
+def arm_contacts(config: WorldConfig, recording: Recording) -> list[ArmContact]:
     """Bodies of the arm that touch each other or the floor, z = 0, in recorded episodes.
 
     Neighbours in the chain may touch, and so may bodies whose shapes overlap at the start pose, as
     hulls of meshes do.
-
-    Args:
-      margin: distance that counts as a contact, m.
     """
-    checker = ContactChecker(config, margin)
+    checker = ContactChecker(config, _MARGIN)
     allowed = checker.touching(np.array(config.default_joint_angles))
     joint_angles, running = (np.asarray(x) for x in (recording.joint_angles, recording.running))
     found: dict[tuple[str, ...], list[int]] = {}

@@ -1,5 +1,6 @@
 """Learning curves from the TensorBoard logs of runs, grouped by config (ignoring the seed)."""
 
+import functools
 import json
 import math
 import zlib
@@ -75,10 +76,9 @@ def read_curves(run: Path) -> RunCurves:
     for name in log.Tags()["scalars"]:
         # A resumed run may have logged a step twice; the later value belongs to the final policy.
         values = {e.step: e.value for e in log.Scalars(name) if math.isfinite(e.value)}
-        if not values:
-            continue
-        steps = sorted(values)
-        curves[name] = LoggedCurve(np.array(steps), np.array([values[step] for step in steps]))
+        if values:
+            steps, points = zip(*sorted(values.items()), strict=True)
+            curves[name] = LoggedCurve(np.array(steps), np.array(points))
     if not curves:
         raise UserError(
             f"{run} holds no TensorBoard scalars; train longer, or give another run's folder"
@@ -122,9 +122,7 @@ def mean_and_band(curves: Sequence[LoggedCurve]) -> tuple[np.ndarray, np.ndarray
     Returns:
       The steps, the means and the standard deviations, each [N].
     """
-    steps = curves[0].steps
-    for curve in curves[1:]:
-        steps = np.intersect1d(steps, curve.steps)
+    steps = functools.reduce(np.intersect1d, [curve.steps for curve in curves])
     values = np.stack([curve.values[np.isin(curve.steps, steps)] for curve in curves])
     return steps, values.mean(axis=0), values.std(axis=0)
 

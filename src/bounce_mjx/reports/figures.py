@@ -101,8 +101,7 @@ def evaluation_figure(env: Env, recording: Recording, width: float = 10.0) -> Fi
 def image(figure: Figure, suffix: str) -> bytes:
     """A figure as an image file of the format `suffix`, "png" or "svg"."""
     buffer = io.BytesIO()
-    metadata = {"Date": None} if suffix == "svg" else None
-    figure.savefig(buffer, format=suffix, dpi=150, metadata=metadata)
+    figure.savefig(buffer, format=suffix, dpi=150, metadata={"Date": None})
     return buffer.getvalue()
 
 

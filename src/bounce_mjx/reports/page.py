@@ -19,7 +19,7 @@ from bounce_mjx.reports import figures
 from bounce_mjx.reports.curves import group_runs
 from bounce_mjx.reports.html_page import data_url, figures_html, page, table
 from bounce_mjx.reports.robustness import load_robustness, robustness_figure
-from bounce_mjx.reports.tables import details_line, result_cells, robot_name
+from bounce_mjx.reports.tables import details_line, result_cells
 from bounce_mjx.runs.checkpoints import read_actor
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.files import write_output
@@ -67,13 +67,14 @@ def write_report(run: Path, recording: Recording | None = None) -> Path:
     }
     if robustness is not None:
         drawn["Perturbed worlds"] = robustness_figure(robustness)
+    robot = "Peitian AIR4-560" if config.env.mjcf is None else config.env.mjcf.stem
     replay, report = replay_first_episode(env, recording), results.best
     seconds = results.seconds | {"total": sum(results.seconds.values())}
     phases = [[name, f"{value:.1f}"] for name, value in seconds.items()]
     resets = "fresh resets" if results.fresh_resets else "the resets of the selection"
     body = f"""<h1>{report.summary}</h1>
 <p>Run <code>{html.escape(str(run))}</code>, seed {config.seed}, task {html.escape(config.task)} on
-the robot {html.escape(robot_name(config.env))}. The best of {len(results.evaluations)} evaluations,
+the robot {html.escape(robot)}. The best of {len(results.evaluations)} evaluations,
 after {results.best_steps:,} of {results.trained_steps:,} environment steps, on {resets}:
 {html.escape(details_line(report))}.</p>
 <p>Trained on {html.escape(results.device)} with bounce_mjx {html.escape(results.version or "?")};

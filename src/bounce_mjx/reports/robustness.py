@@ -17,7 +17,7 @@ from rich.table import Table
 from bounce_mjx.evaluation.robustness import ConditionOutcome, RobustnessReport
 from bounce_mjx.evaluation.suite import NOMINAL
 from bounce_mjx.reports.figures import PANEL_WIDTH, style
-from bounce_mjx.reports.tables import short_text
+from bounce_mjx.reports.tables import figure_text
 from bounce_mjx.runs.files import read_stored
 
 ROBUSTNESS_FILE = "robustness.json"
@@ -74,11 +74,10 @@ def robustness_table(report: RobustnessReport) -> Table:
             name = escape(outcome.perturbation) if i == 0 else ""
             strength = "" if outcome.strength is None else f"{outcome.strength:g} {outcome.unit}"
             verdict = "[green]pass" if outcome.passed else "[red]FAIL"
-            texts = {result: short_text(value) for result, value in outcome.values.items()}
-            figures = [
-                f"[red]{text}*" if result in outcome.failed else f"{text} "
-                for result, text in texts.items()
-            ]
+            figures = []
+            for result, value in outcome.values.items():
+                text = figure_text(value, ".2f" if value is None or abs(value) < 10.0 else ".1f")
+                figures.append(f"[red]{text}*" if result in outcome.failed else f"{text} ")
             table.add_row(name, strength.rstrip(), *figures, verdict)
     return table
 

@@ -7,15 +7,9 @@ from rich.markup import escape
 from rich.table import Column, Table
 
 from bounce_mjx.evaluation.results import Report, Result
-from bounce_mjx.world.config import WorldConfig
 
 # A figure's name, and the unit at its end.
 _NAME = re.compile("(.+?)(?:_((?:m|rad)_s|m|s|rad|kg|N))?")
-
-
-def robot_name(env: WorldConfig) -> str:
-    """The robot of a config: the name of its MJCF file, or the project's own arm."""
-    return "Peitian AIR4-560" if env.mjcf is None else env.mjcf.stem
 
 
 def figure_text(value: float | None, spec: str = ".2f") -> str:
@@ -28,11 +22,6 @@ def count_text(count: float) -> str:
     if count >= 1e6:
         return f"{count / 1e6:.2f}M"
     return f"{count / 1e3:.0f}k" if count >= 1e4 else f"{count:,.0f}"
-
-
-def short_text(value: float | None) -> str:
-    """A measured figure as text with one digit after the point, or two below 10."""
-    return figure_text(value, ".2f" if value is None or abs(value) < 10.0 else ".1f")
 
 
 def _plain_table(title: str, *columns: Column | str) -> Table:

@@ -28,7 +28,6 @@ from bounce_mjx.learning.statistics import RunningStatistics, init_statistics
 from bounce_mjx.runs import folders
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config, runs_folder
 from bounce_mjx.runs.files import MANIFEST_FILE, check_integrity, seal, to_plain, writable
-from bounce_mjx.runs.folders import MIRROR_LAW, Checkpoint, best_checkpoint
 from bounce_mjx.tasks.registry import is_file
 
 # Where orbax moves the checkpoints that are not kept any more.
@@ -59,7 +58,7 @@ class Record(pydantic.BaseModel):
     progress: dict[str, Any]
 
 
-def read_policy(checkpoint: Checkpoint, config: TrainConfig) -> Policy:
+def read_policy(checkpoint: folders.Checkpoint, config: TrainConfig) -> Policy:
     """Restores the policy of a checkpoint."""
     read_record(checkpoint)
     policy = _read_arrays(checkpoint, POLICY, policy_shapes(config))
@@ -74,11 +73,11 @@ def read_policy(checkpoint: Checkpoint, config: TrainConfig) -> Policy:
 
 
 def read_actor(
-    checkpoint: Checkpoint, config: TrainConfig
-) -> tuple[Checkpoint, Policy | None, Callable[[Env], Actor]]:
+    checkpoint: folders.Checkpoint, config: TrainConfig
+) -> tuple[folders.Checkpoint, Policy | None, Callable[[Env], Actor]]:
     """The policy of a checkpoint and what acts with it, or the mirror law, which has no policy; and
     the checkpoint that was read: the next one, if a training replaces it meanwhile."""
-    if checkpoint is MIRROR_LAW:
+    if checkpoint is folders.MIRROR_LAW:
         return checkpoint, None, MirrorLaw
     while True:
         try:
@@ -86,7 +85,7 @@ def read_actor(
         except UserError:
             if checkpoint.folder.exists():
                 raise
-            checkpoint = best_checkpoint(checkpoint.run)
+            checkpoint = folders.best_checkpoint(checkpoint.run)
 
 
 def policy_shapes(config: TrainConfig) -> Policy:
@@ -96,7 +95,7 @@ def policy_shapes(config: TrainConfig) -> Policy:
     return jax.eval_shape(lambda: untrained_policy(networks, size, jax.random.PRNGKey(0)))
 
 
-def read_training(checkpoint: Checkpoint, template: Any) -> tuple[Any, Record]:
+def read_training(checkpoint: folders.Checkpoint, template: Any) -> tuple[Any, Record]:
     """Restores the whole training state of a checkpoint as NumPy arrays, and its record.
 
     Args:
@@ -112,7 +111,7 @@ def read_training(checkpoint: Checkpoint, template: Any) -> tuple[Any, Record]:
 
 
 def read_networks(
-    checkpoint: Checkpoint, config: TrainConfig
+    checkpoint: folders.Checkpoint, config: TrainConfig
 ) -> tuple[Params, RunningStatistics, tuple[str, ...]]:
     """Restores both networks of a checkpoint, the statistics of their inputs, and the names of the
     critic metrics among these."""
@@ -173,7 +172,7 @@ def read_start(config: TrainConfig, env: Env) -> tuple[Params, RunningStatistics
     return params, seen
 
 
-def read_record(checkpoint: Checkpoint) -> Record:
+def read_record(checkpoint: folders.Checkpoint) -> Record:
     """Verifies every file of a checkpoint and reads its plain data."""
     run_config, folder = load_run_config(checkpoint.run), checkpoint.folder
     try:
@@ -199,7 +198,7 @@ def read_record(checkpoint: Checkpoint) -> Record:
     return record
 
 
-def _read_arrays(checkpoint: Checkpoint, item: str, template: Any) -> Any:
+def _read_arrays(checkpoint: folders.Checkpoint, item: str, template: Any) -> Any:
     """Reads an item of a checkpoint with exactly the structure, shapes and dtypes of `template`."""
     folder = (checkpoint.folder / item).absolute()
     try:
@@ -248,7 +247,7 @@ def _forms(tree: Any) -> dict[str, str]:
     }
 
 
-def _damaged(checkpoint: Checkpoint, error: Exception) -> UserError:
+def _damaged(checkpoint: folders.Checkpoint, error: Exception) -> UserError:
     return UserError(
         f"the checkpoint {checkpoint.folder} is damaged or of another version "
         f"({shorten(reason_of(error), 200)}); give another checkpoint"

@@ -171,10 +171,9 @@ def leave_report(seed: job.SeedRun, console: Console) -> None:
     started = time.perf_counter()
     try:
         # Imported during the compilation (`Job.compile`).
-        from bounce_mjx.reports import page
+        from bounce_mjx.reports.page import write_report
 
-        recording = seed.progress.best.recording
-        path = page.write_report(seed.run, recording)
+        path = write_report(seed.run, seed.progress.best.recording)
     except Exception as error:
         again = shlex.join([str(seed.run), *job.named_task(seed.config)])
         reason = reason_of(error)

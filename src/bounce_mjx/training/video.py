@@ -6,7 +6,7 @@ from pathlib import Path
 from PIL import Image
 
 from bounce_mjx.env.env import Env
-from bounce_mjx.learning.policy import make_networks
+from bounce_mjx.learning.policy import networks_of
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training.events import Event
 from bounce_mjx.training.log import TensorBoardLog
@@ -44,8 +44,7 @@ class EvaluationVideo:
             return
         if self._simulation is None:
             env = Env(event.config.env)
-            actor = make_networks(event.config.ppo, env.observation_size, env.action_size)
-            controller = make_policy_controller(actor)
+            controller = make_policy_controller(networks_of(event.config.ppo)(env))
             self._simulation = Simulation(env, controller, 1, seed=0, policy=event.policy)
         self._simulation.policy = event.policy
         self._simulation.reset()
