@@ -141,7 +141,7 @@ MISTAKES = {
     ),
     "size": (
         [dict(name="blind", settings={"observation.ball_position": 0})],
-        "it changes the quantities of the observation",
+        "it changes the observation",
     ),
 }
 

@@ -168,9 +168,9 @@ def test_flags_tell_whether_there_are_other_hosts(flags: str, several: bool) -> 
         (
             {"ppo": PPOConfig(hidden_layers=(8,))},
             None,
-            r"ppo.hidden_layers, which is \[.+\] in process 0 and \[8\] in process 2",
+            r"processes 0 and 2 differ in ppo.hidden_layers, \[.+\] and \[8\];",
         ),
-        ({}, Path("/runs/1"), 'resume, which is null in process 0 and "/runs/1" in process 2'),
+        ({}, Path("/runs/1"), 'differ in resume, null and "/runs/1";'),
         ({"log_dir": Path("elsewhere")}, None, None),
     ],
 )
@@ -203,6 +203,6 @@ def test_hosts_that_do_not_find_each_other_end_with_a_sentence(tmp_path: Path):
 def test_distributed_without_a_launcher_gives_one_sentence(tmp_path: Path):
     with job(tmp_path / "log", "--distributed") as alone:
         assert alone.wait() == 2
-    assert alone.said.startswith("error: the processes of this training cannot be joined")
+    assert alone.said.startswith("error: the processes cannot be joined")
     assert alone.said.count("\n") == 1
     assert shutil.which("srun") is None or "Traceback" not in alone.said

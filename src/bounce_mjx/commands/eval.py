@@ -52,10 +52,7 @@ def main(args: Sequence[str]) -> None:
         raise UserError("--nominal and --world cannot be combined; omit one")
     config = command.config_of(checkpoint)
     if command.limits and config.env.robot.limits.velocity is None:
-        raise UserError(
-            "the arm of this policy has no command limits (env.robot.limits); omit --limits, or "
-            "give a run with an arm that has them, such as --robot ur5e"
-        )
+        raise UserError("the policy's arm has no command limits (env.robot.limits); omit --limits")
     commands = given_commands(config.env)
     set_up_jax(evaluation.on_engine(config.env, command.physics))
     checkpoint, policy, actor = read_actor(checkpoint, config)

@@ -64,10 +64,7 @@ class ActorCommand(RunCommand):
         if str(path) == MIRROR and not os.path.isdir(path):
             return MIRROR_LAW
         if self.robot is not None:
-            raise UserError(
-                "--robot is for the mirror law, and a policy has the robot that it was trained "
-                "with; omit it, or give mirror instead of a checkpoint"
-            )
+            raise UserError("--robot is for the mirror law, and a policy has its own; omit it")
         return choose_checkpoint(path, self.folder)
 
     def config_of(self, checkpoint: "Checkpoint") -> TrainConfig:

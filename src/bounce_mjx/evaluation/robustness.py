@@ -187,13 +187,8 @@ def _spanning_config(conditions: Sequence[Condition], physics: Physics) -> World
 
 def _stack_ranges(names: Sequence[str], conditions: Sequence[Condition]) -> Ranges | None:
     """Ranges of C conditions, each end [C, ...]; None without names."""
-    return {
-        name: tuple(
-            jnp.asarray(np.stack(ends), jnp.float32)
-            for ends in zip(*(condition.range(name) for condition in conditions), strict=True)
-        )
-        for name in names
-    } or None
+    each = [{name: condition.range(name) for name in names} for condition in conditions]
+    return jax.tree.map(lambda *ends: jnp.asarray(np.stack(ends), jnp.float32), *each) or None
 
 
 def _batch_size(conditions: int, episodes: int, on_c: bool) -> int:

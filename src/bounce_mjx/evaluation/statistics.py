@@ -61,14 +61,13 @@ def accumulate(env: Env, statistics: Statistics, states: State, step: jax.Array)
     """
     s, now, running = statistics, _tally(env, states, step), statistics.running
     counted = jax.tree.map(lambda value: jnp.where(running, value, 0.0), now)
+    sums = jax.tree.map(jnp.add, s.tally.sums, counted.sums)
+    maxima = jax.tree.map(jnp.maximum, s.tally.maxima, counted.maxima)
     return Statistics(
         running=running & (states.done == 0),
         steps=s.steps + running,
         episode_return=s.episode_return + jnp.where(running, states.reward, 0.0),
-        tally=Tally(
-            sums=jax.tree.map(jnp.add, s.tally.sums, counted.sums),
-            maxima=jax.tree.map(jnp.maximum, s.tally.maxima, counted.maxima),
-        ),
+        tally=Tally(sums, maxima),
     )
 
 

@@ -206,10 +206,7 @@ def _with_changes(env: WorldConfig, settings: dict[str, Any], source: str) -> Wo
         values = merged(values, nested(name, value))
     changed = validate(type(env), values, source)
     if changed.layout != env.layout:
-        raise UserError(
-            f"{source}: it changes the quantities of the observation, which the policy's network "
-            "fixes; remove that setting"
-        )
+        raise UserError(f"{source}: it changes the observation, which the policy fixes; remove it")
     return changed
 
 

@@ -69,8 +69,7 @@ def read_curves(run: Path) -> RunCurves:
     # Damaged files raise exceptions of many types.
     except Exception as error:
         raise UserError(
-            f"the TensorBoard log in {run} is damaged ({shorten(reason_of(error))}); remove it, or "
-            "give another run's folder"
+            f"the TensorBoard log in {run} is damaged ({shorten(reason_of(error))}); remove it"
         ) from error
     curves = {}
     for name in log.Tags()["scalars"]:
@@ -80,9 +79,7 @@ def read_curves(run: Path) -> RunCurves:
             steps, points = zip(*sorted(values.items()), strict=True)
             curves[name] = LoggedCurve(np.array(steps), np.array(points))
     if not curves:
-        raise UserError(
-            f"{run} holds no TensorBoard scalars; train longer, or give another run's folder"
-        )
+        raise UserError(f"{run} holds no TensorBoard scalars; train longer, or give another run")
     results = load_results(run)
     return RunCurves(run, curves, results.solved_steps if results else None)
 

@@ -208,19 +208,11 @@ def _draw_hits(axes: Axes, env: Env, plot: Hits, points: np.ndarray) -> None:
     """The paddle's outline with a dot for each hit."""
     outline = env.mj_model.geom_size[env.addresses.paddle_geom, :2]
     half_x, half_y = 100.0 * outline
-    axes.add_patch(
-        Rectangle(
-            (-half_y, -half_x), 2.0 * half_y, 2.0 * half_x, facecolor="#f6ebe0", edgecolor="C1"
-        )
-    )
+    corner, size = (-half_y, -half_x), (2.0 * half_y, 2.0 * half_x)
+    axes.add_patch(Rectangle(corner, *size, facecolor="#f6ebe0", edgecolor="C1"))
     axes.plot([0], [0], "+", color=_GREY)
     x, y = 100.0 * points.T[:2]
     axes.plot(y, x, ".", markersize=3, alpha=0.4, color="C0", markeredgewidth=0)
-    axes.set(
-        title=f"{plot.title} ({len(points):,})",
-        xlabel="paddle's y",
-        ylabel="paddle's x",
-        xlim=(-1.3 * half_y, 1.3 * half_y),
-        ylim=(-1.3 * half_x, 1.3 * half_x),
-        aspect="equal",
-    )
+    axes.set_title(f"{plot.title} ({len(points):,})")
+    axes.set(xlabel="paddle's y", ylabel="paddle's x", aspect="equal")
+    axes.set(xlim=(-1.3 * half_y, 1.3 * half_y), ylim=(-1.3 * half_x, 1.3 * half_x))

@@ -10,14 +10,13 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from rich import box
 from rich.markup import escape
-from rich.table import Table
+from rich.table import Column, Table
 
 from bounce_mjx.evaluation.robustness import ConditionOutcome, RobustnessReport
 from bounce_mjx.evaluation.suite import NOMINAL
 from bounce_mjx.reports.figures import PANEL_WIDTH, style
-from bounce_mjx.reports.tables import figure_text
+from bounce_mjx.reports.tables import figure_text, plain_table
 from bounce_mjx.runs.files import read_stored
 
 ROBUSTNESS_FILE = "robustness.json"
@@ -55,20 +54,12 @@ def robustness_table(report: RobustnessReport) -> Table:
     """Table of the results in each condition; an asterisk marks a missed bound."""
     letters = result_letters(report)
     described = [f"{x}  {name}: {report.measured.get(name, '')}" for name, x in letters.items()]
-    table = Table(
-        title=summary(report),
-        title_justify="left",
-        caption=escape("\n".join([*described, "*  misses its bound"])),
-        caption_justify="left",
-        box=box.SIMPLE_HEAD,
-        padding=(0, 0, 0, 1),
-        pad_edge=False,
-    )
+    headers = "strength", *(f"{letter} " for letter in letters.values()), ""
+    columns = [Column(header, justify="right") for header in headers]
     # A word that is wider than the terminal leaves continues in the next line.
-    table.add_column("condition", overflow="fold")
-    table.add_column("strength", justify="right")
-    for header in (*(f"{letter} " for letter in letters.values()), ""):
-        table.add_column(header, justify="right")
+    table = plain_table(summary(report), Column("condition", overflow="fold"), *columns)
+    table.caption = escape("\n".join([*described, "*  misses its bound"]))
+    table.caption_justify = "left"
     for _, rows in _rows(report.outcomes):
         for i, outcome in enumerate(rows):
             name = escape(outcome.perturbation) if i == 0 else ""

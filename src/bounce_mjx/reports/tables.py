@@ -24,7 +24,7 @@ def count_text(count: float) -> str:
     return f"{count / 1e3:.0f}k" if count >= 1e4 else f"{count:,.0f}"
 
 
-def _plain_table(title: str, *columns: Column | str) -> Table:
+def plain_table(title: str, *columns: Column | str) -> Table:
     """A table without lines, so that the results fit into 80 columns."""
     title, padding = escape(title), (0, 1, 0, 0)
     look = dict(title_justify="left", box=None, pad_edge=False, padding=padding)
@@ -34,7 +34,7 @@ def _plain_table(title: str, *columns: Column | str) -> Table:
 def results_table(report: Report, title: str) -> Table:
     """The results as a table."""
     value = Column("value", justify="right")
-    table = _plain_table(title, "result", "measured", value, "bound", "")
+    table = plain_table(title, "result", "measured", value, "bound", "")
     for result in report.results:
         bound, _, condition = result.bound.partition(" (")
         if result.passed is None:
@@ -55,7 +55,7 @@ def seeds_table(reports: dict[int, Report | None]) -> Table:
     known = [report for report in reports.values() if report is not None]
     headers = "seed", *(result.name for result in known[0].results), "all met"
     columns = [Column(header.replace(" ", "\n"), justify="right") for header in headers]
-    table = _plain_table("best checkpoint of each seed", *columns)
+    table = plain_table("best checkpoint of each seed", *columns)
     for seed, report in reports.items():
         if report is None:
             table.add_row(str(seed), "diverged")

@@ -102,10 +102,7 @@ def read_training(checkpoint: folders.Checkpoint, template: Any) -> tuple[Any, R
       template: shapes and dtypes of the state, as from `jax.eval_shape`.
     """
     if not (checkpoint.folder / TRAINING).is_dir() or _is_old(checkpoint.folder):
-        raise UserError(
-            f"the checkpoint {checkpoint.folder} holds no training state of this version to "
-            "continue from; start a new run with --warm-start"
-        )
+        raise UserError(f"{checkpoint.folder} has no state of this version; use --warm-start")
     record = read_record(checkpoint)
     return _read_arrays(checkpoint, TRAINING, template), record
 
@@ -119,8 +116,7 @@ def read_networks(
     items = [item for item in (NETWORKS, TRAINING) if (checkpoint.folder / item).is_dir()]
     if not items:
         raise UserError(
-            f"the checkpoint {checkpoint.folder} holds a policy without its value network; give "
-            "robust_small, or a run that bounce-mjx train made"
+            f"{checkpoint.folder} is without its value network; give robust_small, or a run"
         )
     size, names = config.env.layout.size, names_of_critic_metrics(config.ppo, Env(config.env))
     networks = make_networks(config.ppo, size, config.env.num_joints, len(names))
@@ -191,9 +187,8 @@ def read_record(checkpoint: folders.Checkpoint) -> Record:
     files = {key for key in ("task", "algorithm") if is_file(getattr(config, key))}
     if differing := differing_keys(run_config, config) - RESUMABLE_KEYS - files - {"env.mjcf"}:
         raise UserError(
-            f"the checkpoint {folder} has a different config from "
-            f"{checkpoint.run / CONFIG_FILE}, which differs in {', '.join(sorted(differing))}; "
-            "restore that file or give another checkpoint"
+            f"{folder} has a different config from {checkpoint.run / CONFIG_FILE}, which differs "
+            f"in {', '.join(sorted(differing))}; restore that file"
         )
     return record
 
@@ -299,15 +294,11 @@ def save_checkpoint(
     folder = (run / folders.CHECKPOINTS).absolute()
     folder.mkdir(exist_ok=True)
     alone = {jax.process_index()}
+    best = keep.BestN(get_metric_fn=_score_in, n=1, keep_checkpoints_without_metrics=False)
     options = ocp.CheckpointManagerOptions(
         # Without it, orbax writes no metrics.
         best_fn=_score_in,
-        preservation_policy=keep.AnyPreservationPolicy(
-            [
-                keep.LatestN(1),
-                keep.BestN(get_metric_fn=_score_in, n=1, keep_checkpoints_without_metrics=False),
-            ]
-        ),
+        preservation_policy=keep.AnyPreservationPolicy([keep.LatestN(1), best]),
         create=False,
         cleanup_tmp_directories=True,
         enable_async_checkpointing=False,

@@ -169,8 +169,7 @@ def load_run_config(
         except (OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or error
             raise UserError(
-                f"{run / ROBOT} is not the robot that {run} was trained with ({reason}); restore "
-                "that folder, or train a new run with --mjcf"
+                f"{run / ROBOT} is not the robot of the training ({reason}); restore that folder"
             ) from error
     return config
 
@@ -186,25 +185,26 @@ def _task_of_run(name: str, run: Path, given: str | None) -> type[Task]:
     Raises:
       UserError: the user has not named the file; or the run has another task.
     """
-    differs = given is not None and not registry.is_same_code(name, given)
-    if not is_file(name):
-        if differs:
-            raise UserError(
-                f"the run {run} was trained with the task {name}, but --task is {given}; leave it "
-                "out"
-            )
-        return find_task(name)
-    if differs:
-        print(
-            f"warning: {given} differs from the task that {run} was trained with; the "
-            f"training's is {name}",
-            file=sys.stderr,
-        )
     if given is not None:
-        registry.admit(name, find_task(given))
-    task = registry.known_task(name)
+        if not registry.is_same_code(name, given):
+            if not is_file(name):
+                raise UserError(f"{run} has the task {name}, and --task is {given}; leave it out")
+            note = f"{given} differs from the task that {run} was trained with, {name}"
+            print(f"warning: {note}", file=sys.stderr)
+        if is_file(name):
+            registry.admit(name, find_task(given))
+    return _task_in(f"the run {run}", name)
+
+
+def _task_in(source: str, name: str) -> type[Task]:
+    """The task that a file or a run names.
+
+    Raises:
+      UserError: there is none, or it is in a file that the user has not named.
+    """
+    task = registry.known_task(name) if is_file(name) else find_task(name)
     if task is None:
-        raise unnamed_code(f"the run {run}", "task", name)
+        raise unnamed_code(source, "task", name)
     return task
 
 
@@ -258,8 +258,7 @@ def read_preset(
     if named is not None and named.robot is not None:
         if robot is not None:
             raise UserError(
-                f"the world {world} is for the robot {named.robot}, and a robot is given too; "
-                "leave --robot out"
+                f"{world} is for the robot {named.robot}, and a robot is given too; leave it out"
             )
         robot = _robot_of(named, world)
     if robot is not None:
@@ -309,12 +308,7 @@ def _robot_for(task: type[Task], robot: Path) -> dict[str, Any]:
     own for an arm with this paddle."""
     values = _read(robot, "robot's config file", f"{ROBOTS}/ur5e.yaml")
     name = values.pop("task", DEFAULT)
-    its_task = registry.known_task(name) if is_file(name) else find_task(name)
-    if its_task is None:
-        raise UserError(
-            f"{robot} is of a task in the file {name}, which is code; adopt the arm again without "
-            "--task"
-        )
+    its_task = _task_in(str(robot), name)
     known = validate(train_config(its_task), values, str(robot)).env
     if issubclass(task, its_task):
         return values
@@ -354,8 +348,7 @@ def preset_files(
     bases = {file: values[BASE] for file in files if BASE in (values := _read(file))}
     if unused := bases.keys() - files[:1]:
         raise UserError(
-            f"{min(unused)} lies on {files[0]}, so its {BASE} is not used; leave it out, or give "
-            "that file first"
+            f"{min(unused)} lies on {files[0]}, so its {BASE} is not used; give it first"
         )
     own = [resource_path(name).resolve() for name in ("configs", PRETRAINED)]
     is_preset = any(files[0].resolve().is_relative_to(folder) for folder in own if files)
@@ -365,8 +358,7 @@ def preset_files(
     presets = [resource_path(f"{folder}/{base}.yaml") for folder in (names, "configs")]
     if not (found := list(filter(os.path.isfile, presets))):
         raise UserError(
-            f"{files[0]}: {BASE} is {shorten(repr(base))}; give the name of a preset in configs/, "
-            "such as cpu, or null"
+            f"{files[0]}: {BASE} is {shorten(repr(base))}; give the name of a preset, or null"
         )
     return [found[0], *files]
 
@@ -397,8 +389,7 @@ def named_file(path: Path, folder: str, kind: str | None = None) -> Path:
     names = sorted(file.stem for file in resource_path(folder).glob("*.yaml"))
     names = [name for name in names if not name.startswith("robustness")]
     raise UserError(
-        f"no {kind} is named {shorten(str(path))}; give one of {', '.join(names)}, or the path of "
-        "a YAML file"
+        f"no {kind} is named {shorten(str(path))}; give one of {', '.join(names)}, or a YAML file"
     )
 
 

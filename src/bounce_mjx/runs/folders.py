@@ -71,8 +71,7 @@ def create_run(config: TrainConfig) -> Path:
     if "[" in str(config.log_dir.absolute()):
         # Its search takes brackets for a pattern.
         raise UserError(
-            f"{config.log_dir.absolute()} has a square bracket, and orbax loses the arrays of "
-            "checkpoints in such a folder; give --log-dir without one"
+            f"{config.log_dir.absolute()} has a square bracket, where orbax loses arrays; rename it"
         )
     # Not the local time, which is another one on another machine, and in autumn goes back.
     stamp = datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d_%H-%M-%S")
@@ -138,10 +137,7 @@ def copy_robot(mjcf: Path, run: Path) -> Path:
     # An absolute path in the copy still leads to the original.
     if outside := set(_files_of(copied)) & set(files):
         shutil.rmtree(folder)
-        raise UserError(
-            f"the MJCF file {mjcf} names {min(outside)} by an absolute path, so that a run could "
-            f"not keep a copy of the robot; name it relative to the folder of {mjcf.name}"
-        )
+        raise UserError(f"{mjcf} names {min(outside)} by an absolute path; give a relative one")
     return copied
 
 
@@ -185,8 +181,7 @@ def lock_run(run: Path) -> Iterator[None]:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
                 raise UserError(
-                    f"{run} is in use by another training process; wait until it ends, or stop it "
-                    "with Ctrl-C or SIGTERM, and resume"
+                    f"{run} is in use by another training process; stop it, or wait for its end"
                 ) from error
         yield
     finally:
@@ -204,10 +199,7 @@ def find_run(path: Path) -> Path:
     for folder in (path, *Path(os.path.abspath(path)).parents):
         if (folder / CONFIG_FILE).is_file():
             return folder
-    raise UserError(
-        f"{path} is not in a run's folder, as there is no {CONFIG_FILE}; give a folder that "
-        "bounce-mjx train made"
-    )
+    raise UserError(f"{path} is not in a run's folder with a {CONFIG_FILE}; give one that is")
 
 
 def named_run(path: Path | None, log_dir: Path) -> Path:
@@ -309,8 +301,7 @@ def _greatest(
 ) -> Checkpoint:
     if not checkpoints:
         raise UserError(
-            f"{place} has no checkpoint, because the first one follows the first evaluation; train "
-            "longer or give another run's folder"
+            f"{place} has no checkpoint, because the first follows an evaluation; train longer"
         )
     return max(checkpoints, key=key)
 

@@ -64,9 +64,8 @@ def join(
     # One that is late is a TimeoutError without a text.
     except Exception as error:
         raise UserError(
-            f"the processes of this training cannot be joined ({reason_of(error)[:200]}); start "
-            "one process per host with --coordinator-address HOST:PORT, --num-processes N and "
-            "--process-id I, from which process 0 can be reached, or raise --host-timeout"
+            f"the processes cannot be joined ({reason_of(error)[:200]}); start each with "
+            "--coordinator-address, --num-processes and --process-id, or raise --host-timeout"
         ) from error
 
 
@@ -89,8 +88,7 @@ def agree(config: TrainConfig, resume: Path | None) -> None:
             if ours != theirs:
                 ours, theirs = (shorten(json.dumps(value)) for value in (ours, theirs))
                 raise UserError(
-                    f"the processes of this training differ in {key}, which is {ours} in process 0 "
-                    f"and {theirs} in process {i}; start all with the same flags"
+                    f"processes 0 and {i} differ in {key}, {ours} and {theirs}; give equal flags"
                 )
 
 

@@ -436,9 +436,8 @@ class Job:
         if self._healthy():
             return
         raise UserError(
-            f"training stopped because it diverged: {self.members[-1].progress.fault}; the last "
-            f"good checkpoint is {self._latest() or 'none'}; start a new run with a lower learning "
-            "rate or other rewards"
+            f"training diverged: {self.members[-1].progress.fault}; the last good checkpoint is "
+            f"{self._latest() or 'none'}; lower the learning rate, or change the rewards"
         )
 
     def _end_save(self, is_last: bool = False) -> None:

@@ -116,11 +116,8 @@ class PPOTrainer:
             compiler_options=compiler_options(tunes_products=True),
         )
         self._run = pool.submit(run.lower(self.state_template).compile)
-        init = jax.jit(
-            self._initial_state,
-            out_shardings=self._sharding,
-            compiler_options=compiler_options(runs_once=True),
-        )
+        options = compiler_options(runs_once=True)
+        init = jax.jit(self._initial_state, out_shardings=self._sharding, compiler_options=options)
         self._init = pool.submit(init.lower(self._seeds).compile)
         return self._run
 
@@ -160,11 +157,9 @@ class PPOTrainer:
         """The policies and the whole state."""
         state = hosts.gather(self.state)
         seeds = each_seed(state, self._config.num_seeds)
-        return Snapshot(
-            [ppo.policy_of(seed, self._observation_size) for seed in seeds],
-            state,
-            [{"params": seed.params, "statistics": seed.statistics} for seed in seeds],
-        )
+        policies = [ppo.policy_of(seed, self._observation_size) for seed in seeds]
+        networks = [{"params": seed.params, "statistics": seed.statistics} for seed in seeds]
+        return Snapshot(policies, state, networks)
 
 
 def episode_steps(config: TrainConfig) -> int:
@@ -192,9 +187,7 @@ def make_mesh(num_devices: int | None, config: PPOConfig, num_seeds: int = 1) ->
             f"({devices[0].device_kind}); choose at most that"
         )
     if jax.process_count() > 1 and num_devices < len(devices):
-        raise UserError(
-            f"num_devices is {num_devices}, but the hosts have {len(devices)} and use all; omit it"
-        )
+        raise UserError(f"num_devices is {num_devices}, but the hosts have {len(devices)}; omit it")
     if num_seeds > 1:
         shared, name, advice = num_seeds, f"num_seeds {num_seeds}", f"a multiple of {num_devices}"
     else:
