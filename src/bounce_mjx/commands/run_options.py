@@ -64,7 +64,7 @@ class ActorCommand(RunCommand):
         if str(path) == MIRROR and not os.path.isdir(path):
             return MIRROR_LAW
         if self.robot is not None:
-            raise UserError("--robot is for the mirror law, and a policy has its own; omit it")
+            raise UserError("--robot is for the mirror law; omit it, or give mirror as checkpoint")
         return choose_checkpoint(path, self.folder)
 
     def config_of(self, checkpoint: "Checkpoint") -> TrainConfig:

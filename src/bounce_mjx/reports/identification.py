@@ -63,10 +63,8 @@ def _describe_fit(found: Identified) -> str:
     where = "in windows that the search had not seen" if found.held_out else "in the log"
     named = " and ".join(f"{error:.3g} ({name})" for name, error in errors.items())
     wider = "" if misfit(found) == 1.0 else " The intervals are widened by the excess."
-    return html.escape(
-        f"the world's errors {where} are {named} times the sensors' noise; 1 is a perfect world."
-        + wider
-    )
+    fit = f"the world's errors {where} are {named} times the sensors' noise; 1 is perfect."
+    return html.escape(fit + wider)
 
 
 def _advise(has_doubts: bool, world: Path) -> str:
@@ -74,10 +72,7 @@ def _advise(has_doubts: bool, world: Path) -> str:
     name = html.escape(str(world))
     train = "bounce-mjx train --warm-start robust_small --config finetune --world"
     if has_doubts:
-        return (
-            "do not train with this world yet: look at the warnings at the end of this page, and "
-            "identify again."
-        )
+        return "do not train with this world yet: heed the warnings below, and identify again."
     return (
         f"adapt a policy with <code>{train} {name}</code>, and check the robot later with "
         f"<code>bounce-mjx identify LOG --check {name}</code>."

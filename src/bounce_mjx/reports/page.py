@@ -82,10 +82,8 @@ after {results.best_steps:,} of {results.trained_steps:,} environment steps, on 
 {table(["result", "measured", "value", "bound", ""], map(result_cells, report.results))}
 <h2>The policy in its first recorded episode</h2>
 <iframe title="Replay" src="{data_url("text/html", replay.encode())}"></iframe>
-<p>In the learning curves, lines are the training, whose actions are sampled around the policy's
-(exploration); points are evaluations, whose actions are not. Errors rise first: the policy tries
-more before it knows how far each action goes, and its sampled actions scatter most at the start.
-</p>
+<p>In the learning curves, lines are the training, whose actions are sampled (exploration); points
+are evaluations, whose actions are not. Errors rise first: sampled actions scatter most then.</p>
 {figures_html(drawn)}
 <h2>Where the time went</h2>
 {table(["phase", "seconds"], phases)}

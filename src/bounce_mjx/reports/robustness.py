@@ -37,8 +37,7 @@ def load_robustness(folder: Path) -> RobustnessReport | None:
     Raises:
       UserError: the file is damaged.
     """
-    remedy = "delete it, or write it again with bounce-mjx robustness"
-    return read_stored(folder / ROBUSTNESS_FILE, RobustnessReport, remedy)
+    return read_stored(folder / ROBUSTNESS_FILE, RobustnessReport)
 
 
 def summary(report: RobustnessReport) -> str:

@@ -36,11 +36,8 @@ def to_json(data: Any) -> str:
     return json.dumps(to_plain(data), indent=2) + "\n"
 
 
-def read_stored(path: Path, model: type[ModelT], remedy: str) -> ModelT | None:
+def read_stored(path: Path, model: type[ModelT]) -> ModelT | None:
     """The content of a JSON file that a command wrote; None if there is none.
-
-    Args:
-      remedy: the end of the error.
 
     Raises:
       UserError: the file is damaged.
@@ -52,7 +49,7 @@ def read_stored(path: Path, model: type[ModelT], remedy: str) -> ModelT | None:
     # One of pydantic's is a ValueError.
     except (OSError, ValueError) as error:
         reason = shorten(reason_of(error), 200)
-        raise UserError(f"{path} is damaged ({reason}); {remedy}") from error
+        raise UserError(f"{path} is damaged ({reason}); delete it to continue") from error
 
 
 @contextlib.contextmanager

@@ -94,4 +94,4 @@ def load_results(run: Path) -> Results | None:
     Raises:
       UserError: the file is damaged.
     """
-    return read_stored(run / RESULTS_FILE, Results, "delete it to continue without it")
+    return read_stored(run / RESULTS_FILE, Results)

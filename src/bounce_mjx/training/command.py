@@ -70,7 +70,7 @@ class Start(StrictModel):
     def _warm(self, machine: Path | None) -> TrainConfig:
         """The environment and the networks of a policy, and the other settings of a preset."""
         if self.robot:
-            raise UserError("--warm-start trains the policy's own robot on; leave --robot out")
+            raise UserError("--warm-start and --robot cannot be combined; leave --robot out")
         from bounce_mjx.runs.checkpoints import NETWORK_KEYS
         from bounce_mjx.runs.folders import choose_checkpoint
 
@@ -87,7 +87,7 @@ class Start(StrictModel):
     def _resumed(self) -> TrainConfig:
         for flag in ("config", "robot", "world"):
             if getattr(self, flag):
-                raise UserError(f"--resume keeps the run's config; leave --{flag} out")
+                raise UserError(f"--{flag} and --resume cannot be combined; leave one out")
         run = self.run
         base = run_configs.load_run_config(run, self.task, self.algorithm)
         for key in ("task", "algorithm"):

@@ -153,11 +153,10 @@ class Job:
         # Before, a signal ends the process by its default action.
         self.stop = self.stack.enter_context(StopRequest())
         config = self.config
-        if self.resume is None:
+        self.run = self.resume
+        if self.run is None:
             made = str(folders.create_run(config)) if hosts.is_leader() else None
             self.run = Path(hosts.exchange(made)[0])
-        else:
-            self.run = self.resume
         self.stack.push(self._remove_unstarted)
         if hosts.is_leader():
             self.stack.enter_context(folders.lock_run(self.run))
@@ -184,9 +183,8 @@ class Job:
                 folder.mkdir(exist_ok=True)
                 folders.save_config(folder, own)
         mesh = self.trainer.mesh
-        self.device = mesh.devices.flat[0].device_kind
-        if mesh.size > 1:
-            self.device = f"{mesh.size} x {self.device}"
+        count = f"{mesh.size} x " if mesh.size > 1 else ""
+        self.device = f"{count}{mesh.devices.flat[0].device_kind}"
         self.say(f"physics: {self.env.engine.name} ({self.env.engine.reason})")
         for term in config.env.unseen_noise:
             self.say(f"warning: the policy does not see what {term} changes")

@@ -182,18 +182,14 @@ def make_mesh(num_devices: int | None, config: PPOConfig, num_seeds: int = 1) ->
     if num_devices is None:
         num_devices = 1 if jax.process_count() == 1 else len(devices)
     if num_devices > len(devices):
-        raise UserError(
-            f"num_devices is {num_devices}, but there are {len(devices)} "
-            f"({devices[0].device_kind}); choose at most that"
-        )
+        raise UserError(f"num_devices is {num_devices}, but there are {len(devices)}; choose fewer")
     if jax.process_count() > 1 and num_devices < len(devices):
         raise UserError(f"num_devices is {num_devices}, but the hosts have {len(devices)}; omit it")
     if num_seeds > 1:
         shared, name, advice = num_seeds, f"num_seeds {num_seeds}", f"a multiple of {num_devices}"
     else:
         shared, name = ppo.num_groups(config), f"num_envs {config.num_envs}"
-        multiple = f"a multiple of {num_devices} * num_minibatches as num_envs"
-        advice = f"a power of two as num_devices, and {multiple}"
+        advice = "a power of two as num_devices and as num_envs"
     if shared % num_devices:
         raise UserError(f"{name} cannot be divided among {num_devices} devices; choose {advice}")
     return Mesh(devices[:num_devices], (_AXIS,))
