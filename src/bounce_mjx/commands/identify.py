@@ -59,9 +59,8 @@ def main(args: Sequence[str]) -> None:
         validate(type(config), config.model_dump() | {"randomization": ranges}, str(command.check))
     model = load_model(config.mjcf, config.physics_dt, visual=False, robot=config.robot)
     names = joint_names(model)
-    log = join(
-        [read_log(path, model, command.topics, command.joint_names) for path in command.logs]
-    )
+    logs = [read_log(path, model, command.topics, command.joint_names) for path in command.logs]
+    log = join(logs)
     for warning in log.notes:
         print(f"warning: {warning}")
     set_up_jax(config)

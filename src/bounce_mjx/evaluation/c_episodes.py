@@ -1,7 +1,6 @@
 """Evaluation on MuJoCo's C engine: the same task and policy, with the physics in threads."""
 
 import os
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -10,11 +9,10 @@ import numpy as np
 from mujoco import rollout
 
 from bounce_mjx.env.env import Env, EnvState, State, world_model
-from bounce_mjx.evaluation.episodes import Batch, add_step, begin, reset_episodes
-from bounce_mjx.evaluation.statistics import Statistics
+from bounce_mjx.evaluation.episodes import Batch, Evaluator, add_step, begin, reset_episodes
+from bounce_mjx.evaluation.statistics import Measured
 from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, edited_model, servo_targets
-from bounce_mjx.task.shown import Recording
 from bounce_mjx.world.actuation import Actuation
 from bounce_mjx.world.randomization import Ranges
 
@@ -24,9 +22,7 @@ _CTRL_AND_FORCE = _CTRL | mujoco.mjtState.mjSTATE_XFRC_APPLIED
 _NUM_THREADS = os.cpu_count() or 1
 
 
-def make_mujoco_evaluator(
-    env: Env, actor: Actor, episodes: int, recorded: int = 0
-) -> Callable[..., tuple[Statistics, Recording]]:
+def make_mujoco_evaluator(env: Env, actor: Actor, episodes: int, recorded: int = 0) -> Evaluator:
     """Like `evaluation.make_evaluator`, with `mj_step` (float64) in place of the env's engine.
 
     Each episode is simulated in the world that its reset drew.
@@ -50,9 +46,7 @@ def make_mujoco_evaluator(
         halves = now.states, actions, actuation, physics
         return add_step(env, now, jax.vmap(env.finish_step, in_axes=-1, out_axes=-1)(*halves))
 
-    def evaluate(
-        policy: Policy, key: jax.Array, ranges: Ranges | None = None
-    ) -> tuple[Statistics, Recording]:
+    def evaluate(policy: Policy, key: jax.Array, ranges: Ranges | None = None) -> Measured:
         now = start(key, ranges)
         with rollout.Rollout(nthread=_NUM_THREADS) as pool:
             physics = _Physics(env, now.states.pipeline_state, pool)

@@ -8,9 +8,13 @@ import jax.numpy as jnp
 
 from bounce_mjx.env.env import Env, State
 from bounce_mjx.evaluation import statistics
+from bounce_mjx.evaluation.statistics import Measured
 from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.task.shown import Recording
 from bounce_mjx.world.randomization import Ranges
+
+Evaluator = Callable[..., Measured]
+"""Measures E deterministic episodes from a policy, a key and optional ranges."""
 
 
 class Batch(NamedTuple):
@@ -23,30 +27,21 @@ class Batch(NamedTuple):
     """Control steps so far [], int32."""
 
 
-def make_evaluator(
-    env: Env, actor: Actor, episodes: int, recorded: int = 0
-) -> Callable[..., tuple[statistics.Statistics, Recording]]:
-    """A jitted function (policy, key, ranges) -> statistics of `episodes` deterministic episodes,
-    each from its own reset (`reset_episodes`), and a recording of the first `recorded`. It stops
-    when all episodes have ended or their time limit is reached. The ranges are optional."""
+def make_evaluator(env: Env, actor: Actor, episodes: int, recorded: int = 0) -> Evaluator:
+    """A jitted evaluation of `episodes` episodes, each from its own reset (`reset_episodes`), with
+    a recording of the first `recorded`. It stops when all episodes have ended or their time limit
+    is reached."""
 
-    def evaluate(
-        policy: Policy, key: jax.Array, ranges: Ranges | None = None
-    ) -> tuple[statistics.Statistics, Recording]:
+    def evaluate(policy: Policy, key: jax.Array, ranges: Ranges | None = None) -> Measured:
         states = reset_episodes(env, key, episodes, ranges)
         return run_episodes(env, actor, policy, states, recorded)
 
     return jax.jit(evaluate)
 
 
-def run_episodes(
-    env: Env, actor: Actor, policy: Policy, states: State, recorded: int
-) -> tuple[statistics.Statistics, Recording]:
+def run_episodes(env: Env, actor: Actor, policy: Policy, states: State, recorded: int) -> Measured:
     """Runs one deterministic episode from each of E initial states (batch last), until all have
-    ended or their time limit is reached.
-
-    Returns: The statistics of all episodes, and a recording of the first `recorded`.
-    """
+    ended or their time limit is reached, and records the first `recorded`."""
     first = begin(env, states, recorded)
     last = run_until(env, actor, policy, first, env.config.episode_steps)
     return last.statistics, last.recording

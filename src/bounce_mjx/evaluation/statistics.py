@@ -28,6 +28,10 @@ class Statistics(NamedTuple):
     """Sums and greatest values of what the task tallies, each [E]."""
 
 
+Measured = tuple[Statistics, Recording]
+"""Statistics of all episodes of an evaluation, and a recording of the first ones."""
+
+
 def moment(env: Env, state: State, step: jax.Array) -> Moment:
     """One environment after the control step with this index [], from 0."""
     now = state.pipeline_state

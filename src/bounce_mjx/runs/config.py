@@ -340,10 +340,8 @@ def preset_files(
       UserError: a file is missing or invalid, or names a base that is not used.
     """
     given = [path] if isinstance(path, Path) else list(path or ())
-    if task is None:
-        own = [_read(file) for file in given if os.path.exists(file)]
-        task = next((values["task"] for values in reversed(own) if "task" in values), DEFAULT)
-    names = f"configs/{task}"
+    known = functools.reduce(merged, map(_read, filter(os.path.exists, given)), {})
+    names = f"configs/{task or known.get('task', DEFAULT)}"
     files = [named_file(named_file(file, names), "configs", "preset") for file in given]
     bases = {file: values[BASE] for file in files if BASE in (values := _read(file))}
     if unused := bases.keys() - files[:1]:

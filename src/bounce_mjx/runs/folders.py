@@ -27,9 +27,9 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import bounce_mjx
 from bounce_mjx.config.files import dump_config
@@ -239,7 +239,7 @@ def find_checkpoint(path: Path) -> Checkpoint:
 
 def latest_checkpoint(run: Path) -> Checkpoint:
     """Newest checkpoint of a run, from which its training resumes."""
-    return _greatest(stored_checkpoints(run), lambda x: x.steps, run)
+    return max(_checkpoints_in(run, run), key=lambda x: x.steps)
 
 
 def best_checkpoint(run: Path, place: Path | None = None) -> Checkpoint:
@@ -248,9 +248,7 @@ def best_checkpoint(run: Path, place: Path | None = None) -> Checkpoint:
     Args:
       place: folder of the run in which it lies.
     """
-    place = Path(os.path.abspath(place or run))
-    inside = [x for x in stored_checkpoints(run) if x.folder.is_relative_to(place)]
-    return _greatest(inside, lambda x: (_score(x.folder), x.steps), place)
+    return max(_checkpoints_in(run, place or run), key=lambda x: (_score(x.folder), x.steps))
 
 
 def pretrained_checkpoint(name: str = PRETRAINED) -> Checkpoint:
@@ -296,14 +294,15 @@ def stored_checkpoints(run: Path) -> list[Checkpoint]:
     return [Checkpoint(run, path, int(path.name)) for path in paths if path.is_dir()]
 
 
-def _greatest(
-    checkpoints: list[Checkpoint], key: Callable[[Checkpoint], Any], place: Path
-) -> Checkpoint:
-    if not checkpoints:
+def _checkpoints_in(run: Path, place: Path) -> list[Checkpoint]:
+    """The checkpoints of a run in one of its folders, at least one."""
+    place = Path(os.path.abspath(place))
+    inside = [x for x in stored_checkpoints(run) if x.folder.is_relative_to(place)]
+    if not inside:
         raise UserError(
             f"{place} has no checkpoint, because the first follows an evaluation; train longer"
         )
-    return max(checkpoints, key=key)
+    return inside
 
 
 def _score(folder: Path) -> tuple[float, ...]:

@@ -347,11 +347,10 @@ class Job:
         evaluated = [one for one in each if one[0].progress.fault is None]
         judged = [report for _, report, _ in evaluated]
         self.say(events.evaluation_line(self.config.num_seeds, self.steps, judged))
-        for member, report, policy in evaluated:
-            self._tell(member, events.points_of(report), report=report, policy=policy)
         seconds, scores = sum(self.seconds.values()), {}
         self._end_save()
         for member, report, policy in evaluated:
+            self._tell(member, events.points_of(report), report=report, policy=policy)
             is_best = member.progress.improves(report, self.steps, seconds)
             if is_best:
                 member.best_policy = policy
