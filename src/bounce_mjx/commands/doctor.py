@@ -63,10 +63,9 @@ def version_of(package: str) -> str | None:
 
 def extras() -> dict[str, list[str]]:
     """The packages of each extra; none where the package runs without being installed."""
-    try:
-        names = importlib.metadata.metadata(_DISTRIBUTION).get_all("Provides-Extra", [])
-    except importlib.metadata.PackageNotFoundError:
+    if version_of(_DISTRIBUTION) is None:
         return {}
+    names = importlib.metadata.metadata(_DISTRIBUTION).get_all("Provides-Extra", [])
     return {extra: list(_packages(_DISTRIBUTION, extra)) for extra in names}
 
 

@@ -141,10 +141,7 @@ def parse_with_commands(
 
     def values(env: WorldConfig) -> dict[str, float]:
         for name in given.keys() - env.commands.keys():
-            raise UserError(
-                f"{flag_of(name)} is not a command of the run's task; it has "
-                f"{', '.join(map(flag_of, env.commands)) or 'none'}"
-            )
+            raise UserError(f"{flag_of(name)} is not a command of the run's task; omit it")
         return {name: env.commands[name].checked(x, flag_of(name)) for name, x in given.items()}
 
     return command, values

@@ -9,9 +9,9 @@ from pydantic import Field
 
 from bounce_mjx.config.command_line import Flag, parse
 from bounce_mjx.config.files import differing_keys
-from bounce_mjx.config.settings import Count, NonNegativeInt, Steps, StrictModel, merged
+from bounce_mjx.config.settings import Count, NonNegativeInt, Steps, StrictModel, merged, nested
 from bounce_mjx.config.validation import validate
-from bounce_mjx.errors import UserError, suggest
+from bounce_mjx.errors import UserError
 from bounce_mjx.resources import POLICIES
 from bounce_mjx.runs import config as run_configs
 from bounce_mjx.runs.config import TrainConfig
@@ -149,14 +149,10 @@ def changed(base: TrainConfig, settings: dict[str, Any]) -> TrainConfig:
       UserError: a key is unknown or a value is out of range.
     """
     values = base.model_dump()
-    known = [*values, *values["ppo"], *values["env"]]
     for key, value in settings.items():
-        if key not in known:
-            advice = suggest(key, known) or "see docs/config.md"
-            raise UserError(f"train: unknown setting {key}; {advice}")
-        groups = [group for group in ("ppo", "env") if key in values[group]]
-        nested = {groups[0]: {key: value}} if groups and key not in values else {key: value}
-        values = merged(values, nested)
+        groups = [group for group in ("ppo", "env") if key in values[group] and key not in values]
+        place = f"{groups[0]}.{key}" if groups else key
+        values = merged(values, nested(place, value))
     return validate(type(base), values, "train")
 
 

@@ -29,8 +29,7 @@ def fault_of(metrics: Metrics, config: TrainConfig) -> str | None:
         if wrong.any(axis=1).all():
             return (
                 f"the reward term {name.removeprefix('reward/')} is {values[wrong][0]:.3g} on "
-                f"average, not within {MAX_REWARD:g} after ppo.reward_scale; check the unit of its "
-                "settings and of those of the robot"
+                f"average, not within {MAX_REWARD:g} after ppo.reward_scale; check its units"
             )
     ended = metrics["episode/ended"].sum(axis=1)
     limit = config.ppo.training_episode_seconds or config.env.episode_seconds

@@ -1,8 +1,7 @@
 """Training on several hosts, with one process per host (or per device). Process 0 is the leader.
 
 Every process runs the same program on its shard of the environments. Only the leader decides, reads
-and writes; the others receive its decisions (`exchange`) and send their shards of the state
-(`gather`).
+and writes; the others receive its decisions (`exchange`) and send their shards of the state.
 """
 
 import contextlib
@@ -17,7 +16,6 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 from jax._src import distributed
-from jax.experimental import multihost_utils
 from jax.sharding import Sharding
 
 from bounce_mjx.config.files import flat
@@ -126,12 +124,6 @@ def any_of(flag: bool) -> bool:
     """Whether the flag is set in any process. Every process must call this at the same point; there
     it waits for the others without a time limit."""
     return any(exchange(flag))
-
-
-def gather(tree: Tree) -> Tree:
-    """A pytree of arrays that are sharded over devices of several hosts, as whole NumPy arrays in
-    every process."""
-    return multihost_utils.process_allgather(tree, tiled=True)
 
 
 def distribute(tree: Tree, shardings: Any) -> Tree:

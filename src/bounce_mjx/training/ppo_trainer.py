@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from bounce_mjx.env.env import Env
@@ -133,7 +134,7 @@ class PPOTrainer:
         if state is None:
             self.state = jax.block_until_ready(self._init.result()(self._seeds))
         if networks is not None:
-            state = hosts.gather(self.state)
+            state = multihost_utils.process_allgather(self.state, tiled=True)
             own = state.params, state.statistics
             params, statistics = jax.tree.map(
                 lambda old, new: np.broadcast_to(new, old.shape), own, networks
@@ -154,8 +155,8 @@ class PPOTrainer:
         return {name: np.asarray(x).reshape(shape) for name, x in metrics.items()}
 
     def snapshot(self) -> Snapshot:
-        """The policies and the whole state."""
-        state = hosts.gather(self.state)
+        """The policies and the whole state, in every process."""
+        state = multihost_utils.process_allgather(self.state, tiled=True)
         seeds = each_seed(state, self._config.num_seeds)
         policies = [ppo.policy_of(seed, self._observation_size) for seed in seeds]
         networks = [{"params": seed.params, "statistics": seed.statistics} for seed in seeds]
