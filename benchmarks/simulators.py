@@ -609,7 +609,7 @@ def evaluate(
 ) -> tuple[Report, np.ndarray]:
     """Results of a shipped policy in a simulator, over episodes of the task's time limit, and the
     positions [T, nq] of the first episode."""
-    config = load_run_config(resource_path(POLICIES[policy])).env
+    config = load_run_config(resource_path(POLICIES.get(policy, policy))).env
     env = Env(config.model_copy(update={"randomization": RandomizationConfig()}))
     addresses = env.addresses
     arm_qpos, arm_qvel = list(addresses.arm_qpos), list(addresses.arm_qvel)
@@ -654,7 +654,7 @@ def evaluate(
 def record_logs(policy: str, name: str, world: World, folder: Path) -> None:
     """Writes the logs for `bounce-mjx identify`: the arm in the motion of `bounce-mjx excite`
     (arm.csv), and the policy, with a new target height every 3 s (ball.csv)."""
-    config = load_run_config(resource_path(POLICIES[policy])).env
+    config = load_run_config(resource_path(POLICIES.get(policy, policy))).env
     env, acting = Env(config), load_policy(policy)
     joints, home = acting.metadata.joint_names, np.array(acting.metadata.default_joint_angles)
     dt = acting.metadata.control_dt

@@ -6,7 +6,6 @@ from typing import Annotated
 
 from bounce_mjx.commands.run_options import RunCommand
 from bounce_mjx.config.command_line import Flag, parse
-from bounce_mjx.errors import UserError
 
 
 class ExportCommand(RunCommand):
@@ -17,15 +16,13 @@ class ExportCommand(RunCommand):
     policy that comes with the package: pretrained, robust, robust_small, or the name of a task or
     an arm. The default is the newest run, or the task's policy in the package if there is no
     run."""
-    onnx: Path | None = None
+    onnx: Path = Path("policy.onnx")
     """ONNX file to write: normaliser, network and clipping in one graph, and metadata."""
 
 
 def main(args: Sequence[str]) -> None:
     """Runs the command line."""
     command = parse(ExportCommand, args, prog="bounce-mjx export")
-    if command.onnx is None:
-        raise UserError("there is no file to write; give --onnx FILE")
     from bounce_mjx.deploy.export import export_onnx
     from bounce_mjx.runs.files import check_output, write_output
     from bounce_mjx.runs.folders import choose_checkpoint

@@ -88,7 +88,8 @@ def block_line(
         spread = f" +- {np.std(values):{form}}" if len(values) > 1 else ""
         if values:
             line += f"  {tag.rpartition('/')[2]} {np.mean(values):{form}}{spread}"
-    return f"{line}  {seconds:.1f} s, {'at most ' * config.stop_when_solved}{left:.0f} s left"
+    line += f"  {seconds:.1f} s"
+    return f"{line}, {'at most ' * config.stop_when_solved}{left:.0f} s left" if left else line
 
 
 def evaluation_line(num_seeds: int, steps: int, reports: Sequence[Report]) -> str:

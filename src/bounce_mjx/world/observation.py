@@ -60,7 +60,8 @@ class ObservationConfig(StrictModel):
     former = {"position": "measured"}
 
     joint_angles: Annotated[History, Quantity(None, "rad", "state")] = 1
-    """Measured positions of the acting joints."""
+    """Measured positions of the acting joints: 0 leaves them out, and N shows the last N. So do the
+    numbers of the other quantities."""
     ball_position: Annotated[History, Quantity(3, "m", "state", True)] = 1
     """Measured position of the ball."""
     ball_quaternion: Annotated[History, Quantity(4, "", "state", True)] = 1
