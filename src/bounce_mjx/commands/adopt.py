@@ -15,8 +15,6 @@ from bounce_mjx.runs.config import train_config
 from bounce_mjx.tasks.registry import DEFAULT, find_task
 from bounce_mjx.world.config import WorldConfig
 
-DEFAULT_SITE = "attachment_site"
-
 
 class AdoptCommand(StrictModel):
     """Finds the start pose and the servos of an arm, and writes its config."""
@@ -24,7 +22,7 @@ class AdoptCommand(StrictModel):
     mjcf: Annotated[Path, Flag(metavar="MJCF", is_positional=True)]
     """MJCF file of the arm; package:NAME/FILE for a file of an installed Python package, or
     menagerie:NAME for a model of MuJoCo Menagerie."""
-    site: str = DEFAULT_SITE
+    site: str = "attachment_site"
     """Site or body that holds the paddle; its z points away from the arm."""
     joints: tuple[str, ...] | None = None
     """Acting joints; all hinges and slides from the world to the site by default."""
@@ -73,7 +71,6 @@ def main(args: Sequence[str]) -> None:
     write_output(out, f"# {head}\n{text}")
     print(f"config: {out}")
     named = [] if command.task == DEFAULT else ["--task", command.task]
-    flags = [*named, "--robot", str(out)]
-    shown = shlex.join([*flags, "--actions", "zero"])
-    print(f"see it: bounce-mjx view {shown}")
-    print(f"train it: bounce-mjx train {shlex.join(flags)}")
+    flags = shlex.join([*named, "--robot", str(out)])
+    print(f"see it: bounce-mjx view {flags} --actions zero")
+    print(f"train it: bounce-mjx train {flags}")

@@ -14,7 +14,6 @@ from bounce_mjx.reports.html_page import figures_html, page, table
 
 # Windows of the arm alone, and of a bounce.
 _NUM_WINDOWS = 2
-_TRACES = "Measured (dots) and simulated (lines)"
 
 
 def identification_page(
@@ -40,7 +39,7 @@ def identification_page(
     caveats = sentences(found, joint_names)
     doubts = [text for text in caveats if text.startswith(("warning:", "The model does not"))]
     said = "".join(f"<li>{html.escape(text)}</li>\n" for text in caveats or ["Nothing."])
-    figures = {_TRACES: traces_figure(found, joint_names)}
+    figures = {"Measured (dots) and simulated (lines)": traces_figure(found, joint_names)}
     body = f"""<h1>Identified from {html.escape(source)}</h1>
 <p><b>Found:</b> the log shows {seen} of {len(listed)} quantities of the robot's world, each
 below with the interval that contains it with 95% probability.</p>

@@ -82,9 +82,8 @@ def agree(config: TrainConfig, resume: Path | None) -> None:
     first, *others = map(flat, exchange(plain))
     for i, other in enumerate(others, start=1):
         for key in sorted(first.keys() | other.keys()):
-            ours, theirs = first.get(key), other.get(key)
-            if ours != theirs:
-                ours, theirs = (shorten(json.dumps(value)) for value in (ours, theirs))
+            if first.get(key) != other.get(key):
+                ours, theirs = (shorten(json.dumps(given.get(key))) for given in (first, other))
                 raise UserError(
                     f"processes 0 and {i} differ in {key}, {ours} and {theirs}; give equal flags"
                 )
