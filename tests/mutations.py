@@ -130,7 +130,8 @@ def status(folder: Path, tests: list[str]) -> int:
     names = sorted({f"tests/{file}" for file in files})
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-n", "0", *names]
     command += ["-k", " or ".join(sorted(set(keywords)))]
-    environment = os.environ | {"PYTHONPATH": str(folder / "src")}
+    path = os.pathsep.join([str(folder / "src"), os.environ.get("PYTHONPATH", "")])
+    environment = os.environ | {"PYTHONPATH": path}
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True).returncode
 
 
