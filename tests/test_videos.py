@@ -23,8 +23,7 @@ from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import pretrained_checkpoint
 from bounce_mjx.training.events import Event
 from bounce_mjx.training.video import EvaluationVideo
-from bounce_mjx.viewers import offscreen, show
-from bounce_mjx.viewers.browser import LivePage
+from bounce_mjx.viewers import browser, offscreen, show
 from bounce_mjx.viewers.offscreen import choose_backend
 from bounce_mjx.viewers.video import VideoWriter, find_ffmpeg
 
@@ -181,8 +180,7 @@ def test_policies_given_together_are_named_and_have_one_world(monkeypatch) -> No
 
     shown = []
     monkeypatch.setattr(show, "Simulation", Named)
-    monkeypatch.setattr(LivePage, "__init__", lambda _, server, *given: shown.append(given))
-    monkeypatch.setattr(LivePage, "run", lambda *_: None)
+    monkeypatch.setattr(browser, "run_page", lambda _, *given: shown.append(given[:2]))
     both_play = "pretrained robust --viewer browser --num-envs 4".split()
     play.main(both_play)
     play.main([*both_play, "--randomization.action-latency", "0.0", "0.02"])

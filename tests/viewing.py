@@ -154,7 +154,8 @@ def served(simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> Iterator[
 
     def serve() -> None:
         try:
-            show._page(options, Console(file=printed))(simulation, PageStart("exp[lr] <b>"))
+            start = PageStart("exp[lr] <b>")
+            show._serve(lambda: simulation, start, options, Console(file=printed))
         except BaseException as error:
             failures.append(error)
 

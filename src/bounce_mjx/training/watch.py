@@ -14,7 +14,7 @@ from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.learning.policy import make_networks, untrained_policy
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training.events import Event, evaluation_line, say
-from bounce_mjx.viewers.browser import LivePage, free_port
+from bounce_mjx.viewers.browser import free_port, run_page
 from bounce_mjx.viewers.guard import open_server
 from bounce_mjx.viewers.options import Address, PageStart
 from bounce_mjx.viewers.simulation import Simulation, make_policy_controller
@@ -66,8 +66,8 @@ class TrainingPage:
                     waiting = _text("no evaluation yet; the arm is untrained")
                     self._results = server.gui.add_html(waiting)
                 simulation = _simulate(self._config)
-                page = LivePage(server, simulation, PageStart("training"), side)
-                page.run(None, lambda: self._tell(simulation))
+                start = PageStart("training")
+                run_page(server, simulation, start, lambda: self._tell(simulation), side=side)
         # The training continues without its page.
         except Exception as error:
             reason = reason_of(error)

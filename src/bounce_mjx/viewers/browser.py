@@ -42,66 +42,62 @@ def _window_title(title: str) -> str:
     return f'<img src="data:," alt="" hidden onerror="{script}">'
 
 
-class LivePage:
-    """A simulation in real time on a server."""
+def run_page(
+    server: viser.ViserServer,
+    simulation: Simulation,
+    start: PageStart,
+    is_over: Callable[[], object],
+    seconds: float | None = None,
+    side: viser.PanelHandle | None = None,
+) -> None:
+    """Builds the page of a simulation, steps it in real time, and sends pictures and plots.
 
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        simulation: Simulation,
-        start: PageStart,
-        side: viser.PanelHandle | None = None,
-    ):
-        """
-        Args:
-          side: the left panel, if it has tabs already.
-        """
-        self._server = server
-        self._simulation = simulation
-        gui = server.gui
-        gui.configure_theme(
-            show_logo=False, show_share_button=False, control_width="medium",
-            brand_color=(230, 95, 20),
-        )  # fmt: skip
-        gui.set_panel_label("bounce_mjx")
-        gui.main_panel.dock_right()
-        gui.main_panel.set_width(280)
-        gui.add_html(_window_title(f"bounce_mjx: {start.title}"))
-        self._controls = Controls(gui, simulation, start)
-        self._scene = Scene(server, simulation.env, start.num_shown, start.names)
-        self._history: collections.deque[EnvFrame] = collections.deque(
-            maxlen=round(_PLOT_SECONDS / simulation.env.dt)
+    Args:
+      is_over: called between two pictures; whether to stop.
+      seconds: simulated time; None for no end.
+      side: the left panel, if it has tabs already.
+    """
+    gui = server.gui
+    gui.configure_theme(
+        show_logo=False, show_share_button=False, control_width="medium",
+        brand_color=(230, 95, 20),
+    )  # fmt: skip
+    gui.set_panel_label("bounce_mjx")
+    gui.main_panel.dock_right()
+    gui.main_panel.set_width(280)
+    gui.add_html(_window_title(f"bounce_mjx: {start.title}"))
+    controls = Controls(gui, simulation, start)
+    scene = Scene(server, simulation.env, start.num_shown, start.names)
+    side = side or gui.add_panel()
+    side.dock_left()
+    side.set_width(300)
+    with side.add_tab("robot 1" if start.names is None else start.names[0], viser.Icon.CHART_LINE):
+        plots = _Plots(gui, simulation.env, simulation.frame)
+    next_plot = 0.0
+    for frames in in_real_time(simulation, seconds, controls.pace):
+        if is_over():
+            break
+        controls.apply()
+        if controls.num_shown != scene.num_envs:
+            scene.show(controls.num_shown)
+        plots.history.extend(frames)
+        scene.update(frames or [simulation.frame])
+        if frames and time.monotonic() >= next_plot:
+            plots.update()
+            controls.show_values()
+            next_plot = time.monotonic() + 1.0 / _PLOT_RATE
+    server.flush()
+
+
+class _Plots:
+    """The heights and the reward terms of the first environment."""
+
+    def __init__(self, gui: viser.GuiApi, env: Env, frame: EnvFrame):
+        self._env = env
+        self.history: collections.deque[EnvFrame] = collections.deque(
+            maxlen=round(_PLOT_SECONDS / env.dt)
         )
-        side = side or gui.add_panel()
-        side.dock_left()
-        side.set_width(300)
-        self._add_plots(side, "robot 1" if start.names is None else start.names[0])
-
-    def run(self, seconds: float | None, is_over: Callable[[], object] = lambda: False) -> None:
-        """Steps the simulation and sends pictures and plots.
-
-        Args:
-          seconds: simulated time; None for no end.
-          is_over: called between two pictures; whether to stop.
-        """
-        simulation, controls, scene = self._simulation, self._controls, self._scene
-        next_plot = 0.0
-        for frames in in_real_time(simulation, seconds, controls.pace):
-            if is_over():
-                break
-            controls.apply()
-            if controls.num_shown != scene.num_envs:
-                scene.show(controls.num_shown)
-            self._history.extend(frames)
-            scene.update(frames or [simulation.frame])
-            if frames and time.monotonic() >= next_plot:
-                self._update_plots()
-                controls.show_values()
-                next_plot = time.monotonic() + 1.0 / _PLOT_RATE
-        self._server.flush()
-
-    def _add_plots(self, side: viser.PanelHandle, title: str) -> None:
-        gui, frame = self._server.gui, self._simulation.frame
+        """The last frames."""
         levels = [
             {"label": name, "stroke": colour, "width": 2, "dash": [6, 4]}
             for name, colour in zip(self._levels(frame), itertools.cycle(_LEVEL_COLOURS))
@@ -114,31 +110,30 @@ class LivePage:
             *levels,
             {"label": "paddle", "stroke": "#1c7ed6", "width": 2},
         ]
-        with side.add_tab(title, viser.Icon.CHART_LINE):
-            gui.add_markdown("height, m, over the last seconds")
-            self._heights = gui.add_uplot(
-                (np.zeros(1),) * len(lines),
-                tuple(lines),
-                axes=({**AXIS, "size": 30}, {**AXIS, "size": 40}),
-                scales={"x": {"time": False}, "y": {"range": (0.0, 1.05)}},
-                legend={"live": False},
-                height=190,
-            )
-            gui.add_markdown("reward, by term")
-            self._terms = gui.add_html(reward_bars(dict.fromkeys(_reward_terms(frame), 0.0)))
-            gui.add_html(_legend(self._simulation.env, frame))
+        gui.add_markdown("height, m, over the last seconds")
+        self._heights = gui.add_uplot(
+            (np.zeros(1),) * len(lines),
+            tuple(lines),
+            axes=({**AXIS, "size": 30}, {**AXIS, "size": 40}),
+            scales={"x": {"time": False}, "y": {"range": (0.0, 1.05)}},
+            legend={"live": False},
+            height=190,
+        )
+        gui.add_markdown("reward, by term")
+        self._terms = gui.add_html(reward_bars(dict.fromkeys(_reward_terms(frame), 0.0)))
+        gui.add_html(_legend(env, frame))
 
     def _levels(self, frame: EnvFrame) -> dict[str, float]:
-        """The task's heights of the first environment."""
-        return self._simulation.env.task.levels(at_index(frame.command, 0))
+        """The task's heights."""
+        return self._env.task.levels(at_index(frame.command, 0))
 
-    def _update_plots(self) -> None:
-        env = self._simulation.env
-        frames = list(self._history)
+    def update(self) -> None:
+        """Sends the history to the page."""
+        dt, frames = self._env.dt, list(self.history)
         heights = [(*f.balls[0, :, 2], *self._levels(f).values(), f.paddle[0, 2]) for f in frames]
-        times = np.arange(1 - len(heights), 1) * env.dt
+        times = np.arange(1 - len(heights), 1) * dt
         self._heights.data = (times, *np.array(heights).T)
-        recent = frames[-round(1.0 / _PLOT_RATE / env.dt) :]
+        recent = frames[-round(1.0 / _PLOT_RATE / dt) :]
         terms = jax.tree.map(lambda *values: np.mean(values), *map(_reward_terms, recent))
         self._terms.content = reward_bars(terms)
 

@@ -51,23 +51,25 @@ def show(
     if len({one.config.task for one in shown}) > 1:
         raise UserError("the policies have different tasks; show one at a time")
     viewer = _viewer(options, several=len(shown) > 1)
-    present = {"recording": _recording, "native": _window, "browser": _page}[viewer](
-        options, console
-    )
     each = max(1, options.num_envs // len(shown))
-    with console.status("compiling"):
-        simulation = _simulate(shown, each, options.seed, commands, viewer == "browser")
-    if len(shown) == 1:
-        present(simulation, PageStart(shown[0].title, None, each))
-    else:
+
+    def simulate() -> Simulation:
+        with console.status("compiling"):
+            return _simulate(shown, each, options.seed, commands, viewer == "browser")
+
+    start = PageStart(shown[0].title, None, each)
+    if len(shown) > 1:
         letters = string.ascii_uppercase[: len(shown)]
         titles = [f"{letter}: {one.title}" for letter, one in zip(letters, shown, strict=True)]
         names = [letter for letter in letters for _ in range(each)]
-        present(simulation, PageStart(", ".join(titles), names, len(names)))
-
-
-Present = Callable[[Simulation, PageStart], None]
-"""Shows a simulation."""
+        start = PageStart(", ".join(titles), names, len(names))
+    if viewer == "recording":
+        _record(simulate, start, options, console)
+    elif viewer == "browser":
+        _serve(simulate, start, options, console)
+    else:
+        with StopRequest() as stop:
+            show_window(simulate(), options.seconds, lambda: stop.requested)
 
 
 def _viewer(options: ViewerOptions, several: bool) -> str:
@@ -93,8 +95,10 @@ def _viewer(options: ViewerOptions, several: bool) -> str:
     return "browser"
 
 
-def _recording(options: ViewerOptions, console: Console) -> Present:
-    """Writes the files; checks them at once."""
+def _record(
+    simulate: Callable[[], Simulation], start: PageStart, options: ViewerOptions, console: Console
+) -> None:
+    """Writes the files; checks them before it simulates."""
     film = None
     if options.video is not None:
         from bounce_mjx.viewers.video import SUFFIXES, VideoWriter
@@ -106,46 +110,32 @@ def _recording(options: ViewerOptions, console: Console) -> Present:
 
         check_output(options.html, "--html", SUFFIXES)
 
-    def present(simulation: Simulation, start: PageStart) -> None:
-        with console.status("recording"):
-            recording = simulation.record(options.seconds or _RECORDED_SECONDS)
-            if options.html is not None:
-                page = replay(simulation.env, recording, options.fps, start.names)
-                write_output(options.html, page)
-            if film is not None:
-                film.write(simulation.env, recording)
-        for path in (options.video, options.html):
-            if path is not None:
-                console.out(f"written: {path}", highlight=False)
-
-    return present
+    simulation = simulate()
+    with console.status("recording"):
+        recording = simulation.record(options.seconds or _RECORDED_SECONDS)
+        if options.html is not None:
+            page = replay(simulation.env, recording, options.fps, start.names)
+            write_output(options.html, page)
+        if film is not None:
+            film.write(simulation.env, recording)
+    for path in (options.video, options.html):
+        if path is not None:
+            console.out(f"written: {path}", highlight=False)
 
 
-def _window(options: ViewerOptions, console: Console) -> Present:
-    """Opens MuJoCo's window."""
-
-    def present(simulation: Simulation, start: PageStart) -> None:
-        with StopRequest() as stop:
-            show_window(simulation, options.seconds, lambda: stop.requested)
-
-    return present
-
-
-def _page(options: ViewerOptions, console: Console) -> Present:
-    """Serves the page; looks for a port at once."""
-    from bounce_mjx.viewers.browser import LivePage, free_port
+def _serve(
+    simulate: Callable[[], Simulation], start: PageStart, options: ViewerOptions, console: Console
+) -> None:
+    """Serves the page; looks for a port before it simulates."""
+    from bounce_mjx.viewers.browser import free_port, run_page
     from bounce_mjx.viewers.guard import open_server
 
     port = free_port(options.host, options.port)
     address = Address(options.host, port, options.allow_host)
-
-    def present(simulation: Simulation, start: PageStart) -> None:
-        with StopRequest() as stop, open_server(*address) as server:
-            page = LivePage(server, simulation, start)
-            console.out(f"viewer: {address.url}  (Ctrl-C ends it)", highlight=False)
-            page.run(options.seconds, lambda: stop.requested)
-
-    return present
+    simulation = simulate()
+    with StopRequest() as stop, open_server(*address) as server:
+        console.out(f"viewer: {address.url}  (Ctrl-C ends it)", highlight=False)
+        run_page(server, simulation, start, lambda: stop.requested, options.seconds)
 
 
 def _simulate(

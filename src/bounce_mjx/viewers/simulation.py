@@ -62,17 +62,6 @@ class EnvFrame(NamedTuple):
     fast."""
 
 
-class _Changes(NamedTuple):
-    """What a user changes before a step."""
-
-    command: dict[str, np.float32]
-    """Commands; nan keeps one."""
-    push: np.ndarray
-    """Velocity that is added to the ball's [3], m/s."""
-    world: World
-    """Terms of the world that have a nominal value; nan keeps an entry."""
-
-
 def at_index(values: dict[str, np.ndarray], index: int) -> dict[str, float]:
     """Commands or metrics [N] of one environment, each a number."""
     return {name: float(value[index]) for name, value in values.items()}
@@ -188,8 +177,7 @@ class Simulation:
             if nominal is not None:
                 entries = (np.nan,) if self.world is None else self.world.get(name, (nominal,))
                 world[name] = np.full(shape or 1, entries, np.float32).reshape(shape)
-        changes = _Changes(command, self._push, world)
-        return self.policy, self._key, self._states, self._steps, changes
+        return self.policy, self._key, self._states, self._steps, command, self._push, world
 
     def _reset(self, over: np.ndarray) -> EnvFrame:
         """Starts a new episode in some environments [N]; the frame of all."""
@@ -208,9 +196,9 @@ class Simulation:
         steps = jnp.where(over, 0, steps)
         return states, steps, _view(self.env, states, steps, jnp.zeros_like(over))
 
-    def _advance(self, policy, key, states, steps, changes):
+    def _advance(self, policy, key, states, steps, command, push, world):
         key, action_key = jax.random.split(key)
-        states = _apply(self.env, states, changes)
+        states = _change(self.env, states, command, push, world)
         actions = self._controller(policy, states, action_key)
         after = jax.vmap(self.env.step, in_axes=-1, out_axes=-1)(states, actions)
         steps = steps + 1
@@ -296,33 +284,34 @@ def resample(recording: EnvFrame, dt: float, fps: float) -> EnvFrame:
     fraction = (steps - before)[:, None] * ~recording.over[before]
     frames = jax.tree.map(lambda values: values[before], recording)
 
-    def blend(values):
-        share = fraction.reshape(*fraction.shape, *(1,) * (values.ndim - 2))
-        return values[before] + share * (values[after] - values[before])
+    def blend(values: np.ndarray) -> np.ndarray:
+        return (values[before].T + fraction.T * (values[after] - values[before]).T).T
 
-    return frames._replace(
-        time=frames.time + fraction * dt,
-        qpos=blend(recording.qpos),
-        balls=blend(recording.balls),
-        paddle=blend(recording.paddle),
-    )
+    moving = "time", "qpos", "balls", "paddle"
+    return frames._replace(**{name: blend(getattr(recording, name)) for name in moving})
 
 
-def _apply(env: Env, states: State, changes: _Changes) -> State:
-    """States [..., N] with the changes of a user."""
+def _change(env: Env, states: State, command: World, push: jax.Array, world: World) -> State:
+    """States [..., N] with what a user changes.
+
+    Args:
+      command: commands; nan keeps one.
+      push: velocity that is added to the ball's [3], m/s.
+      world: terms of the world that have a nominal value; nan keeps an entry.
+    """
     before = states.pipeline_state
     qvel = before.physics.qvel
     for ball in env.addresses.balls:
-        qvel = qvel.at[jnp.array(ball.qvel[:3])].add(changes.push[:, None])
+        qvel = qvel.at[jnp.array(ball.qvel[:3])].add(push[:, None])
     changed = before._replace(
         physics=before.physics._replace(qvel=qvel),
-        command=_replace_given(changes.command, before.command),
+        command=_replace_given(command, before.command),
     )
 
     def with_world(state: EnvState) -> EnvState:
-        return env.with_world(state, _replace_given(changes.world, state.world))
+        return env.with_world(state, _replace_given(world, state.world))
 
-    if changes.world:
+    if world:
         changed = jax.vmap(with_world, in_axes=-1, out_axes=-1)(changed)
     observation = jax.vmap(env.observe, in_axes=-1, out_axes=-1)(changed)
     return states.replace(pipeline_state=changed, obs=observation)

@@ -48,17 +48,16 @@ def find_ffmpeg() -> str:
     Raises:
       MissingPackage: there is none.
     """
-    try:
+    with contextlib.suppress(ImportError):
         from imageio_ffmpeg import get_ffmpeg_exe
-    except ImportError as error:
-        found = shutil.which("ffmpeg")
-        if found is None:
-            raise MissingPackage(
-                "a video needs the program ffmpeg, which is not found; install it, or the extra "
-                f"video: {install_command('bounce_mjx[video]')}"
-            ) from error
+
+        return get_ffmpeg_exe()
+    if found := shutil.which("ffmpeg"):
         return found
-    return get_ffmpeg_exe()
+    raise MissingPackage(
+        "a video needs the program ffmpeg, which is not found; install it, or the extra "
+        f"video: {install_command('bounce_mjx[video]')}"
+    )
 
 
 class VideoWriter:
