@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 from jax.extend.core import Jaxpr, JaxprEqn, Literal, Var
+from jax.interpreters.partial_eval import dce_jaxpr
 
 from bounce_mjx.errors import UserError
 
@@ -97,16 +98,6 @@ def onnx_graph(
     return graph.helper.make_graph(graph.nodes, "policy", *tensors, constants)
 
 
-def _equations(jaxpr: Jaxpr) -> list[JaxprEqn]:
-    """The equations on which the outputs depend."""
-    read, equations = set(map(id, jaxpr.outvars)), []
-    for equation in reversed(jaxpr.eqns):
-        if not read.isdisjoint(map(id, equation.outvars)):
-            equations.append(equation)
-            read.update(map(id, equation.invars))
-    return equations[::-1]
-
-
 def _axes(equation: JaxprEqn) -> list[int]:
     """Axes of a reduction, in all rows."""
     return [axis + 1 for axis in equation.params["axes"]]
@@ -158,7 +149,9 @@ class _Graph:
             is_literal = isinstance(atom, Literal)
             return np.asarray(atom.val, atom.aval.dtype) if is_literal else known[atom]
 
-        for equation in _equations(jaxpr):
+        # Without equations on which no output depends.
+        jaxpr, _ = dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars), instantiate=True)
+        for equation in jaxpr.eqns:
             results = self._results(equation, [value(atom) for atom in equation.invars])
             known |= dict(zip(equation.outvars, results, strict=True))
         return [value(atom) for atom in jaxpr.outvars]

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
+from numpy.polynomial.polynomial import polyfit
 
 from bounce_mjx.env.env import world_model
 from bounce_mjx.errors import UserError
@@ -95,14 +96,11 @@ def sensor_noise(log: Log) -> Noise:
         for i in range(2, len(t) - 2, 2):
             near = slice(i - 2, i + 3)
             if t[i + 2] - t[i - 2] < 0.08:
-                since = t[near] - t[i]
-                basis = np.stack([np.ones(5), since, since**2], axis=1)
-                q, _ = np.linalg.qr(basis)
-                ball = log.ball_positions[near]
-                rests.append(np.sqrt(np.sum((ball - q @ (q.T @ ball)) ** 2, axis=0) / 2.0))
+                fitted = polyfit(t[near] - t[i], log.ball_positions[near], 2, full=True)
+                rests.append(fitted[1][0] / 2.0)
         if len(rests) > 50:
             # Of a sum of two squared normal numbers, the median is 1.386 times the variance.
-            balls = np.sqrt(np.median(np.square(rests), axis=0) * 2.0 / 1.386)
+            balls = np.sqrt(np.median(rests, axis=0) * 2.0 / 1.386)
     return Noise(np.maximum(angles, 1e-5), np.maximum(balls, 1e-4))
 
 

@@ -7,6 +7,7 @@ therefore do not build up, and a log may have gaps.
 from typing import NamedTuple
 
 import numpy as np
+from numpy.polynomial.polynomial import polyfit
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.identify.log import Log
@@ -228,9 +229,7 @@ def _joint_start(log: Log, time: float) -> np.ndarray:
     """Angles and velocities [2 n] at a time, by a parabola through the measurements near it."""
     near = np.argsort(np.abs(log.times - time))[:9]
     t = log.times[near] - time
-    basis = np.stack([np.ones_like(t), t, t * t], axis=1)
-    solution = np.linalg.lstsq(basis, log.joint_angles[near], rcond=None)[0]
-    return np.concatenate([solution[0], solution[1]])
+    return polyfit(t, log.joint_angles[near], 2)[:2].ravel()
 
 
 def _ball_start(log: Log, pictures: np.ndarray, bounce: float, zero: float) -> np.ndarray:
@@ -241,7 +240,5 @@ def _ball_start(log: Log, pictures: np.ndarray, bounce: float, zero: float) -> n
     t = log.picture_times[pictures] - zero
     before = t < bounce - 0.012
     t, balls = t[before], log.ball_positions[pictures][before]
-    basis = np.stack([np.ones_like(t), t], axis=1)
-    fall = 0.5 * t[:, None] ** 2 * GRAVITY
-    solution = np.linalg.lstsq(basis, balls - fall, rcond=None)[0]
-    return np.concatenate([solution[0], solution[1], np.zeros(3)])
+    line = polyfit(t, balls - 0.5 * t[:, None] ** 2 * GRAVITY, 1)
+    return np.append(line.ravel(), np.zeros(3))
