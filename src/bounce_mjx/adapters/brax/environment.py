@@ -1,6 +1,7 @@
 """The environment for brax, with this project's physics."""
 
 import copy
+import functools
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -62,6 +63,14 @@ class PipelineState:
 class BraxBounceBall(brax.envs.Env):
     """One environment with brax's interface; `task` is the `Env` in it."""
 
+    # brax's are properties.
+    observation_size: int = 0
+    """Length of the observation vector."""
+    action_size: int = 0
+    """Length of the action vector."""
+    backend: str = ""
+    """Name of the physics engine."""
+
     def __init__(
         self,
         config: WorldConfig | None = None,
@@ -84,31 +93,28 @@ class BraxBounceBall(brax.envs.Env):
         self.task = Env(validate(kind, given | settings, ENV_NAME))
         self.dt, self.mj_model = self.task.dt, self.task.mj_model
         """Time of one control step, s, and MuJoCo's model."""
+        self.observation_size, self.action_size = self.task.observation_size, self.task.action_size
+        self.backend = self.task.backend
         self._model = _Model(self.mj_model)
-        self._base: brax.base.System | None = None
-        self._sys: brax.base.System | None = None
 
-    @property
+    @functools.cached_property
     def sys(self) -> brax.base.System:
         """brax's system of the model. The fields of another system, such as `randomization_fn`
         gives, act from the next reset (`adapters/randomization.py`)."""
-        if self._sys is None:
-            with warnings.catch_warnings():
-                # brax warns that it is no longer maintained.
-                warnings.simplefilter("ignore")
-                self._base = self._sys = mjcf.load_model(_drawable(self.task.mj_model))
-        return self._sys
+        return self._own_sys
 
-    @sys.setter
-    def sys(self, system: brax.base.System) -> None:
-        assert self.sys is not None  # the base to compare with
-        self._sys = system
+    @functools.cached_property
+    def _own_sys(self) -> brax.base.System:
+        with warnings.catch_warnings():
+            # brax warns that it is no longer maintained.
+            warnings.simplefilter("ignore")
+            return mjcf.load_model(_drawable(self.mj_model))
 
     def reset(self, rng: jax.Array) -> State:
         """Starts an episode; consumes the key `rng`."""
         task = self.task
-        if self._sys is not self._base:
-            task = randomized_task(task, self._base.mj_model, self._base, self._sys)
+        if "sys" in vars(self):
+            task = randomized_task(task, self._own_sys.mj_model, self._own_sys, self.sys)
         return self._to_brax(task.reset(rng))
 
     def step(self, state: State, action: jax.Array) -> State:
@@ -118,21 +124,6 @@ class BraxBounceBall(brax.envs.Env):
 
     def _to_brax(self, state: State) -> State:
         return state.replace(pipeline_state=PipelineState(state.pipeline_state, self._model))
-
-    @property
-    def observation_size(self) -> int:
-        """Length of the observation vector."""
-        return self.task.observation_size
-
-    @property
-    def action_size(self) -> int:
-        """Length of the action vector."""
-        return self.task.action_size
-
-    @property
-    def backend(self) -> str:
-        """Name of the physics engine."""
-        return self.task.backend
 
     def render(
         self,

@@ -73,6 +73,12 @@ class TaskData:
 class PlaygroundBounceBall(MjxEnv):
     """One environment with Playground's interface; `task` is the `Env` in it."""
 
+    # Playground's are properties.
+    action_size: int = 0
+    """Length of the action vector."""
+    mj_model: mujoco.MjModel = None
+    """The model."""
+
     def __init__(
         self,
         config: config_dict.ConfigDict | None = None,
@@ -91,14 +97,14 @@ class PlaygroundBounceBall(MjxEnv):
             "episode_seconds": self._config.episode_length * self._config.ctrl_dt,
         }
         self.task = Env(validate(task_config(task), settings, ENV_NAME))
-        self._randomized: mjx.Model | None = None
+        self.action_size, self.mj_model = self.task.action_size, self.task.mj_model
 
     def reset(self, rng: jax.Array) -> State:
         """Starts an episode; consumes the key `rng`."""
         task = self.task
-        if self._randomized is not None:
+        if "_mjx_model" in vars(self):
             own = self._own_mjx_model
-            task = randomized_task(task, self.mj_model, own, self._randomized)
+            task = randomized_task(task, self.mj_model, own, self._mjx_model)
         state = task.reset(rng)
         m, physics = self.mj_model, state.pipeline_state.physics
         dtype = physics.qpos.dtype
@@ -136,29 +142,15 @@ class PlaygroundBounceBall(MjxEnv):
         return str(resource_path("mjcf/bounce_ball.xml") if mjcf is None else locate(mjcf))
 
     @property
-    def action_size(self) -> int:
-        """Length of the action vector."""
-        return self.task.action_size
-
-    @property
-    def mj_model(self) -> mujoco.MjModel:
-        """The model."""
-        return self.task.mj_model
-
-    @property
     def mjx_model(self) -> mjx.Model:
         """The model in MJX; the environment reads the fields that a `randomization_fn` changes."""
         return self._mjx_model
 
-    @property
+    @functools.cached_property
     def _mjx_model(self) -> mjx.Model:
-        return self._own_mjx_model if self._randomized is None else self._randomized
-
-    @_mjx_model.setter
-    def _mjx_model(self, model: mjx.Model) -> None:
         """Playground's domain randomisation assigns one environment's model here; its fields act
         from the next reset (`adapters/randomization.py`)."""
-        self._randomized = None if model is self._own_mjx_model else model
+        return self._own_mjx_model
 
     @functools.cached_property
     def _own_mjx_model(self) -> mjx.Model:
