@@ -58,7 +58,6 @@ def robustness_table(report: RobustnessReport) -> Table:
     # A word that is wider than the terminal leaves continues in the next line.
     table = plain_table(summary(report), Column("condition", overflow="fold"), *columns)
     table.caption = escape("\n".join([*described, "*  misses its bound"]))
-    table.caption_justify = "left"
     for _, rows in _rows(report.outcomes):
         for i, outcome in enumerate(rows):
             name = escape(outcome.perturbation) if i == 0 else ""

@@ -26,9 +26,9 @@ def count_text(count: float) -> str:
 
 def plain_table(title: str, *columns: Column | str) -> Table:
     """A table without lines, so that the results fit into 80 columns."""
-    title, padding = escape(title), (0, 1, 0, 0)
-    look = dict(title_justify="left", box=None, pad_edge=False, padding=padding)
-    return Table(*columns, title=title, **look)
+    left = dict(title_justify="left", caption_justify="left")
+    look = dict(box=None, pad_edge=False, padding=(0, 1, 0, 0))
+    return Table(*columns, title=escape(title), **left, **look)
 
 
 def results_table(report: Report, title: str) -> Table:
@@ -39,7 +39,6 @@ def results_table(report: Report, title: str) -> Table:
         bound, _, condition = result.bound.partition(" (")
         if result.passed is None:
             table.caption = f"{result.name}: not judged" + (condition and f" ({condition}")
-            table.caption_justify = "left"
         colour = {True: "[green]pass", False: "[red]FAIL", None: "-"}[result.passed]
         table.add_row(result.name, result.measured, figure_text(result.value), bound, colour)
     return table
@@ -62,7 +61,6 @@ def seeds_table(reports: dict[int, Report | None]) -> Table:
             continue
         met = "[green]pass" if report.passed else "[red]FAIL"
         table.add_row(str(seed), *(figure_text(result.value) for result in report.results), met)
-    table.add_section()
     columns = zip(*([result.value for result in report.results] for report in known), strict=True)
     # If a seed lacks a figure, the mean of the other seeds would be too favourable.
     complete = [None if None in column else column for column in columns]
