@@ -149,8 +149,6 @@ def test_a_viser_that_cannot_be_guarded_is_refused(monkeypatch) -> None:
 def test_keys_act(page) -> None:
     client, did = page
     client.control("push the ball right")
-    while not client.lines:
-        client.receive()
     assert client.sliders["height, m"] == (0.3, 0.8, 0.01)
     assert client.lines == ["s", "ball", "target", "paddle"]
     client.set(client.control("height, m"), 0.5)

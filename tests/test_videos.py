@@ -25,6 +25,7 @@ from bounce_mjx.training.events import Event
 from bounce_mjx.training.video import EvaluationVideo
 from bounce_mjx.viewers import browser, offscreen, show
 from bounce_mjx.viewers.offscreen import choose_backend
+from bounce_mjx.viewers.simulation import Simulation
 from bounce_mjx.viewers.video import VideoWriter, find_ffmpeg
 
 
@@ -176,7 +177,9 @@ def test_policies_given_together_are_named_and_have_one_world(monkeypatch) -> No
 
     class Named:
         def __init__(self, env, controller, num_envs, seed, ranges, policy):
-            self.env, self.num_envs = env, num_envs
+            self.env, self.others, self._steps = env, (), np.zeros(num_envs)
+
+        num_envs = Simulation.num_envs
 
     shown = []
     monkeypatch.setattr(show, "Simulation", Named)
@@ -185,11 +188,11 @@ def test_policies_given_together_are_named_and_have_one_world(monkeypatch) -> No
     play.main(both_play)
     play.main([*both_play, "--randomization.action-latency", "0.0", "0.02"])
     (both, start), (drawn, _) = shown
-    assert [one.world for one in both._simulations] == [{}, {}]
-    assert [one.world for one in drawn._simulations] == [None, None]
+    assert [one.world for one in (both, *both.others)] == [{}, {}]
+    assert [one.world for one in (drawn, *drawn.others)] == [None, None]
     assert start.names == ["A", "A", "B", "B"] and start.num_shown == both.num_envs == 4
     assert re.fullmatch(r"A: pretrained, .* steps, B: robust, .* steps", start.title)
-    for simulation, name in zip(both._simulations, ("pretrained", "robust"), strict=True):
+    for simulation, name in zip((both, *both.others), ("pretrained", "robust"), strict=True):
         observation = load_run_config(pretrained_checkpoint(name).run).env.observation
         assert simulation.env.config.observation == observation
 

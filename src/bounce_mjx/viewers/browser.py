@@ -47,6 +47,7 @@ def run_page(
     simulation: Simulation,
     start: PageStart,
     is_over: Callable[[], object],
+    on_ready: Callable[[], object] = lambda: None,
     seconds: float | None = None,
     side: viser.PanelHandle | None = None,
 ) -> None:
@@ -54,6 +55,7 @@ def run_page(
 
     Args:
       is_over: called between two pictures; whether to stop.
+      on_ready: called when the page is built.
       seconds: simulated time; None for no end.
       side: the left panel, if it has tabs already.
     """
@@ -73,6 +75,7 @@ def run_page(
     side.set_width(300)
     with side.add_tab("robot 1" if start.names is None else start.names[0], viser.Icon.CHART_LINE):
         plots = _Plots(gui, simulation.env, simulation.frame)
+    on_ready()
     next_plot = 0.0
     for frames in in_real_time(simulation, seconds, controls.pace):
         if is_over():

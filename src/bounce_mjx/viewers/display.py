@@ -107,12 +107,8 @@ def _with_markers(config: WorldConfig, markers: Sequence[Marker]) -> mujoco.MjMo
 def _edges(size: np.ndarray) -> list[tuple[list[float], list[float]]]:
     """Centres and half-sizes of the four edges around a plate of a half-size [3]."""
     (x, y, z), half = size, _EDGE / 2.0
-    return [
-        ([x + half, 0.0, 0.0], [half, y + _EDGE, z]),
-        ([-x - half, 0.0, 0.0], [half, y + _EDGE, z]),
-        ([0.0, y + half, 0.0], [x, half, z]),
-        ([0.0, -y - half, 0.0], [x, half, z]),
-    ]
+    beside = [([side * (x + half), 0.0, 0.0], [half, y + _EDGE, z]) for side in (-1.0, 1.0)]
+    return beside + [([0.0, side * (y + half), 0.0], [x, half, z]) for side in (-1.0, 1.0)]
 
 
 def body_scenes(model: mujoco.MjModel) -> Iterator[tuple[int, trimesh.Scene]]:
@@ -141,12 +137,9 @@ def _geom_mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
         vertices = model.mesh_vert[mesh.vertadr.item() :][: mesh.vertnum.item()]
         faces = model.mesh_face[mesh.faceadr.item() :][: mesh.facenum.item()]
         return trimesh.graph.smooth_shade(trimesh.Trimesh(vertices, faces), angle=_CREASE_ANGLE)
-    return _primitive(model.geom_type[geom], model.geom_size[geom])
-
-
-def _primitive(kind: int, size: np.ndarray) -> trimesh.Trimesh | None:
-    """A sphere, capsule, ellipsoid, cylinder or box of MuJoCo's half-sizes [3], m."""
     types, create, count = mujoco.mjtGeom, trimesh.creation, [_SEGMENTS // 2, _SEGMENTS]
+    # Half-sizes, m.
+    size = model.geom_size[geom]
     makers = {
         types.mjGEOM_SPHERE: lambda: create.uv_sphere(size[0], count=count),
         types.mjGEOM_ELLIPSOID: lambda: create.uv_sphere(1.0, count=count).apply_scale(size),
@@ -154,7 +147,7 @@ def _primitive(kind: int, size: np.ndarray) -> trimesh.Trimesh | None:
         types.mjGEOM_CYLINDER: lambda: create.cylinder(size[0], 2.0 * size[1], sections=_SEGMENTS),
         types.mjGEOM_BOX: lambda: create.box(2.0 * size),
     }
-    make = makers.get(types(int(kind)))
+    make = makers.get(types(int(model.geom_type[geom])))
     return make and trimesh.graph.smooth_shade(make(), angle=_CREASE_ANGLE)
 
 

@@ -2,6 +2,7 @@
 
 import string
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 from rich.console import Console
@@ -14,7 +15,7 @@ from bounce_mjx.robot.model import fingerprint
 from bounce_mjx.runs.files import check_output, write_output
 from bounce_mjx.viewers.native import has_display, show_window
 from bounce_mjx.viewers.options import MAX_ENVS, Address, PageStart, ViewerOptions
-from bounce_mjx.viewers.simulation import Controller, SideBySide, Simulation
+from bounce_mjx.viewers.simulation import Controller, Simulation
 from bounce_mjx.viewers.world import reset_ranges, with_sliders
 from bounce_mjx.world.config import WorldConfig
 
@@ -134,8 +135,8 @@ def _serve(
     address = Address(options.host, port, options.allow_host)
     simulation = simulate()
     with StopRequest() as stop, open_server(*address) as server:
-        console.out(f"viewer: {address.url}  (Ctrl-C ends it)", highlight=False)
-        run_page(server, simulation, start, lambda: stop.requested, options.seconds)
+        say = partial(console.out, f"viewer: {address.url}  (Ctrl-C ends it)", highlight=False)
+        run_page(server, simulation, start, lambda: stop.requested, say, options.seconds)
 
 
 def _simulate(
@@ -164,4 +165,6 @@ def _simulate(
         simulation.command = commands
         simulation.world = None if is_sampled else {}
         simulations.append(simulation)
-    return SideBySide(simulations) if len(simulations) > 1 else simulations[0]
+    first, *others = simulations
+    first.others = others
+    return first

@@ -104,7 +104,6 @@ class Simulation:
           policy: the first value of `policy`.
         """
         self.env = env
-        self.num_envs = num_envs
         self.policy = policy
         """The policy that acts; another one of the same shapes may replace it between two steps."""
         self.command: dict[str, float] = {}
@@ -112,13 +111,16 @@ class Simulation:
         self.world: dict[str, Sequence[float]] | None = None
         """Entries of some terms of the world that are on, in all environments, with the others
         nominal; None for a world sampled at each reset."""
+        self.others: Sequence[Simulation] = ()
+        """Simulations of the same robot that are shown with this one, after its environments, and
+        have its commands and its world."""
         self._controller = controller
         self._ranges = ranges
         self._key = jax.random.PRNGKey(seed)
         self._push = np.zeros(3, np.float32)
+        self._steps = np.zeros(num_envs, np.int32)
         nothing = jax.eval_shape(self._fresh_states, self._key)
         self._states = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), nothing)
-        self._steps = np.zeros(num_envs, np.int32)
         over = np.ones(num_envs, bool)
         programs = (
             jax.jit(self._restart).lower(self._key, self._states, self._steps, over),
@@ -132,9 +134,18 @@ class Simulation:
         self.reset()
 
     @property
+    def num_envs(self) -> int:
+        """Number of environments, with those of the others."""
+        return len(self._steps) + sum(other.num_envs for other in self.others)
+
+    @property
     def frame(self) -> EnvFrame:
         """The current frame, which already shows the commands that the next step sets."""
-        frame = self._frame
+        frames = [self._frame, *(other.frame for other in self.others)]
+        # Each world has its own metrics.
+        shared = set.intersection(*(set(frame.metrics) for frame in frames))
+        frames = [f._replace(metrics={name: f.metrics[name] for name in shared}) for f in frames]
+        frame = jax.tree.map(lambda *values: np.concatenate(values), *frames)
         given = {name: np.full_like(frame.command[name], x) for name, x in self.command.items()}
         return frame._replace(command=frame.command | given)
 
@@ -144,7 +155,9 @@ class Simulation:
 
     def reset(self) -> None:
         """Starts a new episode in every environment."""
-        self._frame = self._reset(np.ones(self.num_envs, bool))
+        self._frame = self._reset(np.ones(len(self._steps), bool))
+        for other in self.others:
+            other.reset()
 
     def push(self, velocity: tuple[float, float, float]) -> None:
         """Adds a velocity (m/s) to every ball at the start of the next step."""
@@ -152,6 +165,10 @@ class Simulation:
 
     def step(self) -> EnvFrame:
         """Advances one control step."""
+        for other in self.others:
+            other.command, other.world = self.command, self.world
+            other.push(self._push)
+            other.step()
         inputs = self._inputs()
         # Before the program runs, so that a push of another thread meanwhile acts on the next step.
         self._push = np.zeros(3, np.float32)
@@ -187,7 +204,7 @@ class Simulation:
 
     def _fresh_states(self, key: jax.Array) -> State:
         return jax.vmap(lambda key: self.env.reset(key, self._ranges), out_axes=-1)(
-            jax.random.split(key, self.num_envs)
+            jax.random.split(key, len(self._steps))
         )
 
     def _restart(self, key, states, steps, over):
@@ -204,43 +221,6 @@ class Simulation:
         steps = steps + 1
         over = (after.done > 0) | (steps >= self.env.config.episode_steps)
         return key, after, steps, _view(self.env, after, steps, over)
-
-
-class SideBySide(Simulation):
-    """Several simulations of one robot, shown as one; the environments of the first come first."""
-
-    def __init__(self, simulations: Sequence[Simulation]):
-        self._simulations = simulations
-        first = simulations[0]
-        self.env, self.command, self.world = first.env, first.command, first.world
-        self.num_envs = sum(simulation.num_envs for simulation in simulations)
-        self._push = np.zeros(3, np.float32)
-
-    @property
-    def _frame(self) -> EnvFrame:
-        frames = [simulation.frame for simulation in self._simulations]
-        # Each world has its own metrics.
-        shared = set.intersection(*(set(frame.metrics) for frame in frames))
-        frames = [f._replace(metrics={name: f.metrics[name] for name in shared}) for f in frames]
-        return jax.tree.map(lambda *values: np.concatenate(values), *frames)
-
-    def world_value(self, term: str) -> float:
-        """See `Simulation.world_value`."""
-        return self._simulations[0].world_value(term)
-
-    def reset(self) -> None:
-        """See `Simulation.reset`."""
-        for simulation in self._simulations:
-            simulation.reset()
-
-    def step(self) -> EnvFrame:
-        """See `Simulation.step`."""
-        push, self._push = self._push, np.zeros(3, np.float32)
-        for simulation in self._simulations:
-            simulation.command, simulation.world = self.command, self.world
-            simulation.push(push)
-            simulation.step()
-        return self.frame
 
 
 def in_real_time(

@@ -97,10 +97,15 @@ class VideoWriter:
         """
         frames = resample(recording, env.dt, self.fps)
         shown = draw_frames(env, frames, self._size, self.fps, self._zoom)
+        width, height = self._size
+        pictures = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {self.fps} -i -"
+        encoding = _ENCODINGS[self._path.suffix.lower()]
         advice = "give another file with --video"
         with writable(self._path, advice), new_file(self._path) as new:
+            # It reads pictures from its standard input.
+            command = [self._ffmpeg, "-y", "-loglevel", "error", *pictures.split(), *encoding]
             encoder = subprocess.Popen(
-                self._command(new), stdin=subprocess.PIPE, stderr=subprocess.PIPE
+                [*command, str(new)], stdin=subprocess.PIPE, stderr=subprocess.PIPE
             )
             try:
                 # A broken pipe means that the encoder failed; it prints the reason.
@@ -116,14 +121,6 @@ class VideoWriter:
             finally:
                 encoder.kill()
                 encoder.communicate()
-
-    def _command(self, path: Path) -> list[str]:
-        """The command line of an encoder that reads pictures from its standard input."""
-        width, height = self._size
-        pictures = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {self.fps} -i -"
-        encoding = _ENCODINGS[path.suffix.lower()]
-        ffmpeg = [self._ffmpeg, "-y", "-loglevel", "error"]
-        return [*ffmpeg, *pictures.split(), *encoding, str(path)]
 
 
 def draw_frames(
