@@ -67,12 +67,8 @@ def excite(
     n, dt = config.num_joints, config.control_dt
     home, names = np.array(config.default_joint_angles), joint_names(model)
     limits = config.robot.limits
-    bounds = np.stack(
-        [
-            np.full(n, np.inf) if limit is None else _BELOW_LIMIT * np.array(limit)
-            for limit in (limits.velocity, limits.acceleration, limits.jerk)
-        ]
-    )
+    given = limits.velocity, limits.acceleration, limits.jerk
+    bounds = _BELOW_LIMIT * np.array([[np.inf] * n if x is None else x for x in given])
     bounds[0] = np.minimum(bounds[0], max_velocity)
     low, high = joint_ranges(model)
     centre = _lift_paddle(model, home, low + _FROM_END, high - _FROM_END)

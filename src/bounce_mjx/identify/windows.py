@@ -177,12 +177,8 @@ def _share_flight(flight: float) -> float:
 
 def _slopes(times: np.ndarray, values: np.ndarray, reach: int) -> np.ndarray:
     """Slope [P] of a line through each point and its neighbours."""
-    slopes = np.zeros(len(times))
-    for i in range(len(times)):
-        part = slice(max(i - reach, 0), i + reach + 1)
-        t = times[part] - np.mean(times[part])
-        slopes[i] = t @ values[part] / max(t @ t, 1e-12)
-    return slopes
+    parts = [slice(max(i - reach, 0), i + reach + 1) for i in range(len(times))]
+    return np.array([polyfit(times[p] - times[p.start], values[p], 1)[1] for p in parts])
 
 
 def _find_rests(log: Log, spans: list[tuple[float, float, float]]) -> list[tuple[float, float]]:

@@ -5,7 +5,7 @@ batch of any size. Batches of equal configs and sizes share their programs.
 """
 
 import functools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -43,14 +43,80 @@ class Step(NamedTuple):
     """The environment's metrics in the order of their names [M, B]."""
 
 
-class Programs(NamedTuple):
+class Programs:
     """The functions of `Episodes`, compiled for one config and number of environments."""
 
-    task: Env
-    start: Any
-    """`_start` without its first argument."""
-    step: Any
-    """`_step` without its first argument; the episodes are donated."""
+    def __init__(self, config: WorldConfig):
+        cache_compilations()
+        self.task = Env(config)
+        self.start = jax.jit(self._start)
+        self.step = jax.jit(self._step, donate_argnums=0)
+
+    def _start(
+        self,
+        episodes: Episodes | None,
+        mask: jax.Array,
+        seeds: jax.Array,
+        seeded: jax.Array,
+        commands: dict[str, jax.Array],
+    ) -> Episodes:
+        """New episodes where the mask [B] is true; `episodes` is None before the first ones.
+
+        Args:
+          seeds: [B]; where `seeded` [B] is false, the environment continues its random numbers.
+          commands: each [B]; NaN samples one.
+        """
+        keys = jax.vmap(jax.random.PRNGKey, out_axes=-1)(seeds)
+        if episodes is not None:
+            keys = jnp.where(seeded, keys, episodes.key)
+        keys, now = jax.vmap(jax.random.split, -1, -1)(keys)
+
+        def reset_one(key: jax.Array, commands: dict[str, jax.Array]) -> State:
+            ranges = self.task.ranges()
+            for name, own in self.task.config.commands.items():
+                ends, given = (own.low, own.high), commands[name]
+                ranges[name] = tuple(jnp.where(jnp.isnan(given), end, given) for end in ends)
+            return self.task.reset(key, ranges)
+
+        env = jax.vmap(reset_one, -1, -1)(now, commands)
+        started = Episodes(env, jnp.zeros(seeds.shape, jnp.int32), keys)
+        return started if episodes is None else _choose(mask, started, episodes)
+
+    def _step(
+        self,
+        episodes: Episodes,
+        actions: jax.Array,
+        limit: jax.Array,
+        reset_before: jax.Array,
+        reset_after: jax.Array,
+    ) -> tuple[Episodes, Step]:
+        """Advances every environment under the actions [B, n].
+
+        Args:
+          limit: time limit of an episode in steps [].
+          reset_before: environments that start a new episode instead of a step [B], bool.
+          reset_after: whether an ended episode is followed by a new one in the same step [].
+        """
+        keys, now = jax.vmap(jax.random.split, -1, -1)(episodes.key)
+        fresh = jax.vmap(self.task.reset, -1, -1)(now)
+        stepped = jax.vmap(self.task.step, -1, -1)(episodes.env, actions.T)
+        length = episodes.length + 1
+        terminated = (stepped.done > 0) & ~reset_before
+        # The limit counts even if the task ended the episode too, as in Gymnasium's TimeLimit.
+        truncated = (length >= limit) & ~reset_before
+        after = _choose(
+            reset_before | (reset_after & (terminated | truncated)),
+            Episodes(fresh, jnp.zeros_like(length), keys),
+            Episodes(stepped, length, episodes.key),
+        )
+        return after, Step(
+            observation=after.env.obs.T.astype(jnp.float32),
+            final_observation=stepped.obs.T.astype(jnp.float32),
+            reward=jnp.where(reset_before, 0.0, stepped.reward),
+            terminated=terminated,
+            truncated=truncated,
+            metrics=jnp.stack([stepped.metrics[name] for name in sorted(stepped.metrics)]),
+        )
 
 
 def shared_programs(config: WorldConfig) -> Programs:
@@ -63,81 +129,7 @@ def shared_programs(config: WorldConfig) -> Programs:
 @functools.lru_cache(maxsize=32)
 def _programs(config: WorldConfig, edited: int | None) -> Programs:
     del edited
-    cache_compilations()
-    task = Env(config)
-    return Programs(
-        task=task,
-        start=jax.jit(functools.partial(_start, task)),
-        step=jax.jit(functools.partial(_step, task), donate_argnums=0),
-    )
-
-
-def _start(
-    task: Env,
-    episodes: Episodes | None,
-    mask: jax.Array,
-    seeds: jax.Array,
-    seeded: jax.Array,
-    commands: dict[str, jax.Array],
-) -> Episodes:
-    """New episodes where the mask [B] is true; `episodes` is None before the first ones.
-
-    Args:
-      seeds: [B]; where `seeded` [B] is false, the environment continues its random numbers.
-      commands: each [B]; NaN samples one.
-    """
-    keys = jax.vmap(jax.random.PRNGKey, out_axes=-1)(seeds)
-    if episodes is not None:
-        keys = jnp.where(seeded, keys, episodes.key)
-    keys, now = jax.vmap(jax.random.split, -1, -1)(keys)
-
-    def reset_one(key: jax.Array, commands: dict[str, jax.Array]) -> State:
-        ranges = task.ranges()
-        for name, own in task.config.commands.items():
-            ends, given = (own.low, own.high), commands[name]
-            ranges[name] = tuple(jnp.where(jnp.isnan(given), end, given) for end in ends)
-        return task.reset(key, ranges)
-
-    env = jax.vmap(reset_one, -1, -1)(now, commands)
-    started = Episodes(env, jnp.zeros(seeds.shape, jnp.int32), keys)
-    return started if episodes is None else _choose(mask, started, episodes)
-
-
-def _step(
-    task: Env,
-    episodes: Episodes,
-    actions: jax.Array,
-    limit: jax.Array,
-    reset_before: jax.Array,
-    reset_after: jax.Array,
-) -> tuple[Episodes, Step]:
-    """Advances every environment under the actions [B, n].
-
-    Args:
-      limit: time limit of an episode in steps [].
-      reset_before: environments that start a new episode instead of a step [B], bool.
-      reset_after: whether an ended episode is followed by a new one in the same step [].
-    """
-    keys, now = jax.vmap(jax.random.split, -1, -1)(episodes.key)
-    fresh = jax.vmap(task.reset, -1, -1)(now)
-    stepped = jax.vmap(task.step, -1, -1)(episodes.env, actions.T)
-    length = episodes.length + 1
-    terminated = (stepped.done > 0) & ~reset_before
-    # The limit counts even if the task ended the episode too, as in Gymnasium's TimeLimit.
-    truncated = (length >= limit) & ~reset_before
-    after = _choose(
-        reset_before | (reset_after & (terminated | truncated)),
-        Episodes(fresh, jnp.zeros_like(length), keys),
-        Episodes(stepped, length, episodes.key),
-    )
-    return after, Step(
-        observation=after.env.obs.T.astype(jnp.float32),
-        final_observation=stepped.obs.T.astype(jnp.float32),
-        reward=jnp.where(reset_before, 0.0, stepped.reward),
-        terminated=terminated,
-        truncated=truncated,
-        metrics=jnp.stack([stepped.metrics[name] for name in sorted(stepped.metrics)]),
-    )
+    return Programs(config)
 
 
 def _choose(mask: jax.Array, chosen: Episodes, other: Episodes) -> Episodes:
