@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial.polynomial import polyfit
+from scipy.ndimage import minimum_filter1d
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.identify.log import Log
@@ -110,24 +111,16 @@ def cut(log: Log, physics_dt: float) -> Windows:
     begins = [max(start - MAX_DELAY, origin) for start, _, _ in spans]
     first = np.array([int((begin - origin) / physics_dt) for begin in begins], int)
     zero = origin + first * physics_dt
-    angle_rows, used, settled = [], -np.inf, _find_settled(log)
-    for (_, end, _), begin in zip(spans, zero, strict=True):
-        inside = np.flatnonzero((log.times >= max(begin, used)) & (log.times < end) & settled)
-        angle_rows.append(inside)
+    angle_rows, picture_rows, starts, used = [], [], [], -np.inf
+    settled, bounces = _find_settled(log), np.array(spans)[:, 2] - zero
+    for (start, end, _), begin, bounce in zip(spans, zero, bounces, strict=True):
+        inside = (log.times >= max(begin, used)) & (log.times < end) & settled
+        seen = (log.picture_times >= start) & (log.picture_times <= end) & np.isfinite(bounce)
+        angle_rows.append(np.flatnonzero(inside))
+        picture_rows.append(np.flatnonzero(seen))
+        ball = _ball_start(log, picture_rows[-1], bounce, begin)
+        starts.append(np.concatenate([_joint_start(log, begin), ball]))
         used = end
-    picture_rows = [
-        np.flatnonzero((log.picture_times >= start) & (log.picture_times <= end))
-        if np.isfinite(bounce)
-        else np.zeros(0, int)
-        for start, end, bounce in spans
-    ]
-    bounces = np.array([bounce for _, _, bounce in spans]) - zero
-    starts = np.stack(
-        [
-            np.concatenate([_joint_start(log, begin), _ball_start(log, pictures, b, begin)])
-            for begin, pictures, b in zip(zero, picture_rows, bounces, strict=True)
-        ]
-    )
     windows = Windows(
         first,
         round(_SECONDS / physics_dt),
@@ -135,7 +128,7 @@ def cut(log: Log, physics_dt: float) -> Windows:
         *_pad(angle_rows, log.times, zero, log.joint_angles),
         *_pad(picture_rows, log.picture_times, zero, log.ball_positions),
         bounces,
-        starts,
+        np.stack(starts),
     )
     near = np.abs(windows.picture_times - bounces[:, None]) < _AT_BOUNCE
     return windows._replace(picture_weights=np.where(near, 0.0, windows.picture_weights))
@@ -150,12 +143,8 @@ def _find_bounces(log: Log) -> list[tuple[float, float, float]]:
             continue
         t, z = times[run], balls[run, 2]
         speed = _slopes(t, z, 3)
-        lowest = [
-            i
-            for i in range(4, len(run) - 4)
-            if z[i] == np.min(z[i - 3 : i + 4])
-            and speed[i - 4] < -_BOUNCING < _BOUNCING < speed[i + 4]
-        ]
+        turns = (speed[:-8] < -_BOUNCING) & (speed[8:] > _BOUNCING)
+        lowest = 4 + np.flatnonzero(turns & (z == minimum_filter1d(z, 7))[4:-4])
         lowest = [i for j, i in enumerate(lowest) if j == 0 or i - lowest[j - 1] > 3]
         ends = [t[0], *t[lowest], t[-1]]
         for j, i in enumerate(lowest):

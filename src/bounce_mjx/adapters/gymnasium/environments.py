@@ -210,10 +210,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         seeded = np.array([s is not None for s in seeds])
         numbers = np.array([(s or 0) % 2**32 for s in seeds], np.uint32)
         given = dict.fromkeys(self.config.commands, np.nan) | commands
-        values = {
-            name: np.broadcast_to(np.asarray(value, np.float32), self.num_envs)
-            for name, value in given.items()
-        }
+        values = {name: np.full(self.num_envs, x, np.float32) for name, x in given.items()}
         self._episodes = self._programs.start(self._episodes, mask, numbers, seeded, values)
         self._ended[mask] = False
         self._begin_statistics(mask)
