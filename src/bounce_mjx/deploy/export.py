@@ -114,7 +114,7 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
     chain, paddle, normal = _hinges(m, env.default_joint_angles)
     servos = list(addresses.actuators)
     gear = m.actuator_gear[servos, 0]
-    torques, limited = m.actuator_forcerange[servos, 1] * gear, m.actuator_forcelimited[servos]
+    torques = m.actuator_forcerange[servos, 1] * gear
     return Metadata(
         format=FORMAT,
         steps=steps,
@@ -136,10 +136,7 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         ),
         servo_stiffness=tuple((m.actuator_gainprm[servos, 0] * gear**2).tolist()),
         servo_damping=tuple((-m.actuator_biasprm[servos, 2] * gear**2).tolist()),
-        torque_limits=tuple(
-            torque if is_limited else None
-            for torque, is_limited in zip(torques.tolist(), limited, strict=True)
-        ),
+        torque_limits=tuple(np.where(m.actuator_forcelimited[servos], torques, None).tolist()),
         default_joint_angles=env.default_joint_angles,
         commands={
             name: CommandRange((command.low, command.high), command.unit)

@@ -122,15 +122,12 @@ class Simulation:
         nothing = jax.eval_shape(self._fresh_states, self._key)
         self._states = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), nothing)
         over = np.ones(num_envs, bool)
-        programs = (
-            jax.jit(self._restart).lower(self._key, self._states, self._steps, over),
-            jax.jit(self._advance).lower(*self._inputs()),
-        )
+        restart = jax.jit(self._restart).lower(self._key, self._states, self._steps, over)
+        advance = jax.jit(self._advance).lower(*self._inputs())
         # Together, as one compilation does not keep two cores busy.
         with ThreadPoolExecutor() as pool:
-            self._reset_program, self._step_program = pool.map(
-                lambda program: program.compile(), programs
-            )
+            compiled = pool.map(lambda program: program.compile(), (restart, advance))
+            self._reset_program, self._step_program = compiled
         self.reset()
 
     @property

@@ -48,9 +48,8 @@ def load_brax_policy(path: str | Path, deterministic: bool = True) -> BraxPolicy
         with config.ignore_type():
             config.observation_size = config.observation_size["shape"][-1]
     networks = training_checkpoint.get_network(config, ppo_networks.make_ppo_networks)
-    return ppo_networks.make_inference_fn(networks)(
-        checkpoint.load(folder), deterministic=deterministic
-    )
+    make_policy = ppo_networks.make_inference_fn(networks)
+    return make_policy(checkpoint.load(folder), deterministic=deterministic)
 
 
 def ppo_settings(config: TrainConfig | None = None) -> dict[str, Any]:
