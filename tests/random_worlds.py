@@ -5,7 +5,7 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.physics import PhysicsParameters
-from bounce_mjx.physics.edited import direct_solref, link_masses
+from bounce_mjx.physics.edited import EditedModel, direct_solref
 from bounce_mjx.robot.model import find_addresses
 
 
@@ -23,7 +23,7 @@ def own_parameters(mj_model: mujoco.MjModel) -> PhysicsParameters:
         servo_damping=-mj_model.actuator_biasprm[at.actuators, 2],
         armature=mj_model.dof_armature[at.arm_qvel,],
         damping=mj_model.dof_damping[at.arm_qvel,],
-        link_mass=link_masses(mj_model),
+        link_mass=EditedModel(mj_model).link_masses(),
         paddle_position=mj_model.geom_pos[at.paddle_geom],
         paddle_rotation=mj_model.geom_quat[at.paddle_geom],
         gravity=mj_model.opt.gravity,

@@ -44,36 +44,6 @@ class Edit(NamedTuple):
     """Which of the parameter's numbers each entry has; by default, each has its own."""
 
 
-def edits(mj_model: mujoco.MjModel) -> tuple[Edit, ...]:
-    """The table of the parameters' entries."""
-    m, at = mj_model, find_addresses(mj_model)
-    dofs, servos = list(at.arm_qvel), list(at.actuators)
-    bodies, geoms = [ball.body for ball in at.balls], [ball.geom for ball in at.balls]
-    pairs = contact_pairs(m)
-    links = enumerate(link_bodies(m))
-    joint = {body: i for i, link in links for body in link.tolist() if m.body_mass[body] > 0.0}
-    heavy, joints = list(joint), list(joint.values())
-    return (
-        Edit("ball_mass", "body_mass", bodies),
-        Edit("ball_radius", "geom_size", (geoms, 0)),
-        Edit("contact_stiffness", "pair_solref", (pairs, 0), -1.0),
-        Edit("contact_damping", "pair_solref", (pairs, 1), -1.0),
-        Edit("contact_friction", "pair_friction", (pairs, slice(0, 2))),
-        Edit("servo_gain", "actuator_gainprm", (servos, 0)),
-        Edit("servo_gain", "actuator_biasprm", (servos, 1), -1.0),
-        Edit("servo_damping", "actuator_biasprm", (servos, 2), -1.0),
-        Edit("force_limit", "actuator_forcerange", (servos, 1)),
-        Edit("force_limit", "actuator_forcerange", (servos, 0), -1.0),
-        Edit("armature", "dof_armature", dofs),
-        Edit("damping", "dof_damping", dofs),
-        Edit("frictionloss", "dof_frictionloss", dofs),
-        Edit("link_mass", "body_mass", heavy, m.body_mass[heavy] / link_masses(m)[joints], joints),
-        Edit("paddle_position", "geom_pos", at.paddle_geom),
-        Edit("paddle_rotation", "geom_quat", at.paddle_geom),
-        Edit("gravity", "opt.gravity", slice(None)),
-    )
-
-
 class EditedModel:
     """A compiled model with new numbers in some entries.
 
@@ -129,6 +99,28 @@ class EditedModel:
         unread = sorted(self._edited.keys() - self._read)
         return [f"{key[0]}[{', '.join(map(str, self._index(key)))}]" for key in unread]
 
+    def link_bodies(self) -> tuple[np.ndarray, ...]:
+        """Bodies of each acting joint's link: the joint's body and the bodies welded to it. A body
+        with several joints belongs to the last one, and the others have no bodies."""
+        m = self.model
+        last_joint = (m.body_jntadr + m.body_jntnum - 1)[m.body_weldid]
+        return tuple(np.flatnonzero(last_joint == j) for j in self.addresses.arm_joints)
+
+    def link_masses(self) -> np.ndarray:
+        """Masses [n] of the acting joints' links without edits, kg."""
+        return np.array([np.sum(self.model.body_mass[bodies]) for bodies in self.link_bodies()])
+
+    def contact_pairs(self) -> list[int]:
+        """Indices of the contact pairs of balls and the paddle, the first ball's with the paddle
+        first; none if that one is missing."""
+        m, at = self.model, self.addresses
+        geoms = {at.paddle_geom, *(ball.geom for ball in at.balls)}
+        both = zip(m.pair_geom1.tolist(), m.pair_geom2.tolist(), strict=True)
+        pairs = {i: set(pair) for i, pair in enumerate(both) if geoms.issuperset(pair)}
+        first = {at.paddle_geom, at.balls[0].geom}
+        own = sorted(pairs, key=lambda i: pairs[i] != first)
+        return own if own and pairs[own[0]] == first else []
+
     def array(self, field: str) -> Array:
         """The field's array; a NumPy array without traced entries."""
         own = _field(self.model, field)
@@ -145,6 +137,37 @@ def _field(mj_model: mujoco.MjModel, name: str) -> np.ndarray:
     return np.asarray(getattr(mj_model.opt if owner == "opt" else mj_model, name))
 
 
+def edits(model: EditedModel) -> tuple[Edit, ...]:
+    """The table of the parameters' entries."""
+    m, at = model.model, model.addresses
+    dofs, servos = list(at.arm_qvel), list(at.actuators)
+    bodies, geoms = [ball.body for ball in at.balls], [ball.geom for ball in at.balls]
+    pairs = model.contact_pairs()
+    links = enumerate(model.link_bodies())
+    joint = {body: i for i, link in links for body in link.tolist() if m.body_mass[body] > 0.0}
+    heavy, joints = list(joint), list(joint.values())
+    share = m.body_mass[heavy] / model.link_masses()[joints]
+    return (
+        Edit("ball_mass", "body_mass", bodies),
+        Edit("ball_radius", "geom_size", (geoms, 0)),
+        Edit("contact_stiffness", "pair_solref", (pairs, 0), -1.0),
+        Edit("contact_damping", "pair_solref", (pairs, 1), -1.0),
+        Edit("contact_friction", "pair_friction", (pairs, slice(0, 2))),
+        Edit("servo_gain", "actuator_gainprm", (servos, 0)),
+        Edit("servo_gain", "actuator_biasprm", (servos, 1), -1.0),
+        Edit("servo_damping", "actuator_biasprm", (servos, 2), -1.0),
+        Edit("force_limit", "actuator_forcerange", (servos, 1)),
+        Edit("force_limit", "actuator_forcerange", (servos, 0), -1.0),
+        Edit("armature", "dof_armature", dofs),
+        Edit("damping", "dof_damping", dofs),
+        Edit("frictionloss", "dof_frictionloss", dofs),
+        Edit("link_mass", "body_mass", heavy, share, joints),
+        Edit("paddle_position", "geom_pos", at.paddle_geom),
+        Edit("paddle_rotation", "geom_quat", at.paddle_geom),
+        Edit("gravity", "opt.gravity", slice(None)),
+    )
+
+
 def edited(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> EditedModel:
     """The model in the world of one environment.
 
@@ -156,10 +179,10 @@ def edited(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> EditedMod
     """
     m, p = EditedModel(mj_model), parameters
     if p.contact_stiffness is not None or p.contact_damping is not None:
-        for pair in contact_pairs(mj_model):
+        for pair in m.contact_pairs():
             direct = to_direct_solref(mj_model.pair_solref[pair], mj_model.opt.timestep)
             m.put("pair_solref", pair, [-float(x) for x in direct])
-    for edit in edits(mj_model):
+    for edit in edits(m):
         value = getattr(p, edit.parameter)
         if value is None:
             continue
@@ -245,13 +268,13 @@ def edited_model(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> muj
 def own_parameters(mj_model: mujoco.MjModel) -> PhysicsParameters:
     """The model's own numbers, as NumPy arrays, except for the contact's. A servo without a limit
     has an infinite one."""
-    m, own = mj_model, {}
-    for edit in edits(m):
+    m, model, own = mj_model, EditedModel(mj_model), {}
+    for edit in edits(model):
         own.setdefault(edit.parameter, _field(m, edit.field)[edit.index] / edit.scale)
-    servos = list(find_addresses(m).actuators)
+    servos = list(model.addresses.actuators)
     least = np.min(np.abs(m.actuator_forcerange[servos]), axis=1)
     own["force_limit"] = np.where(m.actuator_forcelimited[servos], least, np.inf)
-    own["link_mass"] = link_masses(m)
+    own["link_mass"] = model.link_masses()
     own |= {name: own[name][0] for name in ("ball_mass", "ball_radius")}
     own |= dict.fromkeys(("contact_stiffness", "contact_damping", "contact_friction"))
     return PhysicsParameters(**own)
@@ -274,39 +297,14 @@ def check_shapes(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> Non
             )
 
 
-def link_bodies(mj_model: mujoco.MjModel) -> tuple[np.ndarray, ...]:
-    """Bodies of each acting joint's link: the joint's body and the bodies welded to it. A body with
-    several joints belongs to the last one, and the others have no bodies."""
-    m, joints = mj_model, find_addresses(mj_model).arm_joints
-    last_joint = (m.body_jntadr + m.body_jntnum - 1)[m.body_weldid]
-    return tuple(np.flatnonzero(last_joint == j) for j in joints)
-
-
-def link_masses(mj_model: mujoco.MjModel) -> np.ndarray:
-    """Masses [n] of the acting joints' links, kg."""
-    return np.array([np.sum(mj_model.body_mass[bodies]) for bodies in link_bodies(mj_model)])
-
-
 def direct_solref(mj_model: mujoco.MjModel) -> tuple[float, float]:
     """k and b of the first ball's contact with the paddle, `solref` in MuJoCo's direct format.
 
     Raises:
       UserError: they have no contact pair.
     """
-    pairs = contact_pairs(mj_model)
+    pairs = EditedModel(mj_model).contact_pairs()
     if not pairs:
         raise UserError(_NO_PAIR)
     stiffness, damping = to_direct_solref(mj_model.pair_solref[pairs[0]], mj_model.opt.timestep)
     return float(stiffness), float(damping)
-
-
-def contact_pairs(mj_model: mujoco.MjModel) -> list[int]:
-    """Indices of the contact pairs of balls and the paddle, the first ball's with the paddle first;
-    none if that one is missing."""
-    at = find_addresses(mj_model)
-    geoms = {at.paddle_geom, *(ball.geom for ball in at.balls)}
-    both = zip(mj_model.pair_geom1.tolist(), mj_model.pair_geom2.tolist(), strict=True)
-    pairs = {i: set(pair) for i, pair in enumerate(both) if geoms.issuperset(pair)}
-    first = {at.paddle_geom, at.balls[0].geom}
-    own = sorted(pairs, key=lambda i: pairs[i] != first)
-    return own if own and pairs[own[0]] == first else []
