@@ -63,14 +63,6 @@ class PipelineState:
 class BraxBounceBall(brax.envs.Env):
     """One environment with brax's interface; `task` is the `Env` in it."""
 
-    # brax's are properties.
-    observation_size: int = 0
-    """Length of the observation vector."""
-    action_size: int = 0
-    """Length of the action vector."""
-    backend: str = ""
-    """Name of the physics engine."""
-
     def __init__(
         self,
         config: WorldConfig | None = None,
@@ -93,8 +85,6 @@ class BraxBounceBall(brax.envs.Env):
         self.task = Env(validate(kind, given | settings, ENV_NAME))
         self.dt, self.mj_model = self.task.dt, self.task.mj_model
         """Time of one control step, s, and MuJoCo's model."""
-        self.observation_size, self.action_size = self.task.observation_size, self.task.action_size
-        self.backend = self.task.backend
         self._model = _Model(self.mj_model)
 
     @functools.cached_property
@@ -124,6 +114,21 @@ class BraxBounceBall(brax.envs.Env):
 
     def _to_brax(self, state: State) -> State:
         return state.replace(pipeline_state=PipelineState(state.pipeline_state, self._model))
+
+    @property
+    def observation_size(self) -> int:
+        """Length of the observation vector."""
+        return self.task.observation_size
+
+    @property
+    def action_size(self) -> int:
+        """Length of the action vector."""
+        return self.task.action_size
+
+    @property
+    def backend(self) -> str:
+        """Name of the physics engine."""
+        return self.task.backend
 
     def render(
         self,

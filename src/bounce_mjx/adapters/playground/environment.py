@@ -73,12 +73,6 @@ class TaskData:
 class PlaygroundBounceBall(MjxEnv):
     """One environment with Playground's interface; `task` is the `Env` in it."""
 
-    # Playground's are properties.
-    action_size: int = 0
-    """Length of the action vector."""
-    mj_model: mujoco.MjModel = None
-    """The model."""
-
     def __init__(
         self,
         config: config_dict.ConfigDict | None = None,
@@ -97,7 +91,6 @@ class PlaygroundBounceBall(MjxEnv):
             "episode_seconds": self._config.episode_length * self._config.ctrl_dt,
         }
         self.task = Env(validate(task_config(task), settings, ENV_NAME))
-        self.action_size, self.mj_model = self.task.action_size, self.task.mj_model
 
     def reset(self, rng: jax.Array) -> State:
         """Starts an episode; consumes the key `rng`."""
@@ -140,6 +133,16 @@ class PlaygroundBounceBall(MjxEnv):
         """The MJCF file."""
         mjcf = self.task.config.mjcf
         return str(resource_path("mjcf/bounce_ball.xml") if mjcf is None else locate(mjcf))
+
+    @property
+    def action_size(self) -> int:
+        """Length of the action vector."""
+        return self.task.action_size
+
+    @property
+    def mj_model(self) -> mujoco.MjModel:
+        """The model."""
+        return self.task.mj_model
 
     @property
     def mjx_model(self) -> mjx.Model:
