@@ -138,11 +138,9 @@ class Simulation:
     @property
     def frame(self) -> EnvFrame:
         """The current frame, which already shows the commands that the next step sets."""
-        frames = [self._frame, *(other.frame for other in self.others)]
-        # Each world has its own metrics.
-        shared = set.intersection(*(set(frame.metrics) for frame in frames))
-        frames = [f._replace(metrics={name: f.metrics[name] for name in shared}) for f in frames]
-        frame = jax.tree.map(lambda *values: np.concatenate(values), *frames)
+        frame = self._frame
+        if self.others:
+            frame = _side_by_side([frame, *(other.frame for other in self.others)])
         given = {name: np.full_like(frame.command[name], x) for name, x in self.command.items()}
         return frame._replace(command=frame.command | given)
 
@@ -220,6 +218,14 @@ class Simulation:
         return key, after, steps, _view(self.env, after, steps, over)
 
 
+def _side_by_side(frames: Sequence[EnvFrame]) -> EnvFrame:
+    """The environments of several frames in one, with the metrics that all of them have, because
+    each world has its own."""
+    shared = set.intersection(*(set(frame.metrics) for frame in frames))
+    frames = [f._replace(metrics={name: f.metrics[name] for name in shared}) for f in frames]
+    return jax.tree.map(lambda *values: np.concatenate(values), *frames)
+
+
 def in_real_time(
     simulation: Simulation, seconds: float | None, speed: Callable[[], float] = lambda: 1.0
 ) -> Iterator[list[EnvFrame]]:
@@ -262,6 +268,7 @@ def resample(recording: EnvFrame, dt: float, fps: float) -> EnvFrame:
     frames = jax.tree.map(lambda values: values[before], recording)
 
     def blend(values: np.ndarray) -> np.ndarray:
+        # Transposed, a share for each frame and environment fits values of any further axes.
         return (values[before].T + fraction.T * (values[after] - values[before]).T).T
 
     moving = "time", "qpos", "balls", "paddle"
