@@ -137,16 +137,16 @@ def _field(mj_model: mujoco.MjModel, name: str) -> np.ndarray:
     return np.asarray(getattr(mj_model.opt if owner == "opt" else mj_model, name))
 
 
-def edits(model: EditedModel) -> tuple[Edit, ...]:
+def edits(m: EditedModel) -> tuple[Edit, ...]:
     """The table of the parameters' entries."""
-    m, at = model.model, model.addresses
+    at, masses = m.addresses, m.model.body_mass
     dofs, servos = list(at.arm_qvel), list(at.actuators)
     bodies, geoms = [ball.body for ball in at.balls], [ball.geom for ball in at.balls]
-    pairs = model.contact_pairs()
-    links = enumerate(model.link_bodies())
-    joint = {body: i for i, link in links for body in link.tolist() if m.body_mass[body] > 0.0}
+    pairs = m.contact_pairs()
+    links = enumerate(m.link_bodies())
+    joint = {body: i for i, link in links for body in link.tolist() if masses[body] > 0.0}
     heavy, joints = list(joint), list(joint.values())
-    share = m.body_mass[heavy] / model.link_masses()[joints]
+    share = masses[heavy] / m.link_masses()[joints]
     return (
         Edit("ball_mass", "body_mass", bodies),
         Edit("ball_radius", "geom_size", (geoms, 0)),
@@ -268,13 +268,13 @@ def edited_model(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> muj
 def own_parameters(mj_model: mujoco.MjModel) -> PhysicsParameters:
     """The model's own numbers, as NumPy arrays, except for the contact's. A servo without a limit
     has an infinite one."""
-    m, model, own = mj_model, EditedModel(mj_model), {}
-    for edit in edits(model):
-        own.setdefault(edit.parameter, _field(m, edit.field)[edit.index] / edit.scale)
-    servos = list(model.addresses.actuators)
-    least = np.min(np.abs(m.actuator_forcerange[servos]), axis=1)
-    own["force_limit"] = np.where(m.actuator_forcelimited[servos], least, np.inf)
-    own["link_mass"] = model.link_masses()
+    m, own = EditedModel(mj_model), {}
+    for edit in edits(m):
+        own.setdefault(edit.parameter, _field(mj_model, edit.field)[edit.index] / edit.scale)
+    servos = list(m.addresses.actuators)
+    least = np.min(np.abs(mj_model.actuator_forcerange[servos]), axis=1)
+    own["force_limit"] = np.where(mj_model.actuator_forcelimited[servos], least, np.inf)
+    own["link_mass"] = m.link_masses()
     own |= {name: own[name][0] for name in ("ball_mass", "ball_radius")}
     own |= dict.fromkeys(("contact_stiffness", "contact_damping", "contact_friction"))
     return PhysicsParameters(**own)
