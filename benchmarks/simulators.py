@@ -40,9 +40,9 @@ from bounce_mjx.evaluation.episodes import reset_episodes
 from bounce_mjx.evaluation.results import Report, judge
 from bounce_mjx.evaluation.statistics import accumulate, empty_statistics
 from bounce_mjx.identify.excitation import excite
-from bounce_mjx.resources import POLICIES, resource_path
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.runs.config import load_run_config
+from bounce_mjx.runs.folders import choose_checkpoint
 from bounce_mjx.world.config import RandomizationConfig
 
 DROP = 0.3
@@ -609,7 +609,7 @@ def evaluate(
 ) -> tuple[Report, np.ndarray]:
     """Results of a shipped policy in a simulator, over episodes of the task's time limit, and the
     positions [T, nq] of the first episode."""
-    config = load_run_config(resource_path(POLICIES.get(policy, policy))).env
+    config = load_run_config(choose_checkpoint(Path(policy), Path()).run).env
     env = Env(config.model_copy(update={"randomization": RandomizationConfig()}))
     addresses = env.addresses
     arm_qpos, arm_qvel = list(addresses.arm_qpos), list(addresses.arm_qvel)
@@ -654,7 +654,7 @@ def evaluate(
 def record_logs(policy: str, name: str, world: World, folder: Path) -> None:
     """Writes the logs for `bounce-mjx identify`: the arm in the motion of `bounce-mjx excite`
     (arm.csv), and the policy, with a new target height every 3 s (ball.csv)."""
-    config = load_run_config(resource_path(POLICIES.get(policy, policy))).env
+    config = load_run_config(choose_checkpoint(Path(policy), Path()).run).env
     env, acting = Env(config), load_policy(policy)
     joints, home = acting.metadata.joint_names, np.array(acting.metadata.default_joint_angles)
     dt = acting.metadata.control_dt

@@ -199,7 +199,10 @@ def find_run(path: Path) -> Path:
     for folder in (path, *Path(os.path.abspath(path)).parents):
         if (folder / CONFIG_FILE).is_file():
             return folder
-    raise UserError(f"{path} is not in a run's folder with a {CONFIG_FILE}; give one that is")
+    raise UserError(
+        f"{path} is not in a run's folder, as there is no {CONFIG_FILE}; give a folder that "
+        "bounce-mjx train made"
+    )
 
 
 def named_run(path: Path | None, log_dir: Path) -> Path:
