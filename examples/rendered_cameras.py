@@ -1,0 +1,298 @@
+"""What two real cameras would see of a simulated arm: lens distortion, motion blur, noise, and light
+from one side. Needs mujoco and OpenCV; nothing here tells the tracker where the ball is.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import cv2
+import mujoco
+import numpy as np
+from two_cameras import (
+    COLOURS,
+    Calibration,
+    Camera,
+    Tracker,
+    calibrate,
+    find_fixed_ball,
+    plan_poses,
+    rough_camera,
+)
+
+WIDTH, HEIGHT = 640, 480
+FOCAL_LENGTH = 560.0
+"""Of both cameras, pixels."""
+DISTORTION = np.array([-0.12, 0.03, 0.0005, -0.0005, 0.0])
+PLACES = ((1.45, 0.85, 0.75), (1.45, -0.85, 0.75))
+"""Where the cameras stand in the robot's frame, m."""
+GAZE = (0.59, 0.0, 0.33)
+"""The point at which both look, m."""
+BALL_COLOURS = {"white": (0.98, 0.98, 0.95, 1.0), "orange": (1.0, 0.45, 0.05, 1.0)}
+
+
+class Picture(NamedTuple):
+    """A pair of pictures."""
+
+    taken: float
+    """Middle of the exposure, s."""
+    arrives: float
+    """Time at which a program gets it, s."""
+    pictures: tuple[np.ndarray, np.ndarray]
+    """BGR [H, W, 3], uint8."""
+
+
+def true_cameras() -> tuple[Camera, ...]:
+    """The cameras as they are, which only the renderer knows."""
+    field_of_view = np.degrees(2.0 * np.arctan(0.5 * WIDTH / FOCAL_LENGTH))
+    cameras = []
+    for place in PLACES:
+        straight = rough_camera(place, GAZE, (WIDTH, HEIGHT), field_of_view)
+        cameras.append(straight._replace(distortion=DISTORTION))
+    return tuple(cameras)
+
+
+def taped_cameras(error: float = 0.03) -> tuple[Camera, ...]:
+    """The cameras as somebody measured them with a tape: off by some centimetres (m) and, in the
+    focal length, by 2%."""
+    field_of_view = np.degrees(2.0 * np.arctan(0.5 * WIDTH / (1.02 * FOCAL_LENGTH)))
+    cameras = []
+    for k, place in enumerate(PLACES):
+        off = error * np.array([1.0, -1.0, 0.5]) * (1 - 2 * k)
+        gaze = np.array(GAZE) + error
+        cameras.append(rough_camera(np.array(place) + off, gaze, (WIDTH, HEIGHT), field_of_view))
+    return tuple(cameras)
+
+
+def make_model(mjcf: str, ball: str = "white", light_from_one_side: bool = False) -> mujoco.MjModel:
+    """The arm's model with the ball's colour and the lights of a laboratory."""
+    spec = mujoco.MjSpec.from_file(mjcf)
+    spec.material("celluloid").rgba = BALL_COLOURS[ball]
+    spec.visual.global_.offwidth = 2 * WIDTH
+    spec.visual.global_.offheight = 2 * HEIGHT
+    # Markers are for people.
+    for site in spec.sites:
+        site.group = 5
+    if light_from_one_side:
+        spec.material("celluloid").emission = 0.1
+        spec.visual.headlight.ambient = [0.22, 0.22, 0.22]
+        spec.visual.headlight.diffuse = [0.0, 0.0, 0.0]
+        spec.light("key").dir = [0.2, -1.0, -0.4]
+        spec.light("fill").diffuse = [0.0, 0.0, 0.0]
+    return spec.compile()
+
+
+class RenderedCameras:
+    """Pictures of two synchronous cameras."""
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        cameras: Sequence[Camera],
+        rate: float = 120.0,
+        exposure: float = 0.004,
+        transport: float = 0.004,
+        noise: float = 3.0,
+        sub_frames: int = 4,
+        seed: int = 0,
+    ):
+        """Args:
+        rate: pictures in a second, Hz.
+        exposure: time of exposure, s; its picture is the mean of `sub_frames`.
+        transport: time from the end of the exposure until a program has the picture, s.
+        noise: standard deviation of a pixel, of 255.
+        """
+        self.rate = rate
+        self.exposure = exposure
+        self.transport = transport
+        self.noise = noise
+        self.sub_frames = sub_frames
+        self._cameras = tuple(cameras)
+        self._random = np.random.default_rng(seed)
+        self._renderer = mujoco.Renderer(model, HEIGHT, WIDTH)
+        self._option = mujoco.MjvOption()
+        self._views = [_View(camera) for camera in cameras]
+        self._begun = 0
+        self._sums: list[np.ndarray] = []
+        self._times: list[float] = []
+
+    def look(self, data: mujoco.MjData) -> Picture | None:
+        """Sees one instant; call it after each physics step. Returns a pair when its exposure ends.
+
+        The sub-frames of an exposure are taken at the physics steps that are due.
+        """
+        start = self._begun / self.rate
+        due = start + len(self._times) / self.sub_frames * self.exposure
+        if data.time < due - 1e-9:
+            return None
+        for k, view in enumerate(self._views):
+            frame = view.render(self._renderer, data, self._option)
+            if not self._times:
+                self._sums.append(frame.astype(np.float32))
+            else:
+                self._sums[k] += frame
+        self._times.append(data.time)
+        if len(self._times) < self.sub_frames:
+            return None
+        pictures = tuple(
+            self._develop(total / self.sub_frames, view)
+            for total, view in zip(self._sums, self._views, strict=True)
+        )
+        middle = float(np.mean(self._times))
+        arrives = middle + 0.5 * self.exposure + self.transport
+        self._sums = []
+        self._times = []
+        self._begun += 1
+        return Picture(middle, arrives, pictures)
+
+    def still(self, data: mujoco.MjData) -> tuple[np.ndarray, ...]:
+        """A pair of pictures of something that rests."""
+        return tuple(
+            self._develop(view.render(self._renderer, data, self._option).astype(np.float32), view)
+            for view in self._views
+        )
+
+    def _develop(self, mean: np.ndarray, view: "_View") -> np.ndarray:
+        distorted = view.distort(mean)
+        noise = self.noise * self._random.standard_normal(distorted.shape, np.float32)
+        return np.clip(distorted + noise, 0.0, 255.0).astype(np.uint8)
+
+    def close(self) -> None:
+        """Frees the renderer."""
+        self._renderer.close()
+
+
+class _View:
+    """A camera in MuJoCo's renderer, which knows no lens distortion: a wider picture is rendered,
+    and the lens then bends it."""
+
+    def __init__(self, camera: Camera):
+        columns, rows = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+        pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2).astype(float)
+        straight = cv2.undistortPoints(pixels, camera.matrix, camera.distortion).reshape(-1, 2)
+        self._tangent = float(np.max(np.abs(straight / np.array([WIDTH / HEIGHT, 1.0])))) * 1.01
+        scale = 0.5 * HEIGHT / self._tangent
+        self._columns = (0.5 * WIDTH + scale * straight[:, 0] - 0.5).reshape(HEIGHT, WIDTH)
+        self._rows = (0.5 * HEIGHT + scale * straight[:, 1] - 0.5).reshape(HEIGHT, WIDTH)
+        self._columns = self._columns.astype(np.float32)
+        self._rows = self._rows.astype(np.float32)
+        self._camera = camera
+
+    def render(
+        self, renderer: mujoco.Renderer, data: mujoco.MjData, option: mujoco.MjvOption
+    ) -> np.ndarray:
+        """The picture of a lens without distortion, BGR."""
+        renderer.update_scene(data, scene_option=option)
+        near = 0.05
+        for gl_camera in renderer.scene.camera:
+            gl_camera.pos[:] = self._camera.centre
+            gl_camera.forward[:] = self._camera.rotation[2]
+            gl_camera.up[:] = -self._camera.rotation[1]
+            gl_camera.orthographic = 0
+            gl_camera.frustum_near = near
+            gl_camera.frustum_far = 10.0
+            gl_camera.frustum_center = 0.0
+            gl_camera.frustum_width = near * self._tangent * WIDTH / HEIGHT
+            gl_camera.frustum_bottom = -near * self._tangent
+            gl_camera.frustum_top = near * self._tangent
+        return renderer.render()[:, :, ::-1]
+
+    def distort(self, straight: np.ndarray) -> np.ndarray:
+        """The picture of the real lens."""
+        return cv2.remap(straight, self._columns, self._rows, cv2.INTER_LINEAR)
+
+
+class SeenBall:
+    """The ball as a robot's program gets it: pictures, the tracker, and their delays.
+
+    It has the interface of `deploy.Camera`.
+    """
+
+    def __init__(self, cameras: RenderedCameras, tracker: Tracker, processing: float = 0.004):
+        """Args:
+        processing: time that the tracker takes, s.
+        """
+        self._cameras = cameras
+        self._tracker = tracker
+        self._processing = processing
+        self._measured: list[tuple[float, float, np.ndarray]] = []
+        self.num_pairs = 0
+        """Pairs of pictures so far."""
+        self.num_missed = 0
+        """Pairs in which no ball was found."""
+        self.pictures: tuple[np.ndarray, np.ndarray] | None = None
+        """The newest pair."""
+
+    def look(self, data: mujoco.MjData) -> None:
+        """Sees one instant; call it after each physics step."""
+        picture = self._cameras.look(data)
+        if picture is None:
+            return
+        self.num_pairs += 1
+        self.pictures = picture.pictures
+        fix = self._tracker.update(picture.pictures, picture.taken)
+        if fix is None:
+            self.num_missed += 1
+            return
+        arrives = picture.arrives + self._processing
+        self._measured = [*self._measured[-20:], (arrives, fix.time, fix.position)]
+
+    def measure(self, time: float) -> dict:
+        """The newest place of the ball that has arrived, if any, and its velocity from two."""
+        arrived = [entry for entry in self._measured if entry[0] <= time + 1e-6]
+        if not arrived:
+            return {}
+        _, taken, position = arrived[-1]
+        _, before, last_position = arrived[max(len(arrived) - 2, 0)]
+        velocity = (position - last_position) / max(taken - before, 1e-3)
+        return {"ball_position": position, "ball_velocity": velocity, "ball_age": time - taken}
+
+
+def calibrate_with_arm(
+    model: mujoco.MjModel,
+    metadata,
+    cameras: RenderedCameras,
+    ball: str = "white",
+    seed: int = 0,
+) -> Calibration:
+    """The cameras in the frame of the base, from 20 poses of the arm with the ball on its paddle.
+
+    The ball is taped to the paddle some millimetres beside its centre, as a person would do it.
+    """
+    rng = np.random.default_rng(seed)
+    data = mujoco.MjData(model)
+    rough = taped_cameras()
+    joint_angles = plan_poses(metadata, rough, (WIDTH, HEIGHT), seed=seed)
+    beside = 0.003 * rng.standard_normal(2)
+    pixels = np.full((2, len(joint_angles), 2), np.nan)
+    background = cameras.still(_posed(model, data, metadata, joint_angles[0], None))
+    for pose, angles in enumerate(joint_angles):
+        pictures = cameras.still(_posed(model, data, metadata, angles, beside))
+        for k, picture in enumerate(pictures):
+            pixels[k, pose] = find_fixed_ball(
+                metadata, rough[k], angles, picture, COLOURS[ball], background[k]
+            )
+    return calibrate(metadata, rough, joint_angles, pixels)
+
+
+def _posed(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    metadata,
+    joint_angles: np.ndarray,
+    beside: np.ndarray | None,
+) -> mujoco.MjData:
+    """The arm at joint angles with the ball on its paddle, beside its centre by x and y (m) in the
+    paddle's frame; None for no ball."""
+    for name, angle in zip(metadata.joint_names, joint_angles, strict=True):
+        data.joint(name).qpos = angle
+    mujoco.mj_forward(model, data)
+    paddle = model.geom("blocker").id
+    place = np.array([0.0, 0.0, -5.0])
+    if beside is not None:
+        frame = data.geom_xmat[paddle].reshape(3, 3)
+        up = frame[:, 2] * np.sign(frame[2, 2])
+        height = model.geom_size[paddle, 2] + model.geom("ball").size[0]
+        place = data.geom_xpos[paddle] + frame[:, :2] @ beside + height * up
+    data.joint("ball_link").qpos[:3] = place
+    mujoco.mj_forward(model, data)
+    return data

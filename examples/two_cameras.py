@@ -1,0 +1,672 @@
+"""The ball's position from two cameras, for any policy that needs `ball_position`.
+
+    python examples/two_cameras.py calibrate POLICY --cameras cameras.json ...   # with the arm itself
+    python examples/two_cameras.py watch cameras.json --sources 0 1              # prints what it sees
+
+OpenCV does the geometry (`pip install opencv-python-headless`); what is special is here: the ball. It
+is found by its colour, as a circle that is fitted to the edge of its picture. A part of the edge is
+enough, so a ball that the paddle hides in part still gives its centre. What does not fit gives
+nothing: the size, the rays of both cameras and the flight must agree. docs/cameras.md says which
+cameras to take and where to put them.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from scipy.optimize import least_squares
+
+from bounce_mjx.deploy.motion import paddle_position
+
+RADIUS = 0.019
+"""Radius of the ball, m."""
+GRAVITY = np.array([0.0, 0.0, -9.81])
+
+# The ball's colour in OpenCV's HSV (hue 0 to 180, saturation and value 0 to 255): lower and upper
+# ends, wide enough for its side in the shade.
+COLOURS = {
+    "white": ((0, 0, 60), (180, 80, 255)),
+    "orange": ((7, 110, 50), (25, 255, 255)),
+}
+# Difference of a pixel from the background, of 255, that is no noise.
+_DIFFERENCE = 16
+
+# Radii of the ball in a picture before it is known how far it is, pixels.
+_RADII = (3.0, 40.0)
+# Share of the expected radius by which a measured one may differ.
+_RADIUS_TOLERANCE = 0.3
+# Distance of an edge point from the circle, pixels, and the share of the circle's directions in
+# which there must be such points.
+_EDGE_TOLERANCE, _LEAST_ARC = 1.2, 0.35
+_DIRECTIONS = 24
+# Least share of a circle's inside that has the ball's colour, and points [25, 2] spread over the
+# inside of a circle of the radius 1 (a sunflower's seeds).
+_LEAST_FILLED = 0.4
+_SEEDS = np.arange(25)
+_INSIDE = 0.85 * np.sqrt((_SEEDS[:, None] + 0.5) / 25.0)
+_INSIDE = _INSIDE * np.column_stack([np.cos(2.4 * _SEEDS), np.sin(2.4 * _SEEDS)])
+# Distance between a circle's centre and the projection of the triangulated ball, pixels.
+_MAX_REPROJECTION = 3.0
+# Largest change of the ball's velocity at a bounce, m/s, and what is added to the distance from the
+# predicted place, m.
+_MAX_VELOCITY_CHANGE, _PLACE_TOLERANCE = 9.0, 0.02
+# Pictures without a ball after which the whole picture is searched, not the predicted place.
+_LOST_AFTER = 2
+# How far the ball may be from where cameras that were measured with a tape expect it, pixels.
+_TAPE_MARGIN = 90.0
+
+
+class Camera(NamedTuple):
+    """A calibrated camera, in OpenCV's convention: x right, y down, z forward."""
+
+    matrix: np.ndarray
+    """Intrinsic matrix [3, 3], pixels."""
+    distortion: np.ndarray
+    """k1, k2, p1, p2, k3 of the lens [5]."""
+    rotation: np.ndarray
+    """From the robot's frame to the camera's [3, 3]."""
+    translation: np.ndarray
+    """The robot's origin in the camera's frame [3], m."""
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Pixels [N, 2] of points [N, 3] (m) in the robot's frame."""
+        rotation_vector, _ = cv2.Rodrigues(self.rotation)
+        pixels, _ = cv2.projectPoints(
+            np.reshape(points, (-1, 1, 3)).astype(float),
+            rotation_vector,
+            self.translation,
+            self.matrix,
+            self.distortion,
+        )
+        return pixels.reshape(-1, 2)
+
+    @property
+    def centre(self) -> np.ndarray:
+        """Place of the camera in the robot's frame [3], m."""
+        return -self.rotation.T @ self.translation
+
+    def ray(self, pixel: Sequence[float]) -> np.ndarray:
+        """Unit vector [3] in the robot's frame from the camera toward a pixel."""
+        point = np.array(pixel, float).reshape(1, 1, 2)
+        x, y = cv2.undistortPoints(point, self.matrix, self.distortion).ravel()
+        direction = self.rotation.T @ np.array([x, y, 1.0])
+        return direction / np.linalg.norm(direction)
+
+    def radius_at(self, position: np.ndarray) -> float:
+        """Radius of the ball at a position [3] (m) in the picture, pixels."""
+        depth = (self.rotation @ position + self.translation)[2]
+        return float(self.matrix[0, 0] * RADIUS / max(depth, 0.05))
+
+
+class Circle(NamedTuple):
+    """A ball in a picture, pixels."""
+
+    centre: np.ndarray
+    radius: float
+    score: float
+    """Share of the circle's directions in which its edge was seen, times the share of its inside
+    that has the ball's colour."""
+
+
+class Fix(NamedTuple):
+    """A measured place of the ball."""
+
+    time: float
+    """Middle of the exposure, s."""
+    position: np.ndarray
+    """In the robot's frame [3], m."""
+    error: float
+    """Largest distance from a circle's centre to the ball's projection, pixels."""
+
+
+class Expected(NamedTuple):
+    """Where a ball is expected in a picture, pixels."""
+
+    centre: np.ndarray
+    radius: float
+    blur: np.ndarray
+    """Motion during the exposure [2]."""
+    margin: float = 45.0
+    """How far from there the ball may be."""
+
+
+def find_circles(
+    picture: np.ndarray,
+    colour: tuple[Sequence[int], Sequence[int]],
+    background: np.ndarray | None = None,
+    expected: Expected | None = None,
+    count: int = 3,
+) -> list[Circle]:
+    """Circles of the ball's colour in a picture, the most complete ones first.
+
+    Args:
+      picture: BGR [H, W, 3], uint8.
+      colour: lower and upper ends in HSV, as `COLOURS`.
+      background: the picture without a ball; None takes the colour alone.
+      expected: searches around this place alone; None for the whole picture.
+      count: largest number of circles.
+    """
+    corner = np.zeros(2, int)
+    radii = _RADII
+    blur = np.zeros(2)
+    if expected is not None:
+        reach = expected.radius + np.linalg.norm(expected.blur) + expected.margin
+        height, width = picture.shape[:2]
+        lower = np.clip(np.floor(expected.centre - reach), 0, (width, height)).astype(int)
+        upper = np.clip(np.ceil(expected.centre + reach), 0, (width, height)).astype(int)
+        if np.any(upper - lower < 4):
+            return []
+        window = np.s_[lower[1] : upper[1], lower[0] : upper[0]]
+        picture = picture[window]
+        background = None if background is None else background[window]
+        corner = lower
+        tolerance = _RADIUS_TOLERANCE * expected.radius
+        radii = (expected.radius - tolerance, expected.radius + tolerance)
+        blur = expected.blur
+    hsv = cv2.cvtColor(picture, cv2.COLOR_BGR2HSV)
+    mask = cv2.inRange(hsv, np.array(colour[0], np.uint8), np.array(colour[1], np.uint8))
+    if background is not None:
+        difference = cv2.absdiff(picture, background)
+        is_background = cv2.inRange(difference, (0, 0, 0), (_DIFFERENCE,) * 3)
+        mask[is_background > 0] = 0
+    mask = cv2.medianBlur(mask, 3)
+    contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    circles = []
+    for contour in contours:
+        edge = contour.reshape(-1, 2).astype(float)
+        if len(edge) < 3.0 * radii[0]:
+            continue
+        # A picture's border is no edge of the ball.
+        size = np.array(mask.shape[::-1]) - 1
+        edge = edge[np.all((edge > 0) & (edge < size), axis=1)]
+        circle = fit_circle(edge, mask, radii, blur)
+        if circle is not None:
+            circles.append(circle._replace(centre=circle.centre + corner))
+    circles.sort(key=lambda circle: circle.score, reverse=True)
+    return circles[:count]
+
+
+def fit_circle(
+    edge: np.ndarray,
+    mask: np.ndarray,
+    radii: tuple[float, float],
+    blur: np.ndarray = np.zeros(2),
+) -> Circle | None:
+    """The filled circle that most of an edge lies on; None if there is none.
+
+    Circles through three points on arcs of the edge are tried; the one with the most points close
+    to it and the most of its inside filled is refined on these points. With a blur, the edge is
+    that of a circle that moved along a line.
+
+    Args:
+      edge: points [N, 2] in the order of the edge, pixels.
+      mask: pixels of the ball's colour [H, W], not 0.
+      radii: smallest and largest radius.
+      blur: motion [2] during the exposure, pixels.
+    """
+    if len(edge) < 8:
+        return None
+    centre = _most_supported_circle(edge, mask, radii, blur)
+    if centre is None:
+        return None
+    centre, radius = centre
+    for _ in range(6):
+        offsets = edge - _nearest_on_path(edge, centre, blur)
+        distances = np.linalg.norm(offsets, axis=1)
+        is_near = np.abs(distances - radius) < _EDGE_TOLERANCE
+        if np.count_nonzero(is_near) < 8:
+            return None
+        # Gauss-Newton: a shift of the centre changes a distance by its component along the offset.
+        normals = offsets[is_near] / distances[is_near, None]
+        jacobian = np.column_stack([normals, np.ones(len(normals))])
+        residuals = distances[is_near] - radius
+        change, *_ = np.linalg.lstsq(jacobian, residuals, rcond=None)
+        centre = centre + change[:2]
+        radius = radius + change[2]
+    if not radii[0] <= radius <= radii[1]:
+        return None
+    angles = np.arctan2(normals[:, 1], normals[:, 0])
+    directions = np.unique(np.floor((angles + np.pi) / (2.0 * np.pi) * _DIRECTIONS))
+    arc = len(directions) / _DIRECTIONS
+    filled = float(_filled_share(mask, centre[None], np.array([radius]))[0])
+    if arc < _LEAST_ARC or filled < _LEAST_FILLED:
+        return None
+    return Circle(centre, float(radius), arc * filled)
+
+
+def _filled_share(mask: np.ndarray, centres: np.ndarray, radii: np.ndarray) -> np.ndarray:
+    """Share [C] of circles' insides that a mask fills; centres [C, 2] and radii [C] in pixels."""
+    points = centres[:, None] + radii[:, None, None] * _INSIDE
+    columns, rows = np.moveaxis(np.round(points).astype(int), -1, 0)
+    height, width = mask.shape
+    is_in_picture = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    values = mask[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
+    return np.mean(is_in_picture & (values > 0), axis=1)
+
+
+def _nearest_on_path(points: np.ndarray, centre: np.ndarray, blur: np.ndarray) -> np.ndarray:
+    """Nearest places [N, 2] of the moving centre to points [N, 2]."""
+    squared_length = blur @ blur
+    if squared_length < 1e-6:
+        return np.broadcast_to(centre, points.shape)
+    along = np.clip((points - centre) @ blur / squared_length, -0.5, 0.5)
+    return centre + along[:, None] * blur
+
+
+def _most_supported_circle(
+    edge: np.ndarray, mask: np.ndarray, radii: tuple[float, float], blur: np.ndarray
+) -> tuple[np.ndarray, float] | None:
+    """Centre and radius of the circle through three points of an arc that has the most edge points
+    close to it, and is filled."""
+    count = len(edge)
+    starts = np.arange(0, count, max(1, count // 40))
+    triples = []
+    for share in (0.12, 0.22, 0.32):
+        for circumference in (2.0 * np.pi * radii[0], 2.0 * np.pi * radii[1]):
+            stride = int(max(2, min(share * circumference, count / 3)))
+            triples.append(np.stack([starts, starts + stride, starts + 2 * stride], axis=1))
+    corners = edge[np.concatenate(triples) % count]
+    centres, circle_radii = _circles_through(corners)
+    is_possible = (circle_radii > 0.8 * radii[0]) & (circle_radii < 1.2 * radii[1])
+    centres = centres[is_possible]
+    circle_radii = circle_radii[is_possible]
+    if not len(centres):
+        return None
+    tolerance = _EDGE_TOLERANCE + 0.5 * np.linalg.norm(blur)
+    offsets = edge[None] - centres[:, None]
+    distances = np.sqrt(np.sum(offsets * offsets, axis=2))
+    is_near = np.abs(distances - circle_radii[:, None]) < tolerance
+    # A large circle has more edge; its share counts.
+    support = np.count_nonzero(is_near, axis=1) / circle_radii
+    support *= _filled_share(mask, centres, circle_radii)
+    best = int(np.argmax(support))
+    return centres[best], float(np.clip(circle_radii[best], *radii))
+
+
+def _circles_through(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centres [N, 2] and radii [N] of the circles through triples of points [N, 3, 2]."""
+    first = corners[:, 1] - corners[:, 0]
+    second = corners[:, 2] - corners[:, 0]
+    determinant = 2.0 * (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
+    is_straight = np.abs(determinant) < 1e-6
+    determinant = np.where(is_straight, np.inf, determinant)
+    first_squared = np.sum(first * first, axis=1)
+    second_squared = np.sum(second * second, axis=1)
+    x = (second[:, 1] * first_squared - first[:, 1] * second_squared) / determinant
+    y = (first[:, 0] * second_squared - second[:, 0] * first_squared) / determinant
+    offsets = np.stack([x, y], axis=1)
+    radii = np.where(is_straight, np.inf, np.linalg.norm(offsets, axis=1))
+    return corners[:, 0] + offsets, radii
+
+
+def triangulate(cameras: Sequence[Camera], pixels: Sequence[np.ndarray]) -> np.ndarray:
+    """The place [3] (m) with the least sum of squared distances from the rays of all cameras."""
+    matrix = np.zeros((3, 3))
+    vector = np.zeros(3)
+    for camera, pixel in zip(cameras, pixels, strict=True):
+        ray = camera.ray(pixel)
+        across = np.eye(3) - np.outer(ray, ray)
+        matrix += across
+        vector += across @ camera.centre
+    return np.linalg.solve(matrix, vector)
+
+
+class Tracker:
+    """Places of the ball from pairs of pictures, one pair after the other."""
+
+    def __init__(
+        self,
+        cameras: Sequence[Camera],
+        colour: tuple[Sequence[int], Sequence[int]] = COLOURS["white"],
+        exposure: float = 0.004,
+    ):
+        """Args:
+        exposure: of both cameras, s; the ball's motion in it blurs its edge.
+        """
+        self.cameras = tuple(cameras)
+        self.colour = colour
+        self.exposure = exposure
+        self.fixes: list[Fix] = []
+        self._missed = 0
+        self._backgrounds: list[np.ndarray | None] = [None] * len(self.cameras)
+
+    def learn_background(self, pairs: Sequence[Sequence[np.ndarray]]) -> None:
+        """Takes pairs of pictures without a ball as what is always there; some twenty average out
+        the noise. The arm may be in them, and move later."""
+        self._backgrounds = [
+            np.mean(np.stack(pictures).astype(np.float32), axis=0).astype(np.uint8)
+            for pictures in zip(*pairs, strict=True)
+        ]
+
+    def update(self, pictures: Sequence[np.ndarray], taken: float) -> Fix | None:
+        """The place of the ball in a pair of pictures; None if it is not seen for sure.
+
+        Args:
+          pictures: one of each camera, taken at once, BGR.
+          taken: middle of the exposure, s.
+        """
+        motion = self._predict(taken) if self._missed <= _LOST_AFTER else None
+        circles = []
+        for camera, picture, background in zip(
+            self.cameras, pictures, self._backgrounds, strict=True
+        ):
+            expected = None if motion is None else self._expected(camera, *motion)
+            circles.append(find_circles(picture, self.colour, background, expected))
+        fix = self._best_fix(circles, taken, None if motion is None else motion[0])
+        if fix is None:
+            self._missed += 1
+            if self._missed > _LOST_AFTER:
+                self.fixes = []
+            return None
+        self._missed = 0
+        self.fixes = [*self.fixes[-1:], fix]
+        return fix
+
+    def _predict(self, taken: float) -> tuple[np.ndarray, np.ndarray] | None:
+        """Position and velocity [3] at a time, of a ball in free flight since the last picture."""
+        if not self.fixes:
+            return None
+        last = self.fixes[-1]
+        after = taken - last.time
+        velocity = np.zeros(3)
+        if len(self.fixes) > 1:
+            before = self.fixes[-2]
+            between = max(last.time - before.time, 1e-3)
+            velocity = (last.position - before.position) / between + 0.5 * between * GRAVITY
+        position = last.position + after * velocity + 0.5 * after * after * GRAVITY
+        return position, velocity + after * GRAVITY
+
+    def _expected(self, camera: Camera, position: np.ndarray, velocity: np.ndarray) -> Expected:
+        half = 0.5 * self.exposure * velocity
+        start, centre, end = camera.project(np.stack([position - half, position, position + half]))
+        return Expected(centre, camera.radius_at(position), end - start)
+
+    def _best_fix(
+        self, circles: list[list[Circle]], taken: float, predicted: np.ndarray | None
+    ) -> Fix | None:
+        """The pair of circles whose rays meet best, if it can be the ball."""
+        best = None
+        for first in circles[0]:
+            for second in circles[1]:
+                fix = self._fix((first, second), taken, predicted)
+                if fix is not None and (best is None or fix.error < best.error):
+                    best = fix
+        return best
+
+    def _fix(
+        self, pair: Sequence[Circle], taken: float, predicted: np.ndarray | None
+    ) -> Fix | None:
+        position = triangulate(self.cameras, [circle.centre for circle in pair])
+        error = 0.0
+        for camera, circle in zip(self.cameras, pair, strict=True):
+            radius = camera.radius_at(position)
+            if abs(circle.radius - radius) > _RADIUS_TOLERANCE * radius:
+                return None
+            projected = camera.project(position[None])[0]
+            error = max(error, float(np.linalg.norm(projected - circle.centre)))
+        if error > _MAX_REPROJECTION:
+            return None
+        if predicted is not None:
+            since = taken - self.fixes[-1].time
+            reach = _PLACE_TOLERANCE + _MAX_VELOCITY_CHANGE * since
+            if np.linalg.norm(position - predicted) > reach:
+                return None
+        return Fix(taken, position, error)
+
+
+class Calibration(NamedTuple):
+    """Both cameras in the frame of the robot's base, and how well they are known."""
+
+    cameras: tuple[Camera, ...]
+    ball: np.ndarray
+    """Centre of the ball that was fixed to the paddle, from the paddle's centre [3], m, in the axes
+    of the robot's frame at the joints' reference angles."""
+    errors: np.ndarray
+    """Triangulated place less that of the forward kinematics [N, 3], m, of each pose when the others
+    alone were used; NaN where a camera saw no ball."""
+    bad: tuple[int, ...]
+    """Poses that do not fit the others, and were left out."""
+
+    def report(self) -> str:
+        """How well the cameras are known, in words."""
+        used = np.delete(self.errors, self.bad, axis=0)
+        used = used[np.all(np.isfinite(used), axis=1)]
+        x, y, z = 1e3 * np.sqrt(np.mean(used**2, axis=0))
+        text = f"{len(used)} poses; error x {x:.2f}, y {y:.2f}, z {z:.2f} mm (root mean square)"
+        if self.bad:
+            numbers = ", ".join(str(pose + 1) for pose in self.bad)
+            text += f"; left out, as they do not fit: pose {numbers}"
+        return text
+
+
+# Standard deviations of what is known before a calibration: focal length (share), principal point
+# (pixels), k1 and k2, and the place of the ball on the paddle (m).
+_PRIOR_FOCAL, _PRIOR_CENTRE, _PRIOR_LENS, _PRIOR_BALL = 0.05, 10.0, 0.2, 0.005
+# Noise of a circle's centre, pixels, and how far a pose may be off, in pixels and in times the noise.
+_PIXEL_NOISE, _BAD_PIXELS = 0.3, 4.0
+_FOLDS = 4
+# Half of the paddle's thickness, m.
+_HALF_THICKNESS = 0.0035
+
+
+def ball_positions(metadata, joint_angles: np.ndarray, ball: np.ndarray) -> np.ndarray:
+    """Places [N, 3] (m) of a ball that is fixed to the paddle, by the forward kinematics.
+
+    Args:
+      metadata: of the policy for this arm.
+      joint_angles: [N, J], rad.
+      ball: as `Calibration.ball`.
+    """
+    fixed = metadata._replace(paddle=tuple(np.array(metadata.paddle) + ball))
+    return paddle_position(fixed, joint_angles)
+
+
+def plan_poses(
+    metadata, cameras: Sequence[Camera], size: tuple[int, int], count: int = 20, seed: int = 0
+) -> np.ndarray:
+    """Joint angles [count, J] (rad) at which both cameras see the paddle, spread over their views.
+
+    Of many random poses around the start pose, those are kept whose paddle is in both pictures, at
+    least 20 cm over the floor's height below home and with its upper face toward both cameras; then
+    each pose that is farthest from all chosen ones is added.
+
+    Args:
+      cameras: roughly known, such as `rough_camera` gives.
+      size: width and height of the pictures, pixels.
+    """
+    rng = np.random.default_rng(seed)
+    home = np.array(metadata.default_joint_angles)
+    low, high = np.array(
+        [(-np.inf, np.inf) if ends is None else ends for ends in metadata.joint_ranges]
+    ).T
+    angles = home + rng.uniform(-0.5, 0.5, (20_000, len(home)))
+    angles = np.clip(angles, low + 0.05, high - 0.05)
+    places = paddle_position(metadata, angles)
+    normal = np.array(metadata.paddle_normal)
+    upward = ball_positions(metadata, angles, normal) - places
+    home_place = paddle_position(metadata, home)
+    is_good = (places[:, 2] > home_place[2] - 0.05) & (upward[:, 2] > 0.6)
+    for camera in cameras:
+        pixels = camera.project(places)
+        margin = 0.08 * np.array(size)
+        is_good &= np.all((pixels > margin) & (pixels < size - margin), axis=1)
+        toward = camera.centre - places
+        toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+        is_good &= np.sum(toward * upward, axis=1) > 0.25
+    angles = angles[is_good]
+    places = places[is_good]
+    if len(angles) < count:
+        raise SystemExit(
+            f"both cameras see the paddle in {len(angles)} of 20000 poses around the start pose, "
+            f"but {count} are needed; move the cameras so that both see the paddle and 40 cm above it"
+        )
+    chosen = [int(np.argmin(np.linalg.norm(places - home_place, axis=1)))]
+    distances = np.linalg.norm(places - places[chosen[0]], axis=1)
+    while len(chosen) < count:
+        chosen.append(int(np.argmax(distances)))
+        distances = np.minimum(distances, np.linalg.norm(places - places[chosen[-1]], axis=1))
+    return angles[chosen]
+
+
+def rough_camera(
+    place: Sequence[float], gaze: Sequence[float], size: tuple[int, int], field_of_view: float
+) -> Camera:
+    """A camera with a level horizon, measured with a tape.
+
+    Args:
+      place: of the camera [3], m, in the robot's frame.
+      gaze: the point at which it looks [3], m.
+      size: width and height of its pictures, pixels.
+      field_of_view: horizontal, degrees.
+    """
+    width, height = size
+    forward = np.array(gaze, float) - np.array(place, float)
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    focal_length = 0.5 * width / np.tan(0.5 * np.radians(field_of_view))
+    matrix = np.array(
+        [[focal_length, 0.0, width / 2], [0.0, focal_length, height / 2], [0.0, 0.0, 1.0]]
+    )
+    return Camera(matrix, np.zeros(5), rotation, -rotation @ np.array(place, float))
+
+
+def find_fixed_ball(
+    metadata,
+    rough: Camera,
+    joint_angles: np.ndarray,
+    picture: np.ndarray,
+    colour: tuple[Sequence[int], Sequence[int]],
+    background: np.ndarray | None = None,
+) -> np.ndarray:
+    """Pixel [2] of the ball that is fixed to the paddle at joint angles [J]; NaN if it is not seen.
+
+    The other arguments are those of `calibrate` and `find_circles`.
+    """
+    place = ball_positions(metadata, joint_angles, _nominal_ball(metadata))
+    radius = rough.radius_at(place)
+    expected = Expected(rough.project(place)[0], radius, np.zeros(2), _TAPE_MARGIN)
+    circles = find_circles(picture, colour, background, expected, count=1)
+    return circles[0].centre if circles else np.full(2, np.nan)
+
+
+def _nominal_ball(metadata) -> np.ndarray:
+    """`Calibration.ball` of a ball on the middle of the paddle's upper face."""
+    return np.array(metadata.paddle_normal) * (RADIUS + _HALF_THICKNESS)
+
+
+def calibrate(
+    metadata, rough: Sequence[Camera], joint_angles: np.ndarray, pixels: np.ndarray
+) -> Calibration:
+    """Both cameras in the frame of the base, from pictures of a ball that is fixed to the paddle.
+
+    `cv2.solvePnP` starts each camera, and a bundle adjustment finds both with their lenses and the
+    place of the ball on the paddle. A pose that does not fit is left out.
+
+    Args:
+      metadata: of the policy for this arm.
+      rough: the cameras as `rough_camera` gives them; of these the intrinsics count.
+      joint_angles: measured [N, J], rad.
+      pixels: the ball's centre in each camera's pictures [2, N, 2]; NaN where it was not seen.
+    """
+    ball = _nominal_ball(metadata)
+    used = np.all(np.isfinite(pixels), axis=(0, 2))
+    bad: list[int] = []
+    while True:
+        if np.count_nonzero(used) < 8:
+            raise SystemExit(
+                f"{np.count_nonzero(used)} poses are left, but 8 are needed; check that the ball is "
+                "fixed, that both cameras see it, and that the arm has the policy's joints"
+            )
+        cameras, adjusted, residuals = _adjust(metadata, rough, ball, joint_angles, pixels, used)
+        worst = int(np.argmax(residuals))
+        typical = max(_PIXEL_NOISE, 1.5 * float(np.median(residuals[used])))
+        if residuals[worst] < _BAD_PIXELS * typical:
+            break
+        bad.append(worst)
+        used[worst] = False
+    errors = np.full((len(joint_angles), 3), np.nan)
+    numbers = np.flatnonzero(used)
+    for fold in range(_FOLDS):
+        left_out = numbers[fold::_FOLDS]
+        others = used.copy()
+        others[left_out] = False
+        fold_cameras, fold_ball, _ = _adjust(metadata, rough, ball, joint_angles, pixels, others)
+        truth = ball_positions(metadata, joint_angles, fold_ball)
+        for pose in left_out:
+            place = triangulate(fold_cameras, pixels[:, pose])
+            errors[pose] = place - truth[pose]
+    return Calibration(cameras, adjusted, errors, tuple(sorted(bad)))
+
+
+def _adjust(
+    metadata,
+    rough: Sequence[Camera],
+    ball: np.ndarray,
+    joint_angles: np.ndarray,
+    pixels: np.ndarray,
+    used: np.ndarray,
+) -> tuple[tuple[Camera, ...], np.ndarray, np.ndarray]:
+    """Bundle adjustment: the cameras, the ball's place on the paddle, and each pose's residual
+    [N] (pixels; 0 for one that is not used)."""
+    places = ball_positions(metadata, joint_angles, ball)
+    starts = []
+    for camera, seen in zip(rough, pixels, strict=True):
+        _, rotation, translation = cv2.solvePnP(
+            places[used], seen[used], camera.matrix, None, flags=cv2.SOLVEPNP_SQPNP
+        )
+        starts.append([*rotation.ravel(), *translation.ravel(), 1.0, 0.0, 0.0, 0.0, 0.0])
+    size = len(starts[0])
+
+    def cameras_of(unknowns: np.ndarray) -> tuple[Camera, ...]:
+        cameras = []
+        for k, camera in enumerate(rough):
+            values = unknowns[k * size : (k + 1) * size]
+            matrix = camera.matrix.copy()
+            matrix[0, 0] *= values[6]
+            matrix[1, 1] *= values[6]
+            matrix[:2, 2] += values[7:9]
+            distortion = np.array([values[9], values[10], 0.0, 0.0, 0.0])
+            rotation, _ = cv2.Rodrigues(values[:3])
+            cameras.append(Camera(matrix, distortion, rotation, values[3:6]))
+        return tuple(cameras)
+
+    def reprojections(unknowns: np.ndarray) -> np.ndarray:
+        points = ball_positions(metadata, joint_angles, unknowns[-3:])
+        errors = []
+        for camera, seen in zip(cameras_of(unknowns), pixels, strict=True):
+            errors.append(camera.project(points) - seen)
+        return np.stack(errors)
+
+    def residuals(unknowns: np.ndarray) -> np.ndarray:
+        priors = [(unknowns[-3:] - ball) / _PRIOR_BALL]
+        for k in range(len(rough)):
+            values = unknowns[k * size : (k + 1) * size]
+            priors.append([(values[6] - 1.0) / _PRIOR_FOCAL])
+            priors.append(values[7:9] / _PRIOR_CENTRE)
+            priors.append(values[9:11] / _PRIOR_LENS)
+        seen = reprojections(unknowns)[:, used] / _PIXEL_NOISE
+        return np.concatenate([seen.ravel(), *priors])
+
+    start = np.concatenate([*starts, ball])
+    unknowns = least_squares(residuals, start, loss="soft_l1", x_scale="jac").x
+    distances = np.linalg.norm(reprojections(unknowns), axis=2).max(axis=0)
+    return cameras_of(unknowns), unknowns[-3:], np.where(used, distances, 0.0)
+
+
+def save_cameras(path: Path, cameras: Sequence[Camera]) -> None:
+    """Writes calibrated cameras."""
+    entries = [{name: value.tolist() for name, value in c._asdict().items()} for c in cameras]
+    path.write_text(json.dumps(entries, indent=1) + "\n")
+
+
+def load_cameras(path: Path) -> tuple[Camera, ...]:
+    """Reads what `save_cameras` wrote."""
+    entries = json.loads(path.read_text())
+    return tuple(Camera(**{k: np.array(v) for k, v in entry.items()}) for entry in entries)
