@@ -1,7 +1,9 @@
 """A policy in the control loop of a simulated robot with a late and noisy camera.
 
 `python examples/deploy.py [POLICY]` needs numpy, onnxruntime and mujoco, but no JAX. With `--log`,
-it writes the log from which `bounce-mjx identify` estimates the robot's world.
+it writes the log from which `bounce-mjx identify` estimates the robot's world. With `--cameras`,
+the ball is seen in rendered pictures of two cameras alone (`two_cameras.py`), which the arm has
+calibrated before; that needs OpenCV too.
 """
 
 import argparse
@@ -15,6 +17,8 @@ from bounce_mjx.deploy.recorder import Recorder
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.resources import resource_path
 
+MJCF = resource_path("mjcf/bounce_ball.xml")
+
 
 class Camera:
     """Pictures of the ball: their rate (Hz), noise (m) and delay (s)."""
@@ -24,10 +28,12 @@ class Camera:
         self.random = np.random.default_rng(0)
         self.pictures: list[tuple[float, np.ndarray]] = []
 
-    def look(self, time: float, ball: np.ndarray) -> None:
+    def look(self, data: mujoco.MjData) -> None:
         """Takes a picture of the ball if one is due."""
-        if time * self.rate > len(self.pictures) - 1e-6:
-            self.pictures.append((time, ball + self.noise * self.random.standard_normal(3)))
+        if data.time * self.rate > len(self.pictures) - 1e-6:
+            ball = data.joint("ball_link").qpos[:3]
+            noise = self.noise * self.random.standard_normal(3)
+            self.pictures.append((data.time, ball + noise))
 
     def measure(self, time: float) -> dict:
         """Newest picture that has arrived, if any, and the velocity from the last two."""
@@ -41,10 +47,16 @@ class Camera:
 
 
 def simulate(
-    policy, camera: Camera, seconds: float, heights: list[float], recorder: Recorder | None = None
+    policy,
+    camera: Camera,
+    seconds: float,
+    heights: list[float],
+    recorder: Recorder | None = None,
+    model: mujoco.MjModel | None = None,
 ) -> list[tuple[int, float]]:
     """Bounces and length (s) of each episode, each from a new start; a target height lasts 3 s."""
-    model = mujoco.MjModel.from_xml_path(str(resource_path("mjcf/bounce_ball.xml")))
+    if model is None:
+        model = mujoco.MjModel.from_xml_path(str(MJCF))
     data = mujoco.MjData(model)
     joints = [data.joint(name) for name in policy.metadata.joint_names]
     ball = data.joint("ball_link")
@@ -52,7 +64,7 @@ def simulate(
     for joint, angle in zip(joints, policy.metadata.default_joint_angles, strict=True):
         joint.qpos = angle
     policy.reset()
-    camera.look(data.time, ball.qpos[:3])
+    camera.look(data)
     arm = policy.supervise(rate=1.0 / model.opt.timestep, box=((0.2, -0.5, -0.2), (1.0, 0.5, 0.6)))
     episodes, begun, bounces, falling = [], 0.0, 0, False
     while data.time < seconds - 1e-6:
@@ -80,7 +92,7 @@ def simulate(
                 ball.qpos[:], ball.qvel[:] = held, 0.0
             bounces += falling and ball.qvel[2] > 0.0
             falling = ball.qvel[2] < 0.0
-            camera.look(data.time, ball.qpos[:3])
+            camera.look(data)
     return [*episodes, (int(bounces), data.time - begun)] if arm.state == "running" else episodes
 
 
@@ -90,11 +102,25 @@ if __name__ == "__main__":
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--target-height", type=float, nargs="+", default=[0.5], help="m")
     parser.add_argument("--log", help="CSV file for the log, which must not exist")
+    parser.add_argument("--cameras", action="store_true", help="see the ball in rendered pictures")
+    parser.add_argument("--camera-rate", type=float, default=120.0, help="of --cameras, Hz")
+    parser.add_argument("--ball", choices=["white", "orange"], default="white", help="of --cameras")
+    parser.add_argument("--side-light", action="store_true", help="light --cameras from one side")
     args = parser.parse_args()
     with exit_on_user_error(), contextlib.ExitStack() as files:
         robot, recorder = load_policy(args.policy), None
         if args.log:
             joints = robot.metadata.joint_names
             recorder = files.enter_context(Recorder(args.log, joints, {"target_height": "m"}))
-        for count, lasted in simulate(robot, Camera(), args.seconds, args.target_height, recorder):
+        camera, model = Camera(), None
+        if args.cameras:
+            # Before MuJoCo renders; a second import of it changes nothing.
+            import rendered_cameras
+
+            model = rendered_cameras.make_model(str(MJCF), args.ball, args.side_light)
+            camera = rendered_cameras.seen_ball(model, robot.metadata, args.ball, args.camera_rate)
+        episodes = simulate(robot, camera, args.seconds, args.target_height, recorder, model)
+        for count, lasted in episodes:
             print(f"{count} bounces in {lasted:.1f} s of {args.seconds:g} s")
+        if args.cameras:
+            print(camera.report())

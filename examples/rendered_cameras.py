@@ -1,5 +1,8 @@
-"""What two real cameras would see of a simulated arm: lens distortion, motion blur, noise, and light
-from one side. Needs mujoco and OpenCV; nothing here tells the tracker where the ball is.
+"""What two real cameras would see of a simulated arm: pictures with the lens' distortion, motion
+blur, noise, and light from one side. Nothing here tells the tracker where the ball is.
+`deploy.py --cameras` plays from it.
+
+Needs mujoco, OpenCV, and an OpenGL library that renders without a screen: MUJOCO_GL=egl or osmesa.
 """
 
 from collections.abc import Sequence
@@ -39,6 +42,8 @@ class Picture(NamedTuple):
     """Time at which a program gets it, s."""
     pictures: tuple[np.ndarray, np.ndarray]
     """BGR [H, W, 3], uint8."""
+    ball: np.ndarray
+    """True mean place of the ball during the exposure [3], m, to measure errors with."""
 
 
 def true_cameras() -> tuple[Camera, ...]:
@@ -114,6 +119,7 @@ class RenderedCameras:
         self._begun = 0
         self._sums: list[np.ndarray] = []
         self._times: list[float] = []
+        self._places: list[np.ndarray] = []
 
     def look(self, data: mujoco.MjData) -> Picture | None:
         """Sees one instant; call it after each physics step. Returns a pair when its exposure ends.
@@ -131,6 +137,7 @@ class RenderedCameras:
             else:
                 self._sums[k] += frame
         self._times.append(data.time)
+        self._places.append(data.joint("ball_link").qpos[:3].copy())
         if len(self._times) < self.sub_frames:
             return None
         pictures = tuple(
@@ -139,10 +146,12 @@ class RenderedCameras:
         )
         middle = float(np.mean(self._times))
         arrives = middle + 0.5 * self.exposure + self.transport
+        ball = np.mean(self._places, axis=0)
         self._sums = []
         self._times = []
+        self._places = []
         self._begun += 1
-        return Picture(middle, arrives, pictures)
+        return Picture(middle, arrives, pictures, ball)
 
     def still(self, data: mujoco.MjData) -> tuple[np.ndarray, ...]:
         """A pair of pictures of something that rests."""
@@ -214,6 +223,7 @@ class SeenBall:
         self._cameras = cameras
         self._tracker = tracker
         self._processing = processing
+        self._errors: list[float] = []
         self._measured: list[tuple[float, float, np.ndarray]] = []
         self.num_pairs = 0
         """Pairs of pictures so far."""
@@ -233,8 +243,18 @@ class SeenBall:
         if fix is None:
             self.num_missed += 1
             return
+        # The truth is for the report alone.
+        self._errors.append(float(np.linalg.norm(fix.position - picture.ball)))
         arrives = picture.arrives + self._processing
         self._measured = [*self._measured[-20:], (arrives, fix.time, fix.position)]
+
+    def report(self) -> str:
+        """How well the ball was seen, in words."""
+        error = 1e3 * float(np.sqrt(np.mean(np.square(self._errors))))
+        return (
+            f"{self.num_pairs} pairs of pictures, {self.num_missed} without a ball; off by "
+            f"{error:.1f} mm (root mean square), at most {1e3 * max(self._errors):.1f} mm"
+        )
 
     def measure(self, time: float) -> dict:
         """The newest place of the ball that has arrived, if any, and its velocity from two."""
@@ -296,3 +316,17 @@ def _posed(
     data.joint("ball_link").qpos[:3] = place
     mujoco.mj_forward(model, data)
     return data
+
+
+def seen_ball(
+    model: mujoco.MjModel, metadata, ball: str = "white", rate: float = 120.0, seed: int = 0
+) -> SeenBall:
+    """Two cameras that the arm has calibrated, and the tracker that has learned the background."""
+    cameras = RenderedCameras(model, true_cameras(), rate, seed=seed)
+    calibration = calibrate_with_arm(model, metadata, cameras, ball, seed)
+    print(f"cameras calibrated with the arm: {calibration.report()}", flush=True)
+    tracker = Tracker(calibration.cameras, COLOURS[ball], cameras.exposure)
+    home = np.array(metadata.default_joint_angles)
+    empty = _posed(model, mujoco.MjData(model), metadata, home, None)
+    tracker.learn_background([cameras.still(empty) for _ in range(8)])
+    return SeenBall(cameras, tracker)

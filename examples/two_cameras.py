@@ -1,19 +1,19 @@
 """The ball's position from two cameras, for any policy that needs `ball_position`.
 
-    python examples/two_cameras.py calibrate POLICY --cameras cameras.json ...   # with the arm itself
-    python examples/two_cameras.py watch cameras.json --sources 0 1              # prints what it sees
+    python examples/two_cameras.py calibrate POLICY cameras.json --sources 0 1   # with the arm
+    python examples/two_cameras.py watch cameras.json --sources 0 1              # prints the place
 
-OpenCV does the geometry (`pip install opencv-python-headless`); what is special is here: the ball. It
-is found by its colour, as a circle that is fitted to the edge of its picture. A part of the edge is
-enough, so a ball that the paddle hides in part still gives its centre. What does not fit gives
-nothing: the size, the rays of both cameras and the flight must agree. docs/cameras.md says which
-cameras to take and where to put them.
+OpenCV does the geometry (`pip install ".[vision]"`); what is special is here: the ball. It is found
+by its colour, as a circle that is fitted to the edge of its picture. A part of the edge is enough,
+so a ball that the paddle hides in part still gives its centre. What does not fit gives nothing: the
+size, the rays of both cameras and the flight must agree. docs/cameras.md says which cameras to take
+and where to put them; `rendered_cameras.py` has the same program see a simulated arm.
 """
 
 import argparse
 import json
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 from scipy.optimize import least_squares
 
+from bounce_mjx import load_policy
 from bounce_mjx.deploy.motion import paddle_position
 
 RADIUS = 0.019
@@ -36,13 +37,18 @@ COLOURS = {
 # Difference of a pixel from the background, of 255, that is no noise.
 _DIFFERENCE = 16
 
-# Radii of the ball in a picture before it is known how far it is, pixels.
+# Radii of the ball in a picture before it is known how far away it is, pixels.
 _RADII = (3.0, 40.0)
+# Weight of the expected radius beside one edge point, and how much smaller than the ball's a circle
+# through the centres of its outermost pixels is, pixels.
+_RADIUS_WEIGHT = 4.0
+_RADIUS_OF_PIXELS = 0.4
 # Share of the expected radius by which a measured one may differ.
 _RADIUS_TOLERANCE = 0.3
 # Distance of an edge point from the circle, pixels, and the share of the circle's directions in
 # which there must be such points.
-_EDGE_TOLERANCE, _LEAST_ARC = 1.2, 0.35
+_EDGE_TOLERANCE = 1.2
+_LEAST_ARC = 0.35
 _DIRECTIONS = 24
 # Least share of a circle's inside that has the ball's colour, and points [25, 2] spread over the
 # inside of a circle of the radius 1 (a sunflower's seeds).
@@ -54,7 +60,8 @@ _INSIDE = _INSIDE * np.column_stack([np.cos(2.4 * _SEEDS), np.sin(2.4 * _SEEDS)]
 _MAX_REPROJECTION = 3.0
 # Largest change of the ball's velocity at a bounce, m/s, and what is added to the distance from the
 # predicted place, m.
-_MAX_VELOCITY_CHANGE, _PLACE_TOLERANCE = 9.0, 0.02
+_MAX_VELOCITY_CHANGE = 9.0
+_PLACE_TOLERANCE = 0.02
 # Pictures without a ball after which the whole picture is searched, not the predicted place.
 _LOST_AFTER = 2
 # How far the ball may be from where cameras that were measured with a tape expect it, pixels.
@@ -153,6 +160,7 @@ def find_circles(
     """
     corner = np.zeros(2, int)
     radii = _RADII
+    expected_radius = None
     blur = np.zeros(2)
     if expected is not None:
         reach = expected.radius + np.linalg.norm(expected.blur) + expected.margin
@@ -165,6 +173,7 @@ def find_circles(
         picture = picture[window]
         background = None if background is None else background[window]
         corner = lower
+        expected_radius = expected.radius
         tolerance = _RADIUS_TOLERANCE * expected.radius
         radii = (expected.radius - tolerance, expected.radius + tolerance)
         blur = expected.blur
@@ -184,7 +193,7 @@ def find_circles(
         # A picture's border is no edge of the ball.
         size = np.array(mask.shape[::-1]) - 1
         edge = edge[np.all((edge > 0) & (edge < size), axis=1)]
-        circle = fit_circle(edge, mask, radii, blur)
+        circle = fit_circle(edge, mask, radii, blur, expected_radius)
         if circle is not None:
             circles.append(circle._replace(centre=circle.centre + corner))
     circles.sort(key=lambda circle: circle.score, reverse=True)
@@ -195,7 +204,8 @@ def fit_circle(
     edge: np.ndarray,
     mask: np.ndarray,
     radii: tuple[float, float],
-    blur: np.ndarray = np.zeros(2),
+    blur: np.ndarray,
+    expected_radius: float | None = None,
 ) -> Circle | None:
     """The filled circle that most of an edge lies on; None if there is none.
 
@@ -208,23 +218,33 @@ def fit_circle(
       mask: pixels of the ball's colour [H, W], not 0.
       radii: smallest and largest radius.
       blur: motion [2] during the exposure, pixels.
+      expected_radius: from the ball's distance, if it is known.
     """
     if len(edge) < 8:
         return None
-    centre = _most_supported_circle(edge, mask, radii, blur)
-    if centre is None:
+    best = _most_supported_circle(edge, mask, radii, blur)
+    if best is None:
         return None
-    centre, radius = centre
-    for _ in range(6):
+    centre, radius = best
+    # The first centre may be at an end of the motion. In the end, a sharp edge is told by a narrow
+    # tolerance from the edge of what hides the rest.
+    length = float(np.linalg.norm(blur))
+    last_tolerance = 0.5 * _EDGE_TOLERANCE if length < 1.0 else _EDGE_TOLERANCE
+    for tolerance in np.linspace(_EDGE_TOLERANCE + 0.5 * length, last_tolerance, 8):
         offsets = edge - _nearest_on_path(edge, centre, blur)
         distances = np.linalg.norm(offsets, axis=1)
-        is_near = np.abs(distances - radius) < _EDGE_TOLERANCE
+        is_near = np.abs(distances - radius) < tolerance
         if np.count_nonzero(is_near) < 8:
             return None
         # Gauss-Newton: a shift of the centre changes a distance by its component along the offset.
         normals = offsets[is_near] / distances[is_near, None]
         jacobian = np.column_stack([normals, np.ones(len(normals))])
         residuals = distances[is_near] - radius
+        if expected_radius is not None:
+            # Where an arc alone is seen, the radius is better known from the distance.
+            jacobian = np.vstack([jacobian, [0.0, 0.0, _RADIUS_WEIGHT]])
+            known = expected_radius - _RADIUS_OF_PIXELS - radius
+            residuals = np.append(residuals, _RADIUS_WEIGHT * known)
         change, *_ = np.linalg.lstsq(jacobian, residuals, rcond=None)
         centre = centre + change[:2]
         radius = radius + change[2]
@@ -427,8 +447,8 @@ class Calibration(NamedTuple):
     """Centre of the ball that was fixed to the paddle, from the paddle's centre [3], m, in the axes
     of the robot's frame at the joints' reference angles."""
     errors: np.ndarray
-    """Triangulated place less that of the forward kinematics [N, 3], m, of each pose when the others
-    alone were used; NaN where a camera saw no ball."""
+    """Triangulated place less that of the forward kinematics [N, 3], m, of each pose while the
+    others alone were used; NaN where a camera saw no ball."""
     bad: tuple[int, ...]
     """Poses that do not fit the others, and were left out."""
 
@@ -446,9 +466,14 @@ class Calibration(NamedTuple):
 
 # Standard deviations of what is known before a calibration: focal length (share), principal point
 # (pixels), k1 and k2, and the place of the ball on the paddle (m).
-_PRIOR_FOCAL, _PRIOR_CENTRE, _PRIOR_LENS, _PRIOR_BALL = 0.05, 10.0, 0.2, 0.005
-# Noise of a circle's centre, pixels, and how far a pose may be off, in pixels and in times the noise.
-_PIXEL_NOISE, _BAD_PIXELS = 0.3, 4.0
+_PRIOR_FOCAL = 0.05
+_PRIOR_CENTRE = 10.0
+_PRIOR_LENS = 0.2
+_PRIOR_BALL = 0.005
+# Noise of a circle's centre, pixels, and how many times the typical residual a pose may be off.
+_PIXEL_NOISE = 0.3
+_BAD_RATIO = 4.0
+# Parts into which the poses are divided to measure the error with poses that were not used.
 _FOLDS = 4
 # Half of the paddle's thickness, m.
 _HALF_THICKNESS = 0.0035
@@ -502,8 +527,8 @@ def plan_poses(
     places = places[is_good]
     if len(angles) < count:
         raise SystemExit(
-            f"both cameras see the paddle in {len(angles)} of 20000 poses around the start pose, "
-            f"but {count} are needed; move the cameras so that both see the paddle and 40 cm above it"
+            f"both cameras see the paddle in {len(angles)} of 20,000 poses around the start pose, "
+            f"but {count} are needed; move them so that both see the paddle and 40 cm over it"
         )
     chosen = [int(np.argmin(np.linalg.norm(places - home_place, axis=1)))]
     distances = np.linalg.norm(places - places[chosen[0]], axis=1)
@@ -581,13 +606,13 @@ def calibrate(
     while True:
         if np.count_nonzero(used) < 8:
             raise SystemExit(
-                f"{np.count_nonzero(used)} poses are left, but 8 are needed; check that the ball is "
-                "fixed, that both cameras see it, and that the arm has the policy's joints"
+                f"{np.count_nonzero(used)} poses are left, but 8 are needed; check that the ball "
+                "is fixed, that both cameras see it, and that the arm is the policy's"
             )
         cameras, adjusted, residuals = _adjust(metadata, rough, ball, joint_angles, pixels, used)
         worst = int(np.argmax(residuals))
         typical = max(_PIXEL_NOISE, 1.5 * float(np.median(residuals[used])))
-        if residuals[worst] < _BAD_PIXELS * typical:
+        if residuals[worst] < _BAD_RATIO * typical:
             break
         bad.append(worst)
         used[worst] = False
@@ -670,3 +695,116 @@ def load_cameras(path: Path) -> tuple[Camera, ...]:
     """Reads what `save_cameras` wrote."""
     entries = json.loads(path.read_text())
     return tuple(Camera(**{k: np.array(v) for k, v in entry.items()}) for entry in entries)
+
+
+class Sources:
+    """Two cameras of OpenCV, such as USB or GigE ones.
+
+    The time stamp is that of the exposure's middle: the arrival of the second picture less the
+    time of transport and half of the exposure. Cameras without a common trigger expose at different
+    times, and a ball of 4 m/s moves by 4 mm in each millisecond between them: wire the trigger.
+    """
+
+    def __init__(self, sources: Sequence[str], rate: float, exposure: float, transport: float):
+        """Opens the cameras.
+
+        Args:
+          sources: numbers of cameras, or addresses such as rtsp://...
+          rate: pictures in a second, Hz.
+          exposure: s.
+          transport: from the end of the exposure until a picture has arrived, s.
+        """
+        self._behind = transport + 0.5 * exposure
+        self._captures = []
+        for source in sources:
+            capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
+            if not capture.isOpened():
+                raise SystemExit(f"the camera {source} does not open; give its number or address")
+            capture.set(cv2.CAP_PROP_FPS, rate)
+            # An old picture in a buffer would be taken for a new one.
+            capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+            self._captures.append(capture)
+
+    def read(self) -> tuple[tuple[np.ndarray, ...], float]:
+        """The next pair of pictures, and the middle of its exposure (s, of `time.monotonic`)."""
+        # Both are grabbed before either is decoded, which takes milliseconds.
+        if not all(capture.grab() for capture in self._captures):
+            raise SystemExit("a camera gives no picture; check its cable")
+        taken = time.monotonic() - self._behind
+        return tuple(capture.retrieve()[1] for capture in self._captures), taken
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the pictures, pixels."""
+        capture = self._captures[0]
+        width = capture.get(cv2.CAP_PROP_FRAME_WIDTH)
+        return int(width), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+
+
+def calibrate_by_hand(args: argparse.Namespace) -> None:
+    """Asks for one pose after the other, and writes the cameras."""
+    metadata = load_policy(args.policy).metadata
+    sources = Sources(args.sources, args.rate, args.exposure, args.transport)
+    rough = [
+        rough_camera(place, args.gaze, sources.size, args.field_of_view)
+        for place in (args.first, args.second)
+    ]
+    poses = plan_poses(metadata, rough, sources.size)
+    input("Take the ball away, keep the arm out of the pictures if you can, and press Enter.")
+    backgrounds, _ = sources.read()
+    print("Fix the ball to the middle of the paddle.")
+    pixels = np.full((2, len(poses), 2), np.nan)
+    for pose, angles in enumerate(poses):
+        text = ", ".join(
+            f"{name} {angle:.3f}" for name, angle in zip(metadata.joint_names, angles, strict=True)
+        )
+        input(f"{pose + 1} of {len(poses)}: move the arm to {text} (rad), and press Enter.")
+        pictures, _ = sources.read()
+        for k, picture in enumerate(pictures):
+            pixels[k, pose] = find_fixed_ball(
+                metadata, rough[k], angles, picture, COLOURS[args.ball], backgrounds[k]
+            )
+    calibration = calibrate(metadata, rough, poses, pixels)
+    print(calibration.report())
+    save_cameras(args.cameras, calibration.cameras)
+
+
+def watch(args: argparse.Namespace) -> None:
+    """Prints the ball's place for each pair of pictures."""
+    tracker = Tracker(load_cameras(args.cameras), COLOURS[args.ball], args.exposure)
+    sources = Sources(args.sources, args.rate, args.exposure, args.transport)
+    print("learning the background: keep the ball out of the pictures")
+    tracker.learn_background([sources.read()[0] for _ in range(20)])
+    while True:
+        pictures, taken = sources.read()
+        fix = tracker.update(pictures, taken)
+        if fix is not None:
+            x, y, z = fix.position
+            print(f"{fix.time:.4f} s: x {x:.4f}, y {y:.4f}, z {z:.4f} m, {fix.error:.2f} pixels")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    programs = parser.add_subparsers(required=True)
+    by_hand = programs.add_parser("calibrate", help="find the cameras with the arm itself")
+    by_hand.add_argument("policy", help="policy for the arm: name, file or run")
+    watching = programs.add_parser("watch", help="print where the ball is")
+    for program, function in ((by_hand, calibrate_by_hand), (watching, watch)):
+        program.set_defaults(function=function)
+        program.add_argument("cameras", type=Path, help="JSON file of the calibrated cameras")
+        program.add_argument("--sources", nargs=2, default=["0", "1"], help="numbers or addresses")
+        program.add_argument("--ball", choices=list(COLOURS), default="orange")
+        program.add_argument("--rate", type=float, default=120.0, help="Hz")
+        program.add_argument("--exposure", type=float, default=0.004, help="s")
+        program.add_argument("--transport", type=float, default=0.004, help="s")
+    place = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
+    by_hand.add_argument("--first", **place, default=(1.45, 0.85, 0.75), help="by tape, m")
+    by_hand.add_argument("--second", **place, default=(1.45, -0.85, 0.75), help="by tape, m")
+    by_hand.add_argument("--gaze", **place, default=(0.59, 0.0, 0.33), help="where both look, m")
+    by_hand.add_argument("--field-of-view", type=float, default=60.0, help="horizontal, degrees")
+    args = parser.parse_args()
+    args.function(args)
+
+
+if __name__ == "__main__":
+    main()
