@@ -18,7 +18,7 @@ class AnyEnv(Protocol):
     task, which names what to log."""
 
     task: Task | type[Task]
-    """The task, of which a training run reads `curves` and `critic_metrics`."""
+    """The task, of which training reads `curves` and `critic_metrics`; both may be empty."""
 
     observation_size: int
     """Length of the observation vector."""

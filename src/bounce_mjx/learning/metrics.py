@@ -15,6 +15,9 @@ Metrics = dict[str, jax.Array]
 # Prefix of the sums that a curve is the mean over.
 _OVER = "over/"
 
+# Ends of an episode that are no task's, by their metrics, which another environment may lack.
+_ENDS = ("non_finite", "too_fast")
+
 
 def matching_metrics(patterns: Sequence[str], known: Iterable[str]) -> tuple[str, ...]:
     """The known names that match the patterns; a pattern such as world/* matches several.
@@ -43,9 +46,8 @@ def step_metrics(result: vector.VectorStep, groups: int, curves: Sequence[Curve]
         "ended": ended,
         "return": jnp.where(ended, result.episode_return, 0.0),
         "length": jnp.where(ended, result.episode_length, 0),
-        "task/non_finite": result.metrics["non_finite"],
-        "task/too_fast": result.metrics["too_fast"],
     }
+    sums |= {f"task/{name}": result.metrics[name] for name in _ENDS if name in result.metrics}
     for curve in curves:
         value, over = result.metrics[curve.metric], {"steps": ones, "episodes": ended}
         sums[curve.tag] = jnp.where(ended, value, 0.0) if curve.over == "episodes" else value
@@ -66,6 +68,5 @@ def rollout_metrics(steps: Metrics, curves: Sequence[Curve]) -> Metrics:
         "episode/return": total["return"] / total["ended"],
         "episode/length": total["length"] / total["ended"],
         "episode/ended": total["ended"],
-        "task/non_finite": total["task/non_finite"],
-        "task/too_fast": total["task/too_fast"],
+        **{f"task/{name}": total[f"task/{name}"] for name in _ENDS if f"task/{name}" in total},
     }
