@@ -350,6 +350,8 @@ class Run(NamedTuple):
     control: Control
     target_height: np.ndarray
     target_age: np.ndarray
+    rewarded_height: np.ndarray
+    """The target height that the reward used."""
 
 
 WORLDS, CONTROL_STEPS = 64, 200
@@ -381,6 +383,13 @@ def run(moves: bool) -> Run:
             ball_init_pos=(0.59, 0, 0.2),
         )
         env = BounceBall(config)
+        task_step = env.task.step
+
+        def telling_step(state, step):
+            done = task_step(state, step)
+            return done._replace(metrics=done.metrics | {"height": step.command["target_height"]})
+
+        env.task.step = telling_step
         keys = jax.random.split(jax.random.PRNGKey(3), WORLDS)
         actions = np.random.default_rng(1).uniform(-0.15, 0.15, (CONTROL_STEPS, 6, WORLDS))
 
@@ -397,7 +406,7 @@ def run(moves: bool) -> Run:
                 after = env.finish_step(state, action, actuation, physics)
                 pipeline = after.pipeline_state
                 target = pipeline.command["target_height"]
-                seen = (physics, control, target, pipeline.redraw.age)
+                seen = (physics, control, target, pipeline.redraw.age, after.metrics["height"])
                 return after, seen
 
             of_all = jax.vmap(step, in_axes=-1, out_axes=-1)
@@ -507,7 +516,8 @@ def test_targets_change_at_their_interval(at_rest: Run) -> None:
         grid = changed[0] + interval * np.arange(len(changed))
         assert np.abs(changed - grid).max() <= 1.0 + 1e-6
         assert len(changed) >= int(CONTROL_STEPS / interval) - 1
-        # The age after the step of the change is one step.
         since = np.arange(CONTROL_STEPS) - changed[:, None]
-        age = 1 + np.where(since >= 0, since, np.arange(CONTROL_STEPS)).min(axis=0)
+        age = np.where(since >= 0, since, np.arange(CONTROL_STEPS) + 1).min(axis=0)
         np.testing.assert_allclose(at_rest.target_age[:, w], 0.01 * age, atol=1e-9)
+    # The policy sees a new target before a reward depends on it.
+    np.testing.assert_array_equal(at_rest.rewarded_height, heights[:-1])

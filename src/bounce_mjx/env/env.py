@@ -206,16 +206,17 @@ class Env:
         noises, command_draws, task_draws = jnp.split(draws, [size, size + len(commands)])
         task_draws = 0.5 * (task_draws + 1.0)
         ends = {name: given.get(name, (c.low, c.high)) for name, c in commands.items()}
-        command = {
+        sampled = {
             name: low + (high - low) * 0.5 * (draw + 1.0)
             for draw, (name, (low, high)) in zip(command_draws, ends.items(), strict=True)
         }
+        command = self._first_command(sampled)
         redraw = None
         if "command_interval" in world:
             age = jnp.zeros((), draws.dtype)
             redraw = Redraw(age, jax.tree.map(lambda end: jnp.asarray(end, draws.dtype), ends))
 
-        physics = self._first_physics(noises, world, self.task.throw(task_draws, command))
+        physics = self._first_physics(noises, world, self.task.throw(task_draws, sampled))
         state = EnvState(
             physics=physics,
             command=command,
@@ -275,12 +276,11 @@ class Env:
         physics, finite = _keep_finite(physics, before.physics)
         action, is_number = _clip_action(action)
         action = jnp.where(finite, action, before.last_action)
-        now = self._pass_time(
-            before._replace(physics=physics, last_action=action, actuation=actuation)
-        )
+        now = before._replace(physics=physics, last_action=action, actuation=actuation)
         truth = self.kinematics(now)
 
-        done = self.task.step(before.task, Step(truth, now.command, action, before.last_action))
+        done = self.task.step(before.task, Step(truth, before.command, action, before.last_action))
+        now = self._pass_time(now)
         command = self.task.next_command(done.state, now.command)
         now = now._replace(task=done.state, command=command)
         ends = {
@@ -365,15 +365,27 @@ class Env:
         clock = noise.next_clock(state.clock)
         if state.redraw is None:
             return state._replace(clock=clock)
-        (age, ranges), command = state.redraw, {}
+        age, ranges = state.redraw
         interval, phase = state.world["command_interval"], clock.phases[2]
-        now = recurs(interval, phase, state.clock.step, self.dt)
+        is_due = recurs(interval, phase, state.clock.step, self.dt)
         shares = noise.uniform(clock.counter, noise.COMMAND, (len(ranges),), age.dtype)
+        sampled = {}
         for i, name in enumerate(self.config.commands):
             low, high = ranges[name]
-            command[name] = jnp.where(now, low + (high - low) * shares[i], state.command[name])
-        redraw = Redraw(jnp.where(now, 0.0, age) + self.dt, ranges)
+            sampled[name] = low + (high - low) * shares[i]
+        first = self._first_command(sampled)
+        command = {
+            name: jnp.where(is_due, first[name], value) for name, value in state.command.items()
+        }
+        redraw = Redraw(jnp.where(is_due, 0.0, age + self.dt), ranges)
         return state._replace(clock=clock, command=command, redraw=redraw)
+
+    def _first_command(self, sampled: dict[str, jax.Array]) -> dict[str, jax.Array]:
+        """The task's commands from their samples, each []."""
+        command = self.task.first_command(sampled)
+        named = f"first_command of the task {type(self.task).__name__}"
+        check_names(named, "command", command, sampled)
+        return command
 
     def kinematics(self, state: EnvState) -> Kinematics:
         """True positions and velocities of one environment's state, read from its physics."""

@@ -36,7 +36,7 @@ class Step(NamedTuple):
     truth: Kinematics
     """Positions and velocities after the step."""
     command: Values
-    """Value [] of each command during the step."""
+    """Value [] of each command during the step, which the policy saw as it chose the action."""
     action: jax.Array
     """Clipped action [n]."""
     last_action: jax.Array
@@ -62,7 +62,7 @@ class Moment(NamedTuple):
     truth: Kinematics
     """Positions and velocities after the step."""
     command: Values
-    """Value [] of each command."""
+    """Value [] of each command after the step."""
     state: State
     """The task's state after the step."""
     metrics: Values
@@ -110,6 +110,13 @@ class Task:
                 f"the task {cls.__name__} has no Config of its own, and settings belong to one "
                 f"task; write a class that extends that of {cls.__base__.__name__}"
             )
+        owner = vars(cls.Config).get("task")
+        # The cell of a notebook may run again.
+        if owner and (owner.__module__, owner.__qualname__) != (cls.__module__, cls.__qualname__):
+            raise UserError(
+                f"the task {cls.__name__} has the Config of {owner.__name__}, and settings belong "
+                f"to one task; write a class that extends {cls.Config.__qualname__}"
+            )
         cls.Config.task = cls
 
     def __init__(self, config: WorldConfig):
@@ -138,8 +145,18 @@ class Task:
         """
         raise NotImplementedError
 
+    def first_command(self, command: Values) -> Values:
+        """The commands where they are sampled, at a reset and within an episode, for a task in
+        which a sample is not what the policy has to follow, such as the middle of a path.
+
+        Args:
+          command: value [] of each command, as it is sampled.
+        """
+        return command
+
     def next_command(self, state: State, command: Values) -> Values:
-        """The commands from now on, for a task whose commands move within an episode.
+        """The commands from now on, for a task whose commands move within an episode; it follows
+        `first_command` too.
 
         Args:
           state: the task's state after the step or the reset.

@@ -36,6 +36,12 @@ def point(command: Values, xp: Any = None) -> Any:
     return (xp or jnp).stack([command[f"target_{axis}"] for axis in ("x", "y", "height")])
 
 
+def at_point(command: Values, point: Any) -> Values:
+    """The commands with another point now [3], m."""
+    x, y, height = point
+    return command | {"target_x": x, "target_y": y, "target_height": height}
+
+
 def offset(command: Values, size: float, phase: Any, xp: Any = None) -> Any:
     """The point from the middle of its path [3, ...], m, at places on it [...], turns.
 

@@ -101,19 +101,25 @@ class Track(task.Task):
         task.Curve("task/height_error", "height_error", "apexes", "|apex − height|, cm", 100.0),
     )
 
-    def reset(self, start: task.Start) -> tuple[jax.Array, jax.Array]:
-        # Whether the ball rises, and the point's offset, 0 as it is sampled in the middle.
-        return jnp.array(False), jnp.zeros_like(start.truth.ball_position)
+    def reset(self, start: task.Start) -> jax.Array:
+        """Whether the ball rises [], bool."""
+        return jnp.array(False)
 
-    def next_command(self, state: Any, command: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    def first_command(self, command: task.Values) -> task.Values:
+        """The point on its path, whose middle is sampled."""
+        offset = paths.offset(command, self.config.path_size, command["phase"])
+        return paths.at_point(command, paths.point(command) + offset)
+
+    def next_command(self, state: Any, command: task.Values) -> task.Values:
         """The path moves the point on from where it is, which a user may have set."""
-        phase = paths.phase_in(self.config.control_dt, command, self.config.path_size)
-        offset = paths.offset(command, self.config.path_size, phase)
-        x, y, z = paths.point(command) + offset - state[1]
-        command = command | {"target_x": x, "target_y": y, "target_height": z}
+        size = self.config.path_size
+        phase = paths.phase_in(self.config.control_dt, command, size)
+        before = paths.offset(command, size, command["phase"])
+        after = paths.offset(command, size, phase)
+        command = paths.at_point(command, paths.point(command) + after - before)
         return command | {"path": jnp.floor(command["path"]), "phase": phase - jnp.floor(phase)}
 
-    def step(self, state: Any, step: task.Step) -> task.TaskStep:
+    def step(self, rose: jax.Array, step: task.Step) -> task.TaskStep:
         truth, command, home = step.truth, step.command, self.config.home[2]
         ball, velocity, paddle = truth.ball_position, truth.ball_velocity, truth.paddle_position
         flight, size = task.flight(ball, velocity, home + REST), self.config.path_size
@@ -130,10 +136,10 @@ class Track(task.Task):
             "home": paddle[2] - home,
             "calm": jnp.concatenate([truth.joint_velocities, step.action - step.last_action]),
         }
-        is_apex = state[0] & (velocity[2] <= 0.0) & (ball[2] > home + MAX_HEIGHT_ERROR)
+        is_apex = rose & (velocity[2] <= 0.0) & (ball[2] > home + MAX_HEIGHT_ERROR)
         x, y, z = jnp.square(ball - paths.point(command))
         return task.TaskStep(
-            state=(velocity[2] > 0.0, offset),
+            state=velocity[2] > 0.0,
             reward=task.weighted_terms(self.config.reward, **errors),
             ended=(ball[2] < home) | (x + y + z > self.config.max_distance**2),
             metrics={
