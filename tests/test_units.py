@@ -189,6 +189,10 @@ def test_a_mistyped_name_in_a_task_is_one_sentence(wrong: str, reason: str, monk
 def test_a_task_has_its_own_config() -> None:
     with pytest.raises(UserError, match="the task Other has no Config of its own"):
         type("Other", (Mistyped,), {})
+    # Nor another task's, whose environments it would change.
+    with pytest.raises(UserError, match="the task Other has the Config of Mistyped, .* extends"):
+        type("Other", (Mistyped,), {"Config": Mistyped.Config})
+    assert type(Env(Mistyped.Config()).task) is Mistyped
 
 
 def first_block(ended=64.0, too_fast=0.0, non_finite=0.0, height=1.0, fault=0.0) -> dict:

@@ -85,7 +85,10 @@ def test_a_world_with_ranges_of_axes_trains_and_is_doubled(tmp_path: Path) -> No
     trained = TrainConfig()
     there, named = in_world(trained, world)
     conditions = load_suite(
-        resource_path("configs/robustness.yaml"), there.env, there.env, named.double_assumed()
+        resource_path("configs/robustness.yaml"),
+        there.env,
+        there.env,
+        named.double_assumed({"paddle_tilt": 0.0}),
     )
     nominal, twice = (c for c in conditions if c.perturbation.group in ("nominal", TWICE))
     np.testing.assert_allclose(nominal.ranges["paddle_tilt"], TILT)

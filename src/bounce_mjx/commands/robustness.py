@@ -42,6 +42,7 @@ def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 0 if all conditions meet all judged results, 1 if one does
     not, 2 on a mistake."""
     command = parse(RobustnessCommand, args, prog="bounce-mjx robustness")
+    from bounce_mjx.env.env import model_nominals
     from bounce_mjx.evaluation.robustness import RobustnessReport, measure_conditions
     from bounce_mjx.evaluation.suite import load_suite, read_suite
     from bounce_mjx.reports import robustness
@@ -60,7 +61,7 @@ def main(args: Sequence[str]) -> None:
     suite, version, world, assumed = str(path), read_suite(path).version, None, {}
     if command.world is not None:
         there, named = run_configs.in_world(config, command.world)
-        world, assumed = there.env, named.double_assumed()
+        world, assumed = there.env, named.double_assumed(model_nominals(there.env))
     conditions = load_suite(path, config.env, world, assumed)
     if command.assumed:
         # The suite's own conditions follow.

@@ -31,6 +31,7 @@ from bounce_mjx.errors import UserError, needed
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.robot.arm import joint_name
 from bounce_mjx.robot.model import find_addresses, joint_names, load_model
+from bounce_mjx.robot.torques import largest_torques
 from bounce_mjx.runs.checkpoints import read_actor
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import Checkpoint
@@ -114,7 +115,7 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
     chain, paddle, normal = _hinges(m, env.default_joint_angles)
     servos = list(addresses.actuators)
     gear = m.actuator_gear[servos, 0]
-    torques = m.actuator_forcerange[servos, 1] * gear
+    torques = largest_torques(m, addresses.arm_joints, addresses.actuators)
     return Metadata(
         format=FORMAT,
         steps=steps,
@@ -136,7 +137,7 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         ),
         servo_stiffness=tuple((m.actuator_gainprm[servos, 0] * gear**2).tolist()),
         servo_damping=tuple((-m.actuator_biasprm[servos, 2] * gear**2).tolist()),
-        torque_limits=tuple(np.where(m.actuator_forcelimited[servos], torques, None).tolist()),
+        torque_limits=tuple(np.where(np.isfinite(torques), torques, None).tolist()),
         default_joint_angles=env.default_joint_angles,
         commands={
             name: CommandRange((command.low, command.high), command.unit)

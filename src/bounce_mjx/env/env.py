@@ -1,6 +1,7 @@
 """`Env`: one environment, which is a world and a task. It and `State` match brax's by structure."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -22,7 +23,14 @@ from bounce_mjx.world.actuation import Actuation, Actuators, recurs
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.noise import Clock
 from bounce_mjx.world.observation import Kinematics
-from bounce_mjx.world.randomization import TERMS, Ranges, World, physics_parameters, sample_world
+from bounce_mjx.world.randomization import (
+    TERMS,
+    Ranges,
+    World,
+    nominal_values,
+    physics_parameters,
+    sample_world,
+)
 from bounce_mjx.world.sensing import Sensing, Sensors
 
 # MuJoCo's mjMAXVAL: a coordinate beyond it has diverged and counts as non-finite.
@@ -125,6 +133,8 @@ class Env:
         self._actuators = Actuators(config, self.mj_model)
         self._sensors = Sensors(config, self.mj_model, self.engine, self.task)
         self._randomize = randomize
+        self.nominals = nominal_values(self.mj_model, config.randomization.terms)
+        """Values of the terms of the randomisation in an episode that does not sample them."""
         self._fingerprint = robot_model.fingerprint(self.mj_model)
         self.dt = config.control_dt
         """Time of one control step, s."""
@@ -173,7 +183,8 @@ class Env:
         """The ranges of the randomisation, and of the commands where they grow too; `progress` []
         is the share of the warm-up that has passed."""
         randomization = self.config.randomization
-        ranges, first = randomization.ranges(progress), randomization.first_command_range
+        ranges = randomization.ranges(progress, self.nominals)
+        first = randomization.first_command_range
         for name, command in self.config.commands.items() if first < 1.0 else ():
             middle, half = (command.low + command.high) / 2.0, (command.high - command.low) / 2.0
             half *= first + (1.0 - first) * progress
@@ -311,7 +322,9 @@ class Env:
         terms, dtype = self.config.randomization, jnp.result_type(float)
         rng, world_rng, clock_rng = jax.random.split(rng, 3)
         share, shares = (terms.share, terms.shares or {}) if share is None else (share, {})
-        world = sample_world(ranges, world_rng, dtype, self.action_size, share, shares)
+        world = sample_world(
+            ranges, world_rng, dtype, self.action_size, self.nominals, share, shares
+        )
         return rng, world, noise.first_clock(clock_rng, dtype)
 
     def _first_physics(
@@ -459,6 +472,12 @@ def world_model(config: WorldConfig, visual: bool = True) -> mujoco.MjModel:
     if config.friction is None:
         return mj_model
     return edited_model(mj_model, PhysicsParameters(contact_friction=np.float64(config.friction)))
+
+
+@functools.lru_cache(maxsize=8)
+def model_nominals(config: WorldConfig) -> dict[str, np.ndarray]:
+    """The `nominal_values` of all terms for a config, whose model it compiles."""
+    return nominal_values(world_model(config, visual=False), TERMS)
 
 
 def _keep_finite(physics: PhysicsState, before: PhysicsState) -> tuple[PhysicsState, jax.Array]:

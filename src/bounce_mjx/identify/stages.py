@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.polynomial.polynomial import polyfit
 
-from bounce_mjx.env.env import world_model
+from bounce_mjx.env.env import model_nominals, world_model
 from bounce_mjx.errors import UserError
 from bounce_mjx.identify.fit import Fit, Noise, Problem, certainty, minimise, picture_weights
 from bounce_mjx.identify.log import Log, least_age
@@ -17,7 +17,6 @@ from bounce_mjx.identify.unknowns import Layout
 from bounce_mjx.identify.windows import GRAVITY, Windows, cut
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.world.config import WorldConfig
-from bounce_mjx.world.randomization import TERMS
 
 # Every fifth window is held out of the search until its last stage.
 _HELD_OUT = 5
@@ -155,8 +154,8 @@ def identify(
     fit = minimise(problem, fit, stages, problem.weights(pictures, seen), 3, states)
     unseen = minimise(problem, fit, [], problem.weights(pictures, 1.0 - seen), 3, states)
     fit = minimise(problem, unseen, stages, problem.weights(pictures), 3, states)
-    nominal = {name: TERMS[name].nominal for name in layout.terms if name in TERMS}
-    own = layout.vector({name: value for name, value in nominal.items() if value is not None})
+    nominals = model_nominals(config)
+    own = layout.vector({name: nominals[name] for name in layout.terms if name in nominals})
     before = fit._replace(predicted=problem.predict(own, fit.starts))
     counts = np.any(windows.split(fit.weights)[1] > 0.0, axis=(1, 2))
     return Identified(

@@ -17,9 +17,10 @@ import numpy as np
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics.parameters import Array, PhysicsParameters
-from bounce_mjx.physics.scalars import Scalar, Vec, add, mul
+from bounce_mjx.physics.scalars import Scalar, Vec, add, maximum, minimum, mul
 from bounce_mjx.robot.arm import raise_solver_limits
 from bounce_mjx.robot.model import find_addresses, to_direct_solref
+from bounce_mjx.robot.torques import force_ranges, torque_ranges
 
 # MuJoCo's mjMINMU: its C engine computes with no smaller coefficient of friction.
 MIN_FRICTION = 1e-5
@@ -42,6 +43,10 @@ class Edit(NamedTuple):
     """Value of the entries, or of each, per value of the parameter."""
     number: Any = None
     """Which of the parameter's numbers each entry has; by default, each has its own."""
+    least: Any = None
+    """Least value of each entry, for a parameter that limits the model's own values."""
+    greatest: Any = None
+    """Greatest value of each entry, for a parameter that limits the model's own values."""
 
 
 class EditedModel:
@@ -141,6 +146,8 @@ def edits(m: EditedModel) -> tuple[Edit, ...]:
     """The table of the parameters' entries."""
     at, masses = m.addresses, m.model.body_mass
     dofs, servos = list(at.arm_qvel), list(at.actuators)
+    per_torque = 1.0 / np.abs(m.model.actuator_gear[servos, 0])
+    least, greatest = force_ranges(m.model, servos)
     bodies, geoms = [ball.body for ball in at.balls], [ball.geom for ball in at.balls]
     pairs = m.contact_pairs()
     links = enumerate(m.link_bodies())
@@ -156,8 +163,8 @@ def edits(m: EditedModel) -> tuple[Edit, ...]:
         Edit("servo_gain", "actuator_gainprm", (servos, 0)),
         Edit("servo_gain", "actuator_biasprm", (servos, 1), -1.0),
         Edit("servo_damping", "actuator_biasprm", (servos, 2), -1.0),
-        Edit("force_limit", "actuator_forcerange", (servos, 1)),
-        Edit("force_limit", "actuator_forcerange", (servos, 0), -1.0),
+        Edit("force_limit", "actuator_forcerange", (servos, 0), -per_torque, least=least),
+        Edit("force_limit", "actuator_forcerange", (servos, 1), per_torque, greatest=greatest),
         Edit("armature", "dof_armature", dofs),
         Edit("damping", "dof_damping", dofs),
         Edit("frictionloss", "dof_frictionloss", dofs),
@@ -190,8 +197,14 @@ def edited(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> EditedMod
         if not count:
             raise UserError(_NO_PAIR)
         numbers = value if isinstance(value, tuple | list) else (value,) * count
-        each = numbers if edit.number is None else [numbers[i] for i in edit.number]
-        m.put(edit.field, edit.index, map(mul, each, np.broadcast_to(edit.scale, count).tolist()))
+        if edit.number is not None:
+            numbers = [numbers[i] for i in edit.number]
+        values = map(mul, numbers, np.broadcast_to(edit.scale, count).tolist())
+        if edit.least is not None:
+            values = map(maximum, values, edit.least.tolist())
+        if edit.greatest is not None:
+            values = map(minimum, values, edit.greatest.tolist())
+        m.put(edit.field, edit.index, values)
     for name, value in (p.entries or {}).items():
         field, _, inner = name.removesuffix("]").partition("[")
         try:
@@ -266,17 +279,24 @@ def edited_model(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> muj
 
 
 def own_parameters(mj_model: mujoco.MjModel) -> PhysicsParameters:
-    """The model's own numbers, as NumPy arrays, except for the contact's. A servo without a limit
-    has an infinite one."""
+    """The model's own numbers, as NumPy arrays. A servo without a limit has an infinite one, and a
+    model without a contact pair of ball and paddle no numbers of the contact."""
     m, own = EditedModel(mj_model), {}
+    at = m.addresses
     for edit in edits(m):
         own.setdefault(edit.parameter, _field(mj_model, edit.field)[edit.index] / edit.scale)
-    servos = list(m.addresses.actuators)
-    least = np.min(np.abs(mj_model.actuator_forcerange[servos]), axis=1)
-    own["force_limit"] = np.where(mj_model.actuator_forcelimited[servos], least, np.inf)
+    torques = torque_ranges(mj_model, at.arm_joints, at.actuators)
+    own["force_limit"] = np.max(np.abs(torques), axis=0)
     own["link_mass"] = m.link_masses()
     own |= {name: own[name][0] for name in ("ball_mass", "ball_radius")}
     own |= dict.fromkeys(("contact_stiffness", "contact_damping", "contact_friction"))
+    if pairs := m.contact_pairs():
+        stiffness, damping = direct_solref(mj_model)
+        # MuJoCo keeps a coefficient for a frictionless pair too.
+        friction = mj_model.pair_friction[pairs[0], 0] if mj_model.pair_dim[pairs[0]] > 1 else 0.0
+        own["contact_stiffness"] = np.float64(stiffness)
+        own["contact_damping"] = np.float64(damping)
+        own["contact_friction"] = np.float64(friction)
     return PhysicsParameters(**own)
 
 

@@ -72,6 +72,11 @@ def maximum(a: Scalar, b: Scalar) -> Scalar:
     return max(a, b) if is_constant(a) and is_constant(b) else jnp.maximum(a, b)
 
 
+def minimum(a: Scalar, b: Scalar) -> Scalar:
+    """The smaller one."""
+    return min(a, b) if is_constant(a) and is_constant(b) else jnp.minimum(a, b)
+
+
 def dot(a: Sequence[Scalar], b: Sequence[Scalar]) -> Scalar:
     """Inner product of two sequences of one length; 0 if they are empty."""
     return functools.reduce(add, map(mul, a, b), 0.0)

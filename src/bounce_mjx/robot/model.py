@@ -16,6 +16,7 @@ from bounce_mjx.resources import resource_path
 from bounce_mjx.robot import arm
 from bounce_mjx.robot.balls import MAX_BALLS, add_balls, ball_name
 from bounce_mjx.robot.config import RobotConfig
+from bounce_mjx.robot.torques import limit_torques
 
 # Starts of the names of a model's fields with physics in them, and those of colours among them.
 _PHYSICAL = ("body_", "jnt_", "dof_", "geom_", "pair_", "actuator_", "eq_", "tendon_", "qpos")
@@ -102,7 +103,10 @@ def load_model(
         _check_servos(mj_model, addresses)
         if (present := len(addresses.balls)) != num_balls:
             raise UserError(f"{present} balls, but num_balls is {num_balls}; set it to {present}")
-        _limit_torques(mj_model, addresses, robot or RobotConfig())
+        if robot is not None and robot.limits.torque is not None:
+            # `Env` refuses a config with another number of joints than the model.
+            torques = robot.limits.torque[: len(addresses.actuators)]
+            limit_torques(mj_model, addresses.actuators[: len(torques)], torques)
     mj_model.opt.timestep = physics_dt
     _check_step(mj_model)
     return mj_model
@@ -146,20 +150,6 @@ def scatter(rest: np.ndarray, places: Sequence[int], values: jax.Array) -> jax.A
     for place, value in zip(places, values, strict=True):
         entries[place] = value
     return jnp.stack([jnp.asarray(entry, values.dtype) for entry in entries])
-
-
-def _limit_torques(mj_model: mujoco.MjModel, addresses: Addresses, robot: RobotConfig) -> None:
-    """Applies `robot.limits.torque` to the servos, where theirs are not lower."""
-    torques = robot.limits.torque
-    if torques is None:
-        return
-    # `Env` refuses a config with another number of joints than the model.
-    for servo, torque in zip(addresses.actuators, torques, strict=False):
-        force = torque / abs(mj_model.actuator_gear[servo, 0])
-        limits = mj_model.actuator_forcerange[servo]
-        limited = mj_model.actuator_forcelimited[servo]
-        limits[:] = np.clip(limits, -force, force) if limited else (-force, force)
-        mj_model.actuator_forcelimited[servo] = True
 
 
 def _check_step(mj_model: mujoco.MjModel) -> None:

@@ -1,6 +1,7 @@
 """Named worlds: the numbers of a real robot and its camera in a YAML file, each with its source."""
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -66,16 +67,26 @@ class NamedWorld(StrictModel):
         """
         before = env.get("randomization", {}) if training else {}
         kept = {key: value for key, value in before.items() if key in CURRICULUM}
+        terms = [name for name in self.settings.get("randomization", {}) if name in TERMS]
+        if not any(TERMS[name].has_nominal for name in terms):
+            kept.pop("share", None)
+            if kept.get("first_command_range", 1.0) == 1.0:
+                kept.pop("warmup_steps", None)
+        if kept.get("shares"):
+            kept["shares"] = {name: p for name, p in kept["shares"].items() if name in terms}
         return merged(env | {"randomization": kept}, self.settings)
 
-    def double_assumed(self) -> dict[str, dict[str, Any]]:
+    def double_assumed(self, nominals: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         """For each assumed key, the nested settings of `env` in which alone its number is doubled.
 
         A term of the randomisation goes twice as far from the model's value, within its limits; a
         rate, an interval, or a limit, of which less is harder, is halved.
+
+        Args:
+          nominals: the values of the terms without randomisation (`Env.nominals`).
         """
         given = flat(self.settings)
-        return {key: nested(key, _double(key, given[key])) for key in self.assumed}
+        return {key: nested(key, _double(key, given[key], nominals)) for key in self.assumed}
 
 
 def read_world(path: Path) -> NamedWorld:
@@ -88,12 +99,12 @@ def read_world(path: Path) -> NamedWorld:
     return validate(NamedWorld, values, str(path))
 
 
-def _double(key: str, value: Any) -> Any:
+def _double(key: str, value: Any, nominals: Mapping[str, Any]) -> Any:
     group, _, name = key.rpartition(".")
     factor, centre, (least, most) = 2.0, 0.0, (-math.inf, math.inf)
     if group == "randomization":
-        nominal, (least, most) = TERMS[name].nominal, TERMS[name].bounds
-        factor, centre = (0.5, 0.0) if nominal is None else (2.0, nominal)
+        least, most = TERMS[name].bounds
+        factor, centre = (2.0, nominals[name]) if name in nominals else (0.5, 0.0)
     elif group == "robot.limits":
         factor = 0.5
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -69,16 +69,23 @@ def _rotation_xy(angles: jax.Array) -> Quaternion:
     return cos_a * cos_b, sin_a * cos_b, cos_a * sin_b, sin_a * sin_b
 
 
-# The operations of terms, on the model's own value and the sampled one.
-scale, shift = operator.mul, operator.add
+class Operation(NamedTuple):
+    """How a sampled value and the model's own value make a physical parameter."""
+
+    apply: Callable[[Any, Any], Any]
+    """(the model's own value, sampled value) -> value of the parameter."""
+    nominal: float | None
+    """The sampled value that changes nothing; None if it depends on the model."""
 
 
-def limit(own: jax.Array, most: jax.Array) -> jax.Array:
-    return jnp.minimum(own, most)
-
-
-def replace(_: Any, value: jax.Array) -> jax.Array:
-    return value
+SCALE = Operation(operator.mul, 1.0)
+ADD = Operation(operator.add, 0.0)
+TILT_FRAME = Operation(tilt_frame, 0.0)
+TILT_VECTOR = Operation(tilt_vector, 0.0)
+REPLACE = Operation(lambda own, value: value, None)
+"""The nominal value is the model's own."""
+LIMIT = Operation(lambda own, value: value, None)
+"""For a parameter that limits the model's own value, which may have no limit: no nominal value."""
 
 
 class Term(NamedTuple):
@@ -86,19 +93,34 @@ class Term(NamedTuple):
 
     size: tuple[int, ...] | None
     """Shape of one episode's sample; None for one entry for each acting joint."""
-    nominal: float | None
-    """Value without randomisation, from which the range grows during the warm-up; None for a range
-    that does not grow."""
     bounds: tuple[float, float]
     """Smallest and largest sensible value."""
+    nominal: float | None
+    """Value without randomisation, from which the range grows during the warm-up; None if it is the
+    model's (`nominal_values`), or if there is none and the range does not grow."""
     parameter: str | None = None
     """The field of `PhysicsParameters` that it changes."""
-    operation: Callable[[Any, Any], Any] | None = None
-    """(the model's own value, sampled value) -> value of the parameter; None for a restitution."""
+    operation: Operation | None = None
+    """How it changes that parameter."""
+
+    @property
+    def has_nominal(self) -> bool:
+        """Whether it has a value without randomisation."""
+        return self.nominal is not None or self.operation is REPLACE
 
     def shape(self, num_joints: int) -> tuple[int, ...]:
         """Shape of one episode's sample for an arm with this number of acting joints."""
         return (num_joints,) if self.size is None else self.size
+
+
+def physical(
+    parameter: str,
+    operation: Operation,
+    size: tuple[int, ...] | None,
+    bounds: tuple[float, float],
+) -> Term:
+    """A term that changes a field of `PhysicsParameters`."""
+    return Term(size, bounds, operation.nominal, parameter, operation)
 
 
 _FACTOR = (1e-3, 1e3)
@@ -110,78 +132,80 @@ class RandomizationConfig(StrictModel):
 
     former = {"restitution_slope": None, "air_lift": None}
 
-    restitution: Annotated[Sampled, Term((), 0.85, (0.6, 0.98), "contact_damping")] = None
-    """Restitution of the ball on the paddle, 0.6 to 0.98; the model's is 0.85."""
-    ball_mass: Annotated[Sampled, Term((), 1.0, _FACTOR, "ball_mass", scale)] = None
+    restitution: Annotated[Sampled, physical("contact_damping", REPLACE, (), (0.6, 0.98))] = None
+    """Restitution of the ball on the paddle, in place of the model's, which is 0.85 for the
+    project's own robot."""
+    ball_mass: Annotated[Sampled, physical("ball_mass", SCALE, (), _FACTOR)] = None
     """Factor of the ball's mass."""
-    ball_radius: Annotated[Sampled, Term((), 1.0, (0.1, 10.0), "ball_radius", scale)] = None
+    ball_radius: Annotated[Sampled, physical("ball_radius", SCALE, (), (0.1, 10.0))] = None
     """Factor of the ball's radius."""
-    air_drag: Annotated[Sampled, Term((), 0.0, (0.0, 10.0))] = None
+    air_drag: Annotated[Sampled, Term((), (0.0, 10.0), 0.0)] = None
     """Deceleration of the ball by the air divided by its squared speed, 1/m; about 0.11 for a
     table-tennis ball."""
-    contact_friction: Annotated[
-        Sampled, Term((), 0.0, (0.0, 10.0), "contact_friction", replace)
-    ] = None
+    contact_friction: Annotated[Sampled, physical("contact_friction", REPLACE, (), (0.0, 10.0))] = (
+        None
+    )
     """Coefficient of sliding friction between ball and paddle, in place of the model's."""
-    servo_gain: Annotated[Sampled, Term(None, 1.0, _FACTOR, "servo_gain", scale)] = None
+    servo_gain: Annotated[Sampled, physical("servo_gain", SCALE, None, _FACTOR)] = None
     """Factor of each servo's stiffness."""
-    servo_damping: Annotated[Sampled, Term(None, 1.0, _FACTOR, "servo_damping", scale)] = None
+    servo_damping: Annotated[Sampled, physical("servo_damping", SCALE, None, _FACTOR)] = None
     """Factor of each servo's damping."""
-    servo_lag: Annotated[Sampled, Term((), 0.0, (0.0, 1.0))] = None
+    servo_lag: Annotated[Sampled, Term((), (0.0, 1.0), 0.0)] = None
     """Time constant of a first-order lag of the servo targets, s."""
-    torque_limit: Annotated[Sampled, Term(None, None, (1e-3, 1e5), "force_limit", limit)] = None
-    """Largest torque of each servo, N m; a servo that is weaker keeps its own limit."""
-    joint_damping: Annotated[Sampled, Term(None, 0.0, (0.0, 1e4), "damping", shift)] = None
+    torque_limit: Annotated[Sampled, physical("force_limit", LIMIT, None, (1e-3, 1e5))] = None
+    """Largest torque of each servo at its joint, N m; a servo that is weaker keeps its own
+    limit."""
+    joint_damping: Annotated[Sampled, physical("damping", ADD, None, (0.0, 1e4))] = None
     """Viscous damping added to each joint, N m s/rad."""
-    joint_frictionloss: Annotated[Sampled, Term(None, 0.0, (0.0, 1e4), "frictionloss", replace)] = (
+    joint_frictionloss: Annotated[Sampled, physical("frictionloss", REPLACE, None, (0.0, 1e4))] = (
         None
     )
     """Dry friction of each joint, N m, in place of the model's."""
-    armature: Annotated[Sampled, Term(None, 1.0, _FACTOR, "armature", scale)] = None
+    armature: Annotated[Sampled, physical("armature", SCALE, None, _FACTOR)] = None
     """Factor of each joint's rotor inertia."""
-    link_mass: Annotated[Sampled, Term(None, 1.0, _FACTOR, "link_mass", scale)] = None
+    link_mass: Annotated[Sampled, physical("link_mass", SCALE, None, _FACTOR)] = None
     """Factor of each link's mass."""
-    paddle_offset: Annotated[Sampled, Term((3,), 0.0, (-0.5, 0.5), "paddle_position", shift)] = None
+    paddle_offset: Annotated[Sampled, physical("paddle_position", ADD, (3,), (-0.5, 0.5))] = None
     """Displacement of the paddle along each axis of the last link, m."""
-    paddle_tilt: Annotated[Sampled, Term((2,), 0.0, (-1.0, 1.0), "paddle_rotation", tilt_frame)] = (
+    paddle_tilt: Annotated[Sampled, physical("paddle_rotation", TILT_FRAME, (2,), (-1.0, 1.0))] = (
         None
     )
     """Rotation of the paddle about its own x and y axis, rad."""
-    gravity_tilt: Annotated[Sampled, Term((2,), 0.0, (-1.0, 1.0), "gravity", tilt_vector)] = None
+    gravity_tilt: Annotated[Sampled, physical("gravity", TILT_VECTOR, (2,), (-1.0, 1.0))] = None
     """Rotation of gravity about the world's x and y axis, rad."""
-    action_latency: Annotated[Sampled, Term((), 0.0, (0.0, 1.0))] = None
+    action_latency: Annotated[Sampled, Term((), (0.0, 1.0), 0.0)] = None
     """Time from an action to its servo targets, s."""
-    ball_latency: Annotated[Sampled, Term((), 0.0, (0.0, 1.0))] = None
+    ball_latency: Annotated[Sampled, Term((), (0.0, 1.0), 0.0)] = None
     """Time from a camera picture of the ball to its use, s."""
-    camera_rate: Annotated[Sampled, Term((), None, (1.0, 1e4))] = None
+    camera_rate: Annotated[Sampled, Term((), (1.0, 1e4), None)] = None
     """Camera pictures of the ball per second, Hz; null for one at every control step."""
-    frame_drop: Annotated[Sampled, Term((), 0.0, (0.0, 0.99))] = None
+    frame_drop: Annotated[Sampled, Term((), (0.0, 0.99), 0.0)] = None
     """Probability that a camera picture is lost."""
-    ball_position_noise: Annotated[Sampled, Term((), 0.0, (0.0, 0.5))] = None
+    ball_position_noise: Annotated[Sampled, Term((), (0.0, 0.5), 0.0)] = None
     """Standard deviation of the noise of each measured ball coordinate, m."""
-    ball_position_bias: Annotated[Sampled, Term((3,), 0.0, (-0.5, 0.5))] = None
+    ball_position_bias: Annotated[Sampled, Term((3,), (-0.5, 0.5), 0.0)] = None
     """Error of each measured ball coordinate, constant in an episode, m."""
-    ball_velocity_noise: Annotated[Sampled, Term((), 0.0, (0.0, 10.0))] = None
+    ball_velocity_noise: Annotated[Sampled, Term((), (0.0, 10.0), 0.0)] = None
     """Standard deviation of the noise of each component of the measured ball velocity, m/s."""
-    ball_velocity_bias: Annotated[Sampled, Term((3,), 0.0, (-10.0, 10.0))] = None
+    ball_velocity_bias: Annotated[Sampled, Term((3,), (-10.0, 10.0), 0.0)] = None
     """Error of each component of the measured ball velocity, constant in an episode, m/s."""
-    joint_angle_noise: Annotated[Sampled, Term((), 0.0, (0.0, 0.5))] = None
+    joint_angle_noise: Annotated[Sampled, Term((), (0.0, 0.5), 0.0)] = None
     """Standard deviation of the noise of each measured joint angle, rad."""
-    encoder_bias: Annotated[Sampled, Term(None, 0.0, (-0.5, 0.5))] = None
+    encoder_bias: Annotated[Sampled, Term(None, (-0.5, 0.5), 0.0)] = None
     """Error of each encoder's zero, which the servo shares, rad."""
-    joint_velocity_noise: Annotated[Sampled, Term((), 0.0, (0.0, 10.0))] = None
+    joint_velocity_noise: Annotated[Sampled, Term((), (0.0, 10.0), 0.0)] = None
     """Standard deviation of the noise of each measured joint velocity, rad/s."""
-    joint_velocity_bias: Annotated[Sampled, Term(None, 0.0, (-10.0, 10.0))] = None
+    joint_velocity_bias: Annotated[Sampled, Term(None, (-10.0, 10.0), 0.0)] = None
     """Error of each measured joint velocity, constant in an episode, rad/s."""
-    push_speed: Annotated[Sampled, Term((), 0.0, (0.0, 10.0))] = None
+    push_speed: Annotated[Sampled, Term((), (0.0, 10.0), 0.0)] = None
     """Horizontal speed that a push adds to the ball, in a random direction, m/s."""
-    push_interval: Annotated[Sampled, Term((), None, (0.01, 600.0))] = None
+    push_interval: Annotated[Sampled, Term((), (0.01, 600.0), None)] = None
     """Time between two pushes, s; 2 s if only push_speed is given."""
-    command_interval: Annotated[Sampled, Term((), None, (0.01, 600.0))] = None
+    command_interval: Annotated[Sampled, Term((), (0.01, 600.0), None)] = None
     """Time between two samples of the task's commands within an episode, s."""
-    ball_start: Annotated[Sampled, Term((3,), 0.0, (-1.0, 1.0))] = None
+    ball_start: Annotated[Sampled, Term((3,), (-1.0, 1.0), 0.0)] = None
     """Displacement of each coordinate of the ball at a reset, in addition to `env.reset`, m."""
-    joint_start: Annotated[Sampled, Term(None, 0.0, (-3.0, 3.0))] = None
+    joint_start: Annotated[Sampled, Term(None, (-3.0, 3.0), 0.0)] = None
     """Displacement of each joint angle at a reset, in addition to `env.reset`, rad."""
     share: UnitInterval = 1.0
     """Probability that a term with a nominal value is sampled in an episode; otherwise it has that
@@ -200,16 +224,30 @@ class RandomizationConfig(StrictModel):
 
     @pydantic.model_validator(mode="after")
     def _check_ranges(self):
-        for name in (self.shares or {}).keys() - TERMS.keys():
+        for name in sorted(self.shares or {}):
+            if name not in TERMS:
+                reason = "which is not a term"
+            elif getattr(self, name) is None:
+                reason = "a term that is off"
+            elif not TERMS[name].has_nominal:
+                reason = "a term that is sampled in every episode"
+            else:
+                continue
+            raise ValueError(f"shares has a probability for {shorten(name)}, {reason}; remove it")
+        varies = any(TERMS[name].has_nominal for name in self.terms)
+        if self.warmup_steps and not varies and self.first_command_range == 1.0:
             raise ValueError(
-                f"shares has a probability for {shorten(name)}, which is not a term; remove it"
+                "warmup_steps is given without a term whose range grows; give both, or neither"
             )
+        if self.share < 1.0 and not varies:
+            raise ValueError("share is given without a term that it is of; give both, or neither")
         if self.push_interval and not self.push_speed:
             raise ValueError("push_interval is given without push_speed; give both")
         if self.first_command_range < 1.0 and not self.warmup_steps:
             raise ValueError("first_command_range is given without warmup_steps; give both")
         for name in self.terms:
-            ends, (size, _, (least, greatest), *_) = getattr(self, name), TERMS[name]
+            ends, size = getattr(self, name), TERMS[name].size
+            least, greatest = TERMS[name].bounds
             unit = f" {unit_of(type(self).model_fields[name].description)}".rstrip()
             counts = {len(end) if isinstance(end, tuple) else 0 for end in ends}
             if len(counts) > 1 or (size is not None and not counts <= {0, *size}):
@@ -231,18 +269,25 @@ class RandomizationConfig(StrictModel):
         """Names of the active terms."""
         return tuple(name for name in TERMS if getattr(self, name) is not None)
 
-    def ranges(self, progress: jax.Array | float = 1.0) -> Ranges:
+    def ranges(
+        self,
+        progress: jax.Array | float = 1.0,
+        nominals: Mapping[str, Any] = MappingProxyType({}),
+    ) -> Ranges:
         """Ranges of the active terms.
 
         Args:
           progress: share of the warm-up that has passed [], from 0 to 1.
+          nominals: `nominal_values` of the terms, from which their ranges grow; a range without one
+            does not grow.
         """
-
         ranges = {}
         for name in self.terms:
-            ends, nominal = np.array(getattr(self, name)), TERMS[name].nominal
-            start = ends if nominal is None else nominal
-            ranges[name] = tuple(jnp.asarray(start + (ends - start) * progress, jnp.float32))
+            ends = tuple(np.array(end) for end in getattr(self, name))
+            if name in nominals:
+                start = nominals[name]
+                ends = tuple(start + (end - start) * progress for end in ends)
+            ranges[name] = tuple(jnp.asarray(end, jnp.float32) for end in ends)
         return ranges
 
 
@@ -260,11 +305,38 @@ TERMS: dict[str, Term] = {
 """All terms of `RandomizationConfig`."""
 
 
+def nominal_values(mj_model: mujoco.MjModel, terms: Iterable[str]) -> dict[str, np.ndarray]:
+    """Values without randomisation of the terms that have one, each of the term's shape.
+
+    Of a term that replaces a number of the model, it is that number; a model without a contact pair
+    has none of the contact.
+    """
+    # The engines are not needed to read a config.
+    from bounce_mjx.physics.edited import own_parameters
+
+    own, nominals = own_parameters(mj_model), {}
+    for name in terms:
+        term = TERMS[name]
+        value = term.nominal
+        if term.operation is REPLACE:
+            value = getattr(own, term.parameter)
+        if value is not None:
+            nominals[name] = value
+    if "restitution" in nominals:
+        nominals["restitution"] = contact_restitution(own.contact_damping, own.contact_stiffness)
+    num_joints = len(own.armature)
+    return {
+        name: np.broadcast_to(np.float64(value), TERMS[name].shape(num_joints))
+        for name, value in nominals.items()
+    }
+
+
 def sample_world(
     ranges: Ranges,
     key: jax.Array,
     dtype: jnp.dtype,
     num_joints: int,
+    nominals: Mapping[str, Any] = MappingProxyType({}),
     share: float | jax.Array = 1.0,
     shares: Mapping[str, float] = MappingProxyType({}),
 ) -> World:
@@ -272,7 +344,9 @@ def sample_world(
 
     Args:
       num_joints: number of acting joints.
-      share: probability [] that each term with a nominal value is sampled.
+      nominals: `nominal_values`, which the terms have that are not sampled; a term without one is
+        sampled in every episode.
+      share: probability [] that each term is sampled.
       shares: probabilities of single terms, in place of `share`.
     """
     # The order of TERMS, because JAX sorts the keys of a traced dictionary.
@@ -282,12 +356,12 @@ def sample_world(
     uniform = jax.random.uniform(key, (sum(sizes.values()) + len(sizes),), dtype)
     world, start = {}, len(sizes)
     for i, (name, size) in enumerate(sizes.items()):
-        term, (low, high) = TERMS[name], ranges[name]
+        low, high = ranges[name]
         places = uniform[start : start + size].reshape(shapes[name])
         value = jnp.asarray(low, dtype) + jnp.asarray(high - low, dtype) * places
-        if term.nominal is not None:
+        if name in nominals:
             is_sampled = uniform[i] < shares.get(name, share)
-            value = jnp.where(is_sampled, value, jnp.asarray(term.nominal, dtype))
+            value = jnp.where(is_sampled, value, jnp.asarray(nominals[name], dtype))
         world[name] = value
         start += size
     return world
@@ -302,16 +376,15 @@ def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParamet
     terms = {name: term for name, term in TERMS.items() if name in world and term.parameter}
     if not terms:
         return PhysicsParameters()
-    own, given = own_parameters(mj_model), {}
-    for name, (*_, parameter, operation) in terms.items():
-        value, own_value = world[name], getattr(own, parameter)
-        if operation is None:
-            given[parameter] = contact_damping(value, direct_solref(mj_model)[0])
-        else:
-            if own_value is not None:
-                own_value = jnp.asarray(own_value, value.dtype)
-            given[parameter] = operation(own_value, value)
-    return PhysicsParameters(**given)
+    own, parameters = own_parameters(mj_model), {}
+    for name, term in terms.items():
+        value, own_value = world[name], getattr(own, term.parameter)
+        if name == "restitution":
+            value = contact_damping(value, direct_solref(mj_model)[0])
+        if own_value is not None:
+            own_value = jnp.asarray(own_value, value.dtype)
+        parameters[term.parameter] = term.operation.apply(own_value, value)
+    return PhysicsParameters(**parameters)
 
 
 # Damping ratios of the contact, and the measured restitution: the mean of the drops on the held
@@ -329,3 +402,10 @@ def contact_damping(restitution: jax.Array, stiffness: float) -> jax.Array:
     ratio, e = np.array(_DROPS[::-1]).T
     zeta = jnp.interp(restitution, e, ratio)
     return (2.0 * np.sqrt(stiffness) * zeta).astype(jnp.asarray(restitution).dtype)
+
+
+def contact_restitution(damping: float, stiffness: float) -> np.ndarray:
+    """Restitution [] of a contact with a damping (1/s) at a stiffness (1/s^2): the inverse of
+    `contact_damping`."""
+    ratio, e = np.array(_DROPS).T
+    return np.interp(damping / (2.0 * np.sqrt(stiffness)), ratio, e)
