@@ -8,10 +8,11 @@ import pytest
 
 from bounce_mjx import task
 from bounce_mjx.robot.model import find_addresses, load_model
-from bounce_mjx.tasks.juggle import REST, Config, Juggle
+from bounce_mjx.tasks.juggle import Config, Juggle
 
 JUGGLE = Juggle(Config())
 HOME = np.array(JUGGLE.config.home)
+REST = 0.0225
 
 
 def landing_times(z: np.ndarray, speed: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
@@ -70,6 +71,56 @@ def test_a_task_without_events_goes_through_every_command(
     assert again.metadata == policy.metadata
     sizes = {"joint_angles": 6, "joint_velocities": 6, "ball_position": 3, "ball_velocity": 3}
     assert policy.step({name: np.zeros(sizes[name]) for name in policy.needs}).shape == (6,)
+
+
+RADIUS, HALF_HEIGHT = 0.03, 0.01
+
+
+@pytest.fixture
+def large(tmp_path: Path) -> Path:
+    """The project's robot with a larger ball and a thicker paddle."""
+    spec = mujoco.MjSpec.from_file(str(CHECKOUT / "mjcf/bounce_ball.xml"))
+    spec.geom("ball").size[0] = RADIUS
+    spec.geom("blocker").size[2] = HALF_HEIGHT
+    (tmp_path / "large.xml").write_text(spec.to_xml())
+    return tmp_path / "large.xml"
+
+
+def test_tasks_have_the_geometry_of_the_model(large: Path) -> None:
+    """A ball that is laid on the paddle does not start within it, a throw aims at its rest, a
+    flight ends there, and balls touch that overlap."""
+    tasks = {name: find_task(name) for name in ("balance", "catch", "juggle", "track")}
+    balance, catch, juggle, track = (task(task.Config(mjcf=large)) for task in tasks.values())
+    x, y, home = balance.geometry.paddle_home
+    np.testing.assert_allclose((x, y, home), task.PADDLE_HOME, atol=5e-5)
+    rest = home + RADIUS + HALF_HEIGHT
+    assert balance.throw(jnp.full(4, 0.5), {})[0][2] == pytest.approx(rest + 0.003)
+    position, velocity = catch.throw(jnp.array([0.0, 0.0, 0.5, 0.5, 0.5]), {})
+    # A parabola is again at the height from which it rose.
+    assert position[2] == pytest.approx(rest) and velocity[2] == pytest.approx(0.5 * 9.81 * 0.65)
+
+    speed = jnp.zeros(6)
+
+    def truth(balls: jax.Array, velocities: jax.Array) -> task.Kinematics:
+        paddle = jnp.array([x, y, home])
+        return task.Kinematics(speed, balls, None, speed, velocities, None, paddle)
+
+    def touched(distance: float, radius: float | None = None) -> bool:
+        balls = jnp.array([[x, -0.5 * distance, 0.5], [x, 0.5 * distance, 0.5]])
+        state = jnp.array([False, False]), 1.0
+        step = task.Step(
+            truth(balls, jnp.zeros((2, 3))), {"target_height": 0.5}, speed, speed, radius
+        )
+        return bool(juggle.step(state, step).metrics["touched"])
+
+    assert touched(0.059) and not touched(0.061)
+    # In an episode with other balls.
+    assert touched(0.039, 0.02) and not touched(0.041, 0.02)
+    for flown in (juggle, track):
+        height = flown.config.home[2] + RADIUS + HALF_HEIGHT
+        assert flown._ground() == pytest.approx(height)
+    with pytest.raises(UserError, match=r"a ball of the radius 0.03 m rests on .* 0.0898 m"):
+        Env(find_task("bounce").Config(mjcf=large, ball_init_pos=(0.59, 0.0, 0.07)))
 
 
 @pytest.mark.parametrize("name", ["balance", "catch", "juggle", "track"])

@@ -9,8 +9,6 @@ laws", ICRA 1994). The arm's inverse kinematics turn the paddle's pose into join
 Like a policy, the law sees only the observation. It knows the nominal model.
 """
 
-from collections.abc import Sequence
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -19,7 +17,8 @@ import numpy as np
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
-from bounce_mjx.robot.model import data_at, find_addresses, scatter
+from bounce_mjx.robot.geometry import upper_face
+from bounce_mjx.robot.model import data_at, scatter
 from bounce_mjx.world.config import WorldConfig
 
 # Restitution of the ball on the paddle.
@@ -168,14 +167,3 @@ class MirrorLaw:
         # pose again for each entry of a sum over an axis, in each of the steps before it. XLA
         # aborts on a small product of matrices with its option of `join_loops`.
         return jnp.stack(jax.lax.fori_loop(0, _ITERATIONS, improve, home))
-
-
-def upper_face(mj_model: mujoco.MjModel, joint_angles: Sequence[float]) -> tuple[np.ndarray, float]:
-    """Unit normal [3] of the paddle's face that is the upper one at these joint angles (rad), in
-    the frame of the paddle's body, and the face's distance from the paddle's centre, m."""
-    paddle, normal = find_addresses(mj_model).paddle_geom, np.zeros(3)
-    upward = data_at(mj_model, joint_angles).geom_xmat[paddle].reshape(3, 3)[2]
-    axis = int(np.argmax(abs(upward)))
-    face = np.sign(upward[axis]) * np.eye(3)[axis]
-    mujoco.mju_rotVecQuat(normal, face, mj_model.geom_quat[paddle])
-    return normal, float(mj_model.geom_aabb[paddle, 3 + axis])

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from bounce_mjx.baselines.mirror import upper_face
 from bounce_mjx.deploy.graph import onnx_graph
 from bounce_mjx.deploy.metadata import (
     FORMAT,
@@ -30,6 +29,7 @@ from bounce_mjx.deploy.metadata import (
 from bounce_mjx.errors import UserError, needed
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.robot.arm import joint_name
+from bounce_mjx.robot.geometry import upper_face
 from bounce_mjx.robot.model import find_addresses, joint_names, load_model
 from bounce_mjx.robot.torques import largest_torques
 from bounce_mjx.runs.checkpoints import read_actor

@@ -16,6 +16,7 @@ from bounce_mjx.physics.engine import Engine, make_engine
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
 from bounce_mjx.robot import model as robot_model
 from bounce_mjx.robot.balls import BALLS_APART
+from bounce_mjx.robot.geometry import read_geometry
 from bounce_mjx.task.rewards import check_names
 from bounce_mjx.task.task import Start, Step, Task, TaskStep
 from bounce_mjx.world import noise
@@ -130,6 +131,8 @@ class Env:
         self.layout = config.layout
         self.addresses = robot_model.find_addresses(self.mj_model)
         self._check_start()
+        self.task.geometry = read_geometry(self.mj_model, config.default_joint_angles)
+        self._check_rest()
         self._actuators = Actuators(config, self.mj_model)
         self._sensors = Sensors(config, self.mj_model, self.engine, self.task)
         self._randomize = randomize
@@ -173,6 +176,16 @@ class Env:
                     f"{name} has the height {height:g} m, which is not over the paddle at "
                     f"{paddle:.4g} m, where default_joint_angles hold it; change one of the two"
                 )
+
+    def _check_rest(self) -> None:
+        """Checks that the ball does not start within the paddle."""
+        geometry, start = self.task.geometry, self.config.heights.get("ball_init_pos")
+        rest = geometry.paddle_home[2] + geometry.rest_height
+        if start is not None and start < rest - _ROUNDING:
+            raise UserError(
+                f"ball_init_pos has the height {start:g} m, but a ball of the radius "
+                f"{geometry.ball_radius:g} m rests on the paddle at {rest:.4g} m; raise it"
+            )
 
     @property
     def unwrapped(self) -> "Env":
@@ -290,7 +303,16 @@ class Env:
         now = before._replace(physics=physics, last_action=action, actuation=actuation)
         truth = self.kinematics(now)
 
-        done = self.task.step(before.task, Step(truth, before.command, action, before.last_action))
+        done = self.task.step(
+            before.task,
+            Step(
+                truth=truth,
+                command=before.command,
+                action=action,
+                last_action=before.last_action,
+                ball_radius=before.parameters.ball_radius,
+            ),
+        )
         now = self._pass_time(now)
         command = self.task.next_command(done.state, now.command)
         now = now._replace(task=done.state, command=command)

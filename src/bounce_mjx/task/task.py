@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.lazy import jax, jnp
@@ -11,6 +12,9 @@ from bounce_mjx.task.results import Episodes, Figure, Result
 from bounce_mjx.task.shown import Curve, Histogram, Hits, Marker, Recording
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.observation import Kinematics
+
+if TYPE_CHECKING:
+    from bounce_mjx.robot.geometry import Geometry
 
 State = Any
 """A pytree that a task keeps of an episode."""
@@ -41,6 +45,8 @@ class Step(NamedTuple):
     """Clipped action [n]."""
     last_action: jax.Array
     """Clipped action of the previous step [n]."""
+    ball_radius: jax.Array | float | None = None
+    """Radius [] of the balls in this episode, m; None for that of the task's `geometry`."""
 
 
 class TaskStep(NamedTuple):
@@ -121,6 +127,20 @@ class Task:
 
     def __init__(self, config: WorldConfig):
         self.config = config
+
+    @functools.cached_property
+    def geometry(self) -> Geometry:
+        """Sizes and places of ball and paddle in the model. An environment sets those of its own;
+        a task without one compiles the config's model for them."""
+        # The settings alone need no JAX.
+        from bounce_mjx.robot.geometry import read_geometry
+        from bounce_mjx.robot.model import load_model
+
+        config = self.config
+        model = load_model(
+            config.mjcf, config.physics_dt, False, config.robot, num_balls=config.num_balls
+        )
+        return read_geometry(model, config.default_joint_angles)
 
     def throw(self, draws: jax.Array, command: Values) -> tuple[jax.Array, jax.Array] | None:
         """Position [3] (m) and velocity [3] (m/s) of the ball at a reset, before the noise and the

@@ -14,9 +14,11 @@ MAX_SPEED = 0.05
 """Greatest speed of the point, m/s."""
 MIN_RADIUS = 0.01
 """Radius of the point's circle below which the point is slower than `point_speed`, m."""
-START_HEIGHT = 0.0255
-"""Height of the ball over the paddle's centre at a reset, m: 3 mm above its rest, because the noise
-of the joint angles lifts the paddle by up to 2.5 mm."""
+LIFT = 0.003
+"""Height of the ball over its rest on the paddle at a reset, m, because the noise of the joint
+angles lifts the paddle by up to 2.5 mm."""
+START_HEIGHT = 0.0225 + LIFT
+"""The same over the paddle's centre, for the project's own ball and paddle, m."""
 LOST_DISTANCE, LOST_DEPTH = 0.1, 0.02
 """The episode ends when the ball is farther from the paddle's centre, or lower, m."""
 SETTLING_SECONDS = 1.0
@@ -54,7 +56,7 @@ class Config(task.WorldConfig):
         *task.PADDLE_HOME[:2],
         task.PADDLE_HOME[2] + START_HEIGHT,
     )
-    """Mean ball position at a reset, m."""
+    """Mean ball position at a reset, m; higher where a larger ball would be within the paddle."""
     reset: task.ResetConfig = task.ResetConfig(joint_angles=0.002, ball_position=0.0)
     """The noise of a reset."""
     friction: Friction | None = 0.3
@@ -74,6 +76,10 @@ class Config(task.WorldConfig):
         return {"ball_init_pos": [x, y, round(z + START_HEIGHT, 4)]}
 
     @property
+    def heights(self) -> dict[str, float]:
+        return {}
+
+    @property
     def commands(self) -> dict[str, task.Command]:
         reach = task.Command(-REACH, REACH, "m", least=-REACH, greatest=REACH, step=0.005)
         speed = task.Command(-MAX_SPEED, MAX_SPEED, "m/s", -MAX_SPEED, MAX_SPEED, step=0.01)
@@ -90,6 +96,9 @@ class Balance(task.Task):
 
     def throw(self, draws: jax.Array, command: task.Values) -> tuple[jax.Array, jax.Array]:
         x, y, z = self.config.ball_init_pos
+        rest = self.geometry.paddle_home[2] + self.geometry.rest_height
+        if z < rest:
+            z = rest + LIFT
         east, north = REACH * (draws[:2] - 0.5)
         return jnp.stack([x + east, y + north, jnp.full_like(x, z)]), jnp.zeros(3)
 
@@ -141,8 +150,10 @@ class Balance(task.Task):
     def markers(self, command: Any, metrics: Any) -> tuple[task.Marker, ...]:
         """A frame around the ball at the point."""
         x, y, z = self.focus()
-        place = (x + command["point_x"], y + command["point_y"], z + 0.004)
-        size, green = (0.021, 0.021, 0.001), (0.15, 0.9, 0.3, 0.9)
+        radius = self.geometry.ball_radius
+        face = z + self.geometry.rest_height - radius
+        place = (x + command["point_x"], y + command["point_y"], face + 0.0005)
+        size, green = (radius + 0.002, radius + 0.002, 0.001), (0.15, 0.9, 0.3, 0.9)
         return (task.Marker("point", place, size, green, "frame"),)
 
     def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
@@ -150,8 +161,7 @@ class Balance(task.Task):
 
     def focus(self) -> tuple[float, float, float]:
         """Where the paddle is held at a reset."""
-        x, y, z = self.config.ball_init_pos
-        return x, y, z - START_HEIGHT
+        return self.geometry.paddle_home
 
 
 def _point(command: task.Values) -> jax.Array:

@@ -20,7 +20,7 @@ MAX_DIRECTION = math.radians(30.0)
 AIM_RADIUS = 0.05
 """Greatest distance of the aim from the ball's rest on the paddle, m."""
 REST_HEIGHT = 0.0225
-"""Height of a resting ball over the paddle's centre, m."""
+"""Height of a resting ball over the paddle's centre, for the project's own ball and paddle, m."""
 REST_SPEED, REST_SECONDS = 0.05, 0.5
 """A ball is at rest that touched the paddle and was slower relative to it (m/s) for a time (s)."""
 CATCH_SECONDS, MIN_CAUGHT = 2.0, 0.95
@@ -52,7 +52,8 @@ class Config(task.WorldConfig):
         *task.PADDLE_HOME[:2],
         task.PADDLE_HOME[2] + REST_HEIGHT,
     )
-    """Where the ball would rest on the paddle at a reset, m; throws aim near it."""
+    """Where the ball would rest on the paddle at a reset, m; throws aim near it, or higher where a
+    larger ball rests higher."""
     reset: task.ResetConfig = task.ResetConfig(joint_angles=0.02, ball_position=0.0)
     """The noise of a reset."""
     friction: Friction | None = 0.3
@@ -75,6 +76,10 @@ class Config(task.WorldConfig):
                 f"at most {MAX_DISTANCE:g} m from it; give at most {MAX_DISTANCE - AIM_RADIUS:g} m"
             )
         return self
+
+    @property
+    def heights(self) -> dict[str, float]:
+        return {}
 
     @classmethod
     def settings_at(cls, paddle: tuple[float, float, float]) -> dict[str, Any]:
@@ -103,7 +108,9 @@ class Catch(task.Task):
 
     def throw(self, draws: jax.Array, command: task.Values) -> tuple[jax.Array, jax.Array]:
         """The throw starts at the height of its aim, so that the ball falls at 2.9 to 3.4 m/s."""
-        home = jnp.array(self.config.ball_init_pos)
+        x, y, z = self.config.ball_init_pos
+        rest = self.geometry.paddle_home[2] + self.geometry.rest_height
+        home = jnp.array([x, y, max(z, rest)])
         offset = AIM_RADIUS * jnp.sqrt(draws[0]) * _direction(2.0 * math.pi * draws[1])
         seconds = FLIGHTS[0] + (FLIGHTS[1] - FLIGHTS[0]) * draws[2]
         fastest = (MAX_DISTANCE - task.length(home[:2] + offset[:2])) / seconds
@@ -130,7 +137,7 @@ class Catch(task.Task):
         rest = jnp.where(resting, state.rest + dt, 0.0)
         in_time = contact < CATCH_SECONDS + 0.5 * dt
         caught = state.caught | (in_time & (rest > REST_SECONDS - 0.5 * dt))
-        drop = 2.0 * task.GRAVITY * jnp.maximum(offset[2] - REST_HEIGHT, 0.0)
+        drop = 2.0 * task.GRAVITY * jnp.maximum(offset[2] - self.geometry.rest_height, 0.0)
         values = {
             "centre": task.length(offset[:2]),
             "fall": task.safe_sqrt(jnp.sum(jnp.square(velocity)) + drop),
@@ -161,8 +168,7 @@ class Catch(task.Task):
         return {"caught": "yes" if metrics["caught"] else "no"}
 
     def focus(self) -> tuple[float, float, float]:
-        x, y, z = self.config.ball_init_pos
-        return x, y, z - REST_HEIGHT
+        return self.geometry.paddle_home
 
 
 def _direction(angle: jax.Array) -> jax.Array:

@@ -10,9 +10,8 @@ from bounce_mjx import task
 from bounce_mjx.config.settings import Ascending, Coordinate, Finite, Length, Positive
 from bounce_mjx.lazy import jax, jnp
 
-REST, FLOWN = 0.0225, 0.125
-"""Height of a ball's centre over the paddle's while they touch, m; and the share of its flight that
-the last ball has flown at a reset."""
+FLOWN = 0.125
+"""Share of its flight that the last ball has flown at a reset."""
 SETTLING, MAX_HEIGHT_ERROR = 2.0, 0.1
 """Time since the height was commanded after which apexes count, s; and how near they are, m."""
 LEAST_HEIGHT = 0.1
@@ -97,9 +96,13 @@ class Juggle(task.Task):
 
     def _columns(self, height: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The commanded apexes [B, 3] (m) and the time of a whole flight to them [] (s)."""
-        fall = task.safe_sqrt(2.0 * (height - self.config.home[2] - REST) / task.GRAVITY)
+        fall = task.safe_sqrt(2.0 * (height - self._ground()) / task.GRAVITY)
         columns = [jnp.stack([*map(jnp.asarray, top)]) for top in self.config.columns(height)]
         return jnp.stack(columns), 2.0 * fall
+
+    def _ground(self) -> float:
+        """Height of a ball that touches the paddle at home, m."""
+        return self.config.home[2] + self.geometry.rest_height
 
     def throw(self, draws: jax.Array, command: task.Values) -> tuple[jax.Array, jax.Array]:
         """The balls are in their columns and land alternately, the first one first."""
@@ -117,7 +120,7 @@ class Juggle(task.Task):
         terms = {name: getattr(reward, name) for name in task.term_names(type(reward))}
         truth, height, count = step.truth, step.command["target_height"], self.config.num_balls
         balls, velocities, home = truth.ball_position, truth.ball_velocity, self.config.home
-        flights = task.flight(balls, velocities, home[2] + REST)
+        flights = task.flight(balls, velocities, self._ground())
         columns, period = self._columns(height)
         early = jnp.roll(flights.fall, -1) - flights.fall - period / count
         errors = {
@@ -132,7 +135,8 @@ class Juggle(task.Task):
         height_errors = jnp.abs(balls[:, 2] - height)
         far = jnp.sum(jnp.square(balls - columns), axis=1) > self.config.max_distance**2
         closest = task.closest(balls, velocities, self.config.control_dt)
-        touched = closest < 2.0 * self.config.robot.ball.radius
+        radius = self.geometry.ball_radius if step.ball_radius is None else step.ball_radius
+        touched = closest < 2.0 * radius
         landing = _next(flights.end, flights.fall)
         return task.TaskStep(
             state=(rising, jnp.where(jnp.any(hits), jnp.max(numbers * hits), last)),
@@ -152,7 +156,7 @@ class Juggle(task.Task):
 
     def first_quantities(self, measured: task.Values) -> tuple[Any, task.Values]:
         height, velocities = measured["target_height"][0], measured["ball_velocity"]
-        ground, (columns, _) = self.config.home[2] + REST, self._columns(height)
+        ground, (columns, _) = self._ground(), self._columns(height)
         top, end, _, fall = task.flight(measured["ball_position"], velocities, ground)
         parts = (
             (end - measured["paddle_position"])[:, :2],
@@ -189,7 +193,7 @@ class Juggle(task.Task):
         """A disc on top of each column, and a frame where the next ball lands."""
         look = ((0.02, 0.001, 0.0), (0.15, 0.9, 0.3, 0.6), "cylinder")
         tops = enumerate(self.config.columns(command["target_height"]), start=1)
-        place = (metrics["landing_x"], metrics["landing_y"], self.config.home[2] + REST)
+        place = (metrics["landing_x"], metrics["landing_y"], self._ground())
         return (
             *(task.Marker(f"target height {i}", top, *look) for i, top in tops),
             task.Marker("next ball", place, (0.021, 0.021, 0.001), (1.0, 0.8, 0.1, 0.9), "frame"),

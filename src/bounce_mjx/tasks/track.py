@@ -12,8 +12,6 @@ from bounce_mjx.config.settings import Ascending, Coordinate, Finite, Length, Po
 from bounce_mjx.lazy import jax, jnp
 from bounce_mjx.tasks import paths
 
-REST = 0.0225
-"""Height of the ball's centre over the paddle's while they touch, m."""
 SETTLING, STEP_SETTLING = 2.0, 1.0
 """Time since a reset, and since a step of the point, after which apexes count, s."""
 BANDS = {"slow error": (0.0, 0.1, 1.5), "fast error": (0.25, 0.3, 3.0)}
@@ -101,6 +99,10 @@ class Track(task.Task):
         task.Curve("task/height_error", "height_error", "apexes", "|apex − height|, cm", 100.0),
     )
 
+    def _ground(self) -> float:
+        """Height of a ball that touches the paddle at home, m."""
+        return self.config.home[2] + self.geometry.rest_height
+
     def reset(self, start: task.Start) -> jax.Array:
         """Whether the ball rises [], bool."""
         return jnp.array(False)
@@ -122,7 +124,7 @@ class Track(task.Task):
     def step(self, rose: jax.Array, step: task.Step) -> task.TaskStep:
         truth, command, home = step.truth, step.command, self.config.home[2]
         ball, velocity, paddle = truth.ball_position, truth.ball_velocity, truth.paddle_position
-        flight, size = task.flight(ball, velocity, home + REST), self.config.path_size
+        flight, size = task.flight(ball, velocity, self._ground()), self.config.path_size
         offset = paths.offset(command, size, command["phase"])
 
         def point(seconds: jax.Array) -> jax.Array:
@@ -161,7 +163,7 @@ class Track(task.Task):
             change = change / self.config.control_dt
             return jnp.where(jnp.abs(change) <= limit, change, 0.0)
 
-        ground, target = self.config.home[2] + REST, paths.point(measured)[:, 0]
+        ground, target = self._ground(), paths.point(measured)[:, 0]
         flight = task.flight(measured["ball_position"], measured["ball_velocity"], ground)
         time = flight.fall + task.safe_sqrt(2.0 * (target[2] - ground) / task.GRAVITY)
         velocity = rate(target[:2] - memory[0], JUMP_SPEED)
