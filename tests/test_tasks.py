@@ -73,6 +73,16 @@ def test_a_task_without_events_goes_through_every_command(
     assert policy.step({name: np.zeros(sizes[name]) for name in policy.needs}).shape == (6,)
 
 
+def test_a_command_that_the_policy_does_not_see_is_refused() -> None:
+    bounce = find_task("bounce").Config
+    unseen = {"target_height": 0}
+    with pytest.raises(UserError, match="not see the command target_height, which varies from 0.4"):
+        Env(bounce(observation=unseen))
+    # A fixed one, or one that a quantity of the task may show.
+    Env(bounce(observation=unseen, target_height_range=(0.5, 0.5)))
+    Env(bounce(observation=unseen | {"apex_error": 1}))
+
+
 RADIUS, HALF_HEIGHT = 0.03, 0.01
 
 

@@ -144,7 +144,7 @@ class Mistyped(task.Task):
 
         @property
         def commands(self) -> dict[str, Command]:
-            return {"height": Command(0.4, 0.6, "m")}
+            return {"height": Command(0.4, 0.6, "m", hidden=True)}
 
     @property
     def curves(self) -> tuple[task.Curve, ...]:

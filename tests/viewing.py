@@ -207,9 +207,11 @@ class LeanConfig(WorldConfig):
 
     @property
     def commands(self) -> dict[str, task.Command]:
-        angle = task.Command(-0.2, 0.2, "rad", least=-0.3, greatest=0.3, step=0.1)
+        angle = task.Command(-0.2, 0.2, "rad", least=-0.3, greatest=0.3, step=0.1, hidden=True)
         pace = task.Command(2.0, 2.0, span=(1.0, 3.0), step=1.0)
-        gait = task.Command(0.0, 2.0, "", 0.0, 2.0, step=1.0, names=("walk", "slow run"))
+        gait = task.Command(
+            0.0, 2.0, "", 0.0, 2.0, step=1.0, names=("walk", "slow run"), hidden=True
+        )
         return {"lean_angle": angle, "pace": pace, "gait": gait}
 
 

@@ -120,6 +120,7 @@ class Env:
         """
         self.config = config
         self.task: Task = config.task(config)
+        _check_seen(config)
         if config.num_balls not in self.task.num_balls:
             takes = " or ".join(map(str, self.task.num_balls))
             raise UserError(
@@ -178,10 +179,10 @@ class Env:
                 )
 
     def _check_rest(self) -> None:
-        """Checks that the ball does not start within the paddle."""
-        geometry, start = self.task.geometry, self.config.heights.get("ball_init_pos")
+        """Checks that the ball of a task that throws none does not start within the paddle."""
+        geometry, start = self.task.geometry, self.config.ball_init_pos[2]
         rest = geometry.paddle_home[2] + geometry.rest_height
-        if start is not None and start < rest - _ROUNDING:
+        if type(self.task).throw is Task.throw and start < rest - _ROUNDING:
             raise UserError(
                 f"ball_init_pos has the height {start:g} m, but a ball of the radius "
                 f"{geometry.ball_radius:g} m rests on the paddle at {rest:.4g} m; raise it"
@@ -494,6 +495,21 @@ def world_model(config: WorldConfig, visual: bool = True) -> mujoco.MjModel:
     if config.friction is None:
         return mj_model
     return edited_model(mj_model, PhysicsParameters(contact_friction=np.float64(config.friction)))
+
+
+def _check_seen(config: WorldConfig) -> None:
+    """Refuses a command that varies and that the policy does not see."""
+    observation = config.observation
+    if observation.lengths("task"):
+        # The task's own quantities may show any command.
+        return
+    for name, command in config.commands.items():
+        if command.low < command.high and not command.hidden and not getattr(observation, name, 0):
+            raise UserError(
+                f"the policy does not see the command {name}, which varies from {command.low:g} to "
+                f"{command.high:g}; give the observation a quantity {name}, fix the command, or "
+                "mark it as hidden if it acts through others"
+            )
 
 
 @functools.lru_cache(maxsize=8)

@@ -76,13 +76,11 @@ class Config(task.WorldConfig):
         return {"ball_init_pos": [x, y, round(z + START_HEIGHT, 4)]}
 
     @property
-    def heights(self) -> dict[str, float]:
-        return {}
-
-    @property
     def commands(self) -> dict[str, task.Command]:
         reach = task.Command(-REACH, REACH, "m", least=-REACH, greatest=REACH, step=0.005)
-        speed = task.Command(-MAX_SPEED, MAX_SPEED, "m/s", -MAX_SPEED, MAX_SPEED, step=0.01)
+        speed = task.Command(
+            -MAX_SPEED, MAX_SPEED, "m/s", -MAX_SPEED, MAX_SPEED, step=0.01, hidden=True
+        )
         return {"point_x": reach, "point_y": reach, "point_speed": speed}
 
 

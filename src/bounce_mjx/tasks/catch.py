@@ -77,10 +77,6 @@ class Config(task.WorldConfig):
             )
         return self
 
-    @property
-    def heights(self) -> dict[str, float]:
-        return {}
-
     @classmethod
     def settings_at(cls, paddle: tuple[float, float, float]) -> dict[str, Any]:
         x, y, z = paddle

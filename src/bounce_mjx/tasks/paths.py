@@ -22,9 +22,9 @@ FASTEST = (1.0, 1.0, math.sqrt(2.0), math.inf, math.sqrt(32.0) / 3.0)
 SWAY = 0.05
 """Amplitude of the height, m."""
 COMMANDS = {
-    "path": task.Command(0.0, len(NAMES), "", 0.0, len(NAMES), step=1.0, names=NAMES),
-    "course": task.Command(0.0, 1.0, "turns", 0.0, 1.0),
-    "phase": task.Command(0.0, 1.0, "turns", 0.0, 1.0),
+    "path": task.Command(0.0, len(NAMES), "", 0.0, len(NAMES), None, 1.0, NAMES, hidden=True),
+    "course": task.Command(0.0, 1.0, "turns", 0.0, 1.0, hidden=True),
+    "phase": task.Command(0.0, 1.0, "turns", 0.0, 1.0, hidden=True),
 }
 """Number of the path; its direction, and the form of the wandering; the place on it."""
 

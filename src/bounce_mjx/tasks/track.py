@@ -86,7 +86,9 @@ class Config(task.WorldConfig):
             "target_x": task.Command(x - 0.02, x + 0.02, "m", span=(x - 0.15, x + 0.15), step=0.01),
             "target_y": task.Command(y - 0.02, y + 0.02, "m", span=(y - 0.15, y + 0.15), step=0.01),
             "target_height": task.Command(z + low, z + high, "m", span=(z + 0.3, z + 0.7)),
-            "point_speed": task.Command(*self.speed_range, "m/s", 0.0, span=(0.0, 0.3)),
+            "point_speed": task.Command(
+                *self.speed_range, "m/s", 0.0, span=(0.0, 0.3), hidden=True
+            ),
         } | paths.COMMANDS
 
 

@@ -42,6 +42,8 @@ class Command(NamedTuple):
     """Change by a key of a viewer."""
     names: tuple[str, ...] = ()
     """Names of the values 0 to 1, 1 to 2, ..., if they are choices; a user may give a name."""
+    hidden: bool = False
+    """Whether the policy need not see it, because it acts through other commands."""
 
     def checked(self, value: Any, label: str) -> float:
         """A user's value as a number.
