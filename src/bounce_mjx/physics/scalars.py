@@ -3,6 +3,10 @@
 A scalar is a Python float (known while tracing) or a JAX array (known when running). Products with
 the entries 0 and 1 of a robot's fixed rotations vanish here, before XLA sees them. A physics step
 has thousands of operations: `jax.lax` traces them in a fraction of the time of `jax.numpy`.
+
+The rule for its users: where an operand may be a constant, write `add`, `sub`, `mul` and `neg`, or
+`Vec` and `Mat`, which use them; the operators `+`, `-`, `*` and `/` stand where an operand is
+surely an array. A constant is a float, never an int: 0.0, not 0.
 """
 
 import functools

@@ -32,9 +32,10 @@ def read_geometry(mj_model: mujoco.MjModel, joint_angles: Sequence[float]) -> Ge
 def upper_face(mj_model: mujoco.MjModel, joint_angles: Sequence[float]) -> tuple[np.ndarray, float]:
     """Unit normal [3] of the paddle's face that is the upper one at these joint angles (rad), in
     the frame of the paddle's body, and the face's distance from the paddle's centre, m."""
-    paddle, normal = find_addresses(mj_model).paddle_geom, np.zeros(3)
+    paddle = find_addresses(mj_model).paddle_geom
     upward = data_at(mj_model, joint_angles).geom_xmat[paddle].reshape(3, 3)[2]
     axis = int(np.argmax(abs(upward)))
-    face = np.sign(upward[axis]) * np.eye(3)[axis]
-    mujoco.mju_rotVecQuat(normal, face, mj_model.geom_quat[paddle])
+    normal_in_geom = np.sign(upward[axis]) * np.eye(3)[axis]
+    normal = np.zeros(3)
+    mujoco.mju_rotVecQuat(normal, normal_in_geom, mj_model.geom_quat[paddle])
     return normal, float(mj_model.geom_aabb[paddle, 3 + axis])
