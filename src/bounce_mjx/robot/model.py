@@ -100,7 +100,7 @@ def load_model(
     mj_model = arm.compile_spec(spec, path)
     with arm.naming(path):
         addresses = find_addresses(mj_model)
-        _check_servos(mj_model, addresses)
+        check_servos(mj_model, addresses)
         if (present := len(addresses.balls)) != num_balls:
             raise UserError(f"{present} balls, but num_balls is {num_balls}; set it to {present}")
         if robot is not None and robot.limits.torque is not None:
@@ -192,11 +192,14 @@ def to_direct_solref(solref: Any, timestep: float) -> tuple[Any, Any]:
     return stiffness, jnp.where(is_standard, 2.0 / time_constant, -second)
 
 
-def _check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
-    """Refuses actuators whose control is not a target position of their joint.
+def check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
+    """Compares the acting joints' actuators with a position servo, whose control is the target
+    position of its joint.
 
-    With a <pid>, which has several controls, an actuator's index would not be its control's.
+    Raises:
+      UserError: one is another actuator; the text starts with it.
     """
+    # With a <pid>, which has several controls, an actuator's index would not be its control's.
     if np.any(mj_model.actuator_ctrlnum != 1):
         raise UserError("an actuator with several controls; drive each joint by a <position>")
     for joint, actuator in zip(addresses.arm_joints, addresses.actuators, strict=True):
@@ -263,19 +266,16 @@ def _servos(mj_model: mujoco.MjModel) -> dict[int, int]:
     """The actuator of each hinge and slide that has one, in the order of the joints."""
     acting = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
     servos: dict[int, int] = {}
-    for actuator in range(mj_model.nactuator):
-        joint = int(mj_model.actuator_trnid[actuator, 0])
-        if mj_model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_JOINT:
-            continue
+    for joint, actuators in arm.joint_actuators(mj_model).items():
         if int(mj_model.jnt_type[joint]) not in acting:
             continue
-        if joint in servos:
+        if len(actuators) > 1:
             name = arm.joint_name(mj_model, joint)
             raise UserError(f"several actuators on {name}; give it exactly one position servo")
-        servos[joint] = actuator
+        servos[joint] = actuators[0]
     if not servos:
         raise UserError("no actuator on a hinge or slide; give each joint of the arm a <position>")
-    return dict(sorted(servos.items()))
+    return servos
 
 
 def fingerprint(mj_model: mujoco.MjModel) -> bytes:

@@ -25,6 +25,7 @@ from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.interrupt import Interrupted, StopRequest
 from bounce_mjx.learning.policy import Policy
+from bounce_mjx.physics.convergence import solver_warning
 from bounce_mjx.runs import checkpoints, folders
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.files import to_json, writable, write_atomically
@@ -186,6 +187,10 @@ class Job:
         count = f"{mesh.size} x " if mesh.size > 1 else ""
         self.device = f"{count}{mesh.devices.flat[0].device_kind}"
         self.say(f"physics: {self.env.engine.name} ({self.env.engine.reason})")
+        if self.env.engine.name == "fused":
+            warning = solver_warning(self.env.mj_model)
+            if warning is not None:
+                self.say(f"warning: {warning}")
         for term in config.env.unseen_noise:
             self.say(f"warning: the policy does not see what {term} changes")
         self.say(f"device: {self.device}  run: {self.run}")
