@@ -67,10 +67,31 @@ def test_sb3_checks_pass() -> None:
 def test_attributes_are_common_and_stay(envs):
     assert envs.get_attr("dt", [0, 2]) == [0.01, 0.01]
     assert not envs.has_attr("gravity") and envs.env_is_wrapped(Monitor, 1) == [True]
-    for refused in (envs.set_attr, envs.env_method):
-        with pytest.raises(UserError, match="no attributes to set and no methods; give settings"):
-            refused("dt", 0.02)
-    assert Sb3VecEnv(2, task="catch")._envs.episode_steps == 300
+    with pytest.raises(UserError, match="'dt', which is fixed by the settings; give these to"):
+        envs.set_attr("dt", 0.02)
+    with pytest.raises(UserError, match="would change only some of the 3 .* omit indices"):
+        envs.set_attr("lap", 1, [0])
+    for lap in (1, 2):
+        envs.set_attr("lap", lap)
+        assert envs.get_attr("lap", [0, 2]) == envs.env_method("get_wrapper_attr", "lap")[:2]
+    assert envs.get_attr("lap") == [2] * NUM_ENVS
+
+
+def test_methods_of_single_environments(envs):
+    start = envs.reset()
+    high = {"target_height": 0.7}
+    ((observation, info),) = envs.env_method("reset", indices=1, seed=3, options=high)
+    assert observation[TARGET] == np.float32(0.7) and info == {}
+    after = envs.step(np.zeros((NUM_ENVS, 6)))[0]
+    np.testing.assert_array_equal(after[[0, 2], TARGET], start[[0, 2], TARGET])
+    single = gymnasium.make(ENV_ID)
+    np.testing.assert_allclose(observation, single.reset(seed=3, options=high)[0], atol=1e-6)
+    with pytest.raises(UserError, match="'jump'; the environments have the methods reset, render"):
+        envs.env_method("jump")
+
+
+def test_the_time_limit_is_that_of_the_task() -> None:
+    assert Sb3VecEnv(2, task="catch").episode_steps == 300
 
 
 PPO_SETTINGS = {"n_steps": 16, "batch_size": 24, "n_epochs": 1}
