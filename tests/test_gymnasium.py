@@ -165,7 +165,9 @@ def test_options_choose_the_target_and_the_environments(single, vectorised):
     # Only the target differs from the drawn episode.
     np.testing.assert_allclose(observation[0, :TARGET], drawn[:TARGET], atol=1e-6)
     mask = np.array([False, True, False])
-    after, _ = vectorised.reset(options={"reset_mask": mask, "target_height": 0.7})
+    chosen = {"reset_mask": mask, "target_height": 0.7}
+    after, _ = vectorised.reset(seed=[7, np.int64(8), 9], options=chosen)
+    assert vectorised.np_random_seed[:2] == (1, 8)
     np.testing.assert_array_equal(after[:, TARGET], np.float32([0.5, 0.7, 0.5]))
     np.testing.assert_array_equal((after == observation).all(axis=1), ~mask)
     # An episode's steps keep its target.

@@ -243,7 +243,8 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         Args:
           seeds: seed of each environment; None continues its random numbers.
         """
-        self._seeds.seed(seeds)
+        chosen_seeds = [seed if chosen else None for seed, chosen in zip(seeds, mask, strict=True)]
+        self._seeds.seed(chosen_seeds)
         observation = self._batch.start(mask, self._seeds.draw(mask), commands)
         self._seeds.use(mask)
         self._ended[mask] = False
@@ -334,7 +335,8 @@ class EpisodeSeeds:
         """New generators of these seeds; None keeps an environment's generator."""
         for i, seed in enumerate(seeds):
             if seed is not None or self.generators[i] is None:
-                self.generators[i], self.generator_seeds[i] = seeding.np_random(seed)
+                number = None if seed is None else int(seed)
+                self.generators[i], self.generator_seeds[i] = seeding.np_random(number)
                 self._is_drawn[i] = False
 
     def draw(self, mask: np.ndarray) -> np.ndarray:

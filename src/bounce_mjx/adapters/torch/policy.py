@@ -110,4 +110,4 @@ def _bias(linear: nn.Linear) -> jax.Array:
 
 
 def _array(tensor: torch.Tensor) -> jax.Array:
-    return jnp.asarray(np.array(tensor.detach().cpu(), np.float32))
+    return jnp.asarray(tensor.detach().cpu().numpy().astype(np.float32))
