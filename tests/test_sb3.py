@@ -5,13 +5,16 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, VecVideoRecorder
 
 from bounce_mjx.adapters.gymnasium.registration import ENV_ID
 from bounce_mjx.adapters.sb3 import Sb3VecEnv
+from bounce_mjx.adapters.torch.policy import to_policy
 from bounce_mjx.errors import UserError
+from bounce_mjx.learning.policy import make_networks
 
 torch.set_num_threads(1)
 NUM_ENVS = 3
@@ -125,6 +128,19 @@ def test_algorithm_trains_and_loads(envs, library, algorithm, settings, need, tm
     expected, _ = model.predict(observation, deterministic=True)
     given, _ = make.load(tmp_path / "model").predict(observation, deterministic=True)
     np.testing.assert_array_equal(given, expected)
+
+
+def test_a_network_of_sb3_becomes_a_policy(envs):
+    """Its default activation is tanh."""
+    model = PPO("MlpPolicy", envs, policy_kwargs={"net_arch": [8, 4]}, device="cpu", seed=0)
+    parts = model.policy
+    mlp = torch.nn.Sequential(*parts.mlp_extractor.policy_net, parts.action_net)
+    policy = to_policy(mlp, torch.zeros(29), torch.ones(29), parts.log_std)
+    assert policy.config.activation == "tanh" and policy.config.hidden_layers == (8, 4)
+    observation = np.random.default_rng(0).normal(size=(16, 29)).astype(np.float32)
+    expected, _ = model.predict(observation, deterministic=True)
+    given = make_networks(policy.config, 29, 6).act(policy.policy, observation)
+    np.testing.assert_allclose(given, expected, atol=1e-5)
 
 
 def test_videos_tile_the_first_environments(opengl, need, tmp_path):

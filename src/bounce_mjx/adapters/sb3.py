@@ -54,8 +54,10 @@ class Sb3VecEnv(VecEnv):
     def _batch(self) -> Batch:
         return self._envs._batch
 
-    task, mj_model = TaskEnv.task, TaskEnv.mj_model
-    dt, episode_steps = TaskEnv.dt, TaskEnv.episode_steps
+    task = TaskEnv.task
+    mj_model = TaskEnv.mj_model
+    dt = TaskEnv.dt
+    episode_steps = TaskEnv.episode_steps
 
     def reset(self) -> np.ndarray:
         """Starts a new episode in every environment: observations [B, N], float32. It uses the

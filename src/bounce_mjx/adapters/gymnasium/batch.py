@@ -116,7 +116,7 @@ class Batch:
         given = dict.fromkeys(self.config.commands, np.nan) | commands
         values = {name: np.full(self.num_envs, x, np.float32) for name, x in given.items()}
         self._episodes = self.programs.start(self._episodes, mask, seeds, values)
-        return np.array(self._episodes.observation.T, np.float32)
+        return _with_batch_first(np.asarray(self._episodes.observation))
 
     def step(
         self,
@@ -138,14 +138,15 @@ class Batch:
         self._episodes, rows = self.programs.step(
             self._episodes, actions, self.episode_steps, seeds, reset_before, reset_after
         )
-        rows, size = np.asarray(rows), self.programs.task.observation_size
-        reward, terminated, truncated, *_ = numbers = rows[2 * size :].astype(np.float64)
+        rows = np.asarray(rows)
+        size = self.programs.task.observation_size
+        numbers = rows[2 * size :].astype(np.float64)
         return StepArrays(
-            observation=np.array(rows[:size].T, np.float32, order="C"),
-            final_observation=np.array(rows[size : 2 * size].T, np.float32, order="C"),
-            reward=reward,
-            terminated=terminated > 0.0,
-            truncated=truncated > 0.0,
+            observation=_with_batch_first(rows[:size]),
+            final_observation=_with_batch_first(rows[size : 2 * size]),
+            reward=numbers[0],
+            terminated=numbers[1] > 0.0,
+            truncated=numbers[2] > 0.0,
             metrics=numbers[3:],
         )
 
@@ -219,6 +220,12 @@ def whole_number(name: str, value: Any) -> int:
     if number < 1:
         raise UserError(f"{name} is {value!r}, but must be a whole number of at least 1")
     return number
+
+
+def _with_batch_first(observation: np.ndarray) -> np.ndarray:
+    """Observations [B, N], float32, of those with the batch last [N, B]."""
+    # Without strides, which other libraries refuse.
+    return np.array(observation.T, np.float32, order="C")
 
 
 def _check_process() -> None:

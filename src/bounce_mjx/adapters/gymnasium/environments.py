@@ -29,8 +29,9 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.task.task import Task
 from bounce_mjx.tasks.registry import DEFAULT
 
-_ONE = np.ones(1, bool)
-_NONE = np.zeros(1, bool)
+# Of one environment.
+_CHOSEN = np.ones(1, bool)
+_NOT_RESET = np.zeros(1, bool)
 _NO_SEED = np.zeros(1, np.uint32)
 
 
@@ -119,7 +120,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         commands = self._batch.checked_commands(options or {})
         super().reset(seed=seed)
         seeds = np.array([_next_seed(self.np_random)])
-        observation = self._batch.start(_ONE, seeds, commands)
+        observation = self._batch.start(_CHOSEN, seeds, commands)
         self._has_ended = False
         return observation[0], {}
 
@@ -132,7 +133,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         action = checked_actions(action, self.action_space.shape)
         if self._has_ended:
             raise ResetNeeded("the episode has ended; call reset() before the next step")
-        result = self._batch.step(action[None], _NO_SEED, _NONE)
+        result = self._batch.step(action[None], _NO_SEED, _NOT_RESET)
         terminated, truncated = bool(result.terminated[0]), bool(result.truncated[0])
         self._has_ended = terminated or truncated
         metrics = result.metrics[:, 0].tolist()
@@ -195,8 +196,11 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         self._statistics = EpisodeStatistics(num_envs)
         self._ended = np.zeros(num_envs, bool)
 
-    spec, task, mj_model = TaskEnv.spec, TaskEnv.task, TaskEnv.mj_model
-    dt, episode_steps = TaskEnv.dt, TaskEnv.episode_steps
+    spec = TaskEnv.spec
+    task = TaskEnv.task
+    mj_model = TaskEnv.mj_model
+    dt = TaskEnv.dt
+    episode_steps = TaskEnv.episode_steps
 
     @property
     def np_random(self) -> tuple[np.random.Generator, ...]:
@@ -260,20 +264,26 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
           Observations [B, N], rewards [B], terminated [B], truncated [B], and an info of the
           environments' metrics.
         """
-        mode, before = self.autoreset_mode, self._ended
-        if mode is AutoresetMode.DISABLED and before.any():
+        ended_before = self._ended
+        if self.autoreset_mode is AutoresetMode.DISABLED and ended_before.any():
+            numbers = np.flatnonzero(ended_before).tolist()
             raise ResetNeeded(
-                f"the episodes of the environments {np.flatnonzero(before).tolist()} have ended; "
+                f"the episodes of the environments {numbers} have ended; "
                 'reset them with reset(options={"reset_mask": terminated | truncated})'
             )
         actions = checked_actions(actions, self.action_space.shape)
-        same_step = mode is AutoresetMode.SAME_STEP
-        # In the same-step mode, the ended ones have already been reset, and any may end now.
-        skipped = np.zeros_like(before) if same_step else before
-        seeds = self._seeds.draw(~skipped if same_step else skipped)
-        result = self._batch.step(actions, seeds, skipped, same_step)
+        if self.autoreset_mode is AutoresetMode.SAME_STEP:
+            # The ended ones have already been reset, and any one may end now.
+            skipped = np.zeros(self.num_envs, bool)
+            seeds = self._seeds.draw(~skipped)
+            result = self._batch.step(actions, seeds, skipped, reset_after=True)
+            restarted = result.terminated | result.truncated
+        else:
+            skipped = restarted = ended_before
+            seeds = self._seeds.draw(skipped)
+            result = self._batch.step(actions, seeds, skipped)
+        self._seeds.use(restarted)
         self._ended = result.terminated | result.truncated
-        self._seeds.use(self._ended if same_step else skipped)
         info = self._info(result, skipped)
         return result.observation, result.reward, result.terminated, result.truncated, info
 

@@ -29,11 +29,13 @@ class Pictures:
         """
         if render_mode not in (None, "rgb_array"):
             raise UserError(f'render_mode is {render_mode!r}; choose "rgb_array" or omit it')
-        self._batch, self._is_on = batch, render_mode is not None
-        size = whole_number("width", width), whole_number("height", height)
-        self._arguments = (*size, camera)
+        self._batch = batch
+        self._is_on = render_mode is not None
+        self._width = whole_number("width", width)
+        self._height = whole_number("height", height)
+        self._camera = camera
         if self._is_on:
-            _ = self._renderer
+            _ = self._renderer  # which a missing camera or library makes fail
 
     def draw(self, index: int) -> np.ndarray | None:
         """The picture [height, width, 3], uint8, of one environment; None without a mode."""
@@ -46,7 +48,8 @@ class Pictures:
 
     @functools.cached_property
     def _renderer(self) -> Renderer:
-        renderer = Renderer(self._batch.programs.task, *self._arguments, plain=True)
+        task = self._batch.programs.task
+        renderer = Renderer(task, self._width, self._height, self._camera, plain=True)
         # Also closed at exit, where OpenGL would be unloaded before the renderer.
         self._close_renderer = weakref.finalize(self, renderer.close)
         return renderer
