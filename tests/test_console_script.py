@@ -7,6 +7,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import jax
@@ -15,8 +16,10 @@ import pytest
 import yaml
 
 import bounce_mjx
+from bounce_mjx import lazy
 from bounce_mjx.commands import main as console_script
 from bounce_mjx.commands import train as train_command
+from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.interrupt import StopRequest
 
 CHECKOUT = Path(__file__).parent.parent
@@ -45,6 +48,51 @@ def test_an_output_that_cannot_be_written_is_dropped(args: list[str], status: in
     os.close(output)
     assert done.returncode == status
     assert not done.stderr and not done.stdout
+
+
+def test_a_device_on_which_jax_does_not_start_is_named(monkeypatch, capsys) -> None:
+    """Also where a checkpoint could therefore not be read."""
+    monkeypatch.setenv("JAX_PLATFORMS", "nope")
+    for wrap in (False, True):
+        with pytest.raises(SystemExit) as exit_info, exit_on_user_error():
+            try:
+                raise RuntimeError("Unable to initialize backend 'nope': it is not known")
+            except RuntimeError as error:
+                if wrap:
+                    raise UserError("the checkpoint is damaged") from error
+                raise
+        assert exit_info.value.code == 2
+        sentence = capsys.readouterr().err
+        assert sentence.startswith("error: JAX does not start on JAX_PLATFORMS=nope (Unable to")
+        assert sentence.endswith("; unset it, or name platforms of this machine, such as cpu\n")
+    with pytest.raises(RuntimeError, match="another"), exit_on_user_error():
+        raise RuntimeError("another")
+
+
+def test_a_sentence_has_no_codes_that_a_terminal_would_obey(capsys) -> None:
+    with pytest.raises(SystemExit), exit_on_user_error():
+        raise UserError("there is no run a\x1b]0;title\x07 of\nB\udcff")
+    assert capsys.readouterr().err == "error: there is no run a\\x1b]0;title\\x07 of B\\udcff\n"
+
+
+def test_an_import_of_mjx_drops_its_own_lines_alone(monkeypatch, capsys) -> None:
+    """Not those of another thread, and the output is restored also where two threads import."""
+
+    def import_module(name: str) -> str:
+        print("Failed to import warp")
+        other = threading.Thread(target=print, args=("meanwhile",))
+        other.start()
+        other.join()
+        return name
+
+    monkeypatch.setattr(lazy.importlib, "import_module", import_module)
+    threads = [threading.Thread(target=lazy.import_mjx) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    print("after")
+    assert capsys.readouterr().out == "meanwhile\nmeanwhile\nafter\n"
 
 
 def test_version(capsys) -> None:
@@ -124,6 +172,7 @@ def test_each_help_is_light() -> None:
 import contextlib, io, sys
 before = set(sys.modules)
 import bounce_mjx
+from bounce_mjx import lazy
 from bounce_mjx.commands.main import COMMANDS, main
 for name in COMMANDS:
     with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):

@@ -163,7 +163,7 @@ FUNCTIONS = {
     "powers": lambda x: x**2 + x**3 + jnp.square(x) + 1.0 / x**2,
     "rounding": lambda x: jnp.floor(x) + jnp.ceil(x) + jnp.sign(x) + x % 0.3,
     "limits": lambda x: jnp.clip(x, -0.5, 0.5) + jax.lax.clamp(-0.3, x, 0.7) + jnp.maximum(x, 0.1),
-    "activations": lambda x: jax.nn.relu(x) + jax.nn.silu(x) + jax.nn.sigmoid(x),
+    "activations": lambda x: jax.nn.relu(x) + jax.nn.silu(x) + jax.nn.sigmoid(x) + jax.nn.elu(x),
     "no gradient": lambda x: jax.lax.stop_gradient(x) + jnp.copy(x),
     "whole numbers": lambda i: jnp.abs(i) + i * 2 - jnp.minimum(i, 1) + jnp.sign(-i) + i * i,
     "reductions": lambda i, x: jnp.sum(i) + i.max() - i.min() + jnp.mean(x) + x.max() - x.min(),

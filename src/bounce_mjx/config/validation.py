@@ -48,7 +48,8 @@ def describe(
     if first["type"] in ("extra_forbidden", "invalid_key"):
         group, _, name = key.rpartition(".")
         near = [other for other in fields if other.rpartition(".")[2] == name]
-        near += difflib.get_close_matches(key, fields, n=1, cutoff=0.8)
+        groups = {x[:i] for x in fields for i, letter in enumerate(x) if letter == "."}
+        near += difflib.get_close_matches(key, [*fields, *sorted(groups)], n=1, cutoff=0.8)
         group = f"{group}." if group else ""
         here = {x.removeprefix(group).split(".")[0] for x in fields if x.startswith(group)}
         advice = f"known keys here are {', '.join(sorted(here))}"

@@ -67,7 +67,7 @@ class PPOConfig(settings.StrictModel):
     on top of a shared part."""
     shared_critic: bool = False
     """The value network starts from the last hidden layer of the policy, which both train."""
-    activation: Literal["silu", "relu", "tanh"] = "silu"
+    activation: Literal["silu", "relu", "tanh", "elu"] = "silu"
     """Activation of the hidden layers."""
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
     """Type of the hidden layers during training; bfloat16 is faster on a GPU. The rest is

@@ -97,11 +97,14 @@ def network_settings(config: TrainConfig | None = None) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def device_put_replicated() -> Iterator[None]:
-    """Provides `jax.device_put_replicated` inside a `with` block: brax 0.14.2 calls it in
-    `ppo.train`, `sac.train` and `apg.train`, but JAX 0.10 removed it.
+    """Provides `jax.device_put_replicated` inside a `with` block, where JAX lacks it: brax 0.14.2
+    calls it in `ppo.train`, `sac.train` and `apg.train`, but JAX 0.10 removed it.
 
     Not thread-safe: the function is added to the module `jax` and removed at the end.
     """
+    if hasattr(jax, "device_put_replicated"):
+        yield
+        return
     jax.device_put_replicated = replicate
     try:
         yield
