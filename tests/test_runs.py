@@ -9,10 +9,13 @@ import re
 import shutil
 import threading
 import unittest.mock
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from bounce_mjx import Run
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report, Result
@@ -37,6 +40,7 @@ from bounce_mjx.runs.folders import (
     save_config,
 )
 from bounce_mjx.runs.progress import Progress, load_results
+from bounce_mjx.training import run as training_run
 from tiny_runs import contents
 
 CATCH = resource_path("configs/catch/cpu.yaml")
@@ -119,6 +123,25 @@ def test_the_newest_run_is_not_the_greatest_name(tmp_path: Path) -> None:
     while names:
         assert named_run(None, tmp_path).name == names.pop()
         shutil.rmtree(named_run(None, tmp_path))
+
+
+def test_a_run_is_opened_by_its_path_and_reads_its_policy_once(trained: Path, monkeypatch) -> None:
+    """A program may ask for the policy in each of its steps."""
+    run, reads = Run(str(trained)), []
+    monkeypatch.setattr(training_run, "read_actor", counted(training_run.read_actor, reads))
+    observation = np.zeros(run.config.env.layout.size, np.float32)
+    actions = [run.policy(observation) for _ in range(2)]
+    assert run.folder == trained and run.results == load_results(trained).best
+    assert run.checkpoint == find_checkpoint(str(trained)) == find_checkpoint(trained)
+    assert actions[0].shape == (6,) and np.array_equal(*actions) and len(reads) == 1
+
+
+def counted(function: Callable, calls: list) -> Callable:
+    def count(*arguments):
+        calls.append(arguments)
+        return function(*arguments)
+
+    return count
 
 
 def test_a_run_without_a_checkpoint_is_told_as_such(runs: Path) -> None:

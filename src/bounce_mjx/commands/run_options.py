@@ -10,7 +10,7 @@ from pydantic import Field
 
 from bounce_mjx.config.command_line import Flag, flag_of, parse
 from bounce_mjx.config.settings import StrictModel
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import UserError, suggest
 from bounce_mjx.runs import config as run_configs
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.tasks.registry import DEFAULT, find_task, registered_tasks
@@ -63,6 +63,8 @@ class ActorCommand(RunCommand):
 
         if str(path) == MIRROR and not os.path.isdir(path):
             return MIRROR_LAW
+        if path is not None and not os.path.isdir(path) and (near := suggest(str(path), [MIRROR])):
+            raise UserError(f"there is no checkpoint folder and no policy {path}; {near}")
         if self.robot is not None:
             raise UserError("--robot is for the mirror law; omit it, or give mirror as checkpoint")
         return choose_checkpoint(path, self.folder)

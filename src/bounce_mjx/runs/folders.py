@@ -33,7 +33,7 @@ from typing import NamedTuple
 
 import bounce_mjx
 from bounce_mjx.config.files import dump_config
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import UserError, suggest
 from bounce_mjx.lazy import mujoco
 from bounce_mjx.resources import POLICIES, PRETRAINED, TASK_POLICIES, resource_path
 from bounce_mjx.runs.config import BASE, CONFIG_FILE, ROBOT, TrainConfig, runs_folder
@@ -192,10 +192,9 @@ def find_run(path: Path) -> Path:
     """Folder of the run that contains a path; the path may be the folder itself."""
     # Unlike os.path.isdir, Path.is_dir raises an error for a name that is too long.
     if not os.path.isdir(path):
-        raise UserError(
-            f"there is no checkpoint folder {path}; give a run's folder such as "
-            "runs/bounce_ball/<time stamp>"
-        )
+        near = suggest(str(path), [LATEST])
+        advice = near or "give a run's folder such as runs/bounce_ball/<time stamp>"
+        raise UserError(f"there is no checkpoint folder {path}; {advice}")
     for folder in (path, *Path(os.path.abspath(path)).parents):
         if (folder / CONFIG_FILE).is_file():
             return folder
@@ -227,13 +226,14 @@ def runs_in(folder: Path) -> list[Path]:
     return list(filter(stored_checkpoints, runs))
 
 
-def find_checkpoint(path: Path) -> Checkpoint:
+def find_checkpoint(path: str | Path) -> Checkpoint:
     """Finds a checkpoint.
 
     Args:
       path: a run's folder (finds its best checkpoint, or its latest if there is no best), a folder
         of checkpoints in it, or a checkpoint.
     """
+    path = Path(path)
     run = find_run(path)
     if os.path.samefile(path, run):
         path = run = _best_seed(run)
@@ -278,6 +278,8 @@ def choose_checkpoint(path: Path | None, log_dir: Path) -> Checkpoint:
             raise
         print(f"no run in {log_dir}: using the policy that comes with the package")
         return pretrained_checkpoint(folders[log_dir])
+    if not os.path.isdir(run) and (near := suggest(str(path), POLICIES)):
+        raise UserError(f"there is no checkpoint folder and no policy {path}; {near}")
     if run != path:
         results = load_results(_best_seed(run))
         known = results.best.summary if results else "not evaluated"

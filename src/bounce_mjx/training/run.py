@@ -38,6 +38,9 @@ class Run:
     task: str | None = None
     """The task as the user names it: a run of a task in a file, FILE.py:CLASS, needs it once."""
 
+    def __post_init__(self):
+        object.__setattr__(self, "folder", Path(self.folder))
+
     @property
     def config(self) -> TrainConfig:
         """The run's config."""
@@ -70,8 +73,7 @@ class Run:
     def policy(self) -> Callable[[jax.Array], jax.Array]:
         """The best checkpoint's policy: the most likely actions [..., A] of observations [..., N].
         It can be compiled and differentiated."""
-        _, arrays, actor = read_actor(self.checkpoint, self.config)
-        return functools.partial(actor(Env(self.config.env)).act, arrays)
+        return _read_policy(self.checkpoint, self.task)
 
     def evaluate(self, **options: Any) -> Report:
         """Measures the results of the best checkpoint, as `bounce-mjx eval` does.
@@ -86,6 +88,16 @@ class Run:
         _, arrays, actor = read_actor(self.checkpoint, self.config)
         options = EvaluationOptions(**options)
         return evaluate_policy(arrays, self.config.env, actor, options).report
+
+
+# A program may ask for the policy in each of its steps.
+@functools.lru_cache(maxsize=16)
+def _read_policy(
+    checkpoint: folders.Checkpoint, task: str | None
+) -> Callable[[jax.Array], jax.Array]:
+    config = load_run_config(checkpoint.run, task)
+    _, arrays, actor = read_actor(checkpoint, config)
+    return functools.partial(actor(Env(config.env)).act, arrays)
 
 
 def train(
