@@ -178,13 +178,14 @@ def test_a_run_has_a_copy_of_its_robot(robot_run: Path, tmp_path: Path, monkeypa
     moved = tmp_path / "moved"
     robot_run.rename(moved)
     monkeypatch.chdir(tmp_path)
-    for run in (moved, Path("moved")):
+    (tmp_path / "other").mkdir()
+    for run in (moved, Path("moved"), Path("other/../moved")):
         env = load_run_config(run).env
         assert env.mjcf == moved / "robot/mjcf/my robot.xml"
         assert load_model(env.mjcf, 0.001).nmesh == 1
-    before = contents(moved)
-    save_config(moved, load_run_config(moved))
-    assert contents(moved) == before
+        before = contents(moved)
+        save_config(run, load_run_config(run))
+        assert contents(moved) == before
     # The config is a preset too, for a new run.
     assert read_preset(moved / "config.yaml").env.mjcf == env.mjcf
 

@@ -3,7 +3,7 @@
 import argparse
 import re
 import types
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, NoReturn, TypeVar
 
@@ -99,7 +99,7 @@ def parse(
     try:
         return command_class.model_validate(values)
     except pydantic.ValidationError as error:
-        parser.error(describe(error, fields, {key: _flag(key, x) for key, x in fields.items()}))
+        parser.error(describe(error, fields, flag_names(fields)))
 
 
 class _Parser(argparse.ArgumentParser):
@@ -111,9 +111,25 @@ def _mark(field: FieldInfo) -> Flag:
     return next((mark for mark in field.metadata if isinstance(mark, Flag)), Flag())
 
 
-def _flag(key: str, field: FieldInfo) -> str:
-    """The flag of a setting: --reset.joint-angles of env.reset.joint_angles."""
-    return flag_of(_mark(field).name or re.sub(r"^(env|ppo|viewing)\.", "", key))
+def flag_names(fields: Mapping[str, FieldInfo]) -> dict[str, str]:
+    """The flag of each setting by its dotted key: --reset.joint-angles of env.reset.joint_angles.
+    Where another setting has that flag, it has the whole key, such as --env.seed, because a task's
+    author may give a setting or a command any name."""
+    flags, taken = {}, {"--help", "--help-all"}
+    # A setting that stands in no group keeps its flag.
+    for key in sorted(fields, key=lambda key: "." in key):
+        group, _, name = key.rpartition(".")
+        whole = f"{group}." if group else ""
+        whole = flag_of(whole + (_mark(fields[key]).name or name))
+        short = re.sub(r"^--(env|ppo|viewing|commands)\.", "--", whole)
+        flag = whole if short in taken else short
+        taken |= {flag, _negated(flag)} if fields[key].annotation is bool else {flag}
+        flags[key] = flag
+    return flags
+
+
+def _negated(flag: str) -> str:
+    return flag.replace("--", "--no-", 1)
 
 
 def _add_arguments(
@@ -123,7 +139,7 @@ def _add_arguments(
     shown: Sequence[str] | None,
 ) -> None:
     """Adds the arguments, in groups; `defaults` are by dotted name."""
-    parser.usage, groups = f"{parser.prog} [FLAGS]", {}
+    parser.usage, groups, flags = f"{parser.prog} [FLAGS]", {}, flag_names(fields)
     for key, field in fields.items():
         mark = _mark(field)
         text = " ".join((field.description or "").split()).replace("%", "%%")
@@ -148,7 +164,7 @@ def _add_arguments(
             parser.usage += f" {own['metavar']}"
             group.add_argument(key, **own)
         else:
-            group.add_argument(_flag(key, field), dest=key, **own)
+            group.add_argument(flags[key], dest=key, **own)
 
 
 def _is_list(kind: Any) -> bool:
@@ -182,12 +198,10 @@ def _form(kind: Any) -> str:
 
 def flags_of(command_class: type[pydantic.BaseModel]) -> list[str]:
     """The flags of a command."""
-    flags = []
-    for key, field in fields_in(command_class).items():
-        if not _mark(field).is_positional:
-            flags.append(_flag(key, field))
-            if field.annotation is bool:
-                flags.append(flags[-1].replace("--", "--no-", 1))
+    flags, fields = [], fields_in(command_class)
+    for key, flag in flag_names(fields).items():
+        if not _mark(fields[key]).is_positional:
+            flags += [flag, _negated(flag)] if fields[key].annotation is bool else [flag]
     return flags
 
 

@@ -101,10 +101,12 @@ def save_config(run: Path, config: TrainConfig) -> None:
                 write_atomically(run / file, read_source(name))
             config = config.model_copy(update={key: f"{file}:{name.rpartition(':')[2]}"})
     if (mjcf := config.env.mjcf) is not None:
-        if not mjcf.is_relative_to((run / ROBOT).absolute()):
-            mjcf = copy_robot(mjcf, run).absolute()
+        # As a config's own path is absolute and without .. in it.
+        here = Path(os.path.abspath(run))
+        if not mjcf.is_relative_to(here / ROBOT):
+            mjcf = copy_robot(mjcf, here)
         # The run's folder may be moved.
-        env = config.env.model_copy(update={"mjcf": mjcf.relative_to(run.absolute())})
+        env = config.env.model_copy(update={"mjcf": mjcf.relative_to(here)})
         config = config.model_copy(update={"env": env})
     write_config(run, config)
 
