@@ -30,9 +30,8 @@ from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import load_model
 from bounce_mjx.runs import checkpoints
 from bounce_mjx.runs.checkpoints import save_checkpoint
-from bounce_mjx.runs.config import TrainConfig, load_run_config, train_config
+from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import find_checkpoint, save_config
-from bounce_mjx.tasks.registry import find_task
 from bounce_mjx.world.sensing import Sensing
 
 CHECKOUT = Path(__file__).resolve().parent.parent
@@ -99,7 +98,7 @@ def input_name(quantity: str) -> str:
 
 def make_run(folder: Path, env: dict, task: str = "bounce") -> Path:
     """Writes a run with a random policy; its first input never varied in the training."""
-    config = train_config(find_task(task))(task=task, env=env, ppo={"hidden_layers": (24, 8)})
+    config = TrainConfig(task=task, env=env, ppo={"hidden_layers": (24, 8)})
     size = config.env.layout.size
     rng = np.random.default_rng(0)
     std = rng.uniform(0.5, 1.5, size).astype(np.float32)

@@ -33,9 +33,10 @@ from bounce_mjx.reports.curves import (
     read_curves,
 )
 from bounce_mjx.reports.figures import curves_figure
-from bounce_mjx.runs.config import TrainConfig, read_preset, train_config
+from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import save_config
 from bounce_mjx.runs.progress import load_results
+from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.task import Curve, term_names
 from bounce_mjx.task.shown import Hits
 from bounce_mjx.tasks.bounce import Bounce, BounceReward
@@ -203,7 +204,7 @@ def check_report(run: Path) -> str:
     for phase, seconds in results.seconds.items():
         assert re.search(rf">{phase}</td><td class=\"\">{seconds:.1f}</td>", page)
     config = re.search(r"<pre>(.*)</pre>", page, re.DOTALL)[1]
-    shown = train_config(Bounce).model_validate(yaml.safe_load(config))
+    shown = TrainConfig.model_validate(yaml.safe_load(config))
     assert shown == read_preset(run / "config.yaml")
     return page
 

@@ -21,14 +21,9 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import fingerprint, load_model
-from bounce_mjx.runs import config as run_configs
 from bounce_mjx.runs import folders
-from bounce_mjx.runs.config import (
-    TrainConfig,
-    load_run_config,
-    preset_files,
-    read_preset,
-)
+from bounce_mjx.runs import presets as presets_module
+from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.files import to_json
 from bounce_mjx.runs.folders import (
     best_checkpoint,
@@ -39,7 +34,9 @@ from bounce_mjx.runs.folders import (
     named_run,
     save_config,
 )
+from bounce_mjx.runs.presets import preset_files
 from bounce_mjx.runs.progress import Progress, load_results
+from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.training import run as training_run
 from tiny_runs import contents
 
@@ -108,7 +105,7 @@ def test_latest_is_a_name_for_every_command(runs: Path, monkeypatch) -> None:
     monkeypatch.chdir(runs)
     assert named_run(Path("latest"), runs) == named_run(None, runs) == runs / "2026-01-02"
     command = train_command.read_command(["--resume", "latest", "--log-dir", str(runs)])
-    assert command.resume == runs / "2026-01-02"
+    assert command.layers.run == runs / "2026-01-02"
     (runs / "latest").mkdir()
     assert named_run(Path("latest"), runs) == Path("latest")
 
@@ -249,8 +246,8 @@ def test_a_task_has_its_own_preset_of_a_name(tmp_path: Path, monkeypatch) -> Non
         file = tmp_path / "configs" / f"{name}.yaml"
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(f"seed: {seed}")
-    monkeypatch.setattr(run_configs, "resource_path", lambda name: tmp_path / name)
-    monkeypatch.setattr(run_configs, "has_accelerator", lambda: False)
+    monkeypatch.setattr(presets_module, "resource_path", lambda name: tmp_path / name)
+    monkeypatch.setattr(presets_module, "has_accelerator", lambda: False)
     assert read_preset(None).seed == read_preset(Path("cpu"), task="bounce").seed == 2
     assert read_preset(Path("seed")).seed == 3
     assert read_preset(None, task=f"{DRIBBLE}:Dribble").seed == 1
@@ -260,7 +257,7 @@ def test_a_task_has_its_own_preset_of_a_name(tmp_path: Path, monkeypatch) -> Non
 def presets(tmp_path: Path, monkeypatch) -> Path:
     """A working directory on a machine without an accelerator, with a preset of the user's."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(run_configs, "has_accelerator", lambda: False)
+    monkeypatch.setattr(presets_module, "has_accelerator", lambda: False)
     (tmp_path / "my.yaml").write_text("ppo: {learning_rate: 0.001}")
     return tmp_path
 
@@ -302,10 +299,10 @@ def test_files_of_the_user_lie_on_each_other(presets: Path) -> None:
     }
     for flags, rate in orders.items():
         command = train_command.read_command(flags.split())
-        assert command.ppo.learning_rate == rate and command.ppo.discount == 0.9
-        assert command.ppo.num_envs == read_preset(None).ppo.num_envs
-        cpu, *given = preset_files(command.config, command.task)
-        assert cpu == resource_path("configs/cpu.yaml")
+        assert command.config.ppo.learning_rate == rate and command.config.ppo.discount == 0.9
+        assert command.config.ppo.num_envs == read_preset(None).ppo.num_envs
+        cpu, named, given = preset_files(command.flags.config, command.config.task)
+        assert (cpu, named) == (resource_path("configs/cpu.yaml"), None)
         assert " ".join(map(str, given)) == flags.replace("--config=", "").replace("--config ", "")
     (presets / "more.yaml").write_text("base: randomized")
     with pytest.raises(UserError, match="more.yaml lies on my.yaml, so its base is not used"):

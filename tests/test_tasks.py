@@ -24,8 +24,9 @@ from bounce_mjx.env.env import Env
 from bounce_mjx.env.vector import VectorStep
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.metrics import rollout_metrics, step_metrics
-from bounce_mjx.runs.config import CONFIG_FILE, load_run_config, read_preset
+from bounce_mjx.runs.config import CONFIG_FILE, load_run_config
 from bounce_mjx.runs.folders import create_run
+from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.tasks import registry
 from bounce_mjx.tasks.registry import find_task, task_name
 from bounce_mjx.training.command import read_command
@@ -163,7 +164,7 @@ def test_another_file_than_the_runs_is_told(
     assert load_run_config(run_folder, f"{changed}:Dribble").env.reward.apex.weight == 4.0
     assert "changed.py:Dribble differs from the task that" in capsys.readouterr().err
     flags[-1] = f"{mine}:Dribble"
-    assert read_command(flags).env == config.env
+    assert read_command(flags).config.env == config.env
 
 
 def test_a_config_file_cannot_name_code(mine: Path, tmp_path: Path) -> None:
@@ -260,8 +261,8 @@ def test_a_task_may_name_a_command_or_a_setting_like_a_flag(
     assert values(env) == {"episodes": 0.5, "model_config": 1.0, "size": 0.1}
     flags = "--no-report --env.report 0.25 --seed 8 --env.seed 9".split()
     command = read_command([*task_flag, *flags])
-    assert (command.report, command.seed) == (False, 8)
-    assert (command.env.report, command.env.seed) == (0.25, 9)
+    assert (command.flags.report, command.config.seed) == (False, 8)
+    assert (command.config.env.report, command.config.env.seed) == (0.25, 9)
 
 
 class _Rising(rest_task.Rest):

@@ -11,7 +11,7 @@ from bounce_mjx.config.command_line import Flag, parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.robot.config import PaddleConfig, RobotConfig
-from bounce_mjx.runs.config import train_config
+from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.tasks.registry import DEFAULT, find_task
 from bounce_mjx.world.config import WorldConfig
 
@@ -58,7 +58,7 @@ def main(args: Sequence[str]) -> None:
         **task.Config.settings_at((x, y, z)),
     }
     values = ({} if command.task == DEFAULT else {"task": command.task}) | {"env": values}
-    config = validate(train_config(task), values, str(command.mjcf))
+    config = validate(TrainConfig, values, str(command.mjcf))
     env = Env(config.env)
     print(f"paddle: level at x {x:.3f}, y {y:.3f}, z {z:.3f} m; the reach is {pose.reach:.2f} m")
     kind = "kept" if adoption.config.servo_stiffness is None else "made from the reflected inertia"

@@ -13,6 +13,7 @@ from bounce_mjx.config.settings import StrictModel, fields_in
 from bounce_mjx.errors import UserError, suggest
 from bounce_mjx.runs import config as run_configs
 from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.settings import in_world, read_preset
 from bounce_mjx.tasks.registry import DEFAULT, find_task, registered_tasks
 from bounce_mjx.world.config import Command, WorldConfig
 
@@ -80,7 +81,7 @@ class ActorCommand(RunCommand):
 
         if checkpoint is not MIRROR_LAW:
             return self.config(checkpoint.run)
-        config = run_configs.read_preset(Path("default"), self.robot, self.task)
+        config = read_preset(Path("default"), self.robot, self.task)
         return config.model_copy(update={"env": observing(config.env)})
 
 
@@ -108,7 +109,7 @@ class WorldCommand(ActorCommand):
           UserError: as `ActorCommand.config_of` and `in_world`.
         """
         config = super().config_of(checkpoint)
-        return config if self.world is None else run_configs.in_world(config, self.world)[0]
+        return config if self.world is None else in_world(config, self.world)[0]
 
 
 def parse_with_commands(

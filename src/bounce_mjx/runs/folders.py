@@ -36,8 +36,9 @@ from bounce_mjx.config.files import dump_config
 from bounce_mjx.errors import UserError, suggest
 from bounce_mjx.lazy import mujoco
 from bounce_mjx.resources import POLICIES, PRETRAINED, TASK_POLICIES, resource_path
-from bounce_mjx.runs.config import BASE, CONFIG_FILE, ROBOT, TrainConfig, runs_folder
+from bounce_mjx.runs.config import CONFIG_FILE, ROBOT, TrainConfig, dump_sources, runs_folder
 from bounce_mjx.runs.files import seal, writable, write_atomically
+from bounce_mjx.runs.presets import BASE
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file, read_source, source_file
 
@@ -151,7 +152,7 @@ def _files_of(mjcf: Path) -> list[Path]:
 def write_config(run: Path, config: TrainConfig) -> None:
     """Writes the run's config as it is, without copies."""
     head = f"# bounce_mjx {bounce_mjx.__version__}\n{BASE}: null\n"
-    write_atomically(run / CONFIG_FILE, head + dump_config(config))
+    write_atomically(run / CONFIG_FILE, head + dump_config(config) + dump_sources(config))
 
 
 def runs_of_seeds(run: Path) -> list[Path]:
