@@ -26,7 +26,7 @@ from bounce_mjx.identify.world import estimates, to_yaml
 from bounce_mjx.physics import edited_model
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import find_addresses, joint_names
-from bounce_mjx.runs.config import read_preset
+from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.training.setup import set_up_jax
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import RandomizationConfig, physics_parameters, sample_world

@@ -43,7 +43,8 @@ from bounce_mjx.evaluation.results import judge
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.learning.statistics import init_normalizer
-from bounce_mjx.runs.config import TrainConfig, read_preset
+from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.tasks.bounce import BounceConfig as EnvConfig
 from bounce_mjx.tasks.bounce_ball import BounceBall
 from bounce_mjx.training.setup import compiler_options

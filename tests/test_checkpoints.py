@@ -21,7 +21,7 @@ from bounce_mjx.learning.policy import Policy
 from bounce_mjx.learning.ppo import PPO, TrainingState, policy_of
 from bounce_mjx.runs import files
 from bounce_mjx.runs.checkpoints import read_policy, read_training, save_checkpoint
-from bounce_mjx.runs.config import TrainConfig, load_run_config, read_preset
+from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import (
     best_checkpoint,
     create_run,
@@ -29,6 +29,7 @@ from bounce_mjx.runs.folders import (
     latest_checkpoint,
     stored_checkpoints,
 )
+from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.tasks.bounce import BounceConfig
 from bounce_mjx.tasks.bounce_ball import BounceBall
 

@@ -289,7 +289,7 @@ USUAL_SPELLINGS = {
 @pytest.mark.parametrize("flags", USUAL_SPELLINGS)
 def test_usual_spellings_of_flags(flags: str) -> None:
     expected, *path = USUAL_SPELLINGS[flags]
-    value = train_command.read_command(flags.split())
+    value = train_command.read_command(flags.split()).config
     for name in path:
         value = getattr(value, name)
     assert value == expected

@@ -17,7 +17,7 @@ from bounce_mjx.identify.unknowns import Layout
 from bounce_mjx.identify.windows import Windows, cut
 from bounce_mjx.identify.world import compare, estimates, to_yaml
 from bounce_mjx.reports.identification import identification_page
-from bounce_mjx.runs.config import read_preset
+from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.world.named import read_world
 
 BENCHMARK = Path(__file__).parent.parent / "benchmarks" / "identify.py"

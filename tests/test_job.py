@@ -264,7 +264,13 @@ def test_a_callback_sees_blocks_and_evaluations_and_ends_the_training(tmp_path: 
         def close(self) -> None:
             seen.append("closed")
 
-    run = train(tmp_path, {1: 5.0, 2: 9.0, 3: 7.0}, callbacks=[Tracker()])
+    said = io.StringIO()
+    run = train(tmp_path, {1: 5.0, 2: 9.0, 3: 7.0}, callbacks=[Tracker()], said=said)
+    ends = "a callback ended the training after 128 steps; continue with: bounce-mjx train --resume"
+    assert ends in said.getvalue()
+    # The first block, during which other programs are compiled, says nothing about those to come.
+    blocks = [line for line in said.getvalue().splitlines() if "steps/s" in line]
+    assert [" left" in line for line in blocks] == [False, True]
     blocks = [(64, 0.0, False), (64, 5.0, True), (128, 0.0, False), (128, 9.0, True)]
     assert seen == [3 * BLOCK, *blocks, "closed"]
     results = results_of(run)

@@ -152,6 +152,9 @@ def test_keys_act(page) -> None:
     client.control("push the ball right")
     assert client.sliders["height, m"] == (0.3, 0.8, 0.01)
     assert client.lines == ["s", "ball", "target", "paddle"]
+    # A ball above or below the usual range is shown too: uPlot widens ends that are only soft.
+    assert client.height_axis["min"]["soft"] == 0.0 and "hard" not in client.height_axis["min"]
+    assert client.height_axis["max"]["soft"] > 0.8 and "hard" not in client.height_axis["max"]
     client.set(client.control("height, m"), 0.5)
     client.press("target height up")
     wait_until(lambda: did["target"][-1] == pytest.approx(0.55))

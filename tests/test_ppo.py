@@ -360,7 +360,7 @@ def test_settings_of_an_own_algorithm_are_keys(tmp_path):
     (tmp_path / "own.py").write_text(OWN)
     name = f"{tmp_path / 'own.py'}:Own"
     flags = ["--config", "cpu", "--algorithm", name, "--own-cost", "2"]
-    config = read_command(flags, "cpu").training
+    config = read_command(flags, "cpu").config
     assert find_algorithm(config.algorithm)(config.ppo, BounceBall(), 100).config.own_cost == 2.0
     run = create_run(config.model_copy(update={"log_dir": tmp_path / "runs"}))
     assert load_run_config(run, algorithm=name).ppo.own_cost == 2.0

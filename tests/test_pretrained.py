@@ -18,15 +18,10 @@ from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import make_networks, networks_of
 from bounce_mjx.resources import ARM_POLICIES, POLICIES, TASK_POLICIES, resource_path
 from bounce_mjx.runs.checkpoints import read_policy
-from bounce_mjx.runs.config import (
-    TrainConfig,
-    in_world,
-    load_run_config,
-    read_preset,
-    runs_folder,
-)
+from bounce_mjx.runs.config import TrainConfig, load_run_config, runs_folder
 from bounce_mjx.runs.folders import best_checkpoint, choose_checkpoint, pretrained_checkpoint
 from bounce_mjx.runs.progress import load_results
+from bounce_mjx.runs.settings import in_world, read_preset
 from bounce_mjx.tasks.registry import find_task
 
 FOLDER = resource_path("pretrained")
@@ -124,7 +119,11 @@ def test_its_training_command_gives_its_config(shipped: dict, monkeypatch) -> No
     assert (python, script) == ("python", "train_jax.py")
     command = read_command(flags)
     config = read_preset(FOLDER / "config.yaml")
-    assert (command.env, command.ppo, command.seed) == (config.env, config.ppo, shipped["seed"])
+    assert (command.config.env, command.config.ppo, command.config.seed) == (
+        config.env,
+        config.ppo,
+        shipped["seed"],
+    )
     assert shipped["device"]
 
 

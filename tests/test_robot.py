@@ -26,7 +26,7 @@ from bounce_mjx.robot.adopt import adopt, check_as_alone
 from bounce_mjx.robot.arm import build_arm, compile_spec, locate, read_spec
 from bounce_mjx.robot.config import RobotConfig
 from bounce_mjx.robot.model import find_addresses, joint_names, load_model
-from bounce_mjx.runs.config import read_preset
+from bounce_mjx.runs.settings import read_preset
 from random_worlds import random_parameters
 
 FINGERS = "".join(

@@ -158,8 +158,8 @@ def test_two_processes_train_as_one(alone: Path, tmp_path: Path, monkeypatch: py
 )
 def test_flags_tell_whether_there_are_other_hosts(flags: str, several: bool) -> None:
     command = read_command(flags.split())
-    assert command.on_several_hosts == several
-    assert command.host_timeout == (7 if "7" in flags else 300)
+    assert command.flags.on_several_hosts == several
+    assert command.flags.host_timeout == (7 if "7" in flags else 300)
 
 
 @pytest.mark.parametrize(

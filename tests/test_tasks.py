@@ -16,14 +16,21 @@ import pytest
 
 import rest_task
 from bounce_mjx import load_policy, task
+from bounce_mjx.commands.eval import EvalCommand
 from bounce_mjx.commands.main import main
+from bounce_mjx.commands.play import PlayCommand
+from bounce_mjx.commands.run_options import parse_with_commands
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.env.env import Env
+from bounce_mjx.env.vector import VectorStep
 from bounce_mjx.errors import UserError
-from bounce_mjx.runs.config import CONFIG_FILE, load_run_config, read_preset
+from bounce_mjx.learning.metrics import rollout_metrics, step_metrics
+from bounce_mjx.runs.config import CONFIG_FILE, load_run_config
 from bounce_mjx.runs.folders import create_run
+from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.tasks import registry
 from bounce_mjx.tasks.registry import find_task, task_name
+from bounce_mjx.training.command import read_command
 from tiny_runs import TINY
 
 CHECKOUT = Path(__file__).parent.parent
@@ -218,7 +225,7 @@ def test_another_file_than_the_runs_is_told(
     assert load_run_config(run_folder, f"{changed}:Dribble").env.reward.apex.weight == 4.0
     assert "changed.py:Dribble differs from the task that" in capsys.readouterr().err
     flags[-1] = f"{mine}:Dribble"
-    assert read_command(flags).env == config.env
+    assert read_command(flags).config.env == config.env
 
 
 def test_a_config_file_cannot_name_code(mine: Path, tmp_path: Path) -> None:
@@ -280,12 +287,67 @@ def test_a_robot_serves_another_task() -> None:
     np.testing.assert_allclose(above, [0.0, 0.0, 0.2], atol=0.08)
 
 
+NAMED_LIKE_FLAGS = """
+import rest_task
+from bounce_mjx import task
+
+class Sized(rest_task.Rest):
+    class Config(rest_task.Rest.Config):
+        report: float = 0.5
+        \"\"\"A setting whose name a flag of train has.\"\"\"
+        seed: int = 3
+        \"\"\"A setting whose name another setting has.\"\"\"
+
+        @property
+        def commands(self):
+            names = "size", "zoom", "episodes", "copy", "help", "model_config", "depth"
+            return {name: task.Command(0.0, 1.0) for name in names}
+"""
+
+
+def test_a_task_may_name_a_command_or_a_setting_like_a_flag(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The flag that stands in no group stays, and the other one has its group."""
+    (tmp_path / "sized.py").write_text(NAMED_LIKE_FLAGS)
+    task_flag = ["--task", f"{tmp_path / 'sized.py'}:Sized"]
+    env = find_task(task_flag[1]).Config()
+    flags = "--commands.size 0.5 --size 64 64 --copy 0.25 --commands.help 1 --depth 1".split()
+    command, values = parse_with_commands(PlayCommand, [*task_flag, *flags], prog="play")
+    assert command.viewing.size == (64, 64)
+    assert values(env) == {"size": 0.5, "copy": 0.25, "help": 1.0, "depth": 1.0}
+    flags = "--episodes 7 --commands.episodes 0.5 --model-config 1 --size 0.1".split()
+    command, values = parse_with_commands(EvalCommand, [*task_flag, *flags], prog="eval")
+    assert command.episodes == 7
+    assert values(env) == {"episodes": 0.5, "model_config": 1.0, "size": 0.1}
+    flags = "--no-report --env.report 0.25 --seed 8 --env.seed 9".split()
+    command = read_command([*task_flag, *flags])
+    assert (command.flags.report, command.config.seed) == (False, 8)
+    assert (command.config.env.report, command.config.env.seed) == (0.25, 9)
+
+
 class _Rising(rest_task.Rest):
     class Config(rest_task.Rest.Config):
         commands: ClassVar = {"height": task.Command(0.4, 0.4)}
 
     def next_command(self, state: tuple, command: task.Values) -> task.Values:
         return {"height": command["height"] + 0.01}
+
+
+def test_the_log_has_each_metric_of_a_task() -> None:
+    """Also one that no curve names, as its mean over the steps; but not what the world samples."""
+    ended = jnp.array([False, True, False, True])
+    shown = {"apex_error": jnp.array([0.2, 0.0, 0.4, 0.0]), "apexes": jnp.array([1.0, 0, 1.0, 0])}
+    metrics = shown | {"low": jnp.array([1.0, 0.0, 0.0, 2.0]), "world/mass": jnp.ones(4)}
+    metrics |= dict.fromkeys(("non_finite", "too_fast"), jnp.zeros(4))
+    zero = jnp.zeros(4)
+    result = VectorStep(zero, zero, zero, ended, ~ended, metrics, zero, zero)
+    curve = task.Curve("task/error", "apex_error", over="apexes")
+    sums = [step_metrics(result, groups=2, curves=[curve])] * 3
+    logged = rollout_metrics(jax.tree.map(lambda *steps: jnp.stack(steps), *sums))
+    of_task = {name: float(x) for name, x in logged.items() if name.startswith("task/")}
+    expected = {"task/error": 0.3, "task/low": 0.75, "task/non_finite": 0.0, "task/too_fast": 0.0}
+    assert of_task == pytest.approx(expected)
 
 
 @pytest.mark.slow

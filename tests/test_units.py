@@ -12,8 +12,7 @@ from bounce_mjx import task
 from bounce_mjx.config.validation import validate
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
-from bounce_mjx.runs.config import train_config
-from bounce_mjx.tasks.registry import find_task
+from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training.first_block import fault_of
 from bounce_mjx.world.config import Command
 
@@ -52,8 +51,7 @@ target_height_range: [true, 2]                           # and in a list
 
 
 def config(name: str, **env):
-    kind = train_config(find_task(name))
-    return validate(kind, {"task": name, "env": env}, "my.yaml").env
+    return validate(TrainConfig, {"task": name, "env": env}, "my.yaml").env
 
 
 def names(values: dict, prefix: str = "") -> list[str]:
@@ -204,7 +202,7 @@ def first_block(ended=64.0, too_fast=0.0, non_finite=0.0, height=1.0, fault=0.0)
     return {name: np.broadcast_to(value, (2, 4)) for name, value in named.items()}
 
 
-FIRST = train_config(find_task("bounce"))(ppo={"num_envs": 8, "rollout_length": 8})
+FIRST = TrainConfig(ppo={"num_envs": 8, "rollout_length": 8})
 LATE, NAN = np.array([0.0, 0.0, 3.0, 3.0]), np.array([1.0, 1.0, 1.0, np.nan])
 
 

@@ -83,6 +83,7 @@ class Client:
         self.texts: list[str] = []
         self.sliders: dict[str, tuple[float, float, float]] = {}
         self.lines: list[str] = []
+        self.height_axis: object = None
 
     def control(self, label: str) -> str:
         """The identifier of a control or of a key's command, by its label."""
@@ -110,6 +111,7 @@ class Client:
                 self.sliders[props["label"]] = props["min"], props["max"], props["step"]
             if message["type"] == "GuiUplotMessage":
                 self.lines += [line["label"] for line in props["series"]]
+                self.height_axis = props["scales"]["y"]["range"]
             updates = message.get("updates", {})
             self.texts += [part["content"] for part in (props, updates) if "content" in part]
             if "text" in updates:

@@ -12,7 +12,7 @@ from bounce_mjx.config.command_line import Flag, parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.robot.config import PaddleConfig, RobotConfig
-from bounce_mjx.runs.config import train_config
+from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.tasks.registry import DEFAULT, find_task
 from bounce_mjx.world.config import WorldConfig
 
@@ -62,7 +62,7 @@ def main(args: Sequence[str]) -> None:
         **task.Config.settings_at((x, y, z)),
     }
     values = ({} if command.task == DEFAULT else {"task": command.task}) | {"env": values}
-    config = validate(train_config(task), values, str(command.mjcf))
+    config = validate(TrainConfig, values, str(command.mjcf))
     env = Env(config.env)
     for line in describe(adoption):
         print(line)

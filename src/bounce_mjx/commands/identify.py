@@ -10,7 +10,7 @@ from bounce_mjx.config.settings import NonNegative, StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
 from bounce_mjx.identify import Topics
-from bounce_mjx.runs.config import read_preset
+from bounce_mjx.runs.settings import read_preset
 
 
 class IdentifyCommand(StrictModel):

@@ -1,5 +1,7 @@
 """Settings as YAML."""
 
+import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +9,8 @@ import yaml
 
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError, shorten
+
+_MOST_VALUES = 10_000
 
 
 class _Loader(yaml.SafeLoader):
@@ -37,6 +41,7 @@ def read_mapping(path: Path, kind: str, example: str) -> dict[str, Any]:
     advice = f"give a YAML file of keys and values such as {example}"
     try:
         values = yaml.load(path.read_text(encoding="utf-8"), _Loader)
+        _check_size(values)
     # PyYAML raises exceptions of many types where a value looks like a number or a date but is not
     # one.
     except Exception as error:
@@ -50,9 +55,41 @@ def read_mapping(path: Path, kind: str, example: str) -> dict[str, Any]:
     return values or {}
 
 
+def _check_size(values: Any) -> None:
+    """Refuses more values than any config has, which aliases make of a few lines, and without end
+    where one contains itself."""
+    waiting, count = [values], 0
+    while waiting:
+        value = waiting.pop()
+        waiting += value.values() if isinstance(value, dict) else []
+        waiting += value if isinstance(value, list) else []
+        count += 1
+        if count > _MOST_VALUES:
+            raise yaml.YAMLError(f"it has more than {_MOST_VALUES:,} values")
+
+
 def dump_config(config: StrictModel) -> str:
     """The whole config as YAML, for `read_preset`."""
     return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+
+
+def dump_with_sources(plain: dict[str, Any], sources: Mapping[str, str], prefix: str = "") -> str:
+    """Nested settings as YAML, each with a comment that names its source.
+
+    Args:
+      sources: by dotted key.
+      prefix: dotted key of the group, with a dot.
+    """
+    lines, indent = [], "  " * prefix.count(".")
+    for name, value in plain.items():
+        key = prefix + name
+        if isinstance(value, dict) and value:
+            lines.append(f"{indent}{name}:\n")
+            lines.append(dump_with_sources(value, sources, f"{key}."))
+        else:
+            text = yaml.safe_dump({name: value}, default_flow_style=None, width=math.inf).strip()
+            lines.append(f"{indent + text:<48}  # {sources[key]}\n")
+    return "".join(lines)
 
 
 def differing_keys(one: StrictModel, other: StrictModel) -> set[str]:

@@ -176,7 +176,7 @@ def from_entries(entries: dict[str, str]) -> Metadata:
     if "format" in entries and (given := json.loads(entries["format"])) != FORMAT:
         raise ValueError(f"its format is {given}, not {FORMAT}")
     if '"filter"' in (entries.get("position"), entries.get("velocity")):
-        raise ValueError("it sees the ball through a Kalman filter, for which use bounce-mjx 0.1.0")
+        raise ValueError("it sees the ball through a Kalman filter, which this version lacks")
     entries = _LATER | entries
     missing = [name for name in Metadata._fields if name not in entries]
     if missing:

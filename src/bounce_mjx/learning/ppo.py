@@ -261,7 +261,7 @@ class PPO:
         env_state = unpack(packed)
         last_inputs = self.network_inputs(vector.observe(env_state), env_state.env.metrics)
         ends = jnp.stack([last_inputs, timeout_inputs])
-        return env_state, rollout, ends, rollout_metrics(unpack(metrics), self.env.task.curves)
+        return env_state, rollout, ends, rollout_metrics(unpack(metrics))
 
     def network_inputs(self, observation: jax.Array, metrics: Metrics) -> jax.Array:
         """Inputs of the networks before normalisation [B, N + K]."""

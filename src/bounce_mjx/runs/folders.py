@@ -33,11 +33,12 @@ from typing import NamedTuple
 
 import bounce_mjx
 from bounce_mjx.config.files import dump_config
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import UserError, suggest
 from bounce_mjx.lazy import mujoco
 from bounce_mjx.resources import POLICIES, PRETRAINED, TASK_POLICIES, resource_path
-from bounce_mjx.runs.config import BASE, CONFIG_FILE, ROBOT, TrainConfig, runs_folder
+from bounce_mjx.runs.config import CONFIG_FILE, ROBOT, TrainConfig, dump_sources, runs_folder
 from bounce_mjx.runs.files import seal, writable, write_atomically
+from bounce_mjx.runs.presets import BASE
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file, read_source, source_file
 
@@ -101,10 +102,12 @@ def save_config(run: Path, config: TrainConfig) -> None:
                 write_atomically(run / file, read_source(name))
             config = config.model_copy(update={key: f"{file}:{name.rpartition(':')[2]}"})
     if (mjcf := config.env.mjcf) is not None:
-        if not mjcf.is_relative_to((run / ROBOT).absolute()):
-            mjcf = copy_robot(mjcf, run).absolute()
+        # As a config's own path is absolute and without .. in it.
+        here = Path(os.path.abspath(run))
+        if not mjcf.is_relative_to(here / ROBOT):
+            mjcf = copy_robot(mjcf, here)
         # The run's folder may be moved.
-        env = config.env.model_copy(update={"mjcf": mjcf.relative_to(run.absolute())})
+        env = config.env.model_copy(update={"mjcf": mjcf.relative_to(here)})
         config = config.model_copy(update={"env": env})
     write_config(run, config)
 
@@ -149,7 +152,7 @@ def _files_of(mjcf: Path) -> list[Path]:
 def write_config(run: Path, config: TrainConfig) -> None:
     """Writes the run's config as it is, without copies."""
     head = f"# bounce_mjx {bounce_mjx.__version__}\n{BASE}: null\n"
-    write_atomically(run / CONFIG_FILE, head + dump_config(config))
+    write_atomically(run / CONFIG_FILE, head + dump_config(config) + dump_sources(config))
 
 
 def runs_of_seeds(run: Path) -> list[Path]:
@@ -192,10 +195,9 @@ def find_run(path: Path) -> Path:
     """Folder of the run that contains a path; the path may be the folder itself."""
     # Unlike os.path.isdir, Path.is_dir raises an error for a name that is too long.
     if not os.path.isdir(path):
-        raise UserError(
-            f"there is no checkpoint folder {path}; give a run's folder such as "
-            "runs/bounce_ball/<time stamp>"
-        )
+        near = suggest(str(path), [LATEST])
+        advice = near or "give a run's folder such as runs/bounce_ball/<time stamp>"
+        raise UserError(f"there is no checkpoint folder {path}; {advice}")
     for folder in (path, *Path(os.path.abspath(path)).parents):
         if (folder / CONFIG_FILE).is_file():
             return folder
@@ -227,13 +229,14 @@ def runs_in(folder: Path) -> list[Path]:
     return list(filter(stored_checkpoints, runs))
 
 
-def find_checkpoint(path: Path) -> Checkpoint:
+def find_checkpoint(path: str | Path) -> Checkpoint:
     """Finds a checkpoint.
 
     Args:
       path: a run's folder (finds its best checkpoint, or its latest if there is no best), a folder
         of checkpoints in it, or a checkpoint.
     """
+    path = Path(path)
     run = find_run(path)
     if os.path.samefile(path, run):
         path = run = _best_seed(run)
@@ -278,6 +281,8 @@ def choose_checkpoint(path: Path | None, log_dir: Path) -> Checkpoint:
             raise
         print(f"no run in {log_dir}: using the policy that comes with the package")
         return pretrained_checkpoint(folders[log_dir])
+    if not os.path.isdir(run) and (near := suggest(str(path), POLICIES)):
+        raise UserError(f"there is no checkpoint folder and no policy {path}; {near}")
     if run != path:
         results = load_results(_best_seed(run))
         known = results.best.summary if results else "not evaluated"

@@ -7,6 +7,7 @@ a run's copy of a file that the user has named is the same task.
 import importlib
 import importlib.metadata
 import inspect
+import os
 import sys
 import traceback
 import types
@@ -73,8 +74,8 @@ def is_file(name: str) -> bool:
 
 
 def source_file(name: str) -> Path:
-    """Absolute path of the file in FILE.py:CLASS."""
-    return Path(name.rpartition(":")[0]).expanduser().absolute()
+    """Absolute path of the file in FILE.py:CLASS, without .. in it."""
+    return Path(os.path.abspath(Path(name.rpartition(":")[0]).expanduser()))
 
 
 def read_source(name: str) -> bytes:

@@ -271,6 +271,10 @@ class Job:
         self.trainer.start(self.state, self.first)
         self.state = None
         self._lap("compile")
+
+    def _restart_estimate(self) -> None:
+        """Estimates the time that is left from what follows: while the first block and the first
+        evaluation run, other programs are still compiled."""
         self.started, self.first_step = time.monotonic(), self.steps
 
     def _open_logs(self) -> None:
@@ -304,6 +308,8 @@ class Job:
           TrainingStopped: a stop was requested.
         """
         stopping = self._stopping()
+        if self.ended and self.steps < self.config.total_steps:
+            self.say(f"a callback ended the training after {self.steps:,} steps; {self._go_on}")
         if stopping and not self._is_evaluated():
             if self.resume is None and self.steps == 0:
                 jax.distributed.shutdown()
@@ -344,6 +350,7 @@ class Job:
 
     def _evaluate(self) -> bool:
         """Evaluates and saves; returns False if a stop was requested meanwhile."""
+        is_first = "evaluate" not in self.seconds
         snapshot = self.trainer.snapshot()
         reports = self._wait_for_reports(self.evaluators.select, snapshot.policies)
         if reports is None:
@@ -362,6 +369,8 @@ class Job:
             if is_best or len(self.members) == 1:
                 scores[member.run] = report.score
         self._save(snapshot, scores)
+        if is_first:
+            self._restart_estimate()
         return True
 
     def _evaluate_best(self) -> bool:
@@ -407,9 +416,13 @@ class Job:
         rate = len(faults) * self.block_steps / seconds
         metrics["speed/steps_per_second"] = np.full((len(faults), 1), rate)
         points = events.block_points(metrics)
-        # At the mean speed so far with its evaluations.
-        share = (self.config.total_steps - self.steps) / (self.steps - self.first_step)
-        left = share * (time.monotonic() - self.started)
+        if "train" in self.seconds:
+            # At the mean speed with the evaluations.
+            share = (self.config.total_steps - self.steps) / (self.steps - self.first_step)
+            left = share * (time.monotonic() - self.started)
+        else:
+            self._restart_estimate()
+            left = None
         self.say(events.block_line(self.config, self.steps, seconds, left, points))
         if total := int(sum(point["task/non_finite"] for point in points)):
             self.say(f"states that were not finite, whose environments were reset: {total:,}")

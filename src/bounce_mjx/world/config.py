@@ -214,10 +214,10 @@ class WorldConfig(RobotSettings):
     @pydantic.field_validator("mjcf")
     @classmethod
     def _make_absolute(cls, path: Path | None) -> Path | None:
-        """A run's config is read from other folders too."""
+        """A run's config is read from other folders too, and by people: without .. in it."""
         if path is None or is_packaged(path):
             return path
-        return Path(os.path.expanduser(path)).absolute()
+        return Path(os.path.abspath(os.path.expanduser(path)))
 
     @classmethod
     def settings_at(cls, paddle: tuple[float, float, float]) -> dict[str, Any]:
