@@ -104,6 +104,16 @@ BAD_YAML = {
         "env.reward.height.wieght",
         "did you mean env.reward.height.weight?",
     ),
+    "aliases of aliases": (
+        b"a: &a [1, 2, 3, 4, 5, 6, 7, 8, 9]\nb: &b [*a, *a, *a, *a, *a, *a, *a, *a, *a]\n"
+        b"c: &c [*b, *b, *b, *b, *b, *b, *b, *b, *b]\nd: &d [*c, *c, *c, *c, *c, *c, *c, *c, *c]\n"
+        b"e: [*d, *d, *d, *d, *d, *d, *d, *d, *d]",
+        "it has more than 20,000 values",
+    ),
+    "too many keys": (
+        "\n".join(f"key{i}: 1" for i in range(10_001)).encode(),
+        "it has more than 20,000 values",
+    ),
 }
 
 

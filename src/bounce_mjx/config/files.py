@@ -8,9 +8,29 @@ import yaml
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError, shorten
 
+# A config has at most a thousand values.
+_MAX_VALUES = 20_000
+
 
 class _Loader(yaml.SafeLoader):
-    """Refuses YAML in which a key appears twice, of which the last would count."""
+    """Refuses YAML in which a key appears twice, of which the last would count, and YAML that has
+    very many values, also by aliases of aliases."""
+
+    def __init__(self, stream: str):
+        super().__init__(stream)
+        self._count = 0
+        self._counts: dict[yaml.Node, int] = {}
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node:
+        before, is_alias = self._count, self.check_event(yaml.AliasEvent)
+        node = super().compose_node(parent, index)
+        # An alias inside its own anchor has no end.
+        self._count += self._counts.get(node, _MAX_VALUES) if is_alias else 1
+        if self._count > _MAX_VALUES:
+            raise yaml.YAMLError(f"it has more than {_MAX_VALUES:,} values")
+        if not is_alias:
+            self._counts[node] = self._count - before
+        return node
 
     def compose_mapping_node(self, anchor: str | None) -> yaml.MappingNode:
         node = super().compose_mapping_node(anchor)
