@@ -49,7 +49,6 @@ MISTAKES = (
     ("train --config nope", "no preset is named nope", "cpu, default, finetune"),
     ("train --robot nope", "no robot is named nope", "iiwa, panda, peitian, ur5e"),
     ("train --mjcf a.xml", "a.xml", "does not exist", "give the path"),
-    ("train --log-dir exp[lr]", "exp[lr] has a square bracket"),
     ("eval --target-height -1", "--target-height is -1.0", ">= 0.001"),
     ("eval --json nowhere/a.json", "nowhere/a.json", "make it"),
     ("evl", "unknown command evl", "did you mean eval?", "bounce-mjx --help"),

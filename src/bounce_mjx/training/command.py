@@ -40,10 +40,11 @@ class Start(StrictModel):
     """Named world in place of the preset's: a YAML file, or the name of one in configs/worlds/
     (ur5e_rtde, panda_fci, iiwa_fri or fast_servo). It may have a robot."""
     resume: Path | None = None
-    """Folder of a run, or latest for the newest run, to continue in place from its latest
-    checkpoint. The other flags may then change only total-steps, eval-every, eval-episodes,
-    screening-episodes, eval-seed, stop-when-solved, num-devices and log-dir. With total-steps, a
-    run that has met all results continues."""
+    """Folder of a run, or latest for the newest run, to continue in place from its newest
+    checkpoint; or a checkpoint in it, which then counts as the newest. The other flags may then
+    change only total-steps, eval-every, eval-episodes, screening-episodes, eval-seed,
+    stop-when-solved, num-devices and log-dir. With total-steps, a run that has met all results
+    continues."""
 
     task: str | None = None
     algorithm: str | None = None
@@ -88,7 +89,9 @@ class Start(StrictModel):
         for flag in ("config", "robot", "world"):
             if getattr(self, flag):
                 raise UserError(f"--{flag} and --resume cannot be combined; leave one out")
-        run = self.run
+        from bounce_mjx.runs.folders import find_run
+
+        run = find_run(self.resumed)
         base = run_configs.load_run_config(run, self.task, self.algorithm)
         for key in ("task", "algorithm"):
             given, own = getattr(self, key), getattr(base, key)
@@ -101,25 +104,29 @@ class Start(StrictModel):
             raise run_configs.unnamed_code(f"the run {run}", "algorithm", base.algorithm)
         if self.total_steps is None:
             return base
-        from bounce_mjx.runs.folders import runs_of_seeds
-        from bounce_mjx.runs.progress import load_results
+        from bounce_mjx.runs.folders import latest_checkpoint
+        from bounce_mjx.runs.progress import Progress
+        from bounce_mjx.runs.records import verify
 
         # `stop_when_solved` has ended it, and more steps are asked for.
-        results = [load_results(seed) for seed in runs_of_seeds(run)]
-        solved = all(found is not None and found.solved for found in results)
+        progress = verify(latest_checkpoint(run, self.resumed)).progress
+        seeds = [Progress.model_validate(seed) for seed in progress.get("seeds", [progress])]
+        solved = all(seed.solved for seed in seeds)
         return base.model_copy(update={"stop_when_solved": False}) if solved else base
 
     @property
-    def run(self) -> Path | None:
-        """Folder of the resumed run.
+    def resumed(self) -> Path | None:
+        """The resumed run's folder, or a path in it.
 
         Raises:
           UserError: there is none.
         """
-        from bounce_mjx.runs.folders import find_run, named_run
+        if self.resume is None:
+            return None
+        from bounce_mjx.runs.folders import named_run
 
         log_dir = self.log_dir or run_configs.runs_folder(find_task(self.task or DEFAULT))
-        return self.resume and find_run(named_run(self.resume, log_dir))
+        return named_run(self.resume, log_dir)
 
     def settle(self, config: TrainConfig, base: TrainConfig) -> TrainConfig:
         """The user's config with what the start alone decides: the file of the task, and the run of
@@ -217,4 +224,4 @@ def read_command(args: Sequence[str], machine: Path | None = None) -> TrainComma
         parse(own_class, ["--help"], prog=PROG, default=default, **options)
     command = parse(own_class, args, prog=PROG, default=default)
     settled = start.settle(command.training, base)
-    return command.model_copy(update=dict(settled) | {"resume": start.run})
+    return command.model_copy(update=dict(settled) | {"resume": start.resumed})

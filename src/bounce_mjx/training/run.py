@@ -117,7 +117,8 @@ def train(
       robot: name or file of a robot's config.
       world: name or file of a world.
       warm_start: run with whose networks the training starts.
-      resume: run to continue in place; only its length and evaluations may change.
+      resume: run, or a checkpoint in it, to continue in place; only its length and evaluations
+        may change.
       callbacks: functions that are called with an `Event` for each block and each evaluation; the
         training ends once one returns False.
       report: whether to write report.html into the run's folder.
@@ -136,7 +137,7 @@ def train(
         given |= {name: settings.get(name) for name in ("log_dir", "total_steps")}
         start = validate(Start, given, "train")
         base = start.base()
-        config, resume = start.settle(changed(base, settings), base), start.run
+        config, resume = start.settle(changed(base, settings), base), start.resumed
     set_up_jax(config.env)
     console = stdout(quiet=quiet or not hosts.is_leader())
     seeds = job.train(config, console, resume=resume, callbacks=callbacks)
