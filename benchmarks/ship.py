@@ -167,7 +167,7 @@ def write_policy(
             items = {POLICY: policy}
             if networks:
                 items[NETWORKS] = dict(zip(("params", "statistics"), start, strict=True))
-            save_checkpoint(made, config, checkpoint.steps, items, score=report.score)
+            save_checkpoint(made, config, checkpoint.steps, items, report=report)
             write_atomically(made / RESULTS_FILE, to_json(results))
             onnx_file = export_onnx(best_checkpoint(made))
             (made / f"{name}.onnx").write_bytes(onnx_file)

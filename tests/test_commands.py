@@ -49,7 +49,6 @@ MISTAKES = (
     ("train --config nope", "no preset is named nope", "cpu, default, finetune"),
     ("train --robot nope", "no robot is named nope", "iiwa, panda, peitian, ur5e"),
     ("train --mjcf a.xml", "a.xml", "does not exist", "give the path"),
-    ("train --log-dir exp[lr]", "exp[lr] has a square bracket"),
     ("eval --target-height -1", "--target-height is -1.0", ">= 0.001"),
     ("eval --json nowhere/a.json", "nowhere/a.json", "make it"),
     ("evl", "unknown command evl", "did you mean eval?", "bounce-mjx --help"),
@@ -114,6 +113,16 @@ BAD_YAML = {
         b"env: {reward: {height: {wieght: 3}}}",
         "env.reward.height.wieght",
         "did you mean env.reward.height.weight?",
+    ),
+    "aliases of aliases": (
+        b"a: &a [1, 2, 3, 4, 5, 6, 7, 8, 9]\nb: &b [*a, *a, *a, *a, *a, *a, *a, *a, *a]\n"
+        b"c: &c [*b, *b, *b, *b, *b, *b, *b, *b, *b]\nd: &d [*c, *c, *c, *c, *c, *c, *c, *c, *c]\n"
+        b"e: [*d, *d, *d, *d, *d, *d, *d, *d, *d]",
+        "it has more than 20,000 values",
+    ),
+    "too many keys": (
+        "\n".join(f"key{i}: 1" for i in range(10_001)).encode(),
+        "it has more than 20,000 values",
     ),
 }
 

@@ -267,6 +267,50 @@ def test_ctrl_c_while_a_command_is_imported(tmp_path: Path, start: str, moment: 
     assert not list(tmp_path.iterdir())
 
 
+def test_ctrl_c_while_its_handler_changes_is_not_lost() -> None:
+    """Python drops a signal that it has seen and that then gets the default action."""
+    code = """
+import os, signal
+from bounce_mjx.interrupt import StopRequest, end_on_ctrl_c
+change = signal.signal
+def changed(*args):
+    os.kill(os.getpid(), signal.SIGINT)
+    return change(*args)
+signal.signal = changed
+change(signal.SIGINT, signal.default_int_handler)
+end_on_ctrl_c()
+print("lost")
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
+
+
+@pytest.mark.parametrize("is_read", [True, False])
+def test_a_slow_reader_of_an_output_that_does_not_block(is_read: bool) -> None:
+    """Costs lines, and not the process; a reader that is only late gets every line."""
+    code = """
+import sys
+from bounce_mjx.errors import exit_on_user_error
+with exit_on_user_error():
+    for i in range(5000):
+        print(f"{i:099d}")
+print("done", file=sys.stderr)
+"""
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    with os.fdopen(reader, "rb") as lines:
+        process = subprocess.Popen(
+            [sys.executable, "-c", code], stdout=writer, stderr=subprocess.PIPE
+        )
+        os.close(writer)
+        read = lines.read() if is_read else b""
+        assert process.communicate(timeout=60)[1] == b"done\n" and process.returncode == 0
+        read += lines.read()
+    numbers = [int(line) for line in read.splitlines()]
+    assert numbers == list(range(len(numbers)))
+    assert len(numbers) == 5000 if is_read else 0 < len(numbers) < 5000
+
+
 def test_the_innermost_request_receives_the_signal() -> None:
     """A viewer ends, and the command that shows it continues."""
     with StopRequest() as outer:

@@ -1,11 +1,12 @@
 """Learning curves, pictures, the report of a run, and the TensorBoard log."""
 
 import base64
-import errno
 import json
 import math
 import re
+import resource
 import shutil
+import time
 import xml.etree.ElementTree
 from pathlib import Path
 
@@ -273,15 +274,35 @@ def test_tensorboard_reads_everything_back(trained: Path) -> None:
     assert logged_values == {e["steps"]: pytest.approx(e["stable"]) for e in evaluations}
 
 
-def test_a_full_disk_costs_points(tmp_path: Path, monkeypatch) -> None:
-    def fail(_: object) -> None:
-        raise OSError(errno.ENOSPC, "no space")
-
+def test_a_full_disk_costs_points(tmp_path: Path) -> None:
+    """The log stays one file, which TensorBoard reads to its end."""
     log = TensorBoardLog()
     log.start(tmp_path, TrainConfig())
-    (lost,) = tmp_path.glob("events*")
-    monkeypatch.setattr(log._writers[tmp_path], "write_event", fail)
     log(Event(tmp_path, TrainConfig(), 64, {"episode/return": 2.5}))
-    log(Event(tmp_path, TrainConfig(), 128, {"episode/return": 3.5}))
-    lost.unlink()
-    assert logged(tmp_path, "episode/return") == {128: 3.5}
+    (file,) = tmp_path.iterdir()
+    free, (_, limit) = file.stat().st_size + 9, resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (free, limit))
+    try:
+        log(Event(tmp_path, TrainConfig(), 128, {"episode/return": 3.5}))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+    log(Event(tmp_path, TrainConfig(), 192, {"episode/return": 4.5}))
+    assert list(tmp_path.iterdir()) == [file]
+    assert logged(tmp_path, "episode/return") == {64: 2.5, 192: 4.5}
+
+
+def test_a_clock_that_is_set_back_changes_no_curve(tmp_path: Path, monkeypatch) -> None:
+    """The points that a killed training logged after its checkpoint do not count."""
+    save_config(tmp_path, TrainConfig())
+    killed = TensorBoardLog()
+    for steps, value in ((64, 1.0), (128, 2.0), (192, 3.0)):
+        killed(Event(tmp_path, TrainConfig(), steps, {"episode/return": value}))
+    hour_ago = time.time() - 3600.0
+    monkeypatch.setattr(time, "time", lambda: hour_ago)
+    resumed = TensorBoardLog(64)
+    resumed.start(tmp_path, TrainConfig())
+    resumed(Event(tmp_path, TrainConfig(), 128, {"episode/return": 20.0}))
+    curve = read_curves(tmp_path).curves["episode/return"]
+    assert (curve.steps.tolist(), curve.values.tolist()) == ([64, 128], [1.0, 20.0])
+    log = EventAccumulator(str(tmp_path)).Reload()
+    assert [event.step for event in log.Scalars("episode/return")] == [64, 128]

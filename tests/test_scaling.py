@@ -108,7 +108,12 @@ def test_eight_devices_train_as_one(alone: Path, tmp_path: Path, monkeypatch: py
 @pytest.mark.parametrize(
     ("num_devices", "num_envs", "num_seeds", "sentence"),
     [
-        (64, 4096, 1, "num_devices is 64, but there are"),
+        (
+            64,
+            4096,
+            1,
+            "but the number of devices here is 8; give --num-devices 8",
+        ),
         (3, 4096, 1, "num_envs 4096 cannot be divided among 3 devices; choose a power of two"),
         (4, 4098, 1, "num_envs 4098 cannot be divided among 4 devices"),
         (2, 4096, 3, "num_seeds 3 cannot be divided among 2 devices; choose a multiple of 2"),

@@ -2,13 +2,18 @@
 
 import contextlib
 import difflib
+import functools
 import io
 import os
+import select
 import shlex
 import sys
 from collections.abc import Iterable, Iterator
 
 from bounce_mjx.interrupt import leave
+
+# Time for a slow reader of an output that does not block.
+_PATIENCE_SECONDS = 1.0
 
 
 class UserError(Exception):
@@ -102,15 +107,30 @@ def _printable(text: str) -> str:
 
 class _Output(io.FileIO):
     """Standard output or error, which drops everything from the first bytes that cannot be written:
-    the disk is full, or the reader, such as head, or the terminal is gone."""
+    the disk is full, or the reader, such as head, or the terminal is gone. Of an output that does
+    not block, it drops what a slow reader leaves no room for."""
 
-    def write(self, data: memoryview) -> int | None:
+    _is_slow = False
+
+    def write(self, data: memoryview) -> int:
         try:
-            return super().write(data)
+            written = super().write(data)
+            if written is None and not self._is_slow:
+                select.select([], [self], [], _PATIENCE_SECONDS)
+                written = super().write(data)
         except OSError:
             # Also for the output of C++.
             os.dup2(os.open(os.devnull, os.O_WRONLY), self.fileno())
             return len(data)
+        # A training must not wait again and again for a reader that has stopped.
+        self._is_slow = written is None
+        return len(data) if written is None else written
+
+
+@functools.cache
+def warn_once(sentence: str) -> None:
+    """Prints a warning on stderr, unless this process has printed it before."""
+    print(f"warning: {sentence}", file=sys.stderr)
 
 
 def reason_of(error: Exception) -> str:

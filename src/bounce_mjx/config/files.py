@@ -10,11 +10,29 @@ import yaml
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError, shorten
 
-_MOST_VALUES = 10_000
+# A config has at most a thousand values.
+_MAX_VALUES = 20_000
 
 
 class _Loader(yaml.SafeLoader):
-    """Refuses YAML in which a key appears twice, of which the last would count."""
+    """Refuses YAML in which a key appears twice, of which the last would count, and YAML that has
+    very many values, also by aliases of aliases."""
+
+    def __init__(self, stream: str):
+        super().__init__(stream)
+        self._count = 0
+        self._counts: dict[yaml.Node, int] = {}
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node:
+        before, is_alias = self._count, self.check_event(yaml.AliasEvent)
+        node = super().compose_node(parent, index)
+        # An alias inside its own anchor has no end.
+        self._count += self._counts.get(node, _MAX_VALUES) if is_alias else 1
+        if self._count > _MAX_VALUES:
+            raise yaml.YAMLError(f"it has more than {_MAX_VALUES:,} values")
+        if not is_alias:
+            self._counts[node] = self._count - before
+        return node
 
     def compose_mapping_node(self, anchor: str | None) -> yaml.MappingNode:
         node = super().compose_mapping_node(anchor)
@@ -41,7 +59,6 @@ def read_mapping(path: Path, kind: str, example: str) -> dict[str, Any]:
     advice = f"give a YAML file of keys and values such as {example}"
     try:
         values = yaml.load(path.read_text(encoding="utf-8"), _Loader)
-        _check_size(values)
     # PyYAML raises exceptions of many types where a value looks like a number or a date but is not
     # one.
     except Exception as error:
@@ -53,19 +70,6 @@ def read_mapping(path: Path, kind: str, example: str) -> dict[str, Any]:
         kind = f"the {kind} {shorten(str(path))} holds a {type(values).__name__}"
         raise UserError(f"{kind}, not a mapping; {advice}")
     return values or {}
-
-
-def _check_size(values: Any) -> None:
-    """Refuses more values than any config has, which aliases make of a few lines, and without end
-    where one contains itself."""
-    waiting, count = [values], 0
-    while waiting:
-        value = waiting.pop()
-        waiting += value.values() if isinstance(value, dict) else []
-        waiting += value if isinstance(value, list) else []
-        count += 1
-        if count > _MOST_VALUES:
-            raise yaml.YAMLError(f"it has more than {_MOST_VALUES:,} values")
 
 
 def dump_config(config: StrictModel) -> str:

@@ -79,10 +79,11 @@ class Choice(StrictModel):
     """Named world in place of the preset's: a YAML file, or the name of one in configs/worlds/
     (ur5e_rtde, panda_fci, iiwa_fri or fast_servo). It may have a robot."""
     resume: Path | None = None
-    """Folder of a run, or latest for the newest run, to continue in place from its latest
-    checkpoint. The other flags may then change only total-steps, eval-every, eval-episodes,
-    screening-episodes, eval-seed, stop-when-solved, num-devices and log-dir. With total-steps, a
-    run that has met all results continues."""
+    """Folder of a run, or latest for the newest run, to continue in place from its newest
+    checkpoint; or a checkpoint in it, which then counts as the newest. The other flags may then
+    change only total-steps, eval-every, eval-episodes, screening-episodes, eval-seed,
+    stop-when-solved, num-devices and log-dir. With total-steps, a run that has met all results
+    continues."""
 
     task: str | None = None
     algorithm: str | None = None
@@ -150,7 +151,8 @@ def _stack_of_run(choice: Choice, whole: TrainConfig | None) -> "Stack":
         if value:
             raise UserError(f"--{name} and --resume cannot be combined; leave one out")
     log_dir = choice.log_dir or runs_folder(find_task(choice.task or DEFAULT))
-    run = find_run(named_run(choice.resume, log_dir))
+    resume = named_run(choice.resume, log_dir)
+    run = find_run(resume)
     config = load_run_config(run, choice.task, choice.algorithm)
     for key in ("task", "algorithm"):
         given, own = getattr(choice, key), getattr(config, key)
@@ -166,7 +168,7 @@ def _stack_of_run(choice: Choice, whole: TrainConfig | None) -> "Stack":
         algorithm=type(config.ppo),
         layers=(Layer(f"the run {run}", config.model_dump()),),
         decided={"task": config.task, "algorithm": config.algorithm},
-        run=run,
+        resume=resume,
         resumed=config,
     )
 
@@ -396,8 +398,8 @@ class Stack:
     """Values that no layer changes any more, such as the checkpoint that a warm start found."""
     notes: tuple[str, ...] = ()
     """Where a layer wins over another one that a user may have expected to win."""
-    run: Path | None = None
-    """Folder of the resumed run."""
+    resume: Path | None = None
+    """The resumed run's folder, or a checkpoint in it."""
     resumed: TrainConfig | None = None
     """Its config."""
 
@@ -465,13 +467,16 @@ class Stack:
 
     def _go_on(self, user: Layer) -> list[Layer]:
         """Of a run that ended as it had met all results, if more steps are asked for."""
-        if self.run is None or "total_steps" not in user.values:
+        if self.resume is None or "total_steps" not in user.values:
             return []
-        from bounce_mjx.runs.folders import runs_of_seeds
-        from bounce_mjx.runs.progress import load_results
+        from bounce_mjx.runs.folders import find_run, latest_checkpoint
+        from bounce_mjx.runs.progress import Progress
+        from bounce_mjx.runs.records import verify
 
-        results = [load_results(seed) for seed in runs_of_seeds(self.run)]
-        solved = all(found is not None and found.solved for found in results)
+        checkpoint = latest_checkpoint(find_run(self.resume), self.resume)
+        progress = verify(checkpoint).progress
+        seeds = [Progress.model_validate(seed) for seed in progress.get("seeds", [progress])]
+        solved = all(seed.solved for seed in seeds)
         return [Layer(user.source, {"stop_when_solved": False})] if solved else []
 
     def _validated(self, values: dict[str, Any]) -> TrainConfig:

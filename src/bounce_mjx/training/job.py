@@ -28,16 +28,28 @@ from bounce_mjx.learning.policy import Policy
 from bounce_mjx.physics.convergence import solver_warning
 from bounce_mjx.runs import checkpoints, folders
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.files import to_json, writable, write_atomically
+from bounce_mjx.runs.files import to_json, writable
 from bounce_mjx.runs.progress import RESULTS_FILE, Progress
 from bounce_mjx.tasks.registry import is_file
 from bounce_mjx.training import events, hosts, ppo_trainer
 from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.first_block import fault_of
 from bounce_mjx.training.log import TensorBoardLog
+from bounce_mjx.training.saving import Save, Saver
 
 # Imported by name during the compilation, because these imports take half a second each.
 _SLOW_MODULES = "orbax.checkpoint", "bounce_mjx.reports.page"
+
+
+@dataclasses.dataclass(frozen=True)
+class Best:
+    """The best policy of a seed."""
+
+    policy: Policy
+    report: Report
+    steps: int
+    number: int | None = None
+    """Of its checkpoint, once it is saved."""
 
 
 @dataclasses.dataclass
@@ -51,19 +63,26 @@ class SeedRun:
     seconds: dict[str, float]
     """Seconds by phase, for all seeds together."""
     progress: Progress = dataclasses.field(default_factory=Progress)
-    best_policy: Policy | None = None
-    """The policy of the best checkpoint."""
+    best: Best | None = None
+    saved: Best | None = None
+    """The best one of those that were saved."""
 
-    def recall_best(self) -> None:
-        """Takes for the best what the best checkpoint on the disk says: a policy that could not be
-        saved is not the best one, and a process may have been killed before it wrote its state."""
-        self.best_policy, self.progress.best, self.progress.best_steps = None, None, 0
+    def take_best(self, best: Best | None) -> None:
+        """Takes a policy for the best one."""
+        self.best = best
+        self.progress.best = best and best.report
+        self.progress.best_steps = best.steps if best else 0
+
+    def recall_best(self, place: Path | None) -> None:
+        """Takes for the best what the best intact checkpoint in a folder of the run says."""
+        self.take_best(None)
         with contextlib.suppress(UserError):
-            best = folders.best_checkpoint(self.run)
-            stored = Progress.model_validate(checkpoints.read_record(best).progress)
-            if stored.best is not None:
-                self.best_policy = checkpoints.read_policy(best, self.config)
-                self.progress.best, self.progress.best_steps = stored.best, stored.best_steps
+            checkpoint = folders.best_checkpoint(self.run, place)
+            record = checkpoints.read_record(checkpoint)
+            if record.report is not None:
+                policy = checkpoints.read_policy(checkpoint, self.config)
+                self.saved = Best(policy, record.report, record.steps, checkpoint.steps)
+                self.take_best(self.saved)
 
 
 class TrainingStopped(Interrupted):
@@ -82,7 +101,7 @@ def train(
     """Trains with a config, and returns its seeds.
 
     Args:
-      resume: folder of the run to continue, whose config is `config`.
+      resume: the run to continue, whose config is `config`: its folder, or a checkpoint in it.
       callbacks: see `Callback`.
       make_trainer: builds the trainer; raises UserError where the config does not fit it.
       make_evaluators: builds what evaluates the policies, with the arguments of `Evaluators`.
@@ -147,37 +166,30 @@ class Job:
         self.state: Any = None
         self.steps = 0
         self.ended = False
-        self.opening = self.saving = self.pool.submit(lambda: None)
+        self.opening = self.pool.submit(lambda: None)
 
     def open(self) -> None:
         """Makes the folder of a new run, or reads the resumed one, and says what is trained."""
         # Before, a signal ends the process by its default action.
         self.stop = self.stack.enter_context(StopRequest())
         config = self.config
-        self.run = self.resume
-        if self.run is None:
+        if self.resume is None:
             made = str(folders.create_run(config)) if hosts.is_leader() else None
             self.run = Path(hosts.exchange(made)[0])
+        else:
+            self.run = folders.find_run(self.resume)
+        self.saver = Saver(self.run, self.pool, self.say)
         self.stack.push(self._remove_unstarted)
         if hosts.is_leader():
             self.stack.enter_context(folders.lock_run(self.run))
-        self.stack.callback(lambda: concurrent.futures.wait([self.saving]))
+        self.stack.callback(self.saver.wait)
         self.members = []
         for seed in range(config.seed, config.seed + config.num_seeds):
             folder = self.run / f"seed_{seed:03d}" if config.num_seeds > 1 else self.run
             alone = config.model_copy(update={"seed": seed, "num_seeds": 1})
             self.members.append(SeedRun(folder, alone, self.seconds))
         if self.resume is not None:
-            latest = folders.latest_checkpoint(self.run)
-            self.state, record = checkpoints.read_training(latest, self.trainer.state_template)
-            self.steps = record.steps
-            evaluated = record.progress.get("seeds", [record.progress])
-            for member, plain in zip(self.members, evaluated, strict=True):
-                member.progress = Progress.model_validate(plain)
-                member.recall_best()
-            if self._is_done() or self._is_solved():
-                met = "has met all results" if self._is_solved() else "has been trained to its end"
-                self.say(f"{self.run} {met}, {self.steps:,} steps; add --total-steps N to train on")
+            self._read_state()
         configs = {self.run: config} | {member.run: member.config for member in self.members}
         for folder, own in configs.items() if hosts.is_leader() else ():
             with writable(folder, "make room there or make it writable"):
@@ -197,6 +209,22 @@ class Job:
         bound = "at most " if config.stop_when_solved else ""
         self.say(f"steps: {bound}{config.total_steps:,}, in blocks of {self.block_steps:,}")
         self._lap("setup")
+
+    def _read_state(self) -> None:
+        """Reads the checkpoint from which the resumed run continues."""
+        checkpoint = folders.latest_checkpoint(self.run, self.resume)
+        self.state, record = checkpoints.read_training(checkpoint, self.trainer.state_template)
+        self.steps = record.steps
+        # What was trained after a checkpoint that the user named does not count any more.
+        newest = max(stored.steps for stored in folders.stored_checkpoints(self.run))
+        place = None if checkpoint.steps == newest else checkpoint.folder
+        evaluated = record.progress.get("seeds", [record.progress])
+        for member, plain in zip(self.members, evaluated, strict=True):
+            member.progress = Progress.model_validate(plain)
+            member.recall_best(place if member.run == self.run else None)
+        if self._is_done() or self._is_solved():
+            met = "has met all results" if self._is_solved() else "has been trained to its end"
+            self.say(f"{self.run} {met}, {self.steps:,} steps; add --total-steps N to train on")
 
     def _lap(self, name: str) -> None:
         """Adds the time since the last lap to that of a phase."""
@@ -229,7 +257,7 @@ class Job:
 
     def _latest(self) -> Path | None:
         """The newest checkpoint, once the last save has ended."""
-        concurrent.futures.wait([self.saving])
+        self.saver.wait()
         with contextlib.suppress(UserError):
             return folders.latest_checkpoint(self.run).folder
 
@@ -359,16 +387,13 @@ class Job:
         evaluated = [one for one in each if one[0].progress.fault is None]
         judged = [report for _, report, _ in evaluated]
         self.say(events.evaluation_line(self.config.num_seeds, self.steps, judged))
-        seconds, scores = sum(self.seconds.values()), {}
+        seconds = sum(self.seconds.values())
         self._end_save()
         for member, report, policy in evaluated:
             self._tell(member, events.points_of(report), report=report, policy=policy)
-            is_best = member.progress.improves(report, self.steps, seconds)
-            if is_best:
-                member.best_policy = policy
-            if is_best or len(self.members) == 1:
-                scores[member.run] = report.score
-        self._save(snapshot, scores)
+            if member.progress.improves(report, self.steps, seconds):
+                member.best = Best(policy, report, self.steps)
+        self._save(snapshot, {member.run: report for member, report, _ in evaluated})
         if is_first:
             self._restart_estimate()
         return True
@@ -378,15 +403,15 @@ class Job:
         stop was requested meanwhile."""
         # A seed that diverged before its first evaluation has no best policy; another seed's policy
         # takes its place in the batch.
-        best = [member.best_policy for member in self.members]
+        best = [member.best and member.best.policy for member in self.members]
         other = next(policy for policy in best if policy is not None)
         reports = self._wait_for_reports(self.evaluators.final, [x or other for x in best])
         if reports is None:
             return False
         for member, report in zip(self.members, reports, strict=True):
-            member.progress.best = report if member.best_policy else None
+            member.progress.best = report if member.best else None
         if hosts.is_leader():
-            self.saving = self.pool.submit(_write, [], self._results(fresh_resets=True))
+            self.saver.start([], self._results(fresh_resets=True), self.steps)
         self._end_save(is_last=True)
         return True
 
@@ -456,33 +481,33 @@ class Job:
         )
 
     def _end_save(self, is_last: bool = False) -> None:
-        """Waits for the last save. What could not be saved is lost, as the next save has newer
-        data: such a policy is not the best one.
+        """Waits for the last save. A policy that could not be saved is not the best one.
 
         Raises:
           UserError: it failed, and no other follows.
         """
-        problem = None
-        try:
-            self.saving.result()
-        except OSError as error:
-            problem = f"{self.run} cannot be written ({error.strerror})"
-            if is_last:
-                lost = "so the end of the training is lost; make room, and"
-                raise UserError(f"{problem}, {lost} {self._advice}") from error
-            meanwhile = "training continues, and saves at its next evaluation"
-            self.say(f"the state is not saved, as {problem}; make room: {meanwhile}")
-        if hosts.any_of(problem is not None):
-            for member in self.members:
-                member.recall_best()
+        outcome = self.saver.wait()
+        if outcome.problem and is_last:
+            raise UserError(
+                f"{self.run} cannot be written ({outcome.problem}), so the end of the training is "
+                f"lost; make room, and {self._advice}"
+            )
+        self.saver.say(outcome)
+        numbers, has_failed = hosts.exchange([outcome.numbers, outcome.problem is not None])[0]
+        for member in self.members:
+            number = numbers.get(str(member.run))
+            if number is not None and member.best is not member.saved:
+                member.saved = member.best = dataclasses.replace(member.best, number=number)
+            if has_failed:
+                member.take_best(member.saved)
         self._lap("save")
 
-    def _save(self, snapshot: ppo_trainer.Snapshot, scores: dict[Path, tuple[float, ...]]) -> None:
-        """Starts to save the state, and with several seeds the policies of some of them.
+    def _save(self, snapshot: ppo_trainer.Snapshot, reports: dict[Path, Report]) -> None:
+        """Starts to save the state, and with several seeds the policies that are the best of their
+        seed.
 
         Args:
-          scores: quality of the policies that were evaluated, by the seed's folder; with several
-            seeds, of those that are the best of their seed.
+          reports: evaluations of the policies by the seed's folder.
         """
         if hosts.is_leader():
             # A copy, because the training reuses its buffers meanwhile.
@@ -490,16 +515,19 @@ class Job:
             training, is_alone = {checkpoints.TRAINING: state}, len(self.members) == 1
             saves, records = [], [member.progress.model_dump() for member in self.members]
             for i, member in enumerate(self.members):
+                is_best = member.best is not member.saved
+                kept = None if is_best or member.saved is None else member.saved.number
                 items = training.copy() if is_alone else {}
                 items[checkpoints.POLICY] = policies[i]
                 items[checkpoints.NETWORKS] = networks and networks[i]
-                score = scores.get(member.run, ())
-                if is_alone or score:
-                    saves.append((member.run, member.config, self.steps, items, records[i], score))
+                if is_alone or is_best:
+                    where = member.run, member.config, self.steps
+                    report = reports.get(member.run)
+                    saves.append(Save(*where, items, records[i], report, kept))
             if not is_alone:
                 # Last, as it refers to the best policies of the seeds.
-                saves.append((self.run, self.config, self.steps, training, {"seeds": records}))
-            self.saving = self.pool.submit(_write, saves, self._results())
+                saves.append(Save(self.run, self.config, self.steps, training, {"seeds": records}))
+            self.saver.start(saves, self._results(), self.steps)
         self._lap("save")
 
     def _results(self, fresh_resets: bool = False) -> dict[Path, str]:
@@ -511,10 +539,3 @@ class Job:
             for member in self.members
             if member.progress.best is not None
         }
-
-
-def _write(saves: list[tuple[Any, ...]], results: dict[Path, str]) -> None:
-    for arguments in saves:
-        checkpoints.save_checkpoint(*arguments)
-    for path, content in results.items():
-        write_atomically(path, content)

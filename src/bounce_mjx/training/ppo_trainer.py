@@ -183,7 +183,10 @@ def make_mesh(num_devices: int | None, config: PPOConfig, num_seeds: int = 1) ->
     if num_devices is None:
         num_devices = 1 if jax.process_count() == 1 else len(devices)
     if num_devices > len(devices):
-        raise UserError(f"num_devices is {num_devices}, but there are {len(devices)}; choose fewer")
+        raise UserError(
+            f"num_devices is {num_devices}, but the number of devices here is {len(devices)}; give "
+            f"--num-devices {len(devices)}"
+        )
     if jax.process_count() > 1 and num_devices < len(devices):
         raise UserError(f"num_devices is {num_devices}, but the hosts have {len(devices)}; omit it")
     if num_seeds > 1:

@@ -130,7 +130,8 @@ def train(
       world: name or file of a world.
       warm_start: run, or policy of the package, from whose networks and environment the training
         starts.
-      resume: run to continue in place; only its length and evaluations may change.
+      resume: run, or a checkpoint in it, to continue in place; only its length and evaluations
+        may change.
       callbacks: functions that are called with an `Event` for each block and each evaluation; the
         training ends once one returns False.
       report: whether to write report.html into the run's folder.
@@ -163,11 +164,11 @@ def run_training(
     report: bool,
 ) -> Run:
     """Trains with a config, which has its settings from layers, and returns the run."""
-    if layers.run is None:
+    if layers.resume is None:
         say(console, f"config: {layers.title}")
     for note in layers.notes:
         say(console, f"note: {note}")
-    seeds = job.train(config, console, resume=layers.run, callbacks=callbacks)
+    seeds = job.train(config, console, resume=layers.resume, callbacks=callbacks)
     best = print_results(seeds, console)
     if report and hosts.is_leader():
         leave_report(best, console)
