@@ -107,8 +107,8 @@ BAD_YAML = {
         "the key ppo appears twice, in lines 1 and 3; join the two",
     ),
     "unknown key": (b"zzz: 3", "unknown key zzz", "known keys here are", "total_steps"),
-    "many values": (b"a: [" + b"1," * 20000 + b"]", "it has more than 10,000 values"),
-    "aliases": (ALIASES, "it has more than 10,000 values"),
+    "many values": (b"a: [" + b"1," * 20000 + b"]", "it has more than 20,000 values"),
+    "aliases": (ALIASES, "it has more than 20,000 values"),
     "deep near miss": (
         b"env: {reward: {height: {wieght: 3}}}",
         "env.reward.height.wieght",

@@ -105,7 +105,7 @@ def test_latest_is_a_name_for_every_command(runs: Path, monkeypatch) -> None:
     monkeypatch.chdir(runs)
     assert named_run(Path("latest"), runs) == named_run(None, runs) == runs / "2026-01-02"
     command = train_command.read_command(["--resume", "latest", "--log-dir", str(runs)])
-    assert command.layers.run == runs / "2026-01-02"
+    assert command.layers.resume == runs / "2026-01-02"
     (runs / "latest").mkdir()
     assert named_run(Path("latest"), runs) == Path("latest")
 
