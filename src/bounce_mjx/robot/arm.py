@@ -16,6 +16,7 @@ import numpy as np
 from bounce_mjx.errors import UserError, install_command, needed, reason_of, shorten
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.config import PaddleConfig, RobotConfig
+from bounce_mjx.robot.numbers import check_numbers
 
 BALL_BODY_NAME = "ball_link"
 PADDLE_GEOM_NAME = "blocker"
@@ -123,6 +124,7 @@ def build_arm(path: Path, config: RobotConfig) -> Arm:
     """
     arm = read_spec(path)
     model = compile_spec(arm, path)
+    check_numbers(model)
     with _compiling(path):
         return _Builder(arm, model, config).build()
 

@@ -16,11 +16,9 @@ from bounce_mjx.resources import resource_path
 from bounce_mjx.robot import arm
 from bounce_mjx.robot.balls import MAX_BALLS, add_balls, ball_name
 from bounce_mjx.robot.config import RobotConfig
+from bounce_mjx.robot.numbers import check_numbers, physical_fields
 from bounce_mjx.robot.torques import limit_torques
 
-# Starts of the names of a model's fields with physics in them, and those of colours among them.
-_PHYSICAL = ("body_", "jnt_", "dof_", "geom_", "pair_", "actuator_", "eq_", "tendon_", "qpos")
-_PICTURED = ("geom_rgba", "geom_matid", "geom_group")
 # With fewer physics steps in half a period of a contact, the ball can gain energy in a rebound.
 _STEPS_OF_A_CONTACT = 4
 
@@ -88,8 +86,8 @@ def load_model(
 
     Raises:
       UserError: the file is missing, is no MJCF, lacks a name that the task needs, has a joint
-        without a position servo, or more balls than `num_balls`; or half a period of a contact has
-        fewer than four physics steps.
+        without a position servo, more balls than `num_balls`, or a number that cannot be simulated;
+        or half a period of a contact has fewer than four physics steps.
     """
     spec, path = scene_spec(mjcf, robot or RobotConfig())
     add_balls(spec, num_balls)
@@ -99,6 +97,7 @@ def load_model(
         spec.compiler.discardvisual = True
     mj_model = arm.compile_spec(spec, path)
     with arm.naming(path):
+        check_numbers(mj_model)
         addresses = find_addresses(mj_model)
         check_servos(mj_model, addresses)
         if (present := len(addresses.balls)) != num_balls:
@@ -281,10 +280,11 @@ def _servos(mj_model: mujoco.MjModel) -> dict[int, int]:
 def fingerprint(mj_model: mujoco.MjModel) -> bytes:
     """A hash of the numbers on which a simulation depends; it ignores colours and markers."""
     digest = hashlib.blake2b()
-    for owner, kinds in ((mj_model, _PHYSICAL), (mj_model.opt, "")):
-        for name in dir(owner):
-            if name.startswith(kinds) and not name.startswith(("_", *_PICTURED)):
-                digest.update(np.asarray(getattr(owner, name)).tobytes())
+    for name in physical_fields(mj_model):
+        digest.update(np.asarray(getattr(mj_model, name)).tobytes())
+    for name in dir(mj_model.opt):
+        if not name.startswith("_"):
+            digest.update(np.asarray(getattr(mj_model.opt, name)).tobytes())
     return digest.digest()
 
 
