@@ -32,7 +32,7 @@ from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import Term
 from test_ppo import TwoStates
 
-KEYS = fields_of(find_task("bounce"))
+KEYS = fields_of(find_task("bounce").Config)
 
 # Other values, where neither half of the default nor one more of it is one.
 VALUES = {

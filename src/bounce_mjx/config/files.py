@@ -87,12 +87,14 @@ def dump_with_sources(plain: dict[str, Any], sources: Mapping[str, str], prefix:
     lines, indent = [], "  " * prefix.count(".")
     for name, value in plain.items():
         key = prefix + name
-        if isinstance(value, dict) and value:
+        if key not in sources:
             lines.append(f"{indent}{name}:\n")
             lines.append(dump_with_sources(value, sources, f"{key}."))
         else:
-            text = yaml.safe_dump({name: value}, default_flow_style=None, width=math.inf).strip()
-            lines.append(f"{indent + text:<48}  # {sources[key]}\n")
+            # YAML marks the end of a single word.
+            text = yaml.safe_dump(value, default_flow_style=True, width=math.inf).split("\n")[0]
+            line = f"{indent}{name}: {text}"
+            lines.append(f"{line:<48}  # {sources[key]}\n")
     return "".join(lines)
 
 

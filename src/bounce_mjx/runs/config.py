@@ -10,7 +10,6 @@ import yaml
 from pydantic import Field
 from pydantic.fields import FieldInfo
 
-from bounce_mjx.config.files import flat
 from bounce_mjx.config.settings import Count, NonNegativeInt, Steps, StrictModel, fields_in
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
@@ -90,7 +89,14 @@ class TrainConfig(StrictModel):
     def sources(self) -> dict[str, str]:
         """What set each value, by its dotted key, such as configs/cpu.yaml for ppo.num_envs; a
         setting that nothing set has its default."""
-        return {key: self._sources.get(key, DEFAULT_SOURCE) for key in flat(self.model_dump())}
+        sources = dict.fromkeys(fields_of(type(self.env), type(self.ppo)), DEFAULT_SOURCE)
+        for key, source in self._sources.items():
+            # A setting may be a mapping, whose keys are named too.
+            while key and key not in sources:
+                key = key.rpartition(".")[0]
+            if key:
+                sources[key] = source
+        return sources
 
     def set_sources(self, sources: dict[str, str]) -> None:
         """Notes what set the values, by their dotted keys."""
@@ -132,13 +138,16 @@ class TrainConfig(StrictModel):
         return ppo
 
 
-def fields_of(task: type[Task], algorithm: type[PPOConfig] = PPOConfig) -> dict[str, FieldInfo]:
+def fields_of(
+    env: type[WorldConfig], algorithm: type[PPOConfig] = PPOConfig
+) -> dict[str, FieldInfo]:
     """The settings of a training by their dotted keys, such as env.reward.height.weight.
 
     Args:
+      env: the settings of the task.
       algorithm: the settings of the algorithm.
     """
-    groups, fields = {"env": task.Config, "ppo": algorithm}, {}
+    groups, fields = {"env": env, "ppo": algorithm}, {}
     for name, field in TrainConfig.model_fields.items():
         fields |= fields_in(groups[name], f"{name}.") if name in groups else {name: field}
     return fields

@@ -406,7 +406,7 @@ class Stack:
     @functools.cached_property
     def fields(self) -> dict[str, FieldInfo]:
         """The settings that there are, by dotted key."""
-        return fields_of(self.task, self.algorithm)
+        return fields_of(self.task.Config, self.algorithm)
 
     @property
     def title(self) -> str:
