@@ -34,8 +34,9 @@ from bounce_mjx.runs.folders import (
     stored_checkpoints,
 )
 from bounce_mjx.training import job
+from bounce_mjx.training.command import Start
 from bounce_mjx.training.events import Event
-from bounce_mjx.training.ppo_trainer import Snapshot
+from bounce_mjx.training.trainer import Snapshot
 from tiny_runs import contents
 
 BLOCK = 64
@@ -230,6 +231,10 @@ def test_a_training_stops_once_its_results_have_a_margin(tmp_path: Path) -> None
         said=(shown := io.StringIO()),
     )
     assert f"{run} has met all results, 192 steps; add --total-steps N" in shown.getvalue()
+    # Results are not needed to resume.
+    (run / "results.json").write_text("damaged")
+    assert not Start(resume=run, total_steps=10**6).base().stop_when_solved
+    assert Start(resume=run).base().stop_when_solved
     assert latest_checkpoint(run).steps == 192
     train(tmp_path, RETURNS, run, margins=margins)
     assert latest_checkpoint(run).steps == 256
@@ -263,7 +268,13 @@ def test_a_callback_sees_blocks_and_evaluations_and_ends_the_training(tmp_path: 
         def close(self) -> None:
             seen.append("closed")
 
-    run = train(tmp_path, {1: 5.0, 2: 9.0, 3: 7.0}, callbacks=[Tracker()])
+    said = io.StringIO()
+    run = train(tmp_path, {1: 5.0, 2: 9.0, 3: 7.0}, callbacks=[Tracker()], said=said)
+    ends = "a callback ended the training after 128 steps; continue with: bounce-mjx train --resume"
+    assert ends in said.getvalue()
+    # The first block, during which other programs are compiled, says nothing about those to come.
+    blocks = [line for line in said.getvalue().splitlines() if "steps/s" in line]
+    assert [" left" in line for line in blocks] == [False, True]
     blocks = [(64, 0.0, False), (64, 5.0, True), (128, 0.0, False), (128, 9.0, True)]
     assert seen == [3 * BLOCK, *blocks, "closed"]
     results = results_of(run)
