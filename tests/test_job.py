@@ -34,8 +34,9 @@ from bounce_mjx.runs.folders import (
     stored_checkpoints,
 )
 from bounce_mjx.training import job
+from bounce_mjx.training.command import Start
 from bounce_mjx.training.events import Event
-from bounce_mjx.training.ppo_trainer import Snapshot
+from bounce_mjx.training.trainer import Snapshot
 from tiny_runs import contents
 
 BLOCK = 64
@@ -230,6 +231,10 @@ def test_a_training_stops_once_its_results_have_a_margin(tmp_path: Path) -> None
         said=(shown := io.StringIO()),
     )
     assert f"{run} has met all results, 192 steps; add --total-steps N" in shown.getvalue()
+    # Results are not needed to resume.
+    (run / "results.json").write_text("damaged")
+    assert not Start(resume=run, total_steps=10**6).base().stop_when_solved
+    assert Start(resume=run).base().stop_when_solved
     assert latest_checkpoint(run).steps == 192
     train(tmp_path, RETURNS, run, margins=margins)
     assert latest_checkpoint(run).steps == 256

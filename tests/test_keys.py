@@ -26,8 +26,8 @@ from bounce_mjx.robot.model import fingerprint
 from bounce_mjx.runs.config import TrainConfig, fields_of
 from bounce_mjx.tasks.registry import find_task
 from bounce_mjx.training.evaluators import Evaluators
-from bounce_mjx.training.job import Job
-from bounce_mjx.training.ppo_trainer import PPOTrainer, episode_steps
+from bounce_mjx.training.job import open_job
+from bounce_mjx.training.ppo_trainer import episode_steps
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import Term
 from test_ppo import TwoStates
@@ -163,17 +163,11 @@ def of_run(config: TrainConfig) -> tuple:
     """What a run resolves: its blocks, evaluations, seeds and folder."""
     blocks, measured = [], []
     with contextlib.ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
-        job = Job(config, Console(quiet=True), None, (), stack, PPOTrainer)
-        job.open()
-
-        def run_block() -> None:
+        job = open_job(config, Console(quiet=True), stack)
+        patch.setattr(job, "healthy", list)
+        while not job.is_finished():
             blocks.append(job.steps)
             job.steps += job.block_steps
-
-        answers = {"_stopping": lambda: False, "_is_due": lambda: False, "_healthy": list}
-        for name, answer in (answers | {"_run_block": run_block}).items():
-            patch.setattr(job, name, answer)
-        job.train()
         nothing = types.SimpleNamespace(compile=lambda: None)
         patch.setattr(Evaluators, "_lower", lambda _: nothing)
         patch.setattr(Evaluators, "_measure", lambda *given, **_: measured.append(given[2]))

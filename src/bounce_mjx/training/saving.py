@@ -30,7 +30,7 @@ class Outcome:
     """What a save has written."""
 
     numbers: dict[str, int] = dataclasses.field(default_factory=dict)
-    """Those of the checkpoints, by the run's folder."""
+    """Those of the checkpoints, by the name of the run's folder."""
     problem: str | None = None
     """Why something could not be written; None if everything was."""
 
@@ -59,9 +59,18 @@ class Saver:
         self._steps = steps
         self._saving = self._pool.submit(_write, saves, results)
 
-    def wait(self) -> Outcome:
+    def wait(self) -> None:
         """Waits for the end of the save that was started last."""
-        return Outcome() if self._saving is None else self._saving.result()
+        if self._saving is not None:
+            concurrent.futures.wait([self._saving])
+
+    def end(self) -> Outcome:
+        """Waits for the save that was started last, and returns what it has written; asked again,
+        nothing."""
+        if self._saving is None:
+            return Outcome()
+        outcome, self._saving = self._saving.result(), None
+        return outcome
 
     def say(self, outcome: Outcome) -> None:
         """Says that saving fails, or that it succeeds again."""
@@ -70,16 +79,17 @@ class Saver:
                 f"the state is not saved, as {self._run} cannot be written ({outcome.problem}); "
                 "training continues, and tries again after each evaluation"
             )
-        if self._is_failing and not outcome.problem:
+        if self._is_failing and not outcome.problem and outcome.numbers:
             self._say(f"the state is saved again, after {self._steps:,} steps")
-        self._is_failing = outcome.problem is not None
+        if outcome.problem or outcome.numbers:
+            self._is_failing = outcome.problem is not None
 
 
 def _write(saves: Sequence[Save], results: dict[Path, str]) -> Outcome:
     numbers = {}
     try:
         for save in saves:
-            numbers[str(save.run)] = checkpoints.save_checkpoint(
+            numbers[save.run.name] = checkpoints.save_checkpoint(
                 save.run,
                 save.config,
                 save.steps,
