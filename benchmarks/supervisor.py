@@ -29,7 +29,6 @@ from bounce_mjx.runs.checkpoints import read_policy
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import find_checkpoint
 from bounce_mjx.training.setup import set_up_jax
-from bounce_mjx.world import sensing
 
 _BATCH = 64
 
@@ -52,7 +51,8 @@ def recorder(name: str, episodes: int, latencies: list[float] | None) -> Any:
         angles, velocities = truth.joint_angles, truth.joint_velocities
         ball, age = truth.ball_position, jnp.zeros(())
         if now.sensing is not None:
-            angles, velocities = sensing.measured_joints(now.world, now.clock.counter, truth)
+            seen = now.sensing.histories
+            angles, velocities = seen["joint_angles"][0], seen["joint_velocities"][0]
             ball, age = now.sensing.picture.position, now.sensing.picture.age
         control, actuation = env.control(now, action)
         if actuation.setpoint is not None:

@@ -8,9 +8,8 @@ import numpy as np
 
 from bounce_mjx.deploy.metadata import IS_FIRST, MEASURED, NEXT, Metadata, from_entries
 from bounce_mjx.deploy.motion import paddle_position
+from bounce_mjx.deploy.samples import Measurements
 from bounce_mjx.errors import UserError, needed
-
-Measurements = dict[str, np.ndarray]
 
 _LOG_ERRORS_ONLY = 3
 _TYPES = {"tensor(float)": np.float32, "tensor(int32)": np.int32, "tensor(bool)": np.bool_}
