@@ -14,15 +14,13 @@ from bounce_mjx.deploy.samples import Measurements
 _COMPARED = 0.25
 # Latencies of these arms: their distance, and the largest beyond the training's, s.
 _APART, _LATER = 0.01, 0.02
-# Motion beside all these arms, as a share of `action_scale`; in own play it was up to 0.75 of it
-# with latencies in the training, and 0.1 without (benchmarks/supervisor.py).
-_UNLIKE, _UNLIKE_MEASURED = 2.0, 0.5
+# Motion beside all these arms that is too much: a share of what the commands moved meanwhile, a
+# share of `action_scale`, and the encoders' noise in standard deviations.
+_OF_COMMANDS, _OF_SCALE, _OF_NOISE = 0.3, 0.35, 3.0
 # Constant distance from all these arms, rad.
 _OFFSET = 0.1
 # What a resting joint may be off its command beside the encoder's bias: its load, rad.
 _SAG = 0.01
-# Largest noise, in standard deviations.
-_LARGEST_NOISE = 8.0
 # A ball so far below the paddle, or beside it without coming nearer, is lost; one so far above it
 # flies, m.
 _BELOW, _BESIDE, _FLYING = 0.1, 0.9, 0.05
@@ -79,16 +77,15 @@ class Watch:
         self._metadata, self._max_age, dt = metadata, max_picture_age, metadata.control_dt
         self.offset = _SAG + largest_term(metadata, "encoder_bias")
         """Distance of a resting joint from its command, rad."""
-        share = _UNLIKE if metadata.action_base == "target" else _UNLIKE_MEASURED
-        noise = _LARGEST_NOISE * largest_term(metadata, "joint_angle_noise")
-        self._unlike = share * metadata.action_scale + noise
+        noise = largest_term(metadata, "joint_angle_noise")
+        self._least = _OF_SCALE * metadata.action_scale + _OF_NOISE * noise
         self._arms = arm_responses(metadata)
         self._compared = math.ceil(_COMPARED / dt)
 
     def rest(self, angles: np.ndarray, command: np.ndarray) -> None:
         """The arm has rested at these angles [J], commanded to be there [J]."""
         arms, length = self._arms.shape
-        self._commands = np.tile(command, (length, 1))
+        self._commands = np.tile(command, (length + self._compared, 1))
         self._beside = np.tile(angles - command, (self._compared, arms, 1))
 
     def begin(self) -> None:
@@ -104,10 +101,11 @@ class Watch:
           command: at the end of the step before [J], rad.
         """
         self._commands = np.concatenate([command[None], self._commands[:-1]])
-        beside = angles - self._arms @ self._commands
+        beside = angles - self._arms @ self._commands[: self._arms.shape[1]]
         self._beside = np.concatenate([self._beside[1:], beside[None]])
         high, low = np.max(self._beside, axis=0), np.min(self._beside, axis=0)
-        unlike = np.maximum((high - low) / self._unlike, np.maximum(high, -low) / _OFFSET)
+        allowed = self._least + _OF_COMMANDS * np.ptp(self._commands, axis=0)
+        unlike = np.maximum((high - low) / allowed, np.maximum(high, -low) / _OFFSET)
         least = np.min(unlike, axis=0)
         if np.max(least) > 1.0:
             joint = int(np.argmax(least))

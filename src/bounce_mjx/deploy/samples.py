@@ -15,7 +15,7 @@ Measurements = dict[str, np.ndarray]
 
 # An angle outside its range, and the first one from the start pose, rad.
 _OUTSIDE, _NEAR = 0.5, 0.5
-# The start pose in another order of the joints, beside the noise of a start, rad.
+# The start pose in another order or with other signs, beside the noise of a start, rad.
 _SAME = 0.1
 # Share of an arm's own limit of velocity that no joint reaches.
 _OVERSPEED = 1.2
@@ -179,12 +179,13 @@ class Samples:
         self._check_range(angles)
         if np.max(np.abs(angles - self._place)) <= _NEAR + metadata.start_noise:
             return
-        in_another_order = np.abs(np.sort(angles) - np.sort(self._start))
-        if np.max(in_another_order) <= _SAME + metadata.start_noise:
+        reordered = np.abs(np.sort(np.abs(angles)) - np.sort(np.abs(self._start)))
+        if np.max(reordered) <= _SAME + metadata.start_noise:
             raise ImpossibleMeasurement(
                 "joint_order",
-                f"the joint angles fit the start pose in another order; give those of "
-                f"{', '.join(metadata.joint_names)}, or load_policy the driver's joint_names",
+                "the joint angles fit the start pose in another order or with other signs; give "
+                f"those of {', '.join(metadata.joint_names)}, or load_policy the driver's "
+                "joint_names",
             )
         last, self._unconfirmed = self._unconfirmed, angles
         reach = self._fastest * metadata.control_dt + self._noise
