@@ -5,7 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from bounce_mjx.deploy.metadata import PER_BALL, UNITS, Metadata, measurement_sizes
+from bounce_mjx.deploy.metadata import (
+    PER_BALL,
+    UNITS,
+    Metadata,
+    in_driver_order,
+    measurement_sizes,
+)
 from bounce_mjx.deploy.motion import Motion
 from bounce_mjx.deploy.network import OnnxNetwork
 from bounce_mjx.deploy.samples import Measurements, Samples
@@ -74,6 +80,21 @@ class DeployedPolicy:
             ) from error
         self.reset()
 
+    def use_joints(self, names: Sequence[str] | Mapping[str, str]) -> None:
+        """Takes and gives the joints in a driver's order from now on, and resets the policy.
+
+        Args:
+          names: as `joint_names` of `load_policy`.
+
+        Raises:
+          UserError: they are not those of the policy's robot.
+        """
+        order = _joint_order(names, self.metadata)
+        self._network.use_order(order)
+        self.metadata = in_driver_order(self.metadata, tuple(names), order)
+        self.motion, self.samples = Motion(self.metadata), Samples(self.metadata)
+        self.reset()
+
     def reset(self, targets: np.ndarray | None = None) -> None:
         """Forgets the past. The next step fills the whole history with its measurements.
 
@@ -88,7 +109,10 @@ class DeployedPolicy:
         if targets is not None:
             targets = _array("the targets", targets, count, "rad", _LARGEST)
         self._network.reset()
-        self.samples.forget(targets)
+        if targets is None:
+            self.samples.forget()
+        else:
+            self.samples.rest(targets)
         self._measured: Measurements = {}
         self._first: float | None = None
         self.step_number = -1
@@ -320,6 +344,34 @@ class DeployedPolicy:
                 f"pause of {_MAX_PAUSE:g} s, and give seconds"
             )
         return max(0, round((time - self._first) / dt) - self.step_number)
+
+
+def _joint_order(names: Sequence[str] | Mapping[str, str], metadata: Metadata) -> list[int]:
+    """Index among the policy's joints of each of a driver's joints.
+
+    Raises:
+      UserError: the names are not those of the policy's robot.
+    """
+    own = metadata.joint_names
+    if isinstance(names, Mapping):
+        order = [own.index(name) if name in own else -1 for name in names.values()]
+    else:
+        order = [
+            own.index(name) if name in own else _last_of(own, name) for name in dict.fromkeys(names)
+        ]
+    if len(names) != len(own) or sorted(order) != list(range(len(own))):
+        raise UserError(
+            f"joint_names has {', '.join(names)}, but the policy is for {metadata.robot}, whose "
+            f"joints are {', '.join(own)}; give the names of this robot, each once, or a mapping "
+            "from the driver's names to these"
+        )
+    return order
+
+
+def _last_of(own: Sequence[str], name: str) -> int:
+    """Index of the only joint whose name ends a driver's name; -1 if there is none."""
+    found = [i for i, joint in enumerate(own) if name.endswith(joint)]
+    return found[0] if len(found) == 1 else -1
 
 
 def _check_command(name: str, value: float, ends: tuple[float, float], unit: str) -> None:

@@ -13,8 +13,8 @@ from bounce_mjx.errors import UserError
 
 Measurements = dict[str, np.ndarray]
 
-# An angle outside its range, and the first one from the start pose, rad.
-_OUTSIDE, _NEAR = 0.5, 0.5
+# An angle outside its range; the first one from the start pose, and from commands at rest, rad.
+_OUTSIDE, _NEAR, _AT_REST = 0.5, 0.5, 0.1
 # The start pose in another order or with other signs, beside the noise of a start, rad.
 _SAME = 0.1
 # Share of an arm's own limit of velocity that no joint reaches.
@@ -67,13 +67,15 @@ class Samples:
         self._start = np.array(metadata.default_joint_angles)
         self.forget()
 
-    def forget(self, place: np.ndarray | None = None) -> None:
-        """Forgets the last sample.
+    def forget(self, near: np.ndarray | None = None) -> None:
+        """Forgets the last sample; the next one is a first one.
 
         Args:
-          place: where the arm is [J], rad; by default near the start pose.
+          near: commands [J] (rad) at which the arm has rested; by default, the start pose.
         """
-        self._place = self._start if place is None else place
+        self._place, self._room = self._start, _NEAR + self._metadata.start_noise
+        if near is not None:
+            self._place, self._room = near, _AT_REST
         self._last: Measurements = {}
         self._bridged: set[str] = set()
         self._unconfirmed: np.ndarray | None = None
@@ -81,6 +83,11 @@ class Samples:
         self._arm_time = self._now = self._taken = 0.0
         # The newest picture, whether it can be true or not.
         self._seen: np.ndarray | None = None
+
+    def rest(self, angles: np.ndarray) -> None:
+        """The arm rests at angles [J], rad; everything else is forgotten."""
+        self.forget()
+        self._last = {"joint_angles": angles, "joint_velocities": np.zeros(len(angles))}
 
     def take(self, measured: Measurements) -> Measurements:
         """The sample, with the last values in place of those that cannot be true.
@@ -177,7 +184,8 @@ class Samples:
                 "all joint angles are 0, as of a driver without data; wait for its first sample"
             )
         self._check_range(angles)
-        if np.max(np.abs(angles - self._place)) <= _NEAR + metadata.start_noise:
+        far = float(np.max(np.abs(angles - self._place)))
+        if far <= self._room:
             return
         reordered = np.abs(np.sort(np.abs(angles)) - np.sort(np.abs(self._start)))
         if np.max(reordered) <= _SAME + metadata.start_noise:
@@ -190,10 +198,9 @@ class Samples:
         last, self._unconfirmed = self._unconfirmed, angles
         reach = self._fastest * metadata.control_dt + self._noise
         if last is None or np.any(np.abs(angles - last) > reach):
-            far = np.max(np.abs(angles - self._place))
             raise UnconfirmedSample(
-                f"the first joint angles are {far:.3g} rad from the start pose; they count when "
-                "the next sample confirms them"
+                f"the first joint angles are {far:.3g} rad from where the arm starts; they count "
+                "when the next sample confirms them"
             )
 
     def _unwrapped(self, angles: np.ndarray) -> np.ndarray:
