@@ -3,7 +3,8 @@
     python benchmarks/faults.py                        # every fault for every policy
     python benchmarks/faults.py robust --faults joint  # those with a word in their name
 
-The robot has late and noisy pictures, and noisy encoders. In each run the arm goes home, the policy plays, and the fault comes after 1.5 s. A run passes if
+The robot has late and noisy pictures, and noisy encoders. In each run the arm goes home, the policy
+plays, and the fault comes after 1.5 s. A run passes if
 
 - no command is farther from the last one than `Metadata.largest_step`, and the first one is where
   the arm is;

@@ -162,8 +162,8 @@ def report(name: str, found: list[Found], steps: int) -> None:
     alarms = dict(Counter(one.alarm or "none" for one in found))
     bridged = sum(one.bridged for one in found)
     print(
-        f"{name}: {lasted} of {len(found)} episodes last; first alarms: {alarms}; {bridged} samples "
-        "bridged",
+        f"{name}: {lasted} of {len(found)} episodes last; first alarms: {alarms}; "
+        f"{bridged} samples bridged",
         flush=True,
     )
     kinds = {kind for one in found for kind in one.delays}

@@ -106,7 +106,7 @@ class OnnxNetwork:
             self._rows[IS_FIRST][0] = self._is_first
         result, *values = self._session.run(self._outputs, self._rows | self._memory)
         self._is_first = False
-        if not np.all(np.isfinite(result)):
+        if not np.isfinite(result).all():
             raise UserError("the network returned an action that is not finite; stop the robot")
         self._memory = dict(zip(self._memory, values, strict=True))
         action = result[0].astype(float)

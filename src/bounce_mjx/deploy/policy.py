@@ -402,7 +402,8 @@ def _array(label: str, value: Any, size: int, unit: str, limit: float, rows: int
     if array.shape not in ((size,), (rows, size // rows)) and not (size == 1 and not array.shape):
         raise UserError(f"{label} has the shape {list(array.shape)}; give {count} ({unit})")
     array = array.reshape(size)
-    if not np.max(np.abs(array)) <= limit + 1e-6:
-        wrong = array[~(np.abs(array) <= limit + 1e-6)]
+    sizes = np.abs(array)
+    if not sizes.max() <= limit + 1e-6:
+        wrong = array[~(sizes <= limit + 1e-6)]
         raise UserError(f"{label} holds {wrong[0]}; give finite numbers ({unit})")
     return array

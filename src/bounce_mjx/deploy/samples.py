@@ -81,8 +81,10 @@ class Samples:
         self._unconfirmed: np.ndarray | None = None
         self._standing = 0
         self._arm_time = self._now = self._taken = 0.0
-        # The newest picture, whether it can be true or not.
+        # The newest picture, what speaks against it, and whether the one before holds in its place.
         self._seen: np.ndarray | None = None
+        self._doubt: tuple[str, str] | None = None
+        self._is_held = False
 
     def rest(self, angles: np.ndarray) -> None:
         """The arm rests at angles [J], rad; everything else is forgotten."""
@@ -134,14 +136,16 @@ class Samples:
 
     def _take_angles(self, measured: Measurements) -> None:
         """Believes the arm's sample, or bridges it."""
-        angles = measured["joint_angles"] = self._unwrapped(measured["joint_angles"])
-        last = self._last.get("joint_angles")
+        angles, last = measured["joint_angles"], self._last.get("joint_angles")
+        is_outside = self._outside(angles).max() > _OUTSIDE
+        if is_outside:
+            angles = measured["joint_angles"] = self._unwrapped(angles)
         if last is None:
             self._check_first(angles)
             last = angles
         elapsed = max(self._now - self._arm_time, self._metadata.control_dt)
         moved = np.abs(angles - last) - (self._fastest * elapsed + self._noise)
-        if np.any(moved > 0.0):
+        if moved.max() > 0.0:
             joint = int(np.argmax(moved))
             turned = abs(abs(angles[joint] - last[joint]) - 2.0 * math.pi) < 0.2
             reason = (
@@ -152,10 +156,12 @@ class Samples:
             remedy = "give unwrapped angles" if turned else "check the encoder, or call reset"
             self._bridge(measured, _OF_ARM, "joint_jump", reason + remedy)
             return
-        self._check_range(angles)
+        if is_outside:
+            self._check_range(angles)
         velocities = measured.get("joint_velocities", self._fastest)
-        if np.any(np.abs(velocities) > self._fastest):
-            joint = int(np.argmax(np.abs(velocities) - self._fastest))
+        too_fast = np.abs(velocities) - self._fastest
+        if too_fast.max() > 0.0:
+            joint = int(np.argmax(too_fast))
             reason = (
                 f"{self._metadata.joint_names[joint]} has {velocities[joint]:.3g} rad/s, and moves "
                 f"at most at {self._fastest[joint]:.3g} (rad/s); stop the arm"
@@ -165,9 +171,13 @@ class Samples:
         self._believe(measured, _OF_ARM)
         self._arm_time = self._now
 
+    def _outside(self, angles: np.ndarray) -> np.ndarray:
+        """How far each joint is outside of its range [J], rad; negative inside."""
+        return np.maximum(self._low - angles, angles - self._high)
+
     def _check_range(self, angles: np.ndarray) -> None:
-        outside = np.maximum(self._low - angles, angles - self._high)
-        if np.any(outside > _OUTSIDE):
+        outside = self._outside(angles)
+        if outside.max() > _OUTSIDE:
             joint = int(np.argmax(outside))
             raise ImpossibleMeasurement(
                 "joint_range",
@@ -205,62 +215,54 @@ class Samples:
 
     def _unwrapped(self, angles: np.ndarray) -> np.ndarray:
         """Angles far outside of their range by whole turns, where the range has one reading."""
-        outside = np.maximum(self._low - angles, angles - self._high) > _OUTSIDE
-        if not np.any(outside):
-            return angles
         first = np.ceil((self._low - angles) / (2.0 * math.pi))
         last = np.floor((self._high - angles) / (2.0 * math.pi))
-        return angles + 2.0 * math.pi * np.where(outside & (first == last), first, 0.0)
+        has_one = (self._outside(angles) > _OUTSIDE) & (first == last)
+        return angles + 2.0 * math.pi * np.where(has_one, first, 0.0)
 
     def _take_picture(self, measured: Measurements) -> None:
         """Believes the picture of the balls, or bridges it until the next one."""
-        metadata = self._metadata
         balls = measured["ball_position"].reshape(-1, 3)
-        age = float(measured["ball_age"][0]) if "ball_age" in measured else 0.0
-        is_new = self._seen is None or np.any(balls != self._seen)
-        last, taken = self._last.get("ball_position"), self._now - age
-        self._seen = balls
-        if not is_new:
-            if "ball" in self._bridged:
-                self._hold(measured, _OF_BALL)
-            else:
-                self._believe(measured, _OF_BALL)
-            return
-        fault, reason = None, ""
-        if (distance := _longest(balls)) > metadata.ball.distance:
-            fault, reason = (
-                "ball_place",
-                (
-                    f"the distance of ball_position is {distance:.3g}, but the training had 0 to "
-                    f"{metadata.ball.distance:.3g} (m); give this unit, and the robot's frame"
-                ),
+        taken = self._now - (float(measured["ball_age"][0]) if "ball_age" in measured else 0.0)
+        is_new = self._seen is None or (balls != self._seen).any()
+        if is_new:
+            self._seen, self._is_held = balls, False
+            self._doubt = self._doubt_of(balls, measured.get("ball_velocity"), taken)
+        if self._doubt is None:
+            self._believe(measured, _OF_BALL)
+            self._taken = taken if is_new else self._taken
+        elif self._is_held:
+            self._hold(measured, _OF_BALL)
+        else:
+            self._bridge(measured, _OF_BALL, *self._doubt)
+            self._is_held = True
+
+    def _doubt_of(
+        self, balls: np.ndarray, velocities: np.ndarray | None, taken: float
+    ) -> tuple[str, str] | None:
+        """Fault and reason of a new picture of the balls [B, 3] that cannot be true, else None."""
+        bounds, last = self._metadata.ball, self._last.get("ball_position")
+        if (distance := _longest(balls)) > bounds.distance:
+            return "ball_place", (
+                f"the distance of ball_position is {distance:.3g}, but the training had 0 to "
+                f"{bounds.distance:.3g} (m); give this unit, and the robot's frame"
             )
-        elif (speed := _longest(measured.get("ball_velocity", balls * 0.0).reshape(-1, 3))) > (
-            metadata.ball.speed
-        ):
-            fault, reason = (
-                "ball_speed",
-                (
+        if velocities is not None:
+            speed = _longest(velocities.reshape(-1, 3))
+            if speed > bounds.speed:
+                return "ball_speed", (
                     f"the ball has {speed:.3g} m/s, but the training had at most "
-                    f"{metadata.ball.speed:.3g} (m/s); give this unit"
-                ),
-            )
-        elif last is not None:
-            between = max(taken - self._taken, metadata.control_dt)
-            flown = _longest(balls - last.reshape(-1, 3))
-            if flown > metadata.ball.speed * between + self._ball_noise:
-                fault, reason = (
-                    "ball_speed",
-                    (
-                        f"the ball is {flown:.3g} m from {1e3 * between:.0f} ms before, farther "
-                        "than it flies; check the camera, or call reset before a new ball"
-                    ),
+                    f"{bounds.speed:.3g} (m/s); give this unit"
                 )
-        if fault is not None:
-            self._bridge(measured, _OF_BALL, fault, reason)
-            return
-        self._believe(measured, _OF_BALL)
-        self._taken = taken
+        if last is not None:
+            between = max(taken - self._taken, self._metadata.control_dt)
+            flown = _longest(balls - last.reshape(-1, 3))
+            if flown > bounds.speed * between + self._ball_noise:
+                return "ball_speed", (
+                    f"the ball is {flown:.3g} m from {1e3 * between:.0f} ms before, farther than "
+                    "it flies; check the camera, or call reset before a new ball"
+                )
+        return None
 
     def _believe(self, measured: Measurements, names: tuple[str, ...]) -> None:
         self._bridged.discard(names[0])
@@ -283,4 +285,4 @@ class Samples:
 
 def _longest(vectors: np.ndarray) -> float:
     """Length of the longest of vectors [B, 3]."""
-    return math.sqrt(np.max(np.sum(vectors * vectors, axis=-1)))
+    return max(math.hypot(*vector) for vector in vectors.tolist())
