@@ -49,6 +49,7 @@ _OPSET, _IR_VERSION = 17, 8
 # An input and the output cannot share a name.
 _INPUT_NAMES = {"action": "past_actions"}
 
+_OWN_ROBOT = "AIR4-560"
 # Episodes and control steps of a policy's own play, and the margin of its largest step.
 _OWN_EPISODES, _OWN_STEPS, _MARGIN = 64, 300, 1.25
 
@@ -133,7 +134,7 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         format=FORMAT,
         task=config.task,
         steps=steps,
-        robot=scene_spec(env.mjcf, RobotConfig())[0].modelname,
+        robot=_OWN_ROBOT if env.mjcf is None else scene_spec(env.mjcf, RobotConfig())[0].modelname,
         joint_names=joint_names(m),
         num_balls=env.num_balls,
         ball=BallBounds(*env.ball_bounds),

@@ -101,7 +101,8 @@ class Term(NamedTuple):
         return (num_joints,) if self.size is None else self.size
 
 
-_FACTOR = (1e-3, 1e3)
+# Wide, but narrower than the factor between a unit and a thousandth of it.
+_FACTOR = (0.01, 200.0)
 
 
 class RandomizationConfig(StrictModel):
@@ -110,9 +111,9 @@ class RandomizationConfig(StrictModel):
 
     former = {"restitution_slope": None, "air_lift": None}
 
-    restitution: Annotated[Sampled, Term((), 0.85, (0.6, 0.98), "contact_damping")] = None
-    """Restitution of the ball on the paddle, 0.6 to 0.98; the model's is 0.85."""
-    ball_mass: Annotated[Sampled, Term((), 1.0, _FACTOR, "ball_mass", scale)] = None
+    restitution: Annotated[Sampled, Term((), 0.85, (0.4, 0.98), "contact_damping")] = None
+    """Restitution of the ball on the paddle, 0.4 to 0.98; the model's is 0.85."""
+    ball_mass: Annotated[Sampled, Term((), 1.0, (0.01, 1e3), "ball_mass", scale)] = None
     """Factor of the ball's mass."""
     ball_radius: Annotated[Sampled, Term((), 1.0, (0.1, 10.0), "ball_radius", scale)] = None
     """Factor of the ball's radius."""
@@ -129,13 +130,13 @@ class RandomizationConfig(StrictModel):
     """Factor of each servo's damping."""
     servo_lag: Annotated[Sampled, Term((), 0.0, (0.0, 1.0))] = None
     """Time constant of a first-order lag of the servo targets, s."""
-    torque_limit: Annotated[Sampled, Term(None, None, (1e-3, 1e5), "force_limit", limit)] = None
+    torque_limit: Annotated[Sampled, Term(None, None, (0.01, 1e4), "force_limit", limit)] = None
     """Largest torque of each servo, N m; a servo that is weaker keeps its own limit."""
-    joint_damping: Annotated[Sampled, Term(None, 0.0, (0.0, 1e4), "damping", shift)] = None
+    joint_damping: Annotated[Sampled, Term(None, 0.0, (0.0, 500.0), "damping", shift)] = None
     """Viscous damping added to each joint, N m s/rad."""
-    joint_frictionloss: Annotated[Sampled, Term(None, 0.0, (0.0, 1e4), "frictionloss", replace)] = (
-        None
-    )
+    joint_frictionloss: Annotated[
+        Sampled, Term(None, 0.0, (0.0, 500.0), "frictionloss", replace)
+    ] = None
     """Dry friction of each joint, N m, in place of the model's."""
     armature: Annotated[Sampled, Term(None, 1.0, _FACTOR, "armature", scale)] = None
     """Factor of each joint's rotor inertia."""
@@ -143,11 +144,11 @@ class RandomizationConfig(StrictModel):
     """Factor of each link's mass."""
     paddle_offset: Annotated[Sampled, Term((3,), 0.0, (-0.5, 0.5), "paddle_position", shift)] = None
     """Displacement of the paddle along each axis of the last link, m."""
-    paddle_tilt: Annotated[Sampled, Term((2,), 0.0, (-1.0, 1.0), "paddle_rotation", tilt_frame)] = (
+    paddle_tilt: Annotated[Sampled, Term((2,), 0.0, (-0.5, 0.5), "paddle_rotation", tilt_frame)] = (
         None
     )
     """Rotation of the paddle about its own x and y axis, rad."""
-    gravity_tilt: Annotated[Sampled, Term((2,), 0.0, (-1.0, 1.0), "gravity", tilt_vector)] = None
+    gravity_tilt: Annotated[Sampled, Term((2,), 0.0, (-0.5, 0.5), "gravity", tilt_vector)] = None
     """Rotation of gravity about the world's x and y axis, rad."""
     action_latency: Annotated[Sampled, Term((), 0.0, (0.0, 1.0))] = None
     """Time from an action to its servo targets, s."""
@@ -175,9 +176,9 @@ class RandomizationConfig(StrictModel):
     """Error of each measured joint velocity, constant in an episode, rad/s."""
     push_speed: Annotated[Sampled, Term((), 0.0, (0.0, 10.0))] = None
     """Horizontal speed that a push adds to the ball, in a random direction, m/s."""
-    push_interval: Annotated[Sampled, Term((), None, (0.01, 600.0))] = None
+    push_interval: Annotated[Sampled, Term((), None, (0.05, 600.0))] = None
     """Time between two pushes, s; 2 s if only push_speed is given."""
-    command_interval: Annotated[Sampled, Term((), None, (0.01, 600.0))] = None
+    command_interval: Annotated[Sampled, Term((), None, (0.05, 600.0))] = None
     """Time between two samples of the task's commands within an episode, s."""
     ball_start: Annotated[Sampled, Term((3,), 0.0, (-1.0, 1.0))] = None
     """Displacement of each coordinate of the ball at a reset, in addition to `env.reset`, m."""
