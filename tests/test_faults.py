@@ -1,5 +1,4 @@
-"""Faults of a robot under a supervised policy in MuJoCo's C engine: a few of `benchmarks/faults.py`,
-in the order in which it takes them."""
+"""A few of the faults of `benchmarks/faults.py`, in MuJoCo's C engine under a supervised policy."""
 
 import runpy
 from pathlib import Path
