@@ -270,6 +270,9 @@ def test_metadata_describes_the_training_and_survives_the_file() -> None:
     assert metadata.control_dt == config.control_dt and metadata.torque_limits == (None,) * 6
     assert metadata.commands == {"target_height": CommandRange((0.4, 0.6), "m")}
     assert metadata.servo_stiffness == (20000.0,) * 6 and metadata.servo_damping == (200.0,) * 6
+    assert (metadata.task, metadata.robot, metadata.action_base) == ("bounce", "AIR4-560", "target")
+    # In a control step of 10 ms at 2 rad/s.
+    np.testing.assert_allclose(metadata.largest_step, 0.02)
 
 
 def test_servo_targets_lead_the_measured_angles_as_in_the_environment() -> None:
@@ -508,8 +511,7 @@ def test_load_policy_refuses_other_files(tmp_path: Path) -> None:
     model = onnx.load_from_string(shipped)
     broken |= {
         "ball_colour": edited(model, "observation", "ball_velocity", "ball_colour"),
-        "format is 1, not 3": edited(model, "format", "3", "1"),
-        "Kalman filter, which this version lacks": edited(model, "velocity", "measured", "filter"),
+        "format is 1, not 4; export the policy again": edited(model, "format", "4", "1"),
     }
     del model.metadata_props[:]
     broken["lacks format"] = model.SerializeToString()

@@ -47,16 +47,19 @@ RELEASES = sorted((Path(__file__).parent / "releases").iterdir())
 
 
 @pytest.mark.parametrize("release", RELEASES, ids=lambda path: path.name)
-def test_what_a_release_wrote_is_loaded(release: Path) -> None:
-    """The promise in CHANGELOG.md: a run's config, results and checkpoint, and an exported policy.
-    The last two give the same action."""
+def test_what_a_release_wrote_is_loaded(release: Path, tmp_path: Path) -> None:
+    """The promise in CHANGELOG.md: a run's config, results and checkpoint. Its ONNX file of an
+    earlier format is refused, and a new export gives the checkpoint's action."""
     config, results = load_run_config(release), load_results(release)
     assert results is not None and results.best.passed
+    with pytest.raises(UserError, match="its format is 3, not 4; export the policy again"):
+        load_policy(release / "policy.onnx")
     env = BounceBall(config.env)
     observation = np.asarray(env.reset(jax.random.PRNGKey(0)).obs)
     networks = make_networks(config.ppo, env.observation_size, env.action_size)
     expected = networks.act(read_policy(best_checkpoint(release), config), observation)
-    deployed = load_policy(release / "policy.onnx")
+    (tmp_path / "policy.onnx").write_bytes(export_onnx(best_checkpoint(release)))
+    deployed = load_policy(tmp_path / "policy.onnx")
     measured = {name: observation[env.layout[name]] for name in deployed.needs}
     np.testing.assert_allclose(deployed.step(measured), expected, atol=1e-5)
 

@@ -42,6 +42,20 @@ robot: {site: s, paddle: {half_size: [50, 65, 3.5]}}     # mm
 robot: {site: s, paddle: {mass: 100}}                    # g
 robot: {site: s, ball: {radius: 19}}                     # mm
 robot: {limits: {velocity: [180], acceleration: [9]}}    # degrees a second
+robot: {limits: {torque: [0.001, 1, 1, 1, 1, 1]}}        # kN m
+ball_init_pos: [0.589, 0.589, 0.45]                      # beside the paddle
+max_joint_velocity: 60                                   # turns a minute
+reward: {controlled_upward: {max_ideal_velocity: 0.3}}   # below min_ideal_velocity
+randomization: {gravity_tilt: [-1, 1]}                   # degrees
+randomization: {joint_frictionloss: [0, 1000]}           # mN m
+randomization: {torque_limit: [0.001, 0.002]}            # kN m
+randomization: {link_mass: [1000, 1001]}                 # g, where a factor is due
+randomization: {ball_mass: [0.0027, 0.003]}              # kg, where a factor is due
+randomization: {armature: [0.001, 0.002]}                # kg m^2, where a factor is due
+randomization: {servo_gain: [1000, 1001]}                # N m/rad, where a factor is due
+randomization: {servo_damping: [0.001, 0.002]}           # where a factor is due
+randomization: {command_interval: [0.01, 0.02]}          # one control step
+action: {base: target, max_lead: 0.001}                  # less than an action moves
 action: {max_lead: 0.3}                                  # does nothing with the base measured
 randomization: {push_interval: [1, 2]}                   # does nothing without push_speed
 max_joint_velocity: true                                 # a switch is no number
@@ -112,6 +126,8 @@ bounce: {robot: {site: s, ball: {radius: 0.12, mass: 0.62}}}
 bounce: {robot: {site: s, ball: {radius: 0.01, mass: 0.033}}}
 bounce: {robot: {site: s, ball: {radius: 0.15, mass: 0.02}}}
 bounce: {randomization: {ball_radius: [1.1, 6.3], ball_mass: [0.5, 230]}}
+# a soft paddle
+bounce: {randomization: {restitution: [0.5, 0.6]}}
 # a slow robot with a slow camera, and a fast one
 bounce: {randomization: {action_latency: [0.1, 0.3], camera_rate: [15, 30]}}
 bounce: {physics_dt: 0.0005, control_dt: 0.001}

@@ -74,6 +74,10 @@ class EnvState(NamedTuple):
     """For an observation that differs from the true state of one instant."""
 
 
+# A ball that starts farther beside the paddle falls before the paddle is under it, m.
+_FARTHEST_BESIDE = 0.3
+
+
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class State:
@@ -170,13 +174,19 @@ class Env:
                     f"default_joint_angles has {angle:g} for {name}, whose range is {low:.4g} to "
                     f"{high:.4g}; give radians, or metres for a slide, within the range"
                 )
-        paddle = robot_model.data_at(model, angles).geom_xpos[self.addresses.paddle_geom, 2]
+        paddle = robot_model.data_at(model, angles).geom_xpos[self.addresses.paddle_geom]
         for name, height in config.heights.items():
-            if height <= paddle:
+            if height <= paddle[2]:
                 raise UserError(
                     f"{name} has the height {height:g} m, which is not over the paddle at "
-                    f"{paddle:.4g} m, where default_joint_angles hold it; change one of the two"
+                    f"{paddle[2]:.4g} m, where default_joint_angles hold it; change one of the two"
                 )
+        beside = np.linalg.norm(np.array(config.ball_init_pos)[:2] - paddle[:2])
+        if type(self.task).throw is Task.throw and beside > _FARTHEST_BESIDE:
+            raise UserError(
+                f"ball_init_pos is {beside:.3g} m beside the paddle at ({paddle[0]:.3g}, "
+                f"{paddle[1]:.3g}) m, where default_joint_angles hold it; start it over the paddle"
+            )
 
     def _check_rest(self) -> None:
         """Checks that the ball of a task that throws none does not start within the paddle."""

@@ -58,7 +58,7 @@ class LimitsConfig(settings.StrictModel):
     """Largest acceleration of a joint's command, rad/s^2; needed with velocity."""
     jerk: tuple[Annotated[settings.Positive, Field(le=1e6)], ...] | None = None
     """Largest jerk of a joint's command, rad/s^3; null for none."""
-    torque: tuple[Annotated[settings.Positive, Field(le=1e5)], ...] | None = None
+    torque: tuple[Annotated[settings.Positive, Field(ge=0.01, le=1e4)], ...] | None = None
     """Largest torque of each servo, N m; null for those of the servos."""
 
     @pydantic.model_validator(mode="after")

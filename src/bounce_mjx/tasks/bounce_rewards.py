@@ -7,6 +7,7 @@ import dataclasses
 import functools
 from typing import Annotated
 
+import pydantic
 from pydantic import Field
 
 from bounce_mjx.config import settings
@@ -176,6 +177,15 @@ class ControlledUpwardReward(RewardTerm):
     """Width of the sigmoid between falling and rising, m/s."""
     velocity_limit: settings.Speed = 1.5
     """Upward velocity above which the term no longer grows, m/s."""
+
+    @pydantic.model_validator(mode="after")
+    def _check_order(self):
+        if self.min_ideal_velocity > self.max_ideal_velocity:
+            raise ValueError(
+                f"max_ideal_velocity {self.max_ideal_velocity:g} is below min_ideal_velocity "
+                f"{self.min_ideal_velocity:g}; give the greater one as max_ideal_velocity"
+            )
+        return self
 
     def value(self, inputs: RewardInputs) -> jax.Array:
         v_ideal = safe_sqrt(2.0 * inputs.home.gravity * inputs.delta_h)

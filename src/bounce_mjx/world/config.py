@@ -112,7 +112,7 @@ class RobotSettings(settings.StrictModel):
     the project's own robot."""
     action_scale: Annotated[settings.Positive, Field(le=0.5)] = 0.02
     """Change of the servo target for an action of 1, rad."""
-    max_joint_velocity: settings.Speed = 2.0 * math.pi
+    max_joint_velocity: Annotated[settings.Positive, Field(le=50.0)] = 2.0 * math.pi
     """The episode ends when a joint is faster than this, rad/s."""
     randomization: RandomizationConfig = RandomizationConfig()
     """The world that each episode samples."""
@@ -170,6 +170,11 @@ class WorldConfig(RobotSettings):
             raise ValueError(
                 f"control_dt {self.control_dt} is not a whole number of physics steps of "
                 f"{self.physics_dt} s; choose a multiple of physics_dt"
+            )
+        if self.action.base == "target" and self.action.max_lead < self.action_scale:
+            raise ValueError(
+                f"action.max_lead is {self.action.max_lead:g}, which is less than the action_scale "
+                f"{self.action_scale:g}, so that no action would have its full effect; give more"
             )
         limits, terms = self.robot.limits, self.randomization
         counts = {f"robot.limits.{name}": len(x) for name, x in limits if x is not None}

@@ -123,7 +123,8 @@ def physical(
     return Term(size, bounds, operation.nominal, parameter, operation)
 
 
-_FACTOR = (1e-3, 1e3)
+# Wide, but narrower than the factor between a unit and a thousandth of it.
+_FACTOR = (0.01, 200.0)
 
 
 class RandomizationConfig(StrictModel):
@@ -132,10 +133,10 @@ class RandomizationConfig(StrictModel):
 
     former = {"restitution_slope": None, "air_lift": None}
 
-    restitution: Annotated[Sampled, physical("contact_damping", REPLACE, (), (0.6, 0.98))] = None
+    restitution: Annotated[Sampled, physical("contact_damping", REPLACE, (), (0.4, 0.98))] = None
     """Restitution of the ball on the paddle, in place of the model's, which is 0.85 for the
     project's own robot."""
-    ball_mass: Annotated[Sampled, physical("ball_mass", SCALE, (), _FACTOR)] = None
+    ball_mass: Annotated[Sampled, physical("ball_mass", SCALE, (), (0.01, 1e3))] = None
     """Factor of the ball's mass."""
     ball_radius: Annotated[Sampled, physical("ball_radius", SCALE, (), (0.1, 10.0))] = None
     """Factor of the ball's radius."""
@@ -152,12 +153,12 @@ class RandomizationConfig(StrictModel):
     """Factor of each servo's damping."""
     servo_lag: Annotated[Sampled, Term((), (0.0, 1.0), 0.0)] = None
     """Time constant of a first-order lag of the servo targets, s."""
-    torque_limit: Annotated[Sampled, physical("force_limit", LIMIT, None, (1e-3, 1e5))] = None
+    torque_limit: Annotated[Sampled, physical("force_limit", LIMIT, None, (0.01, 1e4))] = None
     """Largest torque of each servo at its joint, N m; a servo that is weaker keeps its own
     limit."""
-    joint_damping: Annotated[Sampled, physical("damping", ADD, None, (0.0, 1e4))] = None
+    joint_damping: Annotated[Sampled, physical("damping", ADD, None, (0.0, 500.0))] = None
     """Viscous damping added to each joint, N m s/rad."""
-    joint_frictionloss: Annotated[Sampled, physical("frictionloss", REPLACE, None, (0.0, 1e4))] = (
+    joint_frictionloss: Annotated[Sampled, physical("frictionloss", REPLACE, None, (0.0, 500.0))] = (
         None
     )
     """Dry friction of each joint, N m, in place of the model's."""
@@ -167,11 +168,11 @@ class RandomizationConfig(StrictModel):
     """Factor of each link's mass."""
     paddle_offset: Annotated[Sampled, physical("paddle_position", ADD, (3,), (-0.5, 0.5))] = None
     """Displacement of the paddle along each axis of the last link, m."""
-    paddle_tilt: Annotated[Sampled, physical("paddle_rotation", TILT_FRAME, (2,), (-1.0, 1.0))] = (
+    paddle_tilt: Annotated[Sampled, physical("paddle_rotation", TILT_FRAME, (2,), (-0.5, 0.5))] = (
         None
     )
     """Rotation of the paddle about its own x and y axis, rad."""
-    gravity_tilt: Annotated[Sampled, physical("gravity", TILT_VECTOR, (2,), (-1.0, 1.0))] = None
+    gravity_tilt: Annotated[Sampled, physical("gravity", TILT_VECTOR, (2,), (-0.5, 0.5))] = None
     """Rotation of gravity about the world's x and y axis, rad."""
     action_latency: Annotated[Sampled, Term((), (0.0, 1.0), 0.0)] = None
     """Time from an action to its servo targets, s."""
@@ -199,9 +200,9 @@ class RandomizationConfig(StrictModel):
     """Error of each measured joint velocity, constant in an episode, rad/s."""
     push_speed: Annotated[Sampled, Term((), (0.0, 10.0), 0.0)] = None
     """Horizontal speed that a push adds to the ball, in a random direction, m/s."""
-    push_interval: Annotated[Sampled, Term((), (0.01, 600.0), None)] = None
+    push_interval: Annotated[Sampled, Term((), (0.05, 600.0), None)] = None
     """Time between two pushes, s; 2 s if only push_speed is given."""
-    command_interval: Annotated[Sampled, Term((), (0.01, 600.0), None)] = None
+    command_interval: Annotated[Sampled, Term((), (0.05, 600.0), None)] = None
     """Time between two samples of the task's commands within an episode, s."""
     ball_start: Annotated[Sampled, Term((3,), (-1.0, 1.0), 0.0)] = None
     """Displacement of each coordinate of the ball at a reset, in addition to `env.reset`, m."""
