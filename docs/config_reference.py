@@ -20,8 +20,8 @@ the full name without `env.` or `ppo.`, with hyphens: `--num-envs` for `ppo.num_
 Later wins: the defaults, the preset of this machine, what your own algorithm changes of PPO's
 defaults, a preset that you name, the policy of a warm start, your files, a robot (`--robot`), a
 world (`--world`), the flags or arguments of `train`. `bounce-mjx train --print-config` prints the
-config with what set each value, as does `Run(FOLDER).config.sources` of a run. Unknown keys, values
-out of range and settings without effect are refused. A list is `256 256` or `256,256` on
+config with what set each value; of a run, that is `Run(FOLDER).config.sources`. Unknown keys,
+values out of range and settings without effect are refused. A list is `256 256` or `256,256` on
 the command line, and a switch `--stop-when-solved`, `--no-stop-when-solved` or
 `--stop-when-solved=false`. Whole numbers are below 2^31, steps at most 10^12 (`1e6` is one too).
 

@@ -21,7 +21,8 @@ from bounce_mjx.runs.checkpoints import read_policy
 from bounce_mjx.runs.config import TrainConfig, load_run_config, runs_folder
 from bounce_mjx.runs.folders import best_checkpoint, choose_checkpoint, pretrained_checkpoint
 from bounce_mjx.runs.progress import load_results
-from bounce_mjx.runs.settings import in_world, read_preset
+from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.runs.worlds import in_world
 from bounce_mjx.tasks.registry import find_task
 
 FOLDER = resource_path("pretrained")

@@ -12,7 +12,8 @@ from bounce_mjx.evaluation.suite import load_suite
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.config import LimitsConfig
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.settings import in_world, read_preset
+from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.runs.worlds import in_world
 from bounce_mjx.world.config import ActionConfig
 from bounce_mjx.world.named import read_world
 

@@ -13,7 +13,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import config as evaluation
 from bounce_mjx.resources import POLICIES, resource_path
 from bounce_mjx.runs.presets import named_file
-from bounce_mjx.runs.settings import in_world
+from bounce_mjx.runs.worlds import in_world
 
 
 class RobustnessCommand(OneActorCommand):

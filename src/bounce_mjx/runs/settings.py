@@ -31,7 +31,7 @@ from pydantic.fields import FieldInfo
 from bounce_mjx.config.command_line import Flag
 from bounce_mjx.config.files import differing_keys, flat
 from bounce_mjx.config.settings import StrictModel, merged, nested
-from bounce_mjx.config.validation import describe, key_of, validate
+from bounce_mjx.config.validation import describe, key_of
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.learning.config import PPO_NAME, PPOConfig, find_algorithm
 from bounce_mjx.resources import POLICIES
@@ -40,23 +40,12 @@ from bounce_mjx.runs.config import (
     fields_of,
     load_run_config,
     runs_folder,
-    task_in,
     unnamed_code,
 )
-from bounce_mjx.runs.presets import (
-    BASE,
-    ROBOTS,
-    SOURCES,
-    WORLDS,
-    named_file,
-    preset_files,
-    read_config_file,
-    shown_file,
-)
+from bounce_mjx.runs.presets import BASE, SOURCES, preset_files, read_config_file, shown_file
+from bounce_mjx.runs.worlds import Layer, robot_and_world
 from bounce_mjx.task.task import Task
 from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file, is_same_code
-from bounce_mjx.world.config import WorldConfig
-from bounce_mjx.world.named import CURRICULUM, NamedWorld, read_world
 
 FLAGS = "flags"
 """Source of the settings on a command line."""
@@ -91,15 +80,6 @@ class Choice(StrictModel):
     log_dir: Path | None = None
 
 
-class Layer(NamedTuple):
-    """The settings of one source."""
-
-    source: str
-    """For people, such as configs/cpu.yaml."""
-    values: dict[str, Any]
-    """Nested, with the keys of `TrainConfig`."""
-
-
 # Reading: what lies on what ---------------------------------------------------------------------
 
 
@@ -129,7 +109,8 @@ def stack(choice: Choice, machine: Path | None = None, whole: TrainConfig | None
     algorithm_name, algorithm = _algorithm(choice, [*machines, *named, *files], whole)
     changed = _changed_defaults(algorithm)
     start = [] if policy is None else [policy.layer(is_in_world=choice.world is not None)]
-    robot, world = _robot_and_world(choice, task, policy)
+    trained = None if policy is None else policy.config.env
+    robot, world = robot_and_world(choice.robot, choice.world, task, trained)
     decided = {"task": task_name, "algorithm": algorithm_name}
     if policy is not None:
         decided["warm_start"] = policy.start
@@ -184,7 +165,7 @@ def _layer_of(config: TrainConfig) -> Layer:
 
 def _last(layers: Sequence[Layer], key: str) -> Any:
     """The value of a key in the last layer that has it; None without one."""
-    return next((x.values[key] for x in reversed(layers) if x.values.get(key) is not None), None)
+    return next((layer.values[key] for layer in reversed(layers) if key in layer.values), None)
 
 
 def _task(
@@ -288,9 +269,12 @@ def _policy(choice: Choice, files: Sequence[Layer], whole: TrainConfig | None) -
     Raises:
       UserError: there is none, or a robot is given too.
     """
-    path = choice.warm_start or _last(files, "warm_start")
-    # A config that stands alone has its environment.
-    if path is None or (whole is not None and choice.warm_start is None):
+    if "warm_start" in choice.model_fields_set:
+        path = choice.warm_start
+    else:
+        # A whole config has its environment already.
+        path = _last(files, "warm_start") if whole is None else None
+    if path is None:
         return None
     if choice.robot:
         raise UserError("--warm-start and --robot cannot be combined; leave --robot out")
@@ -305,82 +289,6 @@ def _policy(choice: Choice, files: Sequence[Layer], whole: TrainConfig | None) -
     checkpoint = choose_checkpoint(Path(path), Path(log_dir))
     config = load_run_config(checkpoint.run, task)
     return _Policy(Path(path) if str(path) in POLICIES else checkpoint.folder, config)
-
-
-def _robot_and_world(
-    choice: Choice, task: type[Task], policy: _Policy | None
-) -> tuple[list[Layer], list[Layer]]:
-    """The layers of the robot, which may be that of the world, and of the world.
-
-    Raises:
-      UserError: one of them is missing or wrong, or the world is of another robot.
-    """
-    robot = choice.robot and named_file(choice.robot, ROBOTS, "robot")
-    if choice.world is None:
-        return ([] if robot is None else [_layer_of_robot(task, robot)]), []
-    path = named_file(choice.world, WORLDS, "world")
-    world = read_world(path)
-    layers = [] if robot is None else [_layer_of_robot(task, robot)]
-    if world.robot is not None:
-        if robot is not None:
-            raise UserError(
-                f"{path} is for the robot {world.robot}, and a robot is given too; leave it out"
-            )
-        file = _robot_of(world, path)
-        if policy is None:
-            layers = [_layer_of_robot(task, file)]
-        else:
-            layers = [_layer_of_same_robot(policy.config.env, world, path)]
-    return layers, [_layer_of_world(task, world, path)]
-
-
-def _layer_of_world(task: type[Task], world: NamedWorld, path: Path) -> Layer:
-    """A named world's settings. Its randomisation is the whole one, but for the curriculum, which
-    describes the training: a term that it does not have is as in the task."""
-    default = task.Config().randomization.model_dump(exclude=set(CURRICULUM))
-    values = merged({"env": {"randomization": default}}, {"env": world.settings})
-    return Layer(f"the world {shown_file(path)}", values)
-
-
-def _robot_of(world: NamedWorld, path: Path) -> Path:
-    """The file of a world's robot: one of the package's, or one relative to the world's file."""
-    robot = named_file(Path(world.robot), ROBOTS)
-    return robot if robot != Path(world.robot) else path.parent / robot
-
-
-def _layer_of_robot(task: type[Task], robot: Path) -> Layer:
-    """A robot's settings for a task. Those of another task are replaced by the task's own for an
-    arm with this paddle."""
-    source = f"the robot {shown_file(robot)}"
-    values = read_config_file(robot, "robot's config file", f"{ROBOTS}/ur5e.yaml")
-    its_task = task_in(str(robot), values.pop("task", DEFAULT))
-    known = validate(its_task.Config, values.get("env", {}), str(robot), "env")
-    if issubclass(task, its_task):
-        return Layer(source, values)
-    world_keys = {k: v for k, v in values.get("env", {}).items() if k in WorldConfig.model_fields}
-    # Imports JAX, which a command line alone does not need.
-    from bounce_mjx.robot.model import paddle_home
-
-    home = paddle_home(known.mjcf, known.robot, known.default_joint_angles)
-    return Layer(source, values | {"env": world_keys | task.Config.settings_at(home)})
-
-
-def _layer_of_same_robot(env: WorldConfig, world: NamedWorld, path: Path) -> Layer:
-    """What a world's robot has, of a policy that was trained with it, such as its limits.
-
-    Raises:
-      UserError: the policy was trained with another robot.
-    """
-    robot = _robot_of(world, path)
-    own = read_preset(Path("default"), robot).env
-    files = {(arm.mjcf or Path()).name for arm in (own, env)}
-    if len(files) > 1 or own.default_joint_angles != env.default_joint_angles:
-        raise UserError(
-            f"the world {path} is for the robot {world.robot}, and the policy was trained "
-            "with another arm or start pose; give a world without a robot, such as fast_servo"
-        )
-    values = {"env": {"robot": own.robot.model_dump(exclude_unset=True)}}
-    return Layer(f"the robot {shown_file(robot)}", values)
 
 
 # Merging and validating -------------------------------------------------------------------------
@@ -546,23 +454,3 @@ def read_preset(
     files = (config,) if isinstance(config, Path) else tuple(config or ())
     choice = Choice(config=files, robot=robot, world=world, task=task)
     return stack(choice, machine).config()
-
-
-def in_world(config: TrainConfig, world: Path) -> tuple[TrainConfig, NamedWorld]:
-    """A run's config in a named world, with the observation and the actions of its policy.
-
-    Args:
-      world: a file, or the name of a file in configs/worlds/.
-
-    Raises:
-      UserError: the world is wrong, or of another robot than the run.
-    """
-    path = named_file(world, WORLDS, "world")
-    named, values = read_world(path), config.env.model_dump()
-    # The curriculum of the training goes too.
-    del values["randomization"]
-    if named.robot is not None:
-        values = merged(values, _layer_of_same_robot(config.env, named, path).values["env"])
-    values = merged(values, named.settings)
-    env = validate(type(config.env), values, f"the world {path}")
-    return config.model_copy(update={"env": env}), named

@@ -147,7 +147,7 @@ def train(
     files = () if whole else (config,) if isinstance(config, str | Path) else tuple(config)
     said = settings | {"task": task, "warm_start": warm_start}
     said = {key: value for key, value in said.items() if key in settings or value is not None}
-    deciding = {key: said.get(key) for key in ("task", "algorithm", "warm_start", "log_dir")}
+    deciding = {k: said[k] for k in ("task", "algorithm", "warm_start", "log_dir") if k in said}
     given = {"config": files, "robot": robot, "world": world, "resume": resume}
     layers = stack(validate(Choice, given | deciding, PYTHON), whole=whole)
     config = layers.config(said)
