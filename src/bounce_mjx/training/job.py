@@ -27,14 +27,15 @@ from bounce_mjx.learning.policy import Policy
 from bounce_mjx.physics.convergence import solver_warning
 from bounce_mjx.runs import checkpoints, folders
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.files import to_json, writable
-from bounce_mjx.runs.progress import RESULTS_FILE, Progress
+from bounce_mjx.runs.files import writable
+from bounce_mjx.runs.progress import Progress
 from bounce_mjx.tasks.registry import is_file
 from bounce_mjx.training import events, faults, hosts
+from bounce_mjx.training.clock import Clock
 from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.log import TensorBoardLog
 from bounce_mjx.training.ppo_trainer import PPOTrainer, iterations_per_block
-from bounce_mjx.training.saving import Save, Saver
+from bounce_mjx.training.saving import Saver
 from bounce_mjx.training.seeds import SeedRun
 from bounce_mjx.training.trainer import Metrics, Snapshot, Trainer
 
@@ -110,7 +111,7 @@ def open_job(
     """
     pool = concurrent.futures.ThreadPoolExecutor()
     stack.callback(pool.shutdown, wait=False, cancel_futures=True)
-    started = time.perf_counter()
+    clock = Clock()
     config = in_whole_blocks(config)
     env = Env(config.env)
     trainer = make_trainer(config, env)
@@ -131,7 +132,7 @@ def open_job(
         pool=pool,
         stack=stack,
         stop=stop,
-        lap_started=started,
+        clock=clock,
     )
     stack.push(job.remove_unstarted)
     if hosts.is_leader():
@@ -184,11 +185,8 @@ class Job:
     pool: concurrent.futures.Executor
     stack: contextlib.ExitStack
     stop: StopRequest
-    lap_started: float
-    """Time at which the current phase started, s."""
+    clock: Clock
 
-    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
-    """Seconds by phase."""
     steps: int = 0
     """Environment steps of each seed so far."""
     is_saved: bool = True
@@ -199,8 +197,6 @@ class Job:
     """State from which the resumed run starts."""
     snapshot: Snapshot | None = None
     """The current state, once it was asked for."""
-    pace: tuple[float, int] = 0.0, 0
-    """Time, s, and steps from which the time that is left is estimated."""
     seeds: list[SeedRun] = dataclasses.field(init=False)
     saver: Saver = dataclasses.field(init=False)
     evaluators: Evaluators = dataclasses.field(init=False)
@@ -208,14 +204,14 @@ class Job:
 
     def __post_init__(self) -> None:
         config = self.config
-        self.saver = Saver(self.run, self.pool, self.say)
         self.block_steps = steps_per_block(config)
         self.eval_steps = self.block_steps * max(1, round(config.eval_every / self.block_steps))
         self.seeds = []
         for seed in range(config.seed, config.seed + config.num_seeds):
             folder = self.run / f"seed_{seed:03d}" if config.num_seeds > 1 else self.run
             alone = config.model_copy(update={"seed": seed, "num_seeds": 1})
-            self.seeds.append(SeedRun(folder, alone, self.seconds))
+            self.seeds.append(SeedRun(folder, alone, self.clock.seconds))
+        self.saver = Saver(self.run, config, self.seeds, self.pool, self.say)
 
     # Opening
 
@@ -260,7 +256,7 @@ class Job:
         bound = "at most " if self.config.stop_when_solved else ""
         steps = f"{self.config.total_steps:,}, in blocks of {self.block_steps:,}"
         self.say(f"steps: {bound}{steps}")
-        self.lap("setup")
+        self.clock.lap("setup")
 
     def compile(self, make_evaluators: MakeEvaluators) -> None:
         """Compiles the programs that training needs to start. Evaluations are compiled, and the
@@ -286,7 +282,7 @@ class Job:
             hosts.any_of(False)
         self.trainer.start(self.state, self.networks)
         self.state = None
-        self.lap("compile")
+        self.clock.lap("compile")
 
     def open_logs(self) -> None:
         """Opens the log, where it is written, and tells the callbacks of each seed, which may
@@ -311,14 +307,15 @@ class Job:
 
     def evaluate(self) -> None:
         """Evaluates the current policies, unless a stop is requested meanwhile."""
-        is_first = "evaluate" not in self.seconds
+        is_first = "evaluate" not in self.clock.seconds
         policies = self.take_snapshot().policies
         reports = self.wait_for_reports(self.evaluators.select, policies)
         if reports is None:
             return
-        seconds = sum(self.seconds.values())
-        # Then it is known which policies were saved.
-        self.end_save()
+        seconds = sum(self.clock.seconds.values())
+        # Then it is known whether the best policy before was saved.
+        self.saver.end()
+        self.clock.lap("save")
         evaluated = [
             (seed, report, policy)
             for seed, report, policy in zip(self.seeds, reports, policies, strict=True)
@@ -331,7 +328,7 @@ class Job:
             seed.add_report(report, policy, self.steps, seconds)
         self.is_saved = False
         if is_first:
-            self.restart_pace()
+            self.clock.restart_estimate(self.steps)
 
     def save_is_due(self) -> bool:
         """Whether the current state is to be saved: after each evaluation."""
@@ -340,11 +337,10 @@ class Job:
     def save(self) -> None:
         """Starts to save the state, and with several seeds the policies that are the best of their
         seed."""
-        self.end_save()
-        if hosts.is_leader():
-            self.saver.start(self.new_checkpoints(), self.results_files(), self.steps)
+        self.saver.end()
+        self.saver.start(self.take_snapshot(), self.steps, self.about())
         self.is_saved = True
-        self.lap("save")
+        self.clock.lap("save")
 
     def is_stopping(self) -> bool:
         """Whether a signal has come to any process."""
@@ -393,7 +389,7 @@ class Job:
             self.tell(seed, seed_points)
         self.end_diverged(block_faults)
         self.is_ended = hosts.any_of(self.is_ended)
-        self.lap("train")
+        self.clock.lap("train")
 
     def finish(self) -> None:
         """Waits until everything is saved, and evaluates the best policy on fresh resets.
@@ -411,7 +407,7 @@ class Job:
             raise Interrupted
         if not self.is_saved:
             self.save()
-        self.end_save(is_last=True)
+        self.end_last_save()
         if not stopping and not self.evaluate_best():
             stopping, where = True, ", before the final evaluation"
         jax.distributed.shutdown()
@@ -430,10 +426,23 @@ class Job:
             return False
         for seed, report in zip(self.seeds, reports, strict=True):
             seed.progress.best = report if seed.best else None
-        if hosts.is_leader():
-            self.saver.start([], self.results_files(fresh_resets=True), self.steps)
-        self.end_save(is_last=True)
+        self.saver.start(None, self.steps, self.about(fresh_resets=True))
+        self.end_last_save()
         return True
+
+    def end_last_save(self) -> None:
+        """Waits for a save that no other follows.
+
+        Raises:
+          UserError: it failed.
+        """
+        problem = self.saver.end(is_last=True)
+        self.clock.lap("save")
+        if problem:
+            raise UserError(
+                f"{self.run} cannot be written ({problem}), so the end of the training is lost; "
+                f"make room, and {self.advice}"
+            )
 
     # What is known of the training
 
@@ -468,24 +477,22 @@ class Job:
         return self.snapshot
 
     def time_left(self) -> float | None:
-        """Estimated time to the last step, s, at the mean speed with the evaluations. None after
-        the first block: meanwhile other programs are still compiled."""
-        if "train" not in self.seconds:
-            self.restart_pace()
-            return None
-        started, first_steps = self.pace
-        share = (self.config.total_steps - self.steps) / (self.steps - first_steps)
-        return share * (time.monotonic() - started)
+        """Estimated time to the last step, s. None after the first block, meanwhile other programs
+        are still compiled."""
+        if "train" in self.clock.seconds:
+            return self.clock.left(self.steps, self.config.total_steps)
+        self.clock.restart_estimate(self.steps)
+        return None
 
-    def restart_pace(self) -> None:
-        """Estimates the time that is left from what follows."""
-        self.pace = time.monotonic(), self.steps
-
-    def lap(self, name: str) -> None:
-        """Adds the time since the last lap to that of a phase."""
-        now = time.perf_counter()
-        self.seconds[name] = self.seconds.get(name, 0.0) + now - self.lap_started
-        self.lap_started = now
+    def about(self, fresh_resets: bool = False) -> dict[str, Any]:
+        """What the results say of the training, see `Results`."""
+        return {
+            "trained_steps": self.steps,
+            "seconds": self.clock.seconds,
+            "device": self.device,
+            "fresh_resets": fresh_resets,
+            "version": bounce_mjx.__version__,
+        }
 
     # Telling
 
@@ -528,7 +535,7 @@ class Job:
         if not self.stop.wait_for(evaluating) and jax.process_count() == 1:
             return None
         reports = evaluating.result()
-        self.lap("evaluate")
+        self.clock.lap("evaluate")
         return reports
 
     def end_diverged(self, block_faults: np.ndarray) -> None:
@@ -576,65 +583,6 @@ class Job:
         is_unstarted = self.is_new and self.steps == 0
         if error is not None and is_unstarted and hosts.is_leader() and self.latest() is None:
             shutil.rmtree(self.run, ignore_errors=True)
-
-    # Saving
-
-    def end_save(self, is_last: bool = False) -> None:
-        """Waits for the last save. A policy that could not be saved is not the best one.
-
-        Raises:
-          UserError: it failed, and no other follows.
-        """
-        outcome = self.saver.end()
-        if outcome.problem and is_last:
-            raise UserError(
-                f"{self.run} cannot be written ({outcome.problem}), so the end of the training is "
-                f"lost; make room, and {self.advice}"
-            )
-        self.saver.say(outcome)
-        numbers, has_failed = hosts.exchange([outcome.numbers, outcome.problem is not None])[0]
-        for seed in self.seeds:
-            seed.end_save(numbers.get(seed.run.name), has_failed)
-        self.lap("save")
-
-    def new_checkpoints(self) -> list[Save]:
-        """The checkpoints to write: one of the state; with several seeds, before it one of each
-        policy that is the best of its seed."""
-        # A copy, because the training reuses its buffers meanwhile.
-        policies, state, networks = jax.tree.map(np.array, self.take_snapshot())
-        items_of_state = {checkpoints.TRAINING: state}
-        progress = [seed.progress.model_dump() for seed in self.seeds]
-        is_alone = len(self.seeds) == 1
-        saves = []
-        for i, seed in enumerate(self.seeds):
-            if not is_alone and not seed.is_best:
-                continue
-            items = {checkpoints.POLICY: policies[i], **(items_of_state if is_alone else {})}
-            if networks is not None:
-                items[checkpoints.NETWORKS] = networks[i]
-            kept = None if seed.is_best or seed.saved is None else seed.saved.number
-            saves.append(
-                Save(seed.run, seed.config, self.steps, items, progress[i], seed.report, kept)
-            )
-        if not is_alone:
-            # Last, as it refers to the best policies of the seeds.
-            seeds = {"seeds": progress}
-            saves.append(Save(self.run, self.config, self.steps, items_of_state, seeds))
-        return saves
-
-    def results_files(self, fresh_resets: bool = False) -> dict[Path, str]:
-        """The content of each seed's results.json; none before its first evaluation.
-
-        Args:
-          fresh_resets: see `Results`.
-        """
-        about = {"trained_steps": self.steps, "seconds": self.seconds, "device": self.device}
-        about |= {"fresh_resets": fresh_resets, "version": bounce_mjx.__version__}
-        return {
-            seed.run / RESULTS_FILE: to_json(seed.progress.results(**about))
-            for seed in self.seeds
-            if seed.progress.best is not None
-        }
 
 
 def _make_run(config: TrainConfig) -> Path:

@@ -158,9 +158,9 @@ class RandomizationConfig(StrictModel):
     limit."""
     joint_damping: Annotated[Sampled, physical("damping", ADD, None, (0.0, 500.0))] = None
     """Viscous damping added to each joint, N m s/rad."""
-    joint_frictionloss: Annotated[Sampled, physical("frictionloss", REPLACE, None, (0.0, 500.0))] = (
-        None
-    )
+    joint_frictionloss: Annotated[
+        Sampled, physical("frictionloss", REPLACE, None, (0.0, 500.0))
+    ] = None
     """Dry friction of each joint, N m, in place of the model's."""
     armature: Annotated[Sampled, physical("armature", SCALE, None, _FACTOR)] = None
     """Factor of each joint's rotor inertia."""
