@@ -5,11 +5,11 @@ matters in one window, are eliminated inside every step: the variable projection
 Pereyra (1973) in the linearised problem.
 """
 
-import itertools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from bounce_mjx.identify.simulation import Simulate
 from bounce_mjx.identify.unknowns import ARM, Layout
@@ -22,11 +22,14 @@ _START_STEPS = (3e-3, 0.1, 0.01, 0.03, 5.0)
 # Entries of a start that are searched: a servo forgets a wrong velocity within milliseconds.
 _SEARCHED = (True, False, True, True, True)
 # Levenberg and Marquardt's dampings, and shares of the change of the starts, that a step tries side
-# by side: the best damping for all, and the best share for each window.
+# by side: the best damping for all, and the best share for each window. With a share of 0, a wrong
+# slope of one window's start cannot spoil the step of all.
 _DAMPINGS = np.array([0.0, 1e-2, 0.3, 10.0])
-_SHARES = np.array([1.0, 0.3])
+_SHARES = np.array([1.0, 0.3, 0.0])
+# Farthest that an angle of a start may be from its guess, a measurement, in deviations.
+_FARTHEST_START = 5.0
 _CONVERGED = 0.3
-# Residuals of pictures beyond this many standard deviations lose weight (Huber 1964).
+# Residuals beyond this many standard deviations lose weight (Huber 1964).
 _HUBER = 3.0
 # Mean squared residual of the pictures of a window beyond which the ball was not in free flight.
 _NO_FLIGHT = 25.0
@@ -73,7 +76,9 @@ class Problem(NamedTuple):
     simulate: Simulate
     windows: Windows
     layout: Layout
+    sensors: Noise
     noise: Noise
+    """What counts as noise: the sensors', or the model's own errors where they are larger."""
     progress: Callable[[str], None] = lambda line: None
     """Called with a line about each step of a search."""
 
@@ -108,14 +113,18 @@ class Problem(NamedTuple):
         return np.concatenate([x.reshape(*scaled.shape[:-1], -1) for x in (angles, white)], axis=-1)
 
     def weights(
-        self, pictures: np.ndarray | float = 1.0, windows: np.ndarray | float = 1.0
+        self,
+        pictures: np.ndarray | float = 1.0,
+        windows: np.ndarray | float = 1.0,
+        angles: np.ndarray | float = 1.0,
     ) -> np.ndarray:
-        """Weights [S, A n + 3 B]; those of the pictures [S, B] are multiplied by `pictures`, and
-        those of the windows [S, 1] by `windows`."""
+        """Weights [S, A n + 3 B]; those of the pictures [S, B] are multiplied by `pictures`, those
+        of the angles [S, A, n] by `angles`, and those of the windows [S, 1] by `windows`."""
         w = self.windows
-        angles = np.repeat(w.angle_weights, w.angles.shape[2], axis=1)
-        balls = np.repeat(w.picture_weights * pictures, 3, axis=1)
-        return np.concatenate([angles, balls], axis=1) * windows
+        of_angles = w.angle_weights[:, :, None] * angles * np.ones(w.angles.shape)
+        of_balls = np.repeat(w.picture_weights * pictures, 3, axis=1)
+        rows = [of_angles.reshape(len(of_angles), -1), of_balls]
+        return np.concatenate(rows, axis=1) * windows
 
 
 def minimise(
@@ -142,6 +151,8 @@ def minimise(
     # The start of a window that does not count stays as it is.
     used = np.any(weights > 0.0, axis=1)
     num_tried, each = len(_DAMPINGS) * len(_SHARES), np.arange(len(guess))
+    is_angle = np.arange(len(deviations)) < layout.num_joints
+    farthest = np.where(is_angle, _FARTHEST_START * deviations, np.inf)
 
     def data_costs(white: np.ndarray, states: np.ndarray) -> np.ndarray:
         """Half the sum of squares of each candidate and window [C, S]."""
@@ -152,7 +163,7 @@ def minimise(
         return 0.5 * np.sum(((vectors - layout.mean) / layout.deviation) ** 2, axis=-1)
 
     for iteration in range(iterations):
-        vector, starts = fit[:2]
+        vector, starts = fit.vector, fit.starts
         line = _linearise(problem, vector, starts, unknowns, entries, weights)
         now = float(np.sum(data_costs(line.white[None], starts[None])) + prior_costs(vector))
         fit = Fit(vector, starts, line.predicted, weights, now)
@@ -161,14 +172,17 @@ def minimise(
         hessian = np.sum(reduced.informations, axis=0) + np.eye(len(unknowns))
         from_mean = (vector[unknowns] - layout.mean[unknowns]) / scale
         slope = np.sum(reduced.gradients, axis=0) + from_mean
+        room = (layout.bounds(vector) - vector)[:, unknowns] / scale
         vectors = np.repeat(vector[None], num_tried, axis=0)
         states = np.repeat(starts[None], num_tried, axis=0)
-        for i, (damping, share) in enumerate(itertools.product(_DAMPINGS, _SHARES)):
-            change = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), slope)
-            vectors[i, unknowns] += change * scale
-            vectors[i] = layout.clip(vectors[i])
-            change = (vectors[i, unknowns] - vector[unknowns]) / scale
-            states[i][:, entries] += share * reduced.states(change) * reach * used[:, None]
+        for d, damping in enumerate(_DAMPINGS):
+            damped = hessian + damping * np.diag(np.diag(hessian))
+            change = _bounded_step(damped, slope, room)
+            moved = reduced.states(change) * reach * used[:, None]
+            for i, share in enumerate(_SHARES, d * len(_SHARES)):
+                vectors[i, unknowns] += change * scale
+                states[i][:, entries] += share * moved
+                states[i] = np.clip(states[i], guess - farthest, guess + farthest)
         outcome = problem.simulate(vectors, states, np.tile(used, (num_tried, 1)))
         costs = data_costs(problem.whiten(outcome, weights), states)
         costs = np.where(np.isfinite(costs), costs, np.inf).reshape(len(_DAMPINGS), -1, len(starts))
@@ -182,6 +196,29 @@ def minimise(
         if not now - totals[damping] >= _CONVERGED:
             break
     return fit
+
+
+def cost_of(problem: Problem, fit: Fit, weights: np.ndarray) -> float:
+    """Half the sum of squared residuals and the prior's, of a fit whose starts are their guess."""
+    white = problem.whiten(problem.predict(fit.vector, fit.starts), weights)
+    from_mean = (fit.vector - problem.layout.mean) / problem.layout.deviation
+    return float(0.5 * np.sum(white**2) + 0.5 * np.sum(from_mean**2))
+
+
+def _bounded_step(hessian: np.ndarray, slope: np.ndarray, room: np.ndarray) -> np.ndarray:
+    """The change x [F] within bounds that minimises x' hessian x / 2 + slope' x.
+
+    By an active set (Stark and Parker 1995, "Bounded-variable least squares"): where one unknown
+    ends at its bound, the others are the best ones there.
+
+    Args:
+      room: smallest and largest change [2, F].
+    """
+    root = np.linalg.cholesky(hessian).T
+    target = -np.linalg.solve(root.T, slope)
+    low, high = np.minimum(room[0], 0.0), np.maximum(room[1], 0.0)
+    inside = lsq_linear(root, target, bounds=(low, np.maximum(high, low + 1e-12)), method="bvls")
+    return inside.x
 
 
 def certainty(problem: Problem, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
@@ -424,6 +461,12 @@ def _scale_starts(windows: Windows) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     sizes = n, n, 3, 3, 3
     groups = _START_DEVIATIONS, _START_STEPS, _SEARCHED
     return tuple(np.repeat(values, sizes) for values in groups)
+
+
+def angle_weights(problem: Problem, predicted: np.ndarray) -> np.ndarray:
+    """Weights [S, A, n] of the joint angles: less for outliers."""
+    size = np.abs(problem.windows.split(problem.whiten(predicted, problem.weights()))[0])
+    return np.minimum(1.0, _HUBER / np.maximum(size, 1e-9))
 
 
 def picture_weights(problem: Problem, predicted: np.ndarray) -> np.ndarray:

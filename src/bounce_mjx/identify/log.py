@@ -29,6 +29,9 @@ _LARGEST_AGE = 1.0
 _FASTEST_DRIFT = 2e-4
 _NO_CLOCK = 0.1
 
+JOINT_GAP = 0.1
+"""Time between two rows of joint angles beyond which a log has a gap, s."""
+
 
 class Log(NamedTuple):
     """What a robot measured and was sent; all times (s) are of one clock, but for a constant."""
@@ -69,6 +72,15 @@ class Rows(NamedTuple):
     values: np.ndarray
     """[R, k]; NaN for what was not measured."""
 
+    def chosen(self, index: np.ndarray) -> "Rows":
+        """Some of the rows, or all in another order."""
+        return self._replace(
+            numbers=self.numbers[index],
+            times=self.times[index],
+            arrivals=self.arrivals[index],
+            values=self.values[index],
+        )
+
     def without(
         self, wrong: np.ndarray, why: str, notes: list[str], refused: float = np.inf, advice=""
     ) -> "Rows":
@@ -91,7 +103,7 @@ class Rows(NamedTuple):
         if count >= max(refused * len(wrong), 2.0):
             raise UserError(sentence + advice)
         notes.append(sentence)
-        return Rows(*self[:2], *(array[~wrong] for array in self[2:]))
+        return self.chosen(~wrong)
 
 
 _ONE_CLOCK = _WRONG_ROWS, "; give each its own time, of one clock"
@@ -107,8 +119,7 @@ def make_log(source: str, angles: Rows, targets: Rows, balls: Rows) -> Log:
     """
     notes: list[str] = []
     angles, targets = (_in_order(rows, notes) for rows in (angles, targets))
-    order = np.argsort(balls.times, kind="stable")
-    balls = Rows(*balls[:2], *(array[order] for array in balls[2:]))
+    balls = balls.chosen(np.argsort(balls.times, kind="stable"))
     # An arm may have been recorded alone, with a tracker that saw no ball. Trackers, and logs of
     # control steps, hold the last picture until the next.
     balls = _clean(balls, notes, lambda rows: rows.values).without(
@@ -121,9 +132,16 @@ def make_log(source: str, angles: Rows, targets: Rows, balls: Rows) -> Log:
     again = np.diff(balls.times, prepend=-np.inf) < _SAME_PICTURE
     balls = balls.without(again, "has the time stamp of another", notes)
     return Log(
-        source, angles.times, angles.values, targets.times, targets.values,
-        balls.times, balls.values, balls.arrivals, tuple(notes),
-    )  # fmt: skip
+        source=source,
+        times=angles.times,
+        joint_angles=angles.values,
+        target_times=targets.times,
+        servo_targets=targets.values,
+        picture_times=balls.times,
+        ball_positions=balls.values,
+        arrivals=balls.arrivals,
+        notes=tuple(notes),
+    )
 
 
 def _clean(
@@ -136,7 +154,8 @@ def _clean(
       told: what rows tell [R, k].
       refused: share of rows with gaps from which the log is refused.
     """
-    wrong = ~np.isfinite(np.column_stack(rows[3:])).all(axis=1)
+    numbers = np.column_stack([rows.times, rows.arrivals, rows.values])
+    wrong = ~np.isfinite(numbers).all(axis=1)
     rows = rows.without(wrong, f"lacks one of its {rows.values.shape[1]} numbers", notes, refused)
     same = np.all(np.diff(told(rows), axis=0, prepend=np.nan) == 0.0, axis=1)
     rows = rows.without(same, "repeats the one before", notes)

@@ -15,6 +15,7 @@ from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.unknowns import CAMERA_ROTATION, Layout
 from bounce_mjx.identify.windows import Windows
 from bounce_mjx.physics import Control, PhysicsState, make_engine
+from bounce_mjx.physics.edited import EditedModel
 from bounce_mjx.robot.model import find_addresses, scatter
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import physics_parameters
@@ -29,12 +30,18 @@ what the sensors would have measured [C, S, A n + 3 B], as `Windows.measured`; a
 not count has the numbers of the first candidate, or 0 if that has none."""
 
 
-def make_simulator(config: WorldConfig, layout: Layout, log: Log, windows: Windows) -> Simulate:
+def make_simulator(
+    config: WorldConfig, layout: Layout, log: Log, windows: Windows, carried: float = 0.0
+) -> Simulate:
     """Builds the simulation of a log's windows in candidate worlds.
 
     Measured angles are the true ones plus `encoder_bias`, which the servos share. A measured ball
     is the true one, `ball_latency` before its time stamp, turned by the camera's rotation about
     the middle of all measured ones, plus `ball_position_bias`.
+
+    Args:
+      carried: share of the links' weight that the controller carries, if it is more than the
+        model's own.
     """
     run, n = _compile(config, layout.num_joints), layout.num_joints
     send = make_targets(log, windows, layout.physics_dt)
@@ -65,7 +72,13 @@ def make_simulator(config: WorldConfig, layout: Layout, log: Log, windows: Windo
         given = {k: np.moveaxis(v, 0, -1).astype(np.float32) for k, v in world.items()}
         first = starts[c, s].T.astype(np.float32)
         out = run(
-            given, first, targets, angle_times[:, s], picture_times[:, s], middle.astype(np.float32)
+            given,
+            first,
+            targets,
+            angle_times[:, s],
+            picture_times[:, s],
+            middle.astype(np.float32),
+            np.float32(carried),
         )
         rows = [np.moveaxis(np.asarray(x), 2, 0).reshape(_LANES, -1) for x in out]
         return np.concatenate(rows, axis=1)[:count].astype(float)
@@ -84,11 +97,19 @@ def make_simulator(config: WorldConfig, layout: Layout, log: Log, windows: Windo
     return simulate
 
 
+def compensated(config: WorldConfig) -> WorldConfig:
+    """The robot with a controller that carries the arm's whole weight."""
+    robot = config.robot.model_copy(update={"gravity_compensation": 1.0})
+    return config.model_copy(update={"robot": robot})
+
+
+@lru_cache(8)
 def _compile(config: WorldConfig, n: int) -> Callable[..., tuple[jax.Array, jax.Array]]:
     """The part of a simulation that is compiled, which is the same for all logs: angles
     [A, n, L], rad, and balls [B, 3, L], m."""
-    model = world_model(config, visual=False)
+    own, model = (world_model(c, visual=False) for c in (config, compensated(config)))
     engine, addresses = make_engine(model, config.physics), find_addresses(model)
+    links = np.concatenate(EditedModel(model).link_bodies()).tolist()
     ball, dt = addresses.balls[0], config.physics_dt
     gears = model.actuator_gear[list(addresses.actuators), 0]
     shown_q = (*addresses.arm_qpos, *ball.qpos[:3])
@@ -111,14 +132,20 @@ def _compile(config: WorldConfig, n: int) -> Callable[..., tuple[jax.Array, jax.
         return near + speed * (times - step * dt)[:, None]
 
     @jax.jit
-    def run(world, starts, targets, angle_times, picture_times, middle):
-        parameters = jax.vmap(lambda w: physics_parameters(w, model), -1, -1)(
+    def run(world, starts, targets, angle_times, picture_times, middle, carried):
+        shares = {f"body_gravcomp[{b}]": jnp.maximum(carried, own.body_gravcomp[b]) for b in links}
+
+        def parameters_of(world):
+            return physics_parameters(world, model)._replace(entries=shares)
+
+        parameters = jax.vmap(parameters_of, -1, -1)(
             {k: v for k, v in world.items() if k != "encoder_bias"}
         )
         bias = world["encoder_bias"]
+        held = world["servo_offset"] - bias
 
         def body(state, target):
-            after = jax.vmap(advance, -1, -1)(parameters, state, target - bias, world["air_drag"])
+            after = jax.vmap(advance, -1, -1)(parameters, state, target + held, world["air_drag"])
             positions = jnp.stack([state.qpos[i] for i in shown_q])
             return after, (positions, jnp.stack([state.qvel[i] for i in shown_v]))
 

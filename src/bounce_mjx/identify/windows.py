@@ -11,7 +11,8 @@ from numpy.polynomial.polynomial import polyfit
 from scipy.ndimage import minimum_filter1d
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.identify.log import Log
+from bounce_mjx.identify.following import SETTLING, find_settled
+from bounce_mjx.identify.log import JOINT_GAP, Log
 
 MAX_DELAY = 0.08
 """Time before the first picture of a window at which its simulation starts, s; a picture may be
@@ -26,10 +27,6 @@ _SHORTEST = 0.16
 _FEWEST, _MOST = 5, 240
 _PADDING = 8
 _PICTURE_GAP = 0.06
-_JOINT_GAP = 0.1
-# Time after the start of a log, or a gap, until the arm has forgotten the unknown targets before
-# it, s: the longest latency and a few of the longest lags.
-_SETTLING = 0.3
 # Speed that the ball must have before and after a bounce, m/s.
 _BOUNCING = 0.5
 # Time about a bounce at which pictures do not count, s: a flight's kink has no derivative.
@@ -65,6 +62,14 @@ class Windows(NamedTuple):
     starts: np.ndarray
     """First guess of the state at the start [S, 2 n + 9]: angles, velocities; the ball's position,
     velocity and spin."""
+
+    dt: float
+    """A physics step, s."""
+
+    @property
+    def zero(self) -> np.ndarray:
+        """Time [S] at which each starts, s."""
+        return self.origin + self.first * self.dt
 
     @property
     def has_ball(self) -> np.ndarray:
@@ -112,7 +117,7 @@ def cut(log: Log, physics_dt: float) -> Windows:
     first = np.array([int((begin - origin) / physics_dt) for begin in begins], int)
     zero = origin + first * physics_dt
     angle_rows, picture_rows, starts, used = [], [], [], -np.inf
-    settled, bounces = _find_settled(log), np.array(spans)[:, 2] - zero
+    settled, bounces = find_settled(log), np.array(spans)[:, 2] - zero
     for (start, end, _), begin, bounce in zip(spans, zero, bounces, strict=True):
         inside = (log.times >= max(begin, used)) & (log.times < end) & settled
         seen = (log.picture_times >= start) & (log.picture_times <= end) & np.isfinite(bounce)
@@ -121,17 +126,25 @@ def cut(log: Log, physics_dt: float) -> Windows:
         ball = _ball_start(log, picture_rows[-1], bounce, begin)
         starts.append(np.concatenate([_joint_start(log, begin), ball]))
         used = end
-    windows = Windows(
-        first,
-        round(_SECONDS / physics_dt),
-        origin,
-        *_pad(angle_rows, log.times, zero, log.joint_angles),
-        *_pad(picture_rows, log.picture_times, zero, log.ball_positions),
-        bounces,
-        np.stack(starts),
+    angle_times, angles, angle_weights = _pad(angle_rows, log.times, zero, log.joint_angles)
+    picture_times, balls, picture_weights = _pad(
+        picture_rows, log.picture_times, zero, log.ball_positions
     )
-    near = np.abs(windows.picture_times - bounces[:, None]) < _AT_BOUNCE
-    return windows._replace(picture_weights=np.where(near, 0.0, windows.picture_weights))
+    near = np.abs(picture_times - bounces[:, None]) < _AT_BOUNCE
+    return Windows(
+        first=first,
+        steps=round(_SECONDS / physics_dt),
+        origin=origin,
+        angle_times=angle_times,
+        angles=angles,
+        angle_weights=angle_weights,
+        picture_times=picture_times,
+        balls=balls,
+        picture_weights=np.where(near, 0.0, picture_weights),
+        bounces=bounces,
+        starts=np.stack(starts),
+        dt=physics_dt,
+    )
 
 
 def _find_bounces(log: Log) -> list[tuple[float, float, float]]:
@@ -173,9 +186,9 @@ def _slopes(times: np.ndarray, values: np.ndarray, reach: int) -> np.ndarray:
 def _find_rests(log: Log, spans: list[tuple[float, float, float]]) -> list[tuple[float, float]]:
     """Times between the windows with a ball, in pieces; none of them spans a gap of the log."""
     taken = sorted((start, end) for start, end, _ in spans)
-    gaps = np.flatnonzero(np.diff(log.times) > _JOINT_GAP)
-    taken += [(log.times[i], log.times[i + 1] + _SETTLING) for i in gaps]
-    first = max(log.times[0], log.target_times[0]) + _SETTLING
+    gaps = np.flatnonzero(np.diff(log.times) > JOINT_GAP)
+    taken += [(log.times[i], log.times[i + 1] + SETTLING) for i in gaps]
+    first = max(log.times[0], log.target_times[0]) + SETTLING
     pieces, begin = [], first
     for start, end in [*sorted(taken), (log.times[-1], np.inf)]:
         length = start - begin
@@ -185,14 +198,6 @@ def _find_rests(log: Log, spans: list[tuple[float, float, float]]) -> list[tuple
             pieces += list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
         begin = max(begin, end)
     return pieces
-
-
-def _find_settled(log: Log) -> np.ndarray:
-    """Which joint angles [T] no longer depend on the targets before the log or in a gap."""
-    begins = log.times[np.flatnonzero(np.diff(log.times) > _JOINT_GAP) + 1]
-    begins = np.concatenate([[max(log.times[0], log.target_times[0])], begins])
-    last = np.maximum(np.searchsorted(begins, log.times, side="right") - 1, 0)
-    return log.times - begins[last] >= _SETTLING
 
 
 def _pad(

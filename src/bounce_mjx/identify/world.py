@@ -64,11 +64,17 @@ class Estimate(NamedTuple):
 def estimates(found: Identified, joint_names: Sequence[str]) -> list[Estimate]:
     """All unknowns with their intervals; a sensor whose residuals exceed its noise widens them.
     `ball_latency` is the time from the exposure to the arrival."""
-    layout, width = found.layout, _HALF_WIDTH * found.deviation * misfit(found)
-    world = layout.world(found.fit.vector)
+    layout, vector = found.layout, found.fit.vector
+    world = layout.world(vector)
     values = np.concatenate([np.ravel(world[name]) for name in layout.terms])
-    low, high = (layout.clip(end) for end in (values - width, values + width))
-    alone = _HALF_WIDTH * misfit(found) / np.sqrt(np.diag(np.linalg.inv(found.covariance)))
+    # What a log does not show is as well known as before it.
+    deviation = np.minimum(found.deviation * misfit(found), layout.deviation)
+    low, high = (
+        layout.decode(layout.clip(vector + side * _HALF_WIDTH * deviation)) for side in (-1.0, 1.0)
+    )
+    given_others = misfit(found) / np.sqrt(np.diag(np.linalg.inv(found.covariance)))
+    ends = layout.decode(vector + _HALF_WIDTH * np.minimum(given_others, layout.deviation))
+    alone = ends - layout.decode(vector)
     for name, ends in _estimate_delays(found).items():
         place = layout.terms[name]
         low[place], high[place] = ends
@@ -110,8 +116,10 @@ def _estimate_delays(found: Identified) -> dict[str, tuple[float, float]]:
 
 
 def misfit(found: Identified) -> float:
-    """Factor by which the residuals exceed the sensors' noise, at least 1."""
-    return max(1.0, *found.after.values())
+    """Factor by which the errors in windows that the search had not seen exceed those in all, at
+    least 1."""
+    ratios = [found.held_out[name] / found.after[name] for name in found.held_out]
+    return max(1.0, *ratios)
 
 
 def sentences(found: Identified, joint_names: Sequence[str]) -> list[str]:

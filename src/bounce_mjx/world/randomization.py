@@ -129,6 +129,8 @@ class RandomizationConfig(StrictModel):
     """Factor of each servo's damping."""
     servo_lag: Annotated[Sampled, Term((), 0.0, (0.0, 1.0))] = None
     """Time constant of a first-order lag of the servo targets, s."""
+    servo_offset: Annotated[Sampled, Term(None, 0.0, (-0.5, 0.5))] = None
+    """Constant error of each servo: where it holds its joint, less its target, rad."""
     torque_limit: Annotated[Sampled, Term(None, None, (1e-3, 1e5), "force_limit", limit)] = None
     """Largest torque of each servo, N m; a servo that is weaker keeps its own limit."""
     joint_damping: Annotated[Sampled, Term(None, 0.0, (0.0, 1e4), "damping", shift)] = None
