@@ -28,7 +28,8 @@ _DAMPINGS = np.array([0.0, 1e-2, 0.3, 10.0])
 _SHARES = np.array([1.0, 0.3, 0.0])
 # Farthest that an angle of a start may be from its guess, a measurement, in deviations.
 _FARTHEST_START = 5.0
-_CONVERGED = 0.3
+# Decrease of the cost, and its share, at which a search ends.
+_CONVERGED, _CONVERGED_SHARE = 0.3, 2e-5
 # Residuals beyond this many standard deviations lose weight (Huber 1964).
 _HUBER = 3.0
 # Mean squared residual of the pictures of a window beyond which the ball was not in free flight.
@@ -193,7 +194,7 @@ def minimise(
         if now > totals[damping]:
             total = float(totals[damping])
             fit = Fit(vectors[best[0]], states[best, each], outcome[best, each], weights, total)
-        if not now - totals[damping] >= _CONVERGED:
+        if not now - totals[damping] >= max(_CONVERGED, _CONVERGED_SHARE * now):
             break
     return fit
 

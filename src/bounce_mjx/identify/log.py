@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import median_filter
 from scipy.stats import theilslopes
 
 from bounce_mjx.errors import UserError
@@ -18,6 +19,11 @@ _MIN_ROWS = 100
 # from the log's middle beyond which one is wrong, s.
 _WRONG_ROWS = 0.05
 _FAR_IN_TIME = 3600.0
+# Step of stamps from which a 32-bit number has made them useless, s.
+_COARSE_STAMP = 2e-3
+# Rows whose median an angle is compared with; distance from it beyond which it is a spike, rad, and
+# in multiples of what is usual about it.
+_SPIKE_ROWS, _SPIKE, _SPIKE_FACTOR = 7, 0.03, 10.0
 # Two pictures closer than this are one, s.
 _SAME_PICTURE = 1e-4
 # Stretches of a log in which the youngest picture is looked for; drift (s) over the log below which
@@ -119,10 +125,14 @@ def make_log(source: str, angles: Rows, targets: Rows, balls: Rows) -> Log:
     """
     notes: list[str] = []
     angles, targets = (_in_order(rows, notes) for rows in (angles, targets))
+    angles = angles.without(
+        _find_spikes(angles.values), "is a spike: the joint is elsewhere before and after", notes
+    )
     balls = balls.chosen(np.argsort(balls.times, kind="stable"))
     # An arm may have been recorded alone, with a tracker that saw no ball. Trackers, and logs of
     # control steps, hold the last picture until the next.
-    balls = _clean(balls, notes, lambda rows: rows.values).without(
+    balls = _clean(balls, notes, lambda rows: rows.values)
+    balls = balls.without(
         np.any(np.abs(balls.values) > _FARTHEST_BALL, axis=1),
         f"is farther away than {_FARTHEST_BALL:g} m",
         notes,
@@ -166,12 +176,41 @@ def _clean(
 
 def _in_order(rows: Rows, notes: list[str]) -> Rows:
     """The rows of a measurement of every control step: whole, once each, with increasing times."""
+    _check_digits(rows)
     rows = _clean(rows, notes, lambda rows: np.column_stack([rows.times, rows.values]), 1.0)
     early = np.diff(np.maximum.accumulate(rows.times), prepend=-np.inf) <= 0.0
     late = np.append(rows.times[:-1] >= np.minimum.accumulate(rows.times[::-1])[-2::-1], False)
     # A time that is too late makes all that follow early, and one too early all before it late.
     wrong = min(early, late[: len(early)], key=np.sum)
     return rows.without(wrong, "has a time out of order", notes, *_ONE_CLOCK)
+
+
+def _check_digits(rows: Rows) -> None:
+    """Refuses times that a 32-bit number has rounded.
+
+    Raises:
+      UserError: they are.
+    """
+    times = rows.times[np.isfinite(rows.times)]
+    if not len(times):
+        return
+    grid = float(np.spacing(np.float32(np.median(np.abs(times)))))
+    off = np.abs(times / grid - np.round(times / grid))
+    if grid > _COARSE_STAMP and np.all(off < 0.02):
+        raise UserError(
+            f"the times of the {rows.name} are multiples of {grid:.3g} s, as a 32-bit number "
+            "rounds them; write seconds as 64-bit numbers, or since the start"
+        )
+
+
+def _find_spikes(angles: np.ndarray) -> np.ndarray:
+    """Which rows [R] of joint angles [R, n] no joint can have: far from the median of the rows
+    about them, although those agree with theirs."""
+    if len(angles) < _SPIKE_ROWS:
+        return np.zeros(len(angles), bool)
+    off = np.abs(angles - median_filter(angles, (_SPIKE_ROWS, 1), mode="nearest"))
+    around = median_filter(off, (2 * _SPIKE_ROWS + 1, 1), mode="nearest")
+    return np.any(off > np.maximum(_SPIKE, _SPIKE_FACTOR * around), axis=1)
 
 
 def align_clocks(log: Log) -> Log:

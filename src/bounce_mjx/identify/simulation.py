@@ -20,8 +20,8 @@ from bounce_mjx.robot.model import find_addresses, scatter
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import physics_parameters
 
-_LANES = 512
-"""Windows that are simulated at a time; more would not fit the processor's cache."""
+_LANES = 128
+"""Windows that one thread simulates at a time; more would not fit the processor's cache."""
 
 
 Simulate = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]

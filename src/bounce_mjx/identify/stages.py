@@ -16,7 +16,6 @@ from bounce_mjx.identify.fit import (
     Problem,
     angle_weights,
     certainty,
-    cost_of,
     minimise,
     picture_weights,
 )
@@ -51,7 +50,7 @@ _SERVO_SHARES = (0.1, 0.3, 0.6, 0.9)
 _LAG_SHARES = (0.0, 0.3, 0.6)
 # Candidates from which a search over a few windows begins, and decrease of the cost from which the
 # controller counts as carrying the arm's weight.
-_KEPT = 3
+_KEPT = 2
 _CARRIED = 10.0
 # Standard deviation of stamps about regular steps below which the steps count as regular, s.
 _JITTER = 5e-4
@@ -354,7 +353,7 @@ def _search_arm(
         left = np.where(is_angle, residuals - offsets, 0.0) / rough
         costs.append(np.sum(left**2) if np.all(np.isfinite(left)) else np.inf)
     best = [Fit(vectors[i], windows.starts) for i in np.argsort(costs)[:_KEPT]]
-    fits = [minimise(problem, fit, ["arm"], few, 3, windows.arm_state) for fit in best]
+    fits = [minimise(problem, fit, ["arm"], few, 2, windows.arm_state) for fit in best]
     fit = min(fits, key=lambda fit: fit.cost)
     return _residual_noise(problem, fit), fit
 
@@ -367,9 +366,7 @@ def _own_servos(layout: Layout) -> np.ndarray:
     )
 
 
-def _late_servos(
-    layout: Layout, config: WorldConfig, log: Log, following: Following
-) -> np.ndarray:
+def _late_servos(layout: Layout, config: WorldConfig, log: Log, following: Following) -> np.ndarray:
     """Candidates [C, P] whose joints follow their commands as late as measured."""
     model = world_model(config, visual=False)
     servos = list(find_addresses(model).actuators)

@@ -49,9 +49,7 @@ ARM = {
     "joint_frictionloss": Unknown(
         1.0, 5.0, 0.5, "N m", "arm", _JOINTS, (0.0, np.inf), 0.0, own=True
     ),
-    "link_mass": Unknown(
-        1.0, 0.15, 0.05, "", "arm", _JOINTS, (0.1, 10.0), 0.0, is_factor=True
-    ),
+    "link_mass": Unknown(1.0, 0.15, 0.05, "", "arm", _JOINTS, (0.1, 10.0), 0.0, is_factor=True),
     "encoder_bias": Unknown(0.0, 0.01, 8e-3, "rad", "bounce", _JOINTS),
     "gravity_tilt": Unknown(0.0, 0.03, 4e-3, "rad", "flight", 2),
 }
