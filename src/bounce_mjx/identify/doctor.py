@@ -23,7 +23,7 @@ _ROWS = 2500
 _SMOOTH = 0.25
 # A joint whose angle or command changes by less does not move, and one that moves by less is too
 # little to judge, rad.
-_STILL, _LITTLE = 5e-3, 0.02
+_STILL, _LITTLE = 5e-3, 0.05
 # Delays count as equally good up to this loss of correlation, and this multiple of the least.
 _TIED, _TIE = 1e-8, 1.1
 # Largest delay of a servo, and largest lead that rounded stamps explain, s; and the largest
@@ -112,6 +112,16 @@ def examine(logs: Sequence[Log], joint_names: Sequence[str]) -> list[Checkup]:
     return checkups
 
 
+def describe(logs: Sequence[Log], checkups: Sequence[Checkup]) -> list[str]:
+    """What was seen in each log, a line each."""
+    lines = []
+    for log, checkup in zip(logs, checkups, strict=True):
+        late = f"its joints follow their commands {1e3 * checkup.delay:.0f} ms later"
+        lines.append(f"{log.source}: {len(checkup.faults)} faults; {late}")
+        lines += [f"  {finding}" for finding in checkup.findings]
+    return lines
+
+
 def _is_same(log: Log, other: Log) -> bool:
     count = min(len(log.joint_angles), len(other.joint_angles), 1000)
     moves = np.ptp(log.joint_angles[:count], axis=0).max() > _STILL
@@ -124,8 +134,8 @@ def _examine_one(log: Log, joint_names: Sequence[str]) -> Checkup:
     correlations, delays = _correlate(log, rows[:: max(len(rows) // _ROWS, 1)])
     of_own = np.abs(np.diagonal(correlations, axis1=1, axis2=2))
     best = np.array([_least_of_best(delays, column) for column in of_own.T])
-    ranges = np.ptp(log.servo_targets, axis=0), np.ptp(log.joint_angles, axis=0)
-    moves = (ranges[0] > _LITTLE) & (ranges[1] > _LITTLE)
+    sent, shown = commanded(log, log.times[rows]), log.joint_angles[rows]
+    moves = np.minimum(np.ptp(sent, axis=0), np.ptp(shown, axis=0)) > _LITTLE
     strong = moves & (np.max(of_own, axis=0) > _FOLLOWS)
     late = float(np.median(delays[best[strong]])) if np.any(strong) else 0.0
     joints = tuple(
@@ -192,6 +202,13 @@ def _compare(log: Log, rows: np.ndarray, j: int, name: str, guess: float) -> Joi
     best = _least_of_best(near, np.array(values))
     delay, strength = float(near[best]), values[best]
     angles, targets = _smoothed(log, rows, j, delay)
+    if _ZERO < abs(np.median(angles - targets)) < _TURN / 4.0:
+        # A motion that goes one way shows an offset as well as a delay.
+        tried = np.arange(_EARLY, _LATE, 2.0 * _FINE)
+        sizes = [_distance(log, few, j, other) for other in tried]
+        if min(sizes) < 0.2 * abs(np.median(angles - targets)):
+            delay = float(tried[np.argmin(sizes)])
+            angles, targets = _smoothed(log, rows, j, delay)
     spread = np.var(targets)
     slope = float(np.cov(targets, angles)[0, 1] / spread) if spread > 1e-10 else 0.0
     offset = float(np.median(angles - targets))
@@ -199,14 +216,20 @@ def _compare(log: Log, rows: np.ndarray, j: int, name: str, guess: float) -> Joi
     left = log.joint_angles[rows, j] - slope * late
     return Joint(
         name=name,
-        commanded=float(np.ptp(log.servo_targets[:, j])),
-        measured=float(np.ptp(log.joint_angles[:, j])),
+        commanded=float(np.ptp(late)),
+        measured=float(np.ptp(log.joint_angles[rows, j])),
         slope=slope,
         offset=offset,
         delay=delay,
         correlation=strength,
         remainder=float(np.std(left)),
     )
+
+
+def _distance(log: Log, rows: np.ndarray, j: int, delay: float) -> float:
+    """Root mean square of the angle of joint j less its late command, rad."""
+    late = np.interp(log.times[rows] - delay, log.target_times, log.servo_targets[:, j])
+    return float(np.sqrt(np.mean((log.joint_angles[rows, j] - late) ** 2)))
 
 
 def _smoothed(log: Log, rows: np.ndarray, j: int, delay: float) -> tuple[np.ndarray, np.ndarray]:
@@ -325,9 +348,16 @@ def _find_gain(log: Log, rows: np.ndarray, j: int, joint: Joint) -> list[Finding
     angles, targets = _smoothed(log, rows, j, joint.delay)
     around = np.median(np.abs(angles - targets - joint.offset))
     if abs(joint.offset) > _ZERO:
+        path = np.sum(np.abs(np.diff(angles)))
         turns = round(joint.offset / _TURN)
         if turns and abs(joint.offset - turns * _TURN) < 0.1:
             text = f"its angle is {turns} whole turns from its command; subtract them"
+        elif abs(angles[-1] - angles[0]) > 0.7 * path:
+            text = (
+                f"its angle is {joint.offset:.3f} rad from its command, but it moves one way "
+                "alone, which cannot tell an offset from a delay"
+            )
+            return [Finding("one way", name, text, is_fault=False)]
         elif around < 0.3 * abs(joint.offset):
             text = (
                 f"its angle is {joint.offset:.3f} rad from its command, in all postures: its zero "
@@ -397,6 +427,12 @@ def _find_delays(log: Log, rows: np.ndarray, checkup: Checkup) -> list[Finding]:
         )
         return [Finding("early", "all joints", text)]
     found = []
+    if late < 0.5 * float(np.median(np.diff(log.target_times))) + _FINE:
+        text = (
+            "the angles follow the targets at once, as a controller's own set points (target_q) "
+            "do; the latency of your commands to it is not in this log"
+        )
+        found.append(Finding("no latency", "all joints", text, is_fault=False))
     for j in moving:
         joint = checkup.joints[j]
         if abs(joint.delay - late) > _APART:
