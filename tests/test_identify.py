@@ -74,8 +74,7 @@ def test_targets_are_late_and_lagged(latency: float, lag: float) -> None:
     random = np.random.default_rng(1)
     log = flight_log()
     log = log._replace(servo_targets=random.normal(size=log.servo_targets.shape))
-    w = windows_of(log)
-    found = make_targets(log, w, 0.001)(latency, lag)
+    found = make_targets(log, 0.001 * np.arange(501))(latency, lag)
     fine = np.arange(0.0, 0.5, 1e-5) + 0.5e-5
     index = np.searchsorted(log.target_times, fine - latency, side="right") - 1
     late = log.servo_targets[np.maximum(index, 0)]
@@ -107,7 +106,8 @@ def linear_problem(log: Log, random: np.random.Generator) -> Problem:
         by_gain = 1e-2 * vectors[:, None, None, places["servo_gain"]] * gain * ramp
         return measured_rows(w, starts[:, :, None, :6] + by_late + by_gain)
 
-    return Problem(simulate, w, layout, Noise(np.full(6, 1e-3), np.full(3, 2e-3)))
+    noise = Noise(np.full(6, 1e-3), np.full(3, 2e-3))
+    return Problem(simulate, w, layout, sensors=noise, noise=noise)
 
 
 @pytest.mark.slow

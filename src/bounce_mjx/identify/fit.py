@@ -32,8 +32,8 @@ _FARTHEST_START = 5.0
 _CONVERGED, _CONVERGED_SHARE = 0.3, 2e-5
 # Residuals beyond this many standard deviations lose weight (Huber 1964).
 _HUBER = 3.0
-# Mean squared residual of the pictures of a window beyond which the ball was not in free flight.
-_NO_FLIGHT = 25.0
+NO_FLIGHT = 25.0
+"""Mean squared residual of a window's pictures beyond which the ball was not in free flight."""
 _WORST = 30.0
 # Largest leverage of a window, its share of the information along a direction: a window with all of
 # it leaves no residual to correct.
@@ -45,6 +45,12 @@ _DISAGREEMENT = 0.1
 # real paddle is not the same everywhere; and a simulated bounce depends by as much on where in a
 # physics step it begins, which makes the fit smooth only with this freedom.
 _BOUNCE_DEVIATION = (0.02, 0.02, 0.1)
+AIR_LIFT = 0.006
+"""Acceleration of a table-tennis ball across its flight, per spin (rad/s) and speed (m/s): a flight
+shows its product with the spin alone."""
+# Deviation of the spin of a flight that shows lift, rad/s, and of the acceleration by the spin
+# after a bounce from the model's, m/s^2.
+_SPIN_DEVIATION, _LIFT_DEVIATION = 150.0, 4.0
 
 
 class Noise(NamedTuple):
@@ -82,6 +88,8 @@ class Problem(NamedTuple):
     """What counts as noise: the sensors', or the model's own errors where they are larger."""
     progress: Callable[[str], None] = lambda line: None
     """Called with a line about each step of a search."""
+    has_lift: bool = False
+    """Whether spin lifts the ball; the spin after a bounce then is as free as that before it."""
 
     @property
     def deviations(self) -> np.ndarray:
@@ -97,21 +105,41 @@ class Problem(NamedTuple):
         """Residuals [..., S, A n + 3 B] in units of the noise, times the roots of their weights,
         and without the common error of the pictures after a bounce.
 
-        A bounce that deviates from the model moves each picture after it, along each axis, by c =
-        time since the bounce * deviation / noise. The residuals' covariance is then I + c c', and
-        its inverse root is I - c c' (1 - 1 / sqrt(1 + |c|^2)) / |c|^2.
+        A bounce that deviates from the model moves each picture after it, along each axis, by the
+        columns C = time since the bounce * deviation of the velocity / noise and, with lift, time^2
+        / 2 * deviation of the acceleration / noise. The residuals' covariance is then I + C C'.
+        With C'C = V diag(l) V', its inverse root is I - C V diag((1 - 1 / sqrt(1 + l)) / l) V' C'.
         """
         w, root = self.windows, np.sqrt(weights)
         scaled = (predicted - w.measured) / self.deviations * root
         angles, balls = w.split(scaled)
-        since = np.nan_to_num(w.picture_times - w.bounces[:, None])
-        common = np.maximum(since, 0.0)[:, :, None] * _BOUNCE_DEVIATION / self.noise.balls
-        common = common * w.split(root)[1]
-        squared = np.maximum(np.sum(common**2, axis=1), 1e-12)
-        share = (1.0 - 1.0 / np.sqrt(1.0 + squared)) / squared
-        along = np.sum(common * balls, axis=-2)
-        white = balls - common * (share * along)[..., None, :]
+        columns = self.bounce_columns() * w.split(root)[1][..., None]
+        squares, vectors = np.linalg.eigh(np.einsum("sbak,sbal->sakl", columns, columns))
+        squares = np.maximum(squares, 1e-12)
+        shares = (1.0 - 1.0 / np.sqrt(1.0 + squares)) / squares
+        inner = np.einsum("saik,sak,sajk->saij", vectors, shares, vectors)
+        along = np.einsum("sbak,...sba->...sak", columns, balls)
+        white = balls - np.einsum("sbai,saij,...saj->...sba", columns, inner, along)
         return np.concatenate([x.reshape(*scaled.shape[:-1], -1) for x in (angles, white)], axis=-1)
+
+    def bounce_columns(self) -> np.ndarray:
+        """Shifts [S, B, 3, K] of the pictures, in units of their noise, by each way in which a
+        bounce may deviate from the model, by its standard deviation."""
+        since = np.nan_to_num(self.windows.picture_times - self.windows.bounces[:, None])
+        since = np.maximum(since, 0.0)[:, :, None]
+        columns = [since * _BOUNCE_DEVIATION / self.noise.balls]
+        if self.has_lift:
+            columns.append(0.5 * since**2 * _LIFT_DEVIATION / self.noise.balls)
+        return np.stack(columns, axis=-1)
+
+    def scale_starts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Deviation, difference and whether it is searched, of each entry of a start [2 n + 9]."""
+        n = self.windows.angles.shape[2]
+        sizes = n, n, 3, 3, 3
+        deviations = np.repeat(_START_DEVIATIONS, sizes)
+        if self.has_lift:
+            deviations[-3:] = _SPIN_DEVIATION
+        return deviations, np.repeat(_START_STEPS, sizes), np.repeat(_SEARCHED, sizes)
 
     def weights(
         self,
@@ -145,7 +173,7 @@ def minimise(
       free_states: which entries [D] of the starts may change; all by default.
     """
     layout, guess = problem.layout, problem.windows.starts
-    deviations, _, searched = _scale_starts(problem.windows)
+    deviations, _, searched = problem.scale_starts()
     unknowns = np.flatnonzero(layout.free(stages))
     entries = np.flatnonzero(searched if free_states is None else searched & free_states)
     scale, reach = layout.deviation[unknowns], deviations[entries]
@@ -245,7 +273,7 @@ def certainty(problem: Problem, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
     (I - H_s)^-1/2 R' g_s. The result is C with each deviation widened to that of the sandwich,
     where that one is larger.
     """
-    layout, (deviations, _, searched) = problem.layout, _scale_starts(problem.windows)
+    layout, (deviations, _, searched) = problem.layout, problem.scale_starts()
     size, entries = len(fit.vector), np.flatnonzero(searched)
     scale, reach = layout.deviation, deviations[entries]
     vector = layout.interior(fit.vector, 2.0)
@@ -351,7 +379,7 @@ def _list_differences(
                 add([p], unknown.step, [rows])
             if unknown.ball_step:
                 add([p], unknown.ball_step, [pictures])
-    start_steps = size * _scale_starts(problem.windows)[1]
+    start_steps = size * problem.scale_starts()[1]
     columns = len(unknowns) + np.arange(len(entries))
     arm = np.flatnonzero(entries < n)
     if len(arm):
@@ -456,14 +484,6 @@ def _multiply(columns: np.ndarray) -> np.ndarray:
     return sum(np.swapaxes(part, 1, 2) @ part for part in parts)
 
 
-def _scale_starts(windows: Windows) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Deviation, difference and whether it is searched, of each entry of a start [2 n + 9]."""
-    n = windows.angles.shape[2]
-    sizes = n, n, 3, 3, 3
-    groups = _START_DEVIATIONS, _START_STEPS, _SEARCHED
-    return tuple(np.repeat(values, sizes) for values in groups)
-
-
 def angle_weights(problem: Problem, predicted: np.ndarray) -> np.ndarray:
     """Weights [S, A, n] of the joint angles: less for outliers."""
     size = np.abs(problem.windows.split(problem.whiten(predicted, problem.weights()))[0])
@@ -473,8 +493,14 @@ def angle_weights(problem: Problem, predicted: np.ndarray) -> np.ndarray:
 def picture_weights(problem: Problem, predicted: np.ndarray) -> np.ndarray:
     """Weights [S, B] of the pictures: less for outliers, and 0 for all of a window whose ball was
     not in free flight, such as one in a hand."""
-    w = problem.windows
-    size = np.max(np.abs(w.split(problem.whiten(predicted, problem.weights()))[1]), axis=2)
-    count = np.maximum(np.sum(w.picture_weights, axis=1), 1.0)
-    mean = np.sum(np.minimum(size, _WORST) ** 2 * w.picture_weights, axis=1) / count
-    return np.minimum(1.0, _HUBER / np.maximum(size, 1e-9)) * (mean < _NO_FLIGHT)[:, None]
+    white = problem.windows.split(problem.whiten(predicted, problem.weights()))[1]
+    size = np.max(np.abs(white), axis=2)
+    flies = flight_errors(problem, predicted, problem.windows.picture_weights) < NO_FLIGHT
+    return np.minimum(1.0, _HUBER / np.maximum(size, 1e-9)) * flies[:, None]
+
+
+def flight_errors(problem: Problem, predicted: np.ndarray, pictures: np.ndarray) -> np.ndarray:
+    """Mean squared residual [S] of the pictures [S, B] that count, in units of their noise."""
+    white = problem.windows.split(problem.whiten(predicted, problem.weights()))[1]
+    size = np.minimum(np.max(np.abs(white), axis=2), _WORST)
+    return np.sum(size**2 * pictures, axis=1) / np.maximum(np.sum(pictures, axis=1), 1.0)

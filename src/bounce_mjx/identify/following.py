@@ -15,6 +15,8 @@ SETTLING = 0.3
 """Time after the start of a log, or a gap, until the arm has forgotten the unknown commands before
 it, s: the longest latency and a few of the longest lags."""
 _STEP = 2e-3
+# Commands that change by less show no delay, rad.
+_STILL = 5e-3
 # Rows that a search over delays looks at; the best one is refined on all.
 _ROWS = 2000
 # Largest residual that counts whole in the size of the error, in medians of the absolute ones.
@@ -54,6 +56,8 @@ def follow(log: Log, rows: np.ndarray, shortest: float = -0.05, longest: float =
       longest: largest one, s.
     """
     chosen = np.flatnonzero(rows)
+    if np.max(np.ptp(log.servo_targets, axis=0)) < _STILL:
+        shortest, longest = 0.0, _STEP
     few = chosen[:: max(len(chosen) // _ROWS, 1)]
 
     def spread(delay: float, at: np.ndarray) -> float:
@@ -62,7 +66,7 @@ def follow(log: Log, rows: np.ndarray, shortest: float = -0.05, longest: float =
 
     tried = np.arange(shortest, longest, _STEP)
     best = tried[np.argmin([spread(delay, few) for delay in tried])]
-    ends = best - _STEP, best + _STEP
+    ends = max(best - _STEP, shortest), best + _STEP
     delay = float(minimize_scalar(spread, bounds=ends, args=(chosen,), method="bounded").x)
     residuals = log.joint_angles[chosen] - commanded(log, log.times[chosen] - delay)
     offsets = np.median(residuals, axis=0)

@@ -16,6 +16,7 @@ from bounce_mjx.identify.unknowns import CAMERA_ROTATION, Layout
 from bounce_mjx.identify.windows import Windows
 from bounce_mjx.physics import Control, PhysicsState, make_engine
 from bounce_mjx.physics.edited import EditedModel
+from bounce_mjx.physics.scalars import quaternion_matrix
 from bounce_mjx.robot.model import find_addresses, scatter
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import physics_parameters
@@ -31,7 +32,12 @@ not count has the numbers of the first candidate, or 0 if that has none."""
 
 
 def make_simulator(
-    config: WorldConfig, layout: Layout, log: Log, windows: Windows, carried: float = 0.0
+    config: WorldConfig,
+    layout: Layout,
+    log: Log,
+    windows: Windows,
+    carried: float = 0.0,
+    lift: float = 0.0,
 ) -> Simulate:
     """Builds the simulation of a log's windows in candidate worlds.
 
@@ -42,9 +48,11 @@ def make_simulator(
     Args:
       carried: share of the links' weight that the controller carries, if it is more than the
         model's own.
+      lift: acceleration of the ball across its flight, per spin and speed.
     """
     run, n = _compile(config, layout.num_joints), layout.num_joints
-    send = make_targets(log, windows, layout.physics_dt)
+    count = int(windows.first.max()) + windows.steps
+    send = make_targets(log, windows.origin + windows.dt * np.arange(count + 1))
     shown = windows.balls[windows.picture_weights > 0.0]
     middle = np.mean(shown, axis=0) if len(shown) else np.zeros(3)
     steps = windows.first + np.arange(windows.steps)[:, None]
@@ -79,6 +87,7 @@ def make_simulator(
             picture_times[:, s],
             middle.astype(np.float32),
             np.float32(carried),
+            np.float32(lift),
         )
         rows = [np.moveaxis(np.asarray(x), 2, 0).reshape(_LANES, -1) for x in out]
         return np.concatenate(rows, axis=1)[:count].astype(float)
@@ -121,9 +130,16 @@ def _compile(config: WorldConfig, n: int) -> Callable[..., tuple[jax.Array, jax.
         moving, speeds = (*addresses.arm_qvel, *ball.qvel), (velocities, ball_speeds)
         return PhysicsState(qpos, scatter(np.zeros(model.nv), moving, jnp.concatenate(speeds)))
 
-    def advance(parameters, state, target, drag):
+    def advance(parameters, state, target, drag, lift):
         ctrl = scatter(np.zeros(model.nu), addresses.actuators, gears * target)
-        return engine.step(parameters, state, Control(ctrl, air_drag=drag), 1)
+        after = engine.step(parameters, state, Control(ctrl, air_drag=drag), 1)
+        speed, spin = (
+            jnp.stack([after.qvel[i] for i in x]) for x in (ball.qvel[:3], ball.qvel[3:])
+        )
+        turned = quaternion_matrix([after.qpos[i] for i in ball.qpos[3:]])
+        across = jnp.cross(jnp.stack(turned @ tuple(spin)), speed)
+        pushed = after.qvel.at[np.array(ball.qvel[:3])].add(dt * lift * across)
+        return after._replace(qvel=pushed)
 
     def at(path: jax.Array, speeds: jax.Array, times: jax.Array) -> jax.Array:
         """A path [T, k, L] at times [M, L], by the nearest step and its velocity."""
@@ -132,7 +148,7 @@ def _compile(config: WorldConfig, n: int) -> Callable[..., tuple[jax.Array, jax.
         return near + speed * (times - step * dt)[:, None]
 
     @jax.jit
-    def run(world, starts, targets, angle_times, picture_times, middle, carried):
+    def run(world, starts, targets, angle_times, picture_times, middle, carried, lift):
         shares = {f"body_gravcomp[{b}]": jnp.maximum(carried, own.body_gravcomp[b]) for b in links}
 
         def parameters_of(world):
@@ -145,7 +161,9 @@ def _compile(config: WorldConfig, n: int) -> Callable[..., tuple[jax.Array, jax.
         held = world["servo_offset"] - bias
 
         def body(state, target):
-            after = jax.vmap(advance, -1, -1)(parameters, state, target + held, world["air_drag"])
+            after = jax.vmap(advance, (-1, -1, -1, -1, None), -1)(
+                parameters, state, target + held, world["air_drag"], lift
+            )
             positions = jnp.stack([state.qpos[i] for i in shown_q])
             return after, (positions, jnp.stack([state.qvel[i] for i in shown_v]))
 
@@ -160,9 +178,13 @@ def _compile(config: WorldConfig, n: int) -> Callable[..., tuple[jax.Array, jax.
     return run
 
 
-def make_targets(log: Log, windows: Windows, dt: float) -> Callable[[float, float], np.ndarray]:
-    """(latency, lag) -> the servo targets [T, n], rad, in each physics step, in float32."""
-    edges = windows.origin + dt * np.arange(int(windows.first.max()) + windows.steps + 1)
+def make_targets(log: Log, edges: np.ndarray) -> Callable[[float, float], np.ndarray]:
+    """(latency, lag) -> the servo targets [T, n], rad, in each physics step, in float32.
+
+    Args:
+      edges: times [T + 1] at which the physics steps begin, and the last one ends, s.
+    """
+    dt = float(edges[1] - edges[0])
     # The integral of the targets, each held until the next: its difference over a step is the
     # step's mean target, whatever the latency's share of a step.
     times = np.minimum(np.append(log.target_times, np.inf), edges[-1] + 1.0)

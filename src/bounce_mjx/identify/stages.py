@@ -11,11 +11,14 @@ from numpy.polynomial.polynomial import polyfit
 from bounce_mjx.env.env import world_model
 from bounce_mjx.errors import UserError
 from bounce_mjx.identify.fit import (
+    AIR_LIFT,
+    NO_FLIGHT,
     Fit,
     Noise,
     Problem,
     angle_weights,
     certainty,
+    flight_errors,
     minimise,
     picture_weights,
 )
@@ -27,7 +30,7 @@ from bounce_mjx.identify.following import (
     held_out_error,
 )
 from bounce_mjx.identify.log import Log, least_age
-from bounce_mjx.identify.simulation import make_simulator
+from bounce_mjx.identify.simulation import Simulate, make_simulator
 from bounce_mjx.identify.unknowns import Layout
 from bounce_mjx.identify.windows import GRAVITY, Windows, cut
 from bounce_mjx.robot.model import find_addresses
@@ -93,6 +96,8 @@ class Identified(NamedTuple):
     """Those of the identified world [n], rad."""
     gravity_compensation: float = 0.0
     """Share of the arm's weight that its controller carries, if more than the model's own."""
+    has_lift: bool = False
+    """Whether the flights show lift by spin."""
     stamp_age: float = 0.0
     """Time from a picture's stamp to its arrival, s: `ball_latency` in the fit is without it."""
 
@@ -212,11 +217,13 @@ def identify(
     progress(f"arm: {1e3 * following.delay:.1f} ms behind its commands")
     fits = [_search_arm(problem, config, log, following) for problem in (own, carried)]
     problem, fit = _choose(own, carried, fits)
+    share = float(problem.simulate is carried.simulate)
     problem, fit = _fit_arm(problem, fit)
     stages, states = ["arm"], windows.arm_state
     pictures, seen = np.ones_like(windows.picture_weights), _training(problem)
     if with_ball:
-        problem, fit, pictures = _fit_ball(problem, fit)
+        lifted = make_simulator(config, layout, log, windows, share, AIR_LIFT)
+        problem, fit, pictures = _fit_ball(problem, fit, lifted)
         stages, states = ["arm", "flight", "bounce"], None
     progress("all")
     angles = angle_weights(problem, problem.predict(fit.vector, fit.starts))
@@ -244,7 +251,8 @@ def identify(
         following=following,
         following_errors=held_out_error(log, following, settled & held_out),
         joint_errors=_joint_errors(windows, unseen),
-        gravity_compensation=float(problem.simulate is carried.simulate),
+        gravity_compensation=share,
+        has_lift=problem.has_lift,
         stamp_age=least_age(log),
     )
 
@@ -307,12 +315,24 @@ def _check_frame(windows: Windows, config: WorldConfig, source: str) -> None:
         )
 
 
-def _fit_ball(problem: Problem, fit: Fit) -> tuple[Problem, Fit, np.ndarray]:
-    """The ball's flights, then its bounces; and the weights of the pictures [S, B]."""
+def _fit_ball(problem: Problem, fit: Fit, lifted: Simulate) -> tuple[Problem, Fit, np.ndarray]:
+    """The ball's flights, then its bounces; and the weights of the pictures [S, B].
+
+    Args:
+      lifted: the simulation with a ball that its spin lifts, which counts where flights show it.
+    """
     windows, states, seen = problem.windows, ~problem.windows.arm_state, _training(problem)
     problem.progress("flight")
     flying = windows.picture_times < windows.bounces[:, None] - BEFORE_BOUNCE
-    fit = minimise(problem, fit, ["flight"], problem.weights(flying, seen), 4, states)
+    plain = minimise(problem, fit, ["flight"], problem.weights(flying, seen), 4, states)
+    if _flies(problem, plain, flying):
+        fit = plain
+    else:
+        spinning = problem._replace(simulate=lifted, has_lift=True)
+        turned = minimise(spinning, fit, ["flight"], problem.weights(flying, seen), 8, states)
+        if _flies(spinning, turned, flying):
+            problem, fit = spinning, turned
+            problem.progress("the flights show lift by spin")
     problem.progress("bounce")
     stages, few = ["flight", "bounce"], problem.weights(1.0, _sample(problem, windows.has_ball))
     # A ball that slips and one that sticks are two valleys, and each latency may be one.
@@ -328,6 +348,14 @@ def _fit_ball(problem: Problem, fit: Fit) -> tuple[Problem, Fit, np.ndarray]:
     pictures = picture_weights(problem, problem.predict(fit.vector, fit.starts))
     fit = minimise(problem, fit, stages, problem.weights(pictures, seen), 6, states)
     return problem, fit, pictures
+
+
+def _flies(problem: Problem, fit: Fit, flying: np.ndarray) -> bool:
+    """Whether most flights [S, B] before a bounce, of those in the search, are explained."""
+    counts = problem.windows.has_ball & (_training(problem)[:, 0] > 0.0)
+    pictures = problem.windows.picture_weights * flying
+    errors = flight_errors(problem, problem.predict(fit.vector, fit.starts), pictures)
+    return bool(np.mean(errors[counts] < NO_FLIGHT) > 0.5)
 
 
 def _search_arm(

@@ -24,7 +24,7 @@ _BEFORE, _AFTER = 0.55, 0.2
 _AFTER_SHARE = 0.3
 _SECONDS = MAX_DELAY + _BEFORE + _AFTER + 0.03
 _SHORTEST = 0.16
-_FEWEST, _MOST = 5, 240
+_FEWEST, _MOST, _MOST_BALLS = 5, 240, 180
 _PADDING = 8
 _PICTURE_GAP = 0.06
 # Speed that the ball must have before and after a bounce, m/s.
@@ -96,7 +96,8 @@ class Windows(NamedTuple):
 
 
 def cut(log: Log, physics_dt: float) -> Windows:
-    """Cuts a log into windows, `_MOST` at most: of more, every k-th is used.
+    """Cuts a log into windows, `_MOST` at most, first those with a bounce: of more, every k-th is
+    used.
 
     Raises:
       UserError: there are fewer than five.
@@ -108,10 +109,12 @@ def cut(log: Log, physics_dt: float) -> Windows:
             f"{log.source} has {len(spans)} stretches of unbroken joint angles and servo targets; "
             "record at least 5 s"
         )
-    spans.sort()
     if len(spans) > _MOST:
-        keep = np.linspace(0, len(spans) - 1, _MOST).round().astype(int)
-        spans = [spans[i] for i in keep]
+        with_ball = [span for span in spans if np.isfinite(span[2])]
+        others = [span for span in spans if not np.isfinite(span[2])]
+        with_ball = _thin(with_ball, max(_MOST_BALLS, _MOST - len(others)))
+        spans = with_ball + _thin(sorted(others), _MOST - len(with_ball))
+    spans.sort()
     origin = float(min(log.times[0], log.target_times[0]))
     begins = [max(start - MAX_DELAY, origin) for start, _, _ in spans]
     first = np.array([int((begin - origin) / physics_dt) for begin in begins], int)
@@ -145,6 +148,13 @@ def cut(log: Log, physics_dt: float) -> Windows:
         starts=np.stack(starts),
         dt=physics_dt,
     )
+
+
+def _thin(spans: list, most: int) -> list:
+    """At most some of the spans, evenly over the log."""
+    if len(spans) <= most:
+        return spans
+    return [spans[i] for i in np.linspace(0, len(spans) - 1, most).round().astype(int)]
 
 
 def _find_bounces(log: Log) -> list[tuple[float, float, float]]:
