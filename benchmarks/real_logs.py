@@ -1,5 +1,5 @@
-"""Identification of real robots and real balls from public logs: errors on data that the fit has not
-seen, beside the simplest models.
+"""Identification of real robots and real balls from public logs: errors on unseen data, beside the
+simplest models.
 
 `python benchmarks/real_logs.py FOLDER... [--out FILE.json]`. A folder is a clone of
 
@@ -9,7 +9,7 @@ seen, beside the simplest models.
 
 An arm's log is cut into halves: each is fitted alone, and the world is tested on the other on
 MuJoCo's C engine, open loop from its first row, with nothing refitted. Flights are moved over the
-paddle of the project's arm, which rests, and compared with a direct fit of the same model of the air.
+paddle of the project's arm, which rests, and compared with a direct fit of the same air.
 """
 
 import argparse
@@ -239,7 +239,7 @@ def _fly(start: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fit_side(times: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, float]:
-    """A direct fit of one side of a bounce: its start, and the error, root mean square of an axis."""
+    """A direct fit of one side of a bounce: its start, and the root mean square error of an axis."""
     line = polyfit(times - times[0], places, 2)
     guess = np.concatenate([line[0], line[1], np.zeros(3), [0.14]])
 

@@ -45,6 +45,8 @@ _DISAGREEMENT = 0.1
 # real paddle is not the same everywhere; and a simulated bounce depends by as much on where in a
 # physics step it begins, which makes the fit smooth only with this freedom.
 _BOUNCE_DEVIATION = (0.02, 0.02, 0.1)
+# The same of a ball with spin, which rubs and rolls in ways that the contact's friction lacks.
+_SPINNING_DEVIATION = (0.5, 0.5, 0.1)
 AIR_LIFT = 0.006
 """Acceleration of a table-tennis ball across its flight, per spin (rad/s) and speed (m/s): a flight
 shows its product with the spin alone."""
@@ -129,6 +131,7 @@ class Problem(NamedTuple):
         since = np.maximum(since, 0.0)[:, :, None]
         columns = [since * _BOUNCE_DEVIATION / self.noise.balls]
         if self.has_lift:
+            columns = [since * _SPINNING_DEVIATION / self.noise.balls]
             columns.append(0.5 * since**2 * _LIFT_DEVIATION / self.noise.balls)
         return np.stack(columns, axis=-1)
 

@@ -42,6 +42,11 @@ def find_settled(log: Log) -> np.ndarray:
     return log.times - begins[last] >= SETTLING
 
 
+def does_move(log: Log) -> bool:
+    """Whether any command of a log changes."""
+    return bool(np.max(np.ptp(log.servo_targets, axis=0)) > _STILL)
+
+
 def commanded(log: Log, times: np.ndarray) -> np.ndarray:
     """The commands [T, n] at times [T], interpolated between those that were sent."""
     return np.stack([np.interp(times, log.target_times, c) for c in log.servo_targets.T], axis=1)
@@ -56,7 +61,7 @@ def follow(log: Log, rows: np.ndarray, shortest: float = -0.05, longest: float =
       longest: largest one, s.
     """
     chosen = np.flatnonzero(rows)
-    if np.max(np.ptp(log.servo_targets, axis=0)) < _STILL:
+    if not does_move(log):
         shortest, longest = 0.0, _STEP
     few = chosen[:: max(len(chosen) // _ROWS, 1)]
 

@@ -24,6 +24,7 @@ from bounce_mjx.identify.fit import (
 )
 from bounce_mjx.identify.following import (
     Following,
+    does_move,
     error_size,
     find_settled,
     follow,
@@ -215,10 +216,12 @@ def identify(
     settled, held_out = find_settled(log), _held_out_rows(log, windows)
     following = follow(log, settled & ~held_out)
     progress(f"arm: {1e3 * following.delay:.1f} ms behind its commands")
-    fits = [_search_arm(problem, config, log, following) for problem in (own, carried)]
-    problem, fit = _choose(own, carried, fits)
+    problem, fit = own, Fit(layout.mean, windows.starts)
+    if does_move(log):
+        fits = [_search_arm(problem, config, log, following) for problem in (own, carried)]
+        problem, fit = _choose(own, carried, fits)
+        problem, fit = _fit_arm(problem, fit)
     share = float(problem.simulate is carried.simulate)
-    problem, fit = _fit_arm(problem, fit)
     stages, states = ["arm"], windows.arm_state
     pictures, seen = np.ones_like(windows.picture_weights), _training(problem)
     if with_ball:
