@@ -27,7 +27,7 @@ from scipy.optimize import brentq, least_squares
 from bounce_mjx.env.env import world_model
 from bounce_mjx.errors import UserError
 from bounce_mjx.identify.doctor import examine
-from bounce_mjx.identify.following import SETTLING, find_settled, follow, held_out_error
+from bounce_mjx.identify.following import SETTLING, Following, commanded, find_settled, follow
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.simulation import compensated, make_targets
 from bounce_mjx.identify.stages import Identified, identify
@@ -136,6 +136,13 @@ def open_loop(config: WorldConfig, found: Identified, log: Log) -> np.ndarray:
     return np.sqrt(np.mean(errors[log.times - log.times[0] > SETTLING] ** 2, axis=0))
 
 
+def late_errors(simple: Following, log: Log) -> np.ndarray:
+    """Errors [n] of a delay and offsets on a log, root mean square, rad."""
+    rows = log.times - log.times[0] > SETTLING
+    expected = commanded(log, log.times[rows] - simple.delay) + simple.offsets
+    return np.sqrt(np.mean((log.joint_angles[rows] - expected) ** 2, axis=0))
+
+
 def measure_arm(arm: ArmLog) -> list[dict[str, Any]]:
     """A row for each way round."""
     config = read_preset(Path("default"), Path(arm.robot)).env
@@ -146,8 +153,7 @@ def measure_arm(arm: ArmLog) -> list[dict[str, Any]]:
         simple = follow(fitted, find_settled(fitted))
         row = {"log": arm.name, "fitted": ("first half", "second half")[which]}
         row["delay and offset, ms"] = 1e3 * simple.delay
-        settled = find_settled(tested)
-        row["delay and offset, mrad"] = (1e3 * held_out_error(tested, simple, settled)).tolist()
+        row["delay and offset, mrad"] = (1e3 * late_errors(simple, tested)).tolist()
         row["faults"] = [str(x) for x in examine([fitted], names)[0].findings]
         begin = time.perf_counter()
         try:
@@ -239,7 +245,7 @@ def _fly(start: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fit_side(times: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, float]:
-    """A direct fit of one side of a bounce: its start, and the root mean square error of an axis."""
+    """A direct fit of one side of a bounce: its start, and the error of an axis."""
     line = polyfit(times - times[0], places, 2)
     guess = np.concatenate([line[0], line[1], np.zeros(3), [0.14]])
 

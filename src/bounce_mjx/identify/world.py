@@ -206,7 +206,8 @@ def total_delay(found: Identified, model: mujoco.MjModel) -> str:
     vector, steps = found.fit.vector, 1e-3 * layout.deviation
     moved = [total(vector + step) for step in np.diag(steps)]
     slope = (np.array(moved) - total(vector)) / steps
-    width = _HALF_WIDTH * misfit(found) * float(np.sqrt(slope @ found.covariance @ slope))
+    covariance = np.linalg.inv(found.information + np.diag(layout.deviation**-2.0))
+    width = _HALF_WIDTH * misfit(found) * float(np.sqrt(slope @ covariance @ slope))
     late = 1e3 * total(vector)
     return f"total delay: {late:.1f} +- {1e3 * width:.1f} ms, of latency, lag and servos"
 
