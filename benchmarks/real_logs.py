@@ -203,8 +203,11 @@ def flights(folder: Path) -> list[Flight]:
 def flights_log(config: WorldConfig, folder: Path, given: list[Flight]) -> Log:
     """The flights, one after another, over the paddle of an arm at rest."""
     stamps, balls, begin = [], [], 1.0
-    for flight in given:
+    for i, flight in enumerate(given):
         place = flight.places - flight.places[flight.lowest] * [1.0, 1.0, 0.0]
+        # Every flight went one way. The table is level: turned about the vertical, a flight is one
+        # that goes another way, and tells a tilt of the table from its restitution.
+        place = place * (1.0 if i % 2 else [-1.0, -1.0, 1.0])
         stamps.append(begin + flight.times)
         balls.append(place + _PADDLE)
         begin += flight.times[-1] + 0.3

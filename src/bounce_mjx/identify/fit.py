@@ -16,11 +16,12 @@ from bounce_mjx.identify.unknowns import ARM, Layout
 from bounce_mjx.identify.windows import Windows
 
 # Deviation of the guessed starts, and the differences for their derivatives: angles (rad), joint
-# velocities (rad/s); the ball's position (m), velocity (m/s) and spin (rad/s).
-_START_DEVIATIONS = (0.01, 1.0, 1.0, 10.0, 10.0)
-_START_STEPS = (3e-3, 0.1, 0.01, 0.03, 5.0)
+# velocities (rad/s); the ball's position (m), velocity (m/s), spin (rad/s) and, relative to that of
+# all flights, drag.
+_START_DEVIATIONS = (0.01, 1.0, 1.0, 10.0, 10.0, 0.15)
+_START_STEPS = (3e-3, 0.1, 0.01, 0.03, 5.0, 0.05)
 # Entries of a start that are searched: a servo forgets a wrong velocity within milliseconds.
-_SEARCHED = (True, False, True, True, True)
+_SEARCHED = (True, False, True, True, True, False)
 # Levenberg and Marquardt's dampings, and shares of the change of the starts, that a step tries side
 # by side: the best damping for all, and the best share for each window. With a share of 0, a wrong
 # slope of one window's start cannot spoil the step of all.
@@ -136,13 +137,15 @@ class Problem(NamedTuple):
         return np.stack(columns, axis=-1)
 
     def scale_starts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Deviation, difference and whether it is searched, of each entry of a start [2 n + 9]."""
+        """Deviation, difference and whether it is searched, of each entry of a start [2 n + 10]."""
         n = self.windows.angles.shape[2]
-        sizes = n, n, 3, 3, 3
+        sizes = n, n, 3, 3, 3, 1
         deviations = np.repeat(_START_DEVIATIONS, sizes)
+        searched = np.repeat(_SEARCHED, sizes)
         if self.has_lift:
-            deviations[-3:] = _SPIN_DEVIATION
-        return deviations, np.repeat(_START_STEPS, sizes), np.repeat(_SEARCHED, sizes)
+            deviations[-4:-1] = _SPIN_DEVIATION
+            searched[-1] = True
+        return deviations, np.repeat(_START_STEPS, sizes), searched
 
     def weights(
         self,

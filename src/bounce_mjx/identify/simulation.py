@@ -26,8 +26,8 @@ _LANES = 128
 
 
 Simulate = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-"""(vectors of unknowns [C, P], states at the starts [C, S, 2 n + 9], which windows count [C, S]) ->
-what the sensors would have measured [C, S, A n + 3 B], as `Windows.measured`; a window that does
+"""(vectors of unknowns [C, P], states at the starts [C, S, 2 n + 10], which windows count [C, S])
+-> what the sensors would have measured [C, S, A n + 3 B], as `Windows.measured`; a window that does
 not count has the numbers of the first candidate, or 0 if that has none."""
 
 
@@ -125,7 +125,8 @@ def _compile(config: WorldConfig, n: int) -> Callable[..., tuple[jax.Array, jax.
     shown_v = (*addresses.arm_qvel, *ball.qvel[:3])
 
     def first_state(start: jax.Array) -> PhysicsState:
-        angles, velocities, position, ball_speeds = jnp.split(start, [n, 2 * n, 2 * n + 3])
+        ends = [n, 2 * n, 2 * n + 3, 2 * n + 9]
+        angles, velocities, position, ball_speeds, _ = jnp.split(start, ends)
         qpos = scatter(model.qpos0, shown_q, jnp.concatenate([angles, position]))
         moving, speeds = (*addresses.arm_qvel, *ball.qvel), (velocities, ball_speeds)
         return PhysicsState(qpos, scatter(np.zeros(model.nv), moving, jnp.concatenate(speeds)))
@@ -159,10 +160,12 @@ def _compile(config: WorldConfig, n: int) -> Callable[..., tuple[jax.Array, jax.
         )
         bias = world["encoder_bias"]
         held = world["servo_offset"] - bias
+        # Spin also brakes a ball.
+        drag = world["air_drag"] * (1.0 + starts[2 * n + 9])
 
         def body(state, target):
             after = jax.vmap(advance, (-1, -1, -1, -1, None), -1)(
-                parameters, state, target + held, world["air_drag"], lift
+                parameters, state, target + held, drag, lift
             )
             positions = jnp.stack([state.qpos[i] for i in shown_q])
             return after, (positions, jnp.stack([state.qvel[i] for i in shown_v]))

@@ -60,8 +60,8 @@ class Windows(NamedTuple):
     bounces: np.ndarray
     """Time [S] of the bounce since the window's start, s; NaN for the arm alone."""
     starts: np.ndarray
-    """First guess of the state at the start [S, 2 n + 9]: angles, velocities; the ball's position,
-    velocity and spin."""
+    """First guess of the state at the start [S, 2 n + 10]: angles, velocities; the ball's position,
+    velocity and spin; the relative deviation of its drag."""
 
     dt: float
     """A physics step, s."""
@@ -91,7 +91,7 @@ class Windows(NamedTuple):
 
     @property
     def arm_state(self) -> np.ndarray:
-        """Which entries [2 n + 9] of a start are the arm's."""
+        """Which entries [2 n + 10] of a start are the arm's."""
         return np.arange(self.starts.shape[1]) < 2 * self.angles.shape[2]
 
 
@@ -233,12 +233,12 @@ def _joint_start(log: Log, time: float) -> np.ndarray:
 
 
 def _ball_start(log: Log, pictures: np.ndarray, bounce: float, zero: float) -> np.ndarray:
-    """Position, velocity and spin [9] of the ball at a time, by a free fall through the pictures
-    before the bounce."""
+    """Position, velocity, spin and deviation of the drag [10] of the ball at a time, by a free fall
+    through the pictures before the bounce."""
     if not len(pictures):
-        return np.concatenate([_NO_BALL, np.zeros(6)])
+        return np.concatenate([_NO_BALL, np.zeros(7)])
     t = log.picture_times[pictures] - zero
     before = t < bounce - 0.012
     t, balls = t[before], log.ball_positions[pictures][before]
     line = polyfit(t, balls - 0.5 * t[:, None] ** 2 * GRAVITY, 1)
-    return np.append(line.ravel(), np.zeros(3))
+    return np.append(line.ravel(), np.zeros(4))
