@@ -41,6 +41,7 @@ from bounce_mjx.physics.edited import EditedModel
 from bounce_mjx.reports.identification import identification_page
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.runs.config import read_preset
+from bounce_mjx.world.actuation import Actuators
 from bounce_mjx.world.named import read_world
 
 BENCHMARK = Path(__file__).parent.parent / "benchmarks" / "identify.py"
@@ -387,3 +388,18 @@ def test_a_hidden_robot_is_identified(tmp_path: Path) -> None:
     assert found.before["ball_position"] > 2.0
     assert all(0.8 < error < 1.2 for error in found.after.values())
     assert all(error < 1.3 for error in found.held_out.values())
+
+
+def test_a_servo_holds_its_joint_beside_the_target() -> None:
+    """By servo_offset, in the world of a training."""
+    config = read_preset(Path("default")).env
+    model = world_model(config, visual=False)
+    actuators, qpos = Actuators(config, model), jnp.asarray(model.qpos0)
+    offsets = jnp.array([0.01, 0.0, -0.02, 0.0, 0.0, 0.003])
+    before, action = actuators.first(qpos), jnp.full(6, 0.5)
+    plain, other = (
+        actuators.next(before, qpos, action, world, None)[0]
+        for world in ({}, {"servo_offset": offsets})
+    )
+    servos = list(find_addresses(model).actuators)
+    np.testing.assert_allclose((other.ctrl - plain.ctrl)[np.array(servos)], offsets, atol=1e-7)
