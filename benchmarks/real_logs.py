@@ -154,7 +154,11 @@ def measure_arm(arm: ArmLog) -> list[dict[str, Any]]:
         row = {"log": arm.name, "fitted": ("first half", "second half")[which]}
         row["delay and offset, ms"] = 1e3 * simple.delay
         row["delay and offset, mrad"] = (1e3 * late_errors(simple, tested)).tolist()
-        row["faults"] = [str(x) for x in examine([fitted], names)[0].findings]
+        checkup = examine([fitted], names)[0]
+        row["findings"] = [str(finding) for finding in checkup.findings]
+        if checkup.faults:
+            rows.append(row | {"refused": checkup.faults[0].text})
+            continue
         begin = time.perf_counter()
         try:
             found = identify(config, fitted)
