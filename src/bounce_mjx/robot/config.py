@@ -91,8 +91,12 @@ class RobotConfig(settings.StrictModel):
     limits: LimitsConfig = LimitsConfig()
     """The arm's own limits, as its manufacturer states them."""
 
+    gravity_compensation: settings.UnitInterval = 0.0
+    """Share of each link's weight that the arm's controller carries, so that the servos do not sag
+    under it; 0 leaves the MJCF's `gravcomp`."""
 
-OF_SITE = RobotConfig.model_fields.keys() - {"site", "limits"}
+
+OF_SITE = RobotConfig.model_fields.keys() - {"site", "limits", "gravity_compensation"}
 """Settings that change nothing without a site."""
 
 

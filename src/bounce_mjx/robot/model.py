@@ -91,6 +91,8 @@ def load_model(
     """
     spec, path = scene_spec(mjcf, robot or RobotConfig())
     add_balls(spec, num_balls)
+    if robot is not None and robot.gravity_compensation > 0.0:
+        _compensate_gravity(spec, robot.gravity_compensation)
     # MuJoCo does not drop geoms that make the bodies' inertia.
     from_geoms = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     if not visual and spec.compiler.inertiafromgeom != from_geoms:
@@ -109,6 +111,13 @@ def load_model(
     mj_model.opt.timestep = physics_dt
     _check_step(mj_model)
     return mj_model
+
+
+def _compensate_gravity(spec: mujoco.MjSpec, share: float) -> None:
+    """Lets a controller carry a share of the weight of each body but the balls."""
+    for body in spec.bodies:
+        if not any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in body.joints):
+            body.gravcomp = share
 
 
 def paddle_home(

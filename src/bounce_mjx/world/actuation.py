@@ -75,6 +75,8 @@ class Actuators:
             angles = angles + world["joint_angle_noise"] * numbers
         wanted = self._joint_targets(angles, action, before.setpoint)
         control, setpoint = self._command(wanted, before.setpoint)
+        if "servo_offset" in world:
+            control = control._replace(ctrl=control.ctrl + self._ctrl(world["servo_offset"]))
         control, memory = add_delay(world, before, control, config.control_dt, config.num_substeps)
         control = control._replace(air_drag=world.get("air_drag"))
         if "push_speed" in world:

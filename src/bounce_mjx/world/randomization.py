@@ -153,6 +153,8 @@ class RandomizationConfig(StrictModel):
     """Factor of each servo's damping."""
     servo_lag: Annotated[Sampled, Term((), (0.0, 1.0), 0.0)] = None
     """Time constant of a first-order lag of the servo targets, s."""
+    servo_offset: Annotated[Sampled, Term(None, (-0.5, 0.5), 0.0)] = None
+    """Constant error of each servo: where it holds its joint, less its target, rad."""
     torque_limit: Annotated[Sampled, physical("force_limit", LIMIT, None, (0.01, 1e4))] = None
     """Largest torque of each servo at its joint, N m; a servo that is weaker keeps its own
     limit."""
