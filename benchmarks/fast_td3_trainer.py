@@ -3,12 +3,13 @@
     git clone https://github.com/younggyoseo/FastTD3 benchmarks/sources/FastTD3
 
 Their `train.py` runs as it is, with `TorchVectorEnv` in place of MuJoCo Playground, and each of its
-checkpoints is evaluated. The settings are theirs for MuJoCo Playground (1,024 environments, batches
-of 32,768, two updates a step), except for these:
+checkpoints is evaluated. The settings are theirs for Playground's LeapCubeReorient, which moves an
+object too (1,024 environments, batches of 32,768, two updates a step, returns over three steps),
+except for these:
 
 | setting              | value                                                              |
 |----------------------|--------------------------------------------------------------------|
-| reward_normalization | on, as in their settings for MTBench: the critic's range is the same |
+| reward_normalization | on, as in their settings for MTBench, to fit the critic's range       |
 | logs, videos         | none                                                               |
 """
 
@@ -103,7 +104,7 @@ def train(config: TrainConfig, on_block: OnBlock, **settings: Any) -> None:
     from fast_td3 import Actor
     from fast_td3_utils import EmpiricalNormalization
 
-    args = hyperparams.MuJoCoPlaygroundArgs(
+    args = hyperparams.LeapCubeReorientArgs(
         env_name="BounceBall",
         seed=config.seed,
         cuda=torch.cuda.is_available(),
