@@ -34,7 +34,7 @@ from bounce_mjx.identify.stages import Identified, identify
 from bounce_mjx.identify.world import describe_doubts, total_delay
 from bounce_mjx.physics import edited_model
 from bounce_mjx.robot.model import find_addresses, joint_names
-from bounce_mjx.runs.config import read_preset
+from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.training.setup import set_up_jax
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import physics_parameters
