@@ -33,8 +33,8 @@ from bounce_mjx.runs.folders import (
     named_run,
     stored_checkpoints,
 )
+from bounce_mjx.runs.settings import Choice, stack
 from bounce_mjx.training import job
-from bounce_mjx.training.command import Start
 from bounce_mjx.training.events import Event
 from bounce_mjx.training.trainer import Snapshot
 from tiny_runs import contents
@@ -233,8 +233,9 @@ def test_a_training_stops_once_its_results_have_a_margin(tmp_path: Path) -> None
     assert f"{run} has met all results, 192 steps; add --total-steps N" in shown.getvalue()
     # Results are not needed to resume.
     (run / "results.json").write_text("damaged")
-    assert not Start(resume=run, total_steps=10**6).base().stop_when_solved
-    assert Start(resume=run).base().stop_when_solved
+    layers = stack(Choice(resume=run))
+    assert not layers.config({"total_steps": 10**6}).stop_when_solved
+    assert layers.config().stop_when_solved
     assert latest_checkpoint(run).steps == 192
     train(tmp_path, RETURNS, run, margins=margins)
     assert latest_checkpoint(run).steps == 256
