@@ -63,6 +63,8 @@ def recorder(name: str, episodes: int, latencies: list[float] | None) -> Any:
             command = actuation.setpoint.position
         else:
             command = control.ctrl[: env.action_size]
+        # The servo shares the offset of the encoder's zero.
+        command = command + now.world.get("encoder_bias", 0.0)
         return {
             "joint_angles": angles,
             "joint_velocities": velocities,
@@ -92,6 +94,8 @@ class Found(NamedTuple):
 
     length: int
     """Control steps."""
+    at: int
+    """Step of the first fault."""
     alarm: str
     """Code of the first fault; empty if there is none before the last step."""
     bridged: int
@@ -151,9 +155,9 @@ def judge(metadata: Metadata, episode: dict[str, np.ndarray], seed: int) -> Foun
     """What the rules say about one episode and about faults in it."""
     length = int(np.sum(episode["running"]))
     episode = {name: values[:length].astype(float) for name, values in episode.items()}
-    _, fault, bridged = first_alarm(metadata, episode)
+    at, fault, bridged = first_alarm(metadata, episode)
     late = delays(metadata, episode, np.random.default_rng(seed))
-    return Found(length, fault, bridged, late)
+    return Found(length, at, fault, bridged, late)
 
 
 def report(name: str, found: list[Found], steps: int) -> None:
@@ -166,6 +170,8 @@ def report(name: str, found: list[Found], steps: int) -> None:
         f"{bridged} samples bridged",
         flush=True,
     )
+    for one in [one for one in found if one.alarm][:10]:
+        print(f"  {one.alarm} in step {one.at} of {one.length}", flush=True)
     kinds = {kind for one in found for kind in one.delays}
     for kind in sorted(kinds):
         values = np.array([one.delays[kind] for one in found if one.delays])

@@ -196,7 +196,7 @@ def test_a_share_of_the_terms_is_drawn() -> None:
     [
         ({"push_interval": (1, 2)}, "push_interval is given without push_speed; give both"),
         ({"air_drag": (0.2, 0.1)}, "air_drag (0.2, 0.1) is not a range within 0 to 10"),
-        ({"restitution": (0.5, 0.9)}, "restitution (0.5, 0.9) is not a range within 0.6 to 0.98"),
+        ({"restitution": (0.3, 0.9)}, "restitution (0.3, 0.9) is not a range within 0.4 to 0.98"),
         ({"frame_drop": (0.0, 1.0)}, "within 0 to 0.99; give the lower end"),
         ({"drag": (0.0, 0.1)}, "drag; did you mean randomization.air_drag?"),
         ({"shares": {"drag": 0.1}}, "shares has a probability for drag, which is not a term"),

@@ -115,10 +115,10 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         servo, or a command has the name of a measurement.
     """
     env, given = config.env, config.env.robot.limits
-    limits, steps = None, [env.action_scale] * env.num_joints
+    limits, largest_steps = None, [env.action_scale] * env.num_joints
     if given.velocity is not None:
         limits = CommandLimits(given.velocity, given.acceleration, given.jerk)
-        steps = [speed * env.control_dt for speed in given.velocity]
+        largest_steps = [speed * env.control_dt for speed in given.velocity]
     displacement = env.randomization.joint_start or (0.0, 0.0)
     if taken := env.commands.keys() & UNITS.keys():
         raise UserError(
@@ -146,7 +146,7 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         action_base=env.action.base,
         action_scale=env.action_scale,
         max_lead=env.action.max_lead if env.action.base == "target" else None,
-        largest_step=tuple(steps),
+        largest_step=tuple(largest_steps),
         max_joint_velocity=env.max_joint_velocity,
         limits=limits,
         joint_ranges=tuple(

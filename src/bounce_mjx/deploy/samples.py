@@ -21,8 +21,8 @@ _SAME = 0.1
 _OVERSPEED = 1.2
 # Largest noise in standard deviations, and the resolution of an encoder, rad.
 _LARGEST_NOISE, _RESOLUTION = 8.0, 2e-3
-# Calls at one time.
-_MOST_STANDING = 50
+# Calls at one time, and a pause, s.
+_MOST_STANDING, _PAUSE = 50, 1.0
 
 _OF_ARM = ("joint_angles", "joint_velocities")
 _OF_BALL = (
@@ -126,7 +126,12 @@ class Samples:
                 "time of each sample, or none",
             )
         if elapsed < -self._metadata.control_dt:
-            reason = f"the time went back by {-elapsed:.3g} s; give seconds of one clock"
+            reason = (
+                f"the time went back by {-elapsed:.3g} s; give seconds of one clock, and call "
+                "reset if it starts again"
+            )
+            if elapsed <= -_PAUSE:
+                raise ImpossibleMeasurement("time", reason)
             self._bridge(measured, ("time",), "time", reason)
             return
         self._bridged.discard("time")
