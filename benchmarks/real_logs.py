@@ -27,7 +27,14 @@ from scipy.optimize import brentq, least_squares
 from bounce_mjx.env.env import world_model
 from bounce_mjx.errors import UserError
 from bounce_mjx.identify.doctor import examine
-from bounce_mjx.identify.following import SETTLING, Following, commanded, find_settled, follow
+from bounce_mjx.identify.following import (
+    SETTLING,
+    Following,
+    commanded,
+    find_settled,
+    follow,
+    set_points,
+)
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.simulation import compensated, make_targets
 from bounce_mjx.identify.stages import Identified, identify
@@ -116,6 +123,7 @@ def open_loop(config: WorldConfig, found: Identified, log: Log) -> np.ndarray:
     model = edited_model(plain, physics_parameters(world, plain))
     data, addresses = mujoco.MjData(model), find_addresses(model)
     qpos, servos = list(addresses.arm_qpos), list(addresses.actuators)
+    log = set_points(log, found.following.delay, dt)
     count = int((log.times[-1] - log.times[0]) / dt) + 1
     send = make_targets(log, log.times[0] + dt * np.arange(count + 1))
     targets = send(float(world["action_latency"]), float(world["servo_lag"]))

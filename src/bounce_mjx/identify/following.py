@@ -78,6 +78,21 @@ def follow(log: Log, rows: np.ndarray, shortest: float = -0.05, longest: float =
     return Following(delay, offsets, error_size(residuals - offsets))
 
 
+def set_points(log: Log, delay: float, dt: float) -> Log:
+    """The log with commands in every physics step, between those of the log, if the joints follow
+    too early for commands that are held: those are then a controller's own set points, recorded
+    now and then.
+
+    Args:
+      delay: time from a command to the angle, s.
+      dt: physics step, s.
+    """
+    if delay >= 0.5 * float(np.median(np.diff(log.target_times))):
+        return log
+    times = np.arange(log.target_times[0], log.target_times[-1], dt)
+    return log._replace(target_times=times, servo_targets=commanded(log, times))
+
+
 def error_size(residuals: np.ndarray) -> np.ndarray:
     """Root mean square [n] of residuals [T, n], of which outliers count no more than at their
     bound."""

@@ -29,6 +29,7 @@ from bounce_mjx.identify.following import (
     find_settled,
     follow,
     held_out_error,
+    set_points,
 )
 from bounce_mjx.identify.log import Log, least_age
 from bounce_mjx.identify.simulation import Simulate, make_simulator
@@ -48,7 +49,7 @@ _FEW = 13
 _LAGS = (0.001, 0.008, 0.016, 0.026, 0.038)
 # Servos that make a joint follow as late as measured: their gains, the share of the delay that is
 # the servo's own, and the share of the rest that is a lag.
-_GAINS = (1.0, 2.0, 4.0, 8.0)
+_GAINS = (1.0, 2.0, 4.0, 8.0, 30.0)
 _SERVO_SHARES = (0.1, 0.3, 0.6, 0.9)
 _LAG_SHARES = (0.0, 0.3, 0.6)
 # Candidates from which a search over a few windows begins, and decrease of the cost from which the
@@ -201,6 +202,9 @@ def identify(
         _check_frame(windows, config, log.source)
     layout = Layout(config.num_joints, with_ball, config.physics_dt, camera_rotation)
     sensors = sensor_noise(log)
+    settled, held_out = find_settled(log), _held_out_rows(log, windows)
+    following = follow(log, settled & ~held_out)
+    log = set_points(log, following.delay, config.physics_dt)
     own, carried = (
         Problem(
             simulate=make_simulator(config, layout, log, windows, share),
@@ -212,8 +216,6 @@ def identify(
         )
         for share in (0.0, 1.0)
     )
-    settled, held_out = find_settled(log), _held_out_rows(log, windows)
-    following = follow(log, settled & ~held_out)
     progress(f"arm: {1e3 * following.delay:.1f} ms behind its commands")
     problem, fit = own, Fit(layout.mean, windows.starts)
     if does_move(log):

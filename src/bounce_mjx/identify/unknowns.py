@@ -40,7 +40,7 @@ ARM = {
     "delay": Unknown(0.035, 0.03, 5e-4, "s", "arm", limits=(0.0, 0.4), ball_step=3e-3),
     "delay_variance": Unknown(2e-4, 4e-4, 1e-5, "s", "arm", limits=(0.0, 0.04), ball_step=6e-5),
     "servo_gain": Unknown(
-        1.0, 0.2, 0.02, "", "arm", _JOINTS, (0.1, 10.0), 0.15, own=True, is_factor=True
+        1.0, 0.2, 0.02, "", "arm", _JOINTS, (0.1, 100.0), 0.15, own=True, is_factor=True
     ),
     "servo_damping": Unknown(
         1.0, 0.3, 0.02, "", "arm", _JOINTS, (0.05, 20.0), 0.15, own=True, is_factor=True
