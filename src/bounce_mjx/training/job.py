@@ -43,7 +43,7 @@ Result = TypeVar("Result")
 MakeTrainer = Callable[[TrainConfig, Env], Trainer]
 MakeEvaluators = Callable[..., Evaluators]
 
-# Imported by name during the compilation, because these imports take half a second each.
+# Imported during the compilation, because these imports take half a second each.
 _SLOW_MODULES = "orbax.checkpoint", "bounce_mjx.reports.page"
 
 
@@ -273,7 +273,7 @@ class Job:
         with self.console.status("compiling"):
             self.evaluators, compiling = self.wait_for(self.pool.submit(trace))
             self.open_logs()
-            self.pool.map(importlib.import_module, _SLOW_MODULES)
+            self.pool.submit(_import_slow_modules)
             self.wait_for(compiling)
         if jax.process_count() > 1:
             # A process that finds its programs in the cache waits here for a process that compiles
@@ -589,3 +589,8 @@ def _make_run(config: TrainConfig) -> Path:
     """The folder of a new run, which the leader makes."""
     made = str(folders.create_run(config)) if hosts.is_leader() else None
     return Path(hosts.exchange(made)[0])
+
+
+def _import_slow_modules() -> None:
+    for name in _SLOW_MODULES:
+        importlib.import_module(name)
