@@ -52,6 +52,17 @@ def test_models_that_cannot_be_simulated_are_refused(tmp_path, name):
     assert str(mjcf) in str(error.value)
 
 
+@pytest.mark.parametrize("memory", ["1K", "900T"])
+def test_the_memory_that_a_file_asks_for_is_ignored(memory, tmp_path):
+    """Too little of it ends a step, and too much the process."""
+    path = tmp_path / "robot.xml"
+    path.write_text(XML.replace("<worldbody>", f'<size memory="{memory}"/><worldbody>', 1))
+    model = load_model(path, 0.001)
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data)
+    assert data.time == 0.001
+
+
 @pytest.mark.parametrize(
     ("solref", "longest"),
     [("-98696 -31.4", 0.0025), ("-1e6 -60", 0.0031416 / 4), ("0.02 0.1", 0.0062832 / 4)],

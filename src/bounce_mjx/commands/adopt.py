@@ -69,6 +69,8 @@ def main(args: Sequence[str]) -> None:
     print(f"physics: {env.engine.name} ({env.engine.reason})")
     out = command.out or Path(f"{command.mjcf.stem}.yaml")
     head = f"An arm with a paddle: bounce-mjx adopt {command.mjcf} --site {adoption.config.site}"
+    # A path may have a line break, which would end the comment.
+    head = " ".join(head.splitlines())
     text = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)
     write_output(out, f"# {head}\n{text}")
     print(f"config: {out}")

@@ -136,7 +136,10 @@ def read_spec(path: Path) -> mujoco.MjSpec:
       UserError: the file is no MJCF.
     """
     with _compiling(path):
-        return mujoco.MjSpec.from_file(str(path))
+        spec = mujoco.MjSpec.from_file(str(path))
+    # MuJoCo chooses the memory: with too little of it, a step ends the process.
+    spec.memory = -1
+    return spec
 
 
 def compile_spec(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
@@ -434,7 +437,11 @@ class _Builder:
         # With what acts on them, such as a gripper's tendons.
         self._remove("removed the grippers and loose objects", [bodies[b] for b in loose])
         self._remove("fixed the joints that do not act", fixed)
-        couplings = [_constraint_words(equality) for equality in arm.equalities]
+        couplings = [
+            _constraint_words(equality)
+            for equality in arm.equalities
+            if _moves_with(model, equality.id, joints)
+        ]
         couplings += [tendons[tendon.id] for tendon in arm.tendons]
         if couplings:
             raise UserError(
@@ -444,6 +451,7 @@ class _Builder:
         floors = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
         elements = (
             *(*arm.keys, *arm.sensors, *arm.pairs, *arm.excludes, *arm.lights, *arm.cameras),
+            *arm.equalities,
             *(actuator for actuator in arm.actuators if actuator.target not in acting),
             *(geom for geom in arm.geoms if geom.type in floors),
         )
@@ -652,6 +660,21 @@ def _constraint_words(equality: mujoco.MjsEquality) -> str:
     kind = mujoco.mjtEq(equality.type).name.removeprefix("mjEQ_").lower()
     connected = _list((equality.name1, equality.name2))
     return f"unnamed equality constraint ({kind}: {connected})"
+
+
+def _moves_with(model: mujoco.MjModel, constraint: int, joints: list[int]) -> bool:
+    """Whether an equality constraint is one of the acting joints, or of a body that they move."""
+    kinds = mujoco.mjtEq
+    ends = [int(model.eq_obj1id[constraint]), int(model.eq_obj2id[constraint])]
+    kind = kinds(model.eq_type[constraint])
+    if kind == kinds.mjEQ_JOINT:
+        return not set(joints).isdisjoint(ends)
+    if kind not in (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD):
+        return True
+    if model.eq_objtype[constraint] == mujoco.mjtObj.mjOBJ_SITE:
+        ends = [int(model.site_bodyid[site]) for site in ends]
+    moved = [int(model.jnt_bodyid[joint]) for joint in joints]
+    return any(is_below(model, body, moved) for body in ends)
 
 
 def _tendon_words(model: mujoco.MjModel, tendon: int) -> str:
