@@ -475,7 +475,9 @@ def test_a_policy_needs_only_what_it_sees(tmp_path: Path) -> None:
         "ball_quaternion": 1,
         "action": 1,
     }
-    policy = load_policy(make_run(tmp_path / "run", {"observation": observation}))
+    # A target that varies would have to be seen.
+    env = {"observation": observation, "target_height_range": (0.5, 0.5)}
+    policy = load_policy(make_run(tmp_path / "run", env))
     assert policy.needs == ("ball_position",)
     policy.step({"ball_position": (0.1, 0.2, 0.3)})
     policy.step({"ball_position": (0.12, 0.22, 0.32)})
