@@ -383,3 +383,18 @@ def test_robot_page_has_every_term_of_the_randomisation() -> None:
     section = page.split("## Randomised quantities\n")[1].split("\n## ")[0]
     rows = re.findall(r"^\| \w+ \| (`.+) \|$", section, re.MULTILINE)
     assert sorted(name for row in rows for name in re.findall(r"`(\w+)`", row)) == sorted(TERMS)
+
+
+def test_each_promise_has_its_place_and_its_test() -> None:
+    """The rows of "What we promise" in CONTRIBUTING.md."""
+    section = (CHECKOUT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    section = section.split("## What we promise\n")[1].split("\n## ")[0]
+    rows = re.findall(r"^\| (.+) \| (`.+`) \| (`.+`) \|$", section, re.MULTILINE)
+    assert len(rows) >= 40
+    for promise, places, tests in rows:
+        for place in re.findall(r"`([^`]+)`", places):
+            assert (CHECKOUT / "src/bounce_mjx" / place).is_file(), f"{promise}: {place}"
+        for test in re.findall(r"`([^`]+)`", tests):
+            file, _, name = test.partition("::")
+            text = (CHECKOUT / "tests" / file).read_text(encoding="utf-8")
+            assert name in text, f"{promise}: {test}"
