@@ -46,6 +46,7 @@ from bounce_mjx.runs.presets import BASE, SOURCES, preset_files, read_config_fil
 from bounce_mjx.runs.worlds import Layer, robot_and_world
 from bounce_mjx.task.task import Task
 from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file, is_same_code
+from bounce_mjx.world.named import without_idle_curriculum
 
 FLAGS = "flags"
 """Source of the settings on a command line."""
@@ -413,6 +414,9 @@ def _merge(layers: Sequence[Layer]) -> tuple[dict[str, Any], dict[str, str]]:
     values, sources = {}, {}
     for layer in layers:
         values = merged(values, layer.values)
+        if layer.is_world:
+            randomization = without_idle_curriculum(values["env"]["randomization"])
+            values["env"] = values["env"] | {"randomization": randomization}
         sources |= dict.fromkeys(flat(layer.values), layer.source)
     return values, sources
 

@@ -21,6 +21,9 @@ class Layer(NamedTuple):
     """For people, such as configs/cpu.yaml."""
     values: dict[str, Any]
     """Nested, with the keys of `TrainConfig`."""
+    is_world: bool = False
+    """Whether it brings the whole randomisation: what a preset's curriculum says of other terms
+    then ends."""
 
 
 def robot_and_world(
@@ -80,7 +83,7 @@ def _layer_of_world(task: type[Task], world: NamedWorld, path: Path) -> Layer:
     describes the training: a term that it does not have is as in the task."""
     default = task.Config().randomization.model_dump(exclude=set(CURRICULUM))
     values = merged({"env": {"randomization": default}}, {"env": world.settings})
-    return Layer(f"the world {shown_file(path)}", values)
+    return Layer(f"the world {shown_file(path)}", values, is_world=True)
 
 
 def _robot_of(world: NamedWorld, path: Path) -> Path:

@@ -67,14 +67,8 @@ class NamedWorld(StrictModel):
         """
         before = env.get("randomization", {}) if training else {}
         kept = {key: value for key, value in before.items() if key in CURRICULUM}
-        terms = [name for name in self.settings.get("randomization", {}) if name in TERMS]
-        if not any(TERMS[name].has_nominal for name in terms):
-            kept.pop("share", None)
-            if kept.get("first_command_range", 1.0) == 1.0:
-                kept.pop("warmup_steps", None)
-        if kept.get("shares"):
-            kept["shares"] = {name: p for name, p in kept["shares"].items() if name in terms}
-        return merged(env | {"randomization": kept}, self.settings)
+        values = merged(env | {"randomization": kept}, self.settings)
+        return values | {"randomization": without_idle_curriculum(values["randomization"])}
 
     def double_assumed(self, nominals: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         """For each assumed key, the nested settings of `env` in which alone its number is doubled.
@@ -87,6 +81,20 @@ class NamedWorld(StrictModel):
         """
         given = flat(self.settings)
         return {key: nested(key, _double(key, given[key], nominals)) for key in self.assumed}
+
+
+def without_idle_curriculum(randomization: dict[str, Any]) -> dict[str, Any]:
+    """Settings of a randomisation without the parts of the curriculum that act on none of its
+    terms: `shares` of other terms, and `share` and `warmup_steps` without a term to share."""
+    terms = [name for name in TERMS if randomization.get(name) is not None]
+    acting = dict(randomization)
+    if not any(TERMS[name].has_nominal for name in terms):
+        acting.pop("share", None)
+        if acting.get("first_command_range", 1.0) == 1.0:
+            acting.pop("warmup_steps", None)
+    if acting.get("shares"):
+        acting["shares"] = {name: p for name, p in acting["shares"].items() if name in terms}
+    return acting
 
 
 def read_world(path: Path) -> NamedWorld:
