@@ -77,7 +77,7 @@ FAULTS = [
      "jnp.where(step <= control.switch, control.previous, control.ctrl)", "test_randomization.py -k late_and_lagging"),
     ("the air pushes the ball", CONTROL, "tuple(-air_drag * speed", "tuple(air_drag * speed", "test_randomization.py -k brakes"),
     ("the restitution is clipped", RANDOMIZATION,
-     "jnp.interp(restitution, e, ratio)", "jnp.interp(jnp.maximum(restitution, 0.8), e, ratio)", "test_randomization.py -k drops_bounce"),
+     "jnp.interp(restitution, restitutions", "jnp.interp(jnp.maximum(restitution, 0.8), restitutions", "test_randomization.py -k drops_bounce"),
     ("the range of a command shrinks", ENV,
      "first + (1.0 - first) * progress", "1.0 - (1.0 - first) * progress", "test_randomization.py -k about_its_middle"),
     ("the ball is seen a step too late", SENSING,
