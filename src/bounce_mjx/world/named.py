@@ -108,12 +108,20 @@ def read_world(path: Path) -> NamedWorld:
 
 
 def _double(key: str, value: Any, nominals: Mapping[str, Any]) -> Any:
+    """The value of an assumed setting in `double_assumed`."""
     group, _, name = key.rpartition(".")
-    factor, centre, (least, most) = 2.0, 0.0, (-math.inf, math.inf)
+    factor = 2.0
+    centre = 0.0
+    least = -math.inf
+    greatest = math.inf
     if group == "randomization":
-        least, most = TERMS[name].bounds
-        factor, centre = (2.0, nominals[name]) if name in nominals else (0.5, 0.0)
+        least, greatest = TERMS[name].bounds
+        if name in nominals:
+            centre = nominals[name]
+        else:
+            factor = 0.5
     elif group == "robot.limits":
         factor = 0.5
 
-    return np.clip(centre + factor * (np.array(value) - centre), least, most).tolist()
+    doubled = centre + factor * (np.array(value) - centre)
+    return np.clip(doubled, least, greatest).tolist()
