@@ -54,6 +54,8 @@ QUANTITIES = EnvConfig().observation.quantities()
 # sinks only by micrometres.
 STIFF = {"servo_gain": (100.0, 100.0), "servo_damping": (10.0, 10.0)}
 LEVEL = {
+    # Exported without a simulation of own play.
+    "action": {"base": "target"},
     "action_scale": 1e-5,
     "ball_init_pos": (0.58856, 0.01, 1.0),
     "reset": {"ball_position": 0.0, "joint_angles": 0.0, "joint_velocities": 0.0},
