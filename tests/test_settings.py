@@ -225,13 +225,15 @@ def test_a_mistake_names_the_layer_that_has_it(folder: Path, refused) -> None:
 
 
 def test_the_printed_config_is_a_config_and_says_its_sources(folder: Path) -> None:
+    said_by_user = "--seed 3 --randomization.restitution 0.8 0.9".split()
+    said_by_user += "--randomization.shares restitution 0.5".split()
     said = io.StringIO()
     with contextlib.redirect_stdout(said):
-        main("train --seed 3 --randomization.shares restitution 0.5 --print-config".split())
+        main(["train", *said_by_user, "--print-config"])
     lines = {line.partition(":")[0].strip(): line for line in said.getvalue().splitlines()}
     assert lines["seed"].split() == ["seed:", "3", "#", "flags"]
     assert lines["num_envs"].split() == ["num_envs:", "512", "#", "configs/cpu.yaml"]
     assert lines["num_seeds"].split() == ["num_seeds:", "1", "#", "default"]
     (folder / "again.yaml").write_text(said.getvalue())
     again = read_command(["--config", "again.yaml"]).config
-    assert again == read_command("--seed 3 --randomization.shares restitution 0.5".split()).config
+    assert again == read_command(said_by_user).config
