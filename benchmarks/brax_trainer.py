@@ -22,7 +22,7 @@ from brax.envs.base import State, Wrapper
 from brax.training.agents.ppo.networks import PPONetworks
 from brax.training.distribution import NormalDistribution
 from brax.training.networks import FeedForwardNetwork
-from trainers import OnBlock, block_iterations
+from trainers import OnBlock, TrainingEnded, block_iterations
 
 from bounce_mjx.adapters.brax import device_put_replicated
 from bounce_mjx.adapters.brax.ppo import ppo_settings
@@ -31,10 +31,6 @@ from bounce_mjx.learning.policy import NetworkFunctions, Policy, make_networks
 from bounce_mjx.learning.statistics import MIN_VARIANCE, Normalizer, normalize
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.tasks.bounce_ball import BounceBall
-
-
-class _TrainingEnded(Exception):
-    """Ends brax's training, which offers no other way to stop."""
 
 
 class CriticObservation(Wrapper):
@@ -76,7 +72,7 @@ def train(physics: Literal["auto", "mjx"], config: TrainConfig, on_block: OnBloc
             statistics = params[0]
             policy = Policy(_normalizer(statistics, "state"), params[1])
             if on_block(steps, seconds, policy):
-                raise _TrainingEnded
+                raise TrainingEnded
         started = time.perf_counter()
 
     def networks(_, action_size: int, preprocess_observations_fn):
@@ -97,7 +93,7 @@ def train(physics: Literal["auto", "mjx"], config: TrainConfig, on_block: OnBloc
                 policy_params_fn=on_params,
                 seed=config.seed,
             )
-    except _TrainingEnded:
+    except TrainingEnded:
         pass
 
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from bounce_mjx import load_policy
 from bounce_mjx.deploy.recorder import Recorder
-from bounce_mjx.env.env import world_model
+from bounce_mjx.env.env import model_nominals, world_model
 from bounce_mjx.identify.excitation import excite
 from bounce_mjx.identify.reading import read_csv
 from bounce_mjx.identify.stages import Identified, identify
@@ -26,7 +26,7 @@ from bounce_mjx.identify.world import estimates, to_yaml
 from bounce_mjx.physics import edited_model
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import find_addresses, joint_names
-from bounce_mjx.runs.config import read_preset
+from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.training.setup import set_up_jax
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import RandomizationConfig, physics_parameters, sample_world
@@ -56,10 +56,11 @@ class Hidden(NamedTuple):
 def hidden_robot(seed: int) -> Hidden:
     """Draws a robot: about 30% of the terms of configs/transfer.yaml, and all that a servo differs
     in."""
-    wide = read_preset(resource_path("configs/transfer.yaml")).env.randomization
-    ranges = {k: v for k, v in wide.ranges().items() if k not in _FIXED}
+    wide = read_preset(resource_path("configs/transfer.yaml")).env
+    ranges = {k: v for k, v in wide.randomization.ranges().items() if k not in _FIXED}
     key, rare, always = jax.random.split(jax.random.PRNGKey(seed), 3)
-    world = sample_world(ranges, rare, np.dtype("float32"), 6, 0.3)
+    nominals = model_nominals(wide)
+    world = sample_world(ranges, rare, np.dtype("float32"), 6, nominals, share=0.3)
     servos = RandomizationConfig(
         action_latency=(0.0, 0.04),
         ball_latency=(0.0, 0.02),
@@ -67,7 +68,7 @@ def hidden_robot(seed: int) -> Hidden:
         servo_damping=(0.8, 1.2),
         joint_frictionloss=(0.0, 5.0),
     )
-    world |= sample_world(servos.ranges(), always, np.dtype("float32"), 6, 1.0)
+    world |= sample_world(servos.ranges(), always, np.dtype("float32"), 6)
     world = {name: np.asarray(value, np.float32) for name, value in world.items()}
     flaw = ("nothing", "backlash", "nothing", "asymmetric friction")[seed % 4]
     return Hidden(world, flaw)

@@ -1,12 +1,13 @@
-"""Five PPO trainers on one task: environment steps/s, time and steps to the five results, return.
+"""Six trainers on one task: environment steps/s, time and steps to the five results, return.
 
     python benchmarks/jax_vs_torch.py                                    # all trainers and seeds
     python benchmarks/jax_vs_torch.py --methods rsl_rl skrl --seeds 0    # some of them
     python benchmarks/jax_vs_torch.py --methods --merge FILES            # existing records only
 
-The trainers are ours, brax's PPO on the fused and on the mjx physics, rsl_rl and skrl.
-They use the config's hyperparameters as far as each library has them (`trainers.py`). Each run is a
-separate process with an empty compilation cache. All trainers start episodes with the task's
+The trainers are ours, brax's PPO on the fused and on the mjx physics, rsl_rl and skrl, which use
+the config's hyperparameters as far as each library has them (`trainers.py`); and FastTD3 and
+FlashSAC, which are off-policy, with their authors' own scripts and settings. Each run is a separate
+process with an empty compilation cache. All trainers start episodes with the task's
 resets. Every `eval_every` steps, the same evaluation measures the policy without noise, on the same
 resets and on the fused physics.
 
@@ -26,6 +27,7 @@ import sys
 import tempfile
 import threading
 import time
+import typing
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, TextIO
@@ -41,20 +43,22 @@ from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import judge
 from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.learning.policy import Policy, make_networks
-from bounce_mjx.learning.statistics import init_normalizer
-from bounce_mjx.runs.config import TrainConfig, read_preset
+from bounce_mjx.learning.policy import Actor, make_networks, untrained_policy
+from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.tasks.bounce import BounceConfig as EnvConfig
 from bounce_mjx.tasks.bounce_ball import BounceBall
 from bounce_mjx.training.setup import compiler_options
 
-METHODS: tuple[Method, ...] = ("ours", "brax", "brax_mjx", "rsl_rl", "skrl")
+METHODS: tuple[Method, ...] = typing.get_args(Method)
 _NAMES = {
     "ours": "bounce_mjx (JAX)",
     "brax": "brax ppo, fused physics",
     "brax_mjx": "brax ppo, mjx physics",
     "rsl_rl": "rsl_rl (PyTorch)",
     "skrl": "skrl (PyTorch)",
+    "fast_td3": "FastTD3 (PyTorch), 1,024 environments",
+    "flash_sac": "FlashSAC (PyTorch), 1,024 environments",
 }
 _STARTED = "BOUNCE_MJX_BENCHMARK_STARTED"
 _RECORDS = "jax_vs_torch.jsonl"
@@ -132,6 +136,7 @@ def train_in_a_process(command: Command, args: list[str], method: Method, seed: 
     with tempfile.TemporaryDirectory() as cache:
         environment = os.environ | {
             "JAX_COMPILATION_CACHE_DIR": cache,
+            "TORCHINDUCTOR_CACHE_DIR": f"{cache}/torch",
             # JAX would otherwise reserve most of the memory, and PyTorch needs some of it.
             "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
             _STARTED: str(time.time()),
@@ -165,26 +170,26 @@ class _Judge:
         self._command, self._config, self._method, self._file = command, config, method, file
         self._started = float(os.environ.get(_STARTED) or time.time())
         self._env = BounceBall(config.env)
-        self._networks = make_networks(
-            config.ppo, self._env.observation_size, self._env.action_size
-        )
         self._key = jax.random.PRNGKey(config.eval_seed)
         self._device = device_name()
 
-    def prepare(self) -> None:
+    def prepare(self, actor: Actor | None = None, policy: Any = None) -> None:
         """Starts the compilation of the evaluation."""
-        self._policy = jax.eval_shape(self._empty_policy)
-        self._evaluator = _Background(self._compile)
+        if actor is None:
+            actor = make_networks(
+                self._config.ppo, self._env.observation_size, self._env.action_size
+            )
+            key = jax.random.PRNGKey(0)
+            size = self._env.observation_size
+            policy = jax.eval_shape(lambda: untrained_policy(actor, size, key))
+        self._policy = jax.eval_shape(lambda: policy)
+        self._evaluator = _Background(lambda: self._compile(actor))
 
-    def _empty_policy(self) -> Policy:
-        params = self._networks.policy_network.init(jax.random.PRNGKey(0))
-        return Policy(init_normalizer(self._env.observation_size), params)
-
-    def _compile(self) -> Callable[[Policy, jax.Array], tuple]:
-        evaluate = make_evaluator(self._env, self._networks, self._config.eval_episodes)
+    def _compile(self, actor: Actor) -> Callable[[Any, jax.Array], tuple]:
+        evaluate = make_evaluator(self._env, actor, self._config.eval_episodes)
         return evaluate.lower(self._policy, self._key).compile(compiler_options())
 
-    def __call__(self, steps: int, seconds: float, policy: Policy) -> bool:
+    def __call__(self, steps: int, seconds: float, policy: Any) -> bool:
         config, method = self._config, self._method
         policy = jax.tree.map(
             lambda x, like: jax.numpy.asarray(x, like.dtype), policy, self._policy

@@ -1,12 +1,15 @@
 """Writes the policies that come with the package in this version's format, for maintainers:
-`python benchmarks/rewrite_policies.py`. Their numbers stay as they are."""
+`python benchmarks/rewrite_policies.py`, and with `--onnx` their ONNX files alone. Their numbers
+stay as they are."""
 
+import argparse
 import shutil
 from pathlib import Path
 
 import jax
 import numpy as np
 
+from bounce_mjx.deploy.export import export_onnx
 from bounce_mjx.resources import POLICIES, resource_path
 from bounce_mjx.runs.checkpoints import (
     NETWORKS,
@@ -18,11 +21,21 @@ from bounce_mjx.runs.checkpoints import (
 )
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import CHECKPOINTS, best_checkpoint, write_config
+from bounce_mjx.training.setup import set_up_jax
 
 
 def main() -> None:
-    for folder in POLICIES.values():
-        rewrite(resource_path(folder))
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--onnx", action="store_true", help="the ONNX files alone")
+    parser.add_argument("policies", nargs="*", default=list(POLICIES), help="names")
+    given = parser.parse_args()
+    set_up_jax()
+    for name in given.policies:
+        run = resource_path(POLICIES[name])
+        if not given.onnx:
+            rewrite(run)
+        (run / f"{name}.onnx").write_bytes(export_onnx(best_checkpoint(run)))
+        print(f"written: {run / f'{name}.onnx'}", flush=True)
 
 
 def rewrite(run: Path) -> None:

@@ -57,7 +57,7 @@ class RslRlLearner:
         """The current policy, without action noise."""
         actor = self.algorithm.get_policy()
         seen = actor.obs_normalizer
-        return to_policy(actor.mlp, seen.mean, seen.std, actor.distribution.log_std_param)
+        return to_policy(actor.mlp, seen.mean, seen.std, actor.distribution.log_std_param).policy
 
 
 class Network(MLPModel):

@@ -27,14 +27,7 @@ from bounce_mjx.runs.checkpoints import (
     read_policy,
     save_checkpoint,
 )
-from bounce_mjx.runs.config import (
-    CONFIG_FILE,
-    ROBOT,
-    TrainConfig,
-    load_run_config,
-    read_preset,
-    runs_folder,
-)
+from bounce_mjx.runs.config import CONFIG_FILE, ROBOT, TrainConfig, load_run_config, runs_folder
 from bounce_mjx.runs.files import MANIFEST_FILE, to_json, write_atomically
 from bounce_mjx.runs.folders import (
     Checkpoint,
@@ -44,6 +37,7 @@ from bounce_mjx.runs.folders import (
     write_config,
 )
 from bounce_mjx.runs.progress import RESULTS_FILE, load_results
+from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.training.setup import set_up_jax
 
 
@@ -173,7 +167,7 @@ def write_policy(
             items = {POLICY: policy}
             if networks:
                 items[NETWORKS] = dict(zip(("params", "statistics"), start, strict=True))
-            save_checkpoint(made, config, checkpoint.steps, items, score=report.score)
+            save_checkpoint(made, config, checkpoint.steps, items, report=report)
             write_atomically(made / RESULTS_FILE, to_json(results))
             onnx_file = export_onnx(best_checkpoint(made))
             (made / f"{name}.onnx").write_bytes(onnx_file)

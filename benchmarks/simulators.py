@@ -13,7 +13,8 @@ that a ball that drops onto the paddle of the arm at rest rebounds with the worl
 the time constant of the motors, such that a step of 0.05 rad takes as long to 63% as MuJoCo's
 servos take. (`physx` has servos of the same stiffness and damping, and needs none.) The policy acts
 through `load_policy`, as on a robot: it sees the joints and the newest picture of the ball. The
-environment's own functions measure the results. `mujoco` is the C engine, as a comparison.
+environment's own functions measure the results, and the supervisor's alarms but lost balls are
+counted. `mujoco` is the C engine, as a comparison.
 """
 
 import argparse
@@ -33,8 +34,10 @@ import mujoco
 import numpy as np
 
 from bounce_mjx import load_policy
+from bounce_mjx.deploy.faults import Watch, picture_age
 from bounce_mjx.deploy.policy import DeployedPolicy
 from bounce_mjx.deploy.recorder import Recorder
+from bounce_mjx.deploy.samples import ImpossibleMeasurement
 from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.episodes import reset_episodes
 from bounce_mjx.evaluation.results import Report, judge
@@ -561,6 +564,9 @@ class Episode:
 
     def __init__(self, policy: DeployedPolicy, simulator: Simulator, world: World):
         self.policy, self.simulator, self.world = policy, simulator, world
+        self.alarm = ""
+        """Code of the first fault that a supervisor would stop for, but a lost ball's."""
+        self._watch = Watch(policy.metadata, picture_age(policy.metadata))
         self._steps, self._targets, self._balls = 0, [], []
 
     @property
@@ -572,6 +578,8 @@ class Episode:
         """Starts with the arm at angles [J], at rest, and the balls as `Simulator.reset`."""
         self.simulator.reset(angles, positions, velocities)
         self.policy.reset()
+        self._watch.rest(angles, angles)
+        self._watch.begin()
         self._steps, self._targets = 0, [angles]
         self._balls = [self.simulator.ball_state()]
 
@@ -587,7 +595,15 @@ class Episode:
 
     def control_step(self, command: dict[str, np.ndarray]) -> None:
         """The policy acts on what it knows, and the physics runs until its next step."""
-        self.policy.step(self.measure() | command)
+        try:
+            measured = self.policy.read(self.measure() | command)
+        except ImpossibleMeasurement as error:
+            self.alarm = self.alarm or error.fault
+        else:
+            last = self._targets[-1]
+            codes = [code for code, _ in self._watch.faults(measured, last) if code != "ball_lost"]
+            self.alarm = self.alarm or "".join(codes[:1])
+            self.policy.act(measured)
         self.run(self.policy.commands(RATE))
 
     def run(self, targets: np.ndarray) -> None:
@@ -606,9 +622,9 @@ class Episode:
 
 def evaluate(
     policy: str, name: str, world: World, episodes: int, seed: int
-) -> tuple[Report, np.ndarray]:
-    """Results of a shipped policy in a simulator, over episodes of the task's time limit, and the
-    positions [T, nq] of the first episode."""
+) -> tuple[Report, np.ndarray, list[str]]:
+    """Results of a shipped policy in a simulator, over episodes of the task's time limit, the
+    positions [T, nq] of the first episode, and the supervisor's alarms."""
     config = load_run_config(choose_checkpoint(Path(policy), Path()).run).env
     env = Env(config.model_copy(update={"randomization": RandomizationConfig()}))
     addresses = env.addresses
@@ -648,7 +664,8 @@ def evaluate(
             break
     for episode in running:
         episode.simulator.close()
-    return judge(env, statistics), np.array(path)
+    alarms = [episode.alarm for episode in running if episode.alarm]
+    return judge(env, statistics), np.array(path), alarms
 
 
 def record_logs(policy: str, name: str, world: World, folder: Path) -> None:
@@ -693,7 +710,7 @@ def measure(policy: str, name: str, world: str, given: argparse.Namespace) -> st
     if given.logs:
         record_logs(policy, name, WORLDS[world], given.logs)
         return f"written: {given.logs}/arm.csv, {given.logs}/ball.csv"
-    report, path = evaluate(policy, name, WORLDS[world], given.episodes, given.seed)
+    report, path, alarms = evaluate(policy, name, WORLDS[world], given.episodes, given.seed)
     if given.out:
         given.out.mkdir(parents=True, exist_ok=True)
         file = f"{policy}_{name}_{world}.npy".replace(" ", "_")
@@ -706,7 +723,9 @@ def measure(policy: str, name: str, world: str, given: argparse.Namespace) -> st
     length = report.details["mean_length_s"]
     error = report.details.get("mean_apex_error_m")
     apex = "" if error is None else f"{100.0 * error:.1f} cm"
-    return " | ".join(["", policy, name, world, *values, apex, f"{length:.1f} s", ""]).strip()
+    stopped = f"{len(alarms)} alarms {' '.join(sorted(set(alarms)))}".strip()
+    cells = ["", policy, name, world, *values, apex, f"{length:.1f} s", stopped, ""]
+    return " | ".join(cells).strip()
 
 
 def main() -> None:

@@ -64,7 +64,7 @@ class SkrlLearner:
     def policy(self) -> Policy:
         """The current policy, without action noise."""
         actor, seen = self.agent.policy, self.agent.checkpoint_modules["observation_preprocessor"]
-        return to_policy(actor.mlp, seen.mean, seen.std, actor.log_std)
+        return to_policy(actor.mlp, seen.mean, seen.std, actor.log_std).policy
 
     def _step(self) -> None:
         """Runs one step of every environment, and an update at the end of a rollout."""

@@ -1,7 +1,7 @@
 """False alarms of the supervisor's rules over simulated episodes, and the time from a fault until
 the arm brakes.
 
-    python benchmarks/supervisor.py robust --episodes 1024
+    python benchmarks/supervisor.py robust --episodes 1024 --jobs 16
     python benchmarks/supervisor.py robust --episodes 1024 --latencies 0.06 0.03
     python benchmarks/supervisor.py --episodes 128
 
@@ -11,8 +11,10 @@ on, the encoder of one joint repeats its last angle, or the camera its last pict
 """
 
 import argparse
+import concurrent.futures
+import multiprocessing
 from collections import Counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +23,7 @@ import numpy as np
 from bounce_mjx import load_policy
 from bounce_mjx.deploy.faults import Watch, picture_age
 from bounce_mjx.deploy.metadata import Metadata
+from bounce_mjx.deploy.samples import ImpossibleMeasurement, Samples
 from bounce_mjx.env.env import Env, State
 from bounce_mjx.evaluation.episodes import reset_episodes
 from bounce_mjx.learning.policy import make_networks
@@ -29,9 +32,9 @@ from bounce_mjx.runs.checkpoints import read_policy
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import find_checkpoint
 from bounce_mjx.training.setup import set_up_jax
-from bounce_mjx.world import sensing
 
-_BATCH = 64
+_BATCH = 128
+MEASURED = ("joint_angles", "joint_velocities", "ball_position", "ball_age")
 
 
 def recorder(name: str, episodes: int, latencies: list[float] | None) -> Any:
@@ -52,13 +55,16 @@ def recorder(name: str, episodes: int, latencies: list[float] | None) -> Any:
         angles, velocities = truth.joint_angles, truth.joint_velocities
         ball, age = truth.ball_position, jnp.zeros(())
         if now.sensing is not None:
-            angles, velocities = sensing.measured_joints(now.world, now.clock.counter, truth)
+            seen = now.sensing.histories
+            angles, velocities = seen["joint_angles"][0], seen["joint_velocities"][0]
             ball, age = now.sensing.picture.position, now.sensing.picture.age
         control, actuation = env.control(now, action)
         if actuation.setpoint is not None:
             command = actuation.setpoint.position
         else:
             command = control.ctrl[: env.action_size]
+        # The servo shares the offset of the encoder's zero.
+        command = command + now.world.get("encoder_bias", 0.0)
         return {
             "joint_angles": angles,
             "joint_velocities": velocities,
@@ -83,61 +89,94 @@ def recorder(name: str, episodes: int, latencies: list[float] | None) -> Any:
     return run
 
 
-def first(metadata: Metadata, episode: dict[str, np.ndarray], start: int = 0) -> tuple[int, str]:
-    """The first step from one on that breaks a rule, and the rule's code."""
-    watch = Watch(metadata, picture_age(metadata), 2.0 * metadata.control_dt)
+class Found(NamedTuple):
+    """What the rules say about one episode."""
+
+    length: int
+    """Control steps."""
+    at: int
+    """Step of the first fault."""
+    alarm: str
+    """Code of the first fault; empty if there is none before the last step."""
+    bridged: int
+    """Samples that were taken as impossible."""
+    delays: dict[str, float]
+    """Times from injected faults until a rule is broken, s; infinite where none is in 2 s."""
+
+
+def first_alarm(
+    metadata: Metadata, episode: dict[str, np.ndarray], start: int = 0
+) -> tuple[int, str, int]:
+    """The first step from one on that breaks a rule, the rule's code, and the number of bridged
+    samples until then."""
+    samples, watch = Samples(metadata), Watch(metadata, picture_age(metadata))
     angles, commands = episode["joint_angles"], episode["commands"]
+    samples.rest(angles[0])
     watch.rest(angles[0], angles[0])
     watch.begin()
+    bridged = 0
     for step in range(len(angles)):
-        measured = {name: np.ravel(values[step]) for name, values in episode.items()}
-        sent = commands[step - 1] if step else angles[0]
-        found = list(watch.faults(measured, sent))
+        given = {name: np.ravel(episode[name][step]) for name in MEASURED}
+        given["time"] = np.array([step * metadata.control_dt])
+        try:
+            measured = samples.take(given)
+        except ImpossibleMeasurement as error:
+            if step >= start:
+                return step, error.fault, bridged
+            continue
+        bridged += any(np.any(measured[name] != given[name]) for name in MEASURED)
+        found = list(watch.faults(measured, commands[step - 1] if step else angles[0]))
         if found and step >= start:
-            return step, found[0][0]
-    return len(angles), "none"
+            return step, found[0][0], bridged
+    return len(angles), "", bridged
 
 
 def delays(
     metadata: Metadata, episode: dict[str, np.ndarray], rng: np.random.Generator
 ) -> dict[str, float]:
     """Times from a fault until a rule is broken, s; infinite where none is in 2 s."""
-    length = int(np.sum(episode["running"]))
-    if length < 200:
+    length, before = len(episode["ball_age"]), 100
+    if length < 400:
         return {}
-    step, found = int(rng.integers(50, length - 100)), {}
-    episode = {key: value[step - 50 : min(step + 200, length)] for key, value in episode.items()}
-    step, length = 50, len(episode["ball_age"])
+    step, found = int(rng.integers(before, length - 200)), {}
+    part = {key: value[step - before : step + 200] for key, value in episode.items()}
     repeated = {
         f"the angle of joint {j + 1}": ("joint_angles", j) for j in range(len(metadata.joint_names))
     }
     for name, (kind, entry) in ({"a picture": ("ball_position", ...)} | repeated).items():
-        changed = {key: value.copy() for key, value in episode.items()}
-        changed[kind][step:, entry] = changed[kind][step, entry]
-        at, _ = first(metadata, changed, step)
-        found[name] = (at - step) * metadata.control_dt if at < length else np.inf
+        changed = {key: value.copy() for key, value in part.items()}
+        changed[kind][before:, entry] = changed[kind][before, entry]
+        at, fault, _ = first_alarm(metadata, changed, before)
+        found[name] = (at - before) * metadata.control_dt if fault else np.inf
     return found
 
 
-def judge(name: str, given: argparse.Namespace, rng: np.random.Generator) -> None:
+def judge(metadata: Metadata, episode: dict[str, np.ndarray], seed: int) -> Found:
+    """What the rules say about one episode and about faults in it."""
+    length = int(np.sum(episode["running"]))
+    episode = {name: values[:length].astype(float) for name, values in episode.items()}
+    at, fault, bridged = first_alarm(metadata, episode)
+    late = delays(metadata, episode, np.random.default_rng(seed))
+    return Found(length, at, fault, bridged, late)
+
+
+def report(name: str, found: list[Found], steps: int) -> None:
     """Prints the first alarms of a policy's episodes, and the times from faults."""
-    metadata = load_policy(name).metadata
-    run = recorder(name, min(_BATCH, given.episodes), given.latencies)
-    alarms, late, lasted = Counter(), {}, 0
-    for batch in range(-(-given.episodes // _BATCH)):
-        rows = jax.tree.map(np.asarray, run(jax.random.key(1000 * given.seed + batch)))
-        for n in range(len(rows["running"])):
-            episode = {key: value[n] for key, value in rows.items()}
-            length = int(np.sum(episode["running"]))
-            lasted += length == len(episode["running"])
-            step, fault = first(metadata, episode)
-            alarms[fault if step < length else "none"] += 1
-            for kind, delay in delays(metadata, episode, rng).items():
-                late.setdefault(kind, []).append(delay)
-    print(f"{name}: {lasted} episodes last; first alarms: {dict(alarms)}", flush=True)
-    for kind, values in late.items():
-        share = np.mean(np.array(values) <= 0.5)
-        print(f"  {kind} repeats: {np.median(values):.2f} s, {share:.0%} within 0.5 s", flush=True)
+    lasted = sum(one.length == steps for one in found)
+    alarms = dict(Counter(one.alarm or "none" for one in found))
+    bridged = sum(one.bridged for one in found)
+    print(
+        f"{name}: {lasted} of {len(found)} episodes last; first alarms: {alarms}; "
+        f"{bridged} samples bridged",
+        flush=True,
+    )
+    for one in [one for one in found if one.alarm][:10]:
+        print(f"  {one.alarm} in step {one.at} of {one.length}", flush=True)
+    kinds = {kind for one in found for kind in one.delays}
+    for kind in sorted(kinds):
+        values = np.array([one.delays[kind] for one in found if one.delays])
+        shares = (f"{np.mean(values <= limit):.0%} within {limit} s" for limit in (0.3, 0.5))
+        print(f"  {kind} repeats: {np.median(values):.2f} s, {', '.join(shares)}", flush=True)
 
 
 def main() -> None:
@@ -146,11 +185,24 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=128)
     parser.add_argument("--latencies", type=float, nargs=2, help="of action and ball, s")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=1, help="processes at once")
     given = parser.parse_args()
     set_up_jax()
-    rng = np.random.default_rng(given.seed)
-    for name in given.policies:
-        judge(name, given, rng)
+    spawn = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(given.jobs, spawn) as pool:
+        waiting = []
+        for name in given.policies:
+            batch = min(_BATCH, given.episodes)
+            metadata, run = load_policy(name).metadata, recorder(name, batch, given.latencies)
+            found = []
+            for number in range(-(-given.episodes // batch)):
+                rows = jax.tree.map(np.asarray, run(jax.random.key(1000 * given.seed + number)))
+                for n in range(batch):
+                    episode = {key: value[n] for key, value in rows.items()}
+                    found.append(pool.submit(judge, metadata, episode, number * batch + n))
+            waiting.append((name, found, rows["running"].shape[1]))
+        for name, found, steps in waiting:
+            report(name, [one.result() for one in found], steps)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from mujoco import sysid
 from bounce_mjx.identify.reading import read_csv
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import find_addresses, joint_names, load_model, scene_spec
-from bounce_mjx.runs.config import read_preset
+from bounce_mjx.runs.settings import read_preset
 
 _STARTS = {"servo_gain": 1.0, "servo_damping": 1.0, "joint_frictionloss": 1.0}
 _LIMITS = {

@@ -4,35 +4,45 @@ Each trains on the config's environment until `on_block` returns True. `on_block
 number of environment steps so far, the block's time in seconds, and the policy.
 
 The differences of the libraries' hyperparameters from ours are in the tables of
-`rsl_rl_learner.py`, `skrl_learner.py` and `brax_trainer.py`. A process imports only the library
-that it measures.
+`rsl_rl_learner.py`, `skrl_learner.py` and `brax_trainer.py`; `fast_td3_trainer.py` and
+`flash_sac_trainer.py` run their authors' scripts with their settings. A process imports only the
+library that it measures.
 """
 
 import concurrent.futures
 import functools
 import time
 from collections.abc import Callable
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import jax
 import jax.numpy as jnp
 
-from bounce_mjx.learning.policy import Policy
+from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.learning.ppo import PPO, policy_of
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.tasks.bounce_ball import BounceBall
 from bounce_mjx.training.setup import compiler_options
 
-Method = Literal["ours", "brax", "brax_mjx", "rsl_rl", "skrl"]
+Method = Literal["ours", "brax", "brax_mjx", "rsl_rl", "skrl", "fast_td3", "flash_sac"]
+
+
+class TrainingEnded(Exception):
+    """Ends the training of a library that offers no other way to stop."""
 
 
 class OnBlock(Protocol):
     """Callbacks of a trainer."""
 
-    def prepare(self) -> None:
-        """Called once before the first block, when it does not delay the trainer's own tracing."""
+    def prepare(self, actor: Actor | None = None, policy: Any = None) -> None:
+        """Called once before the first block, when it does not delay the trainer's own tracing.
 
-    def __call__(self, steps: int, seconds: float, policy: Policy) -> bool:
+        Args:
+          actor: what acts with the policies of the blocks; None for this project's networks.
+          policy: a policy of that actor.
+        """
+
+    def __call__(self, steps: int, seconds: float, policy: Policy | Any) -> bool:
         """Called after every block; returns whether the training may end."""
 
 
@@ -106,6 +116,20 @@ def train_brax(physics: Literal["auto", "mjx"], config: TrainConfig, on_block: O
     brax_trainer.train(physics, config, on_block)
 
 
+def train_fast_td3(config: TrainConfig, on_block: OnBlock) -> None:
+    """FastTD3's own script."""
+    import fast_td3_trainer
+
+    fast_td3_trainer.train(config, on_block)
+
+
+def train_flash_sac(config: TrainConfig, on_block: OnBlock) -> None:
+    """FlashSAC's own script."""
+    import flash_sac_trainer
+
+    flash_sac_trainer.train(config, on_block)
+
+
 def block_iterations(config: TrainConfig) -> int:
     """Iterations between two evaluations."""
     return max(1, round(config.eval_every / config.ppo.batch_steps))
@@ -117,4 +141,6 @@ TRAINERS: dict[Method, Callable[[TrainConfig, OnBlock], None]] = {
     "brax_mjx": functools.partial(train_brax, "mjx"),
     "rsl_rl": train_rsl_rl,
     "skrl": train_skrl,
+    "fast_td3": train_fast_td3,
+    "flash_sac": train_flash_sac,
 }

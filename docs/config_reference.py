@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from bounce_mjx.config.settings import StrictModel
-from bounce_mjx.runs.config import train_config
-from bounce_mjx.tasks.registry import DEFAULT, find_task
+from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.world.randomization import Term
 
 _HEAD = """# Config reference
@@ -18,7 +17,10 @@ file](training.md#a-file-of-your-own) the keys are nested groups, one per sectio
 the full name without `env.` or `ppo.`, with hyphens: `--num-envs` for `ppo.num_envs`,
 `--reward.height.weight` for `env.reward.height.weight`.
 
-Later wins: the defaults, a preset, your file, a robot (`--robot`), the flags. Unknown keys,
+Later wins: the defaults, the preset of this machine, what your own algorithm changes of PPO's
+defaults, a preset that you name, the policy of a warm start, your files, a robot (`--robot`), a
+world (`--world`), the flags or arguments of `train`. `bounce-mjx train --print-config` prints the
+config with what set each value; of a run, that is `Run(FOLDER).config.sources`. Unknown keys,
 values out of range and settings without effect are refused. A list is `256 256` or `256,256` on
 the command line, and a switch `--stop-when-solved`, `--no-stop-when-solved` or
 `--stop-when-solved=false`. Whole numbers are below 2^31, steps at most 10^12 (`1e6` is one too).
@@ -32,8 +34,6 @@ the command line, and a switch `--stop-when-solved`, `--no-stop-when-solved` or
 `python docs/config_reference.py > docs/config.md` writes this page.
 """
 
-_CONFIG = train_config(find_task(DEFAULT))
-
 
 def main() -> None:
     """Prints the page."""
@@ -42,20 +42,20 @@ def main() -> None:
 
 def reference() -> str:
     """The whole page, Markdown."""
-    return _HEAD + "".join(_section(model, prefix) for model, prefix in _groups(_CONFIG, ""))
+    return _HEAD + "".join(_section(group, prefix) for group, prefix in _groups(TrainConfig(), ""))
 
 
-def _groups(model: type[StrictModel], prefix: str) -> Iterator[tuple[type[StrictModel], str]]:
+def _groups(group: StrictModel, prefix: str) -> Iterator[tuple[StrictModel, str]]:
     """A group of settings and the groups nested in it, each with the prefix of its keys."""
-    yield model, prefix
-    for name, field in model.model_fields.items():
-        if isinstance(field.annotation, type) and issubclass(field.annotation, StrictModel):
-            yield from _groups(field.annotation, f"{prefix}{name}.")
+    yield group, prefix
+    for name, value in group:
+        if isinstance(value, StrictModel):
+            yield from _groups(value, f"{prefix}{name}.")
 
 
-def _section(model: type[StrictModel], prefix: str) -> str:
-    entries, values = [], []
-    schema = model.model_json_schema()
+def _section(group: StrictModel, prefix: str) -> str:
+    entries, values, model = [], [], type(group)
+    schema, defaults = model.model_json_schema(), group.model_dump(mode="json")
     for name, field in model.model_fields.items():
         plain = schema["properties"][name]
         if "$ref" in plain:
@@ -66,7 +66,7 @@ def _section(model: type[StrictModel], prefix: str) -> str:
         kind = "" if terms or "enum" in plain else _type(plain, plain.get("default") is None)
         values.append((", " if kind == "list" else " ").join(p for p in (kind, span) if p))
         text = "" if text == "Weight of the term." else f" {text}"
-        entries.append(f"- `{name}: {_default(plain.get('default'))}`{text}")
+        entries.append(f"- `{name}: {_default(defaults[name])}`{text}")
     title = f"`{prefix.removesuffix('.')}`" if prefix else "The run"
     text = " ".join((model.__doc__ or "").split())
     # Most quantities of the observation have the same range.

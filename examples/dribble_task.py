@@ -8,9 +8,6 @@ import jax.numpy as jnp
 
 from bounce_mjx import task
 
-REST = 0.0225
-"""Height of the ball's centre over the paddle's while they touch, m."""
-
 
 class Inputs(NamedTuple):
     """What the reward terms depend on."""
@@ -90,7 +87,7 @@ class Dribble(task.Task):
 
     def step(self, rose: jax.Array, step: task.Step) -> task.TaskStep:
         ball, speed = step.truth.ball_position, step.truth.ball_velocity[2]
-        height = ball[2] - step.truth.paddle_position[2] - REST
+        height = ball[2] - step.truth.paddle_position[2] - self.geometry.rest_height
         distance = task.horizontal_distance(ball, self.config.ball_init_pos)
         wish = step.command["apex"]
         inputs = Inputs(height + jnp.square(speed) / (2.0 * 9.81), wish, distance)

@@ -2,7 +2,8 @@
 
 `python examples/ros2_bridge.py POLICY [JOINT ...]` subscribes to /joint_states and /ball
 (PointStamped, in the frame of the base), and publishes /forward_position_controller/commands at
-500 Hz. The joints are the driver's names in the policy's order, if they differ from the policy's.
+500 Hz. The joints are the driver's names in the order of the controller, if they differ from the
+policy's.
 Publish a message on /start for each episode, also after a fault. Read "Safety steps" in
 docs/real-robot.md first.
 """
@@ -64,6 +65,9 @@ class Bridge(Node):
                 age = now - rclpy.time.Time.from_msg(self.taken)
                 measured["ball_age"] = age.nanoseconds * 1e-9
             self.queue = list(self.arm.commands(measured))
+        if not self.queue:
+            # The first sample is not believed yet, and nothing is sent.
+            return
         self.publisher.publish(Float64MultiArray(data=self.queue.pop(0).tolist()))
 
 

@@ -55,6 +55,9 @@ def pytest_configure(config: pytest.Config) -> None:
     # A shell script starts a process in the background with SIGINT ignored, and the processes of
     # the tests about Ctrl-C would inherit that. A command leaves a program's own handler alone.
     signal.signal(signal.SIGINT, lambda *args: signal.default_int_handler(*args))
+    # nohup starts one with SIGHUP ignored, which this one still ignores, and its processes do not.
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, lambda *_: None)
     # The workers of pytest-xdist inherit the folders.
     if not hasattr(config, "workerinput"):
         os.environ[RUNS] = tempfile.mkdtemp(prefix="bounce_mjx_runs_")

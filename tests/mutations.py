@@ -23,11 +23,8 @@ REWARDS, BOUNCE = "tasks/bounce_rewards.py", "tasks/bounce.py"
 ENV, VECTOR, ACTUATION = "env/env.py", "env/vector.py", "world/actuation.py"
 SENSING, RANDOMIZATION = "world/sensing.py", "world/randomization.py"
 PPO, STATISTICS = "learning/ppo.py", "learning/statistics.py"
-CONTROL, DYNAMICS, NORMALS = (
-    "physics/control.py",
-    "physics/fused/dynamics.py",
-    "physics/fused/normals.py",
-)
+CONTROL = "physics/control.py"
+BALL, NORMALS = "physics/fused/ball.py", "physics/fused/normals.py"
 EXPORT, POLICY = "deploy/export.py", "deploy/policy.py"
 
 # What is wrong, the file, its text, the faulty text, and the test that catches it.
@@ -72,27 +69,27 @@ FAULTS = [
      "whole = jnp.floor(latency + 1e-4)", "whole = jnp.floor(latency + 1e-4) + 1.0", "test_randomization.py -k late_and_lagging"),
     ("a late action is early", ACTUATION,
      "previous=older.ctrl",
-     "ctrl=older.ctrl, previous=control.ctrl", "test_randomization.py -k late_and_lagging"),
+     "ctrl=older.ctrl, previous=newer.ctrl", "test_randomization.py -k late_and_lagging"),
     ("the servo's lag is counted in control steps", ACTUATION,
      'world["servo_lag"] / (control_dt / num_substeps)', 'world["servo_lag"] / control_dt', "test_randomization.py -k late_and_lagging"),
     ("a late target waits one physics step more", CONTROL,
-     "jnp.where(step < before, control.previous, control.ctrl)",
-     "jnp.where(step <= before, control.previous, control.ctrl)", "test_randomization.py -k late_and_lagging"),
+     "jnp.where(step < control.switch, control.previous, control.ctrl)",
+     "jnp.where(step <= control.switch, control.previous, control.ctrl)", "test_randomization.py -k late_and_lagging"),
     ("the air pushes the ball", CONTROL, "tuple(-air_drag * speed", "tuple(air_drag * speed", "test_randomization.py -k brakes"),
     ("the restitution is clipped", RANDOMIZATION,
-     "jnp.interp(restitution, e, ratio)", "jnp.interp(jnp.maximum(restitution, 0.8), e, ratio)", "test_randomization.py -k drops_bounce"),
+     "jnp.interp(restitution, restitutions", "jnp.interp(jnp.maximum(restitution, 0.8), restitutions", "test_randomization.py -k drops_bounce"),
     ("the range of a command shrinks", ENV,
      "first + (1.0 - first) * progress", "1.0 - (1.0 - first) * progress", "test_randomization.py -k about_its_middle"),
     ("the ball is seen a step too late", SENSING,
-     "number, age = steps, latency", "number, age = steps, latency + 1.0", "test_sensors.py -k latency_without"),
+     "age = latency\n", "age = latency + 1.0\n", "test_sensors.py -k latency_without"),
     ("lost pictures are seen, and seen ones lost", SENSING,
      'chance >= world["frame_drop"]', 'chance < world["frame_drop"]', "test_sensors.py -k lost_pictures"),
     ("a velocity from differences ignores the pictures' age", SENSING,
-     "jnp.maximum(held_age - age * control_dt, 1e-3)", "jnp.maximum(held_age, 1e-3)", "test_sensors.py -k latency_without"),
+     "jnp.maximum(last_age - age * control_dt, 1e-3)", "jnp.maximum(last_age, 1e-3)", "test_sensors.py -k latency_without"),
     ("the encoders' bias has the other sign", SENSING,
      'angles = angles + world["encoder_bias"]', 'angles = angles - world["encoder_bias"]', "test_sensors.py -k measured_angles"),
     ("a history has the oldest value first", SENSING,
-     "jnp.concatenate([measured[name][None], past[:-1]])", "jnp.concatenate([past[1:], measured[name][None]])", "test_sensors.py -k bounces_are"),
+     "with_newest(past, measured[name])", "jnp.concatenate([past[1:], measured[name][None]])", "test_sensors.py -k bounces_are"),
     ("the bootstrap of a time-out is dropped", PPO,
      "jnp.where(rollout.truncated, timeout_values, values[1:])", "values[1:]", "test_ppo.py -k bootstraps"),
     ("advantages leak across a time-out", PPO,
@@ -103,9 +100,9 @@ FAULTS = [
      "jnp.where(is_large, 1.0 / _LEARNING_RATE_FACTOR, factor)", "jnp.where(is_large, _LEARNING_RATE_FACTOR, factor)", "test_ppo.py -k kl_divergence"),
     ("the variance is measured from the old mean", STATISTICS,
      "jnp.sum(from_old_mean * (batch - mean)", "jnp.sum(from_old_mean * from_old_mean", "test_policy.py -k statistics_equal"),
-    ("the ball moves with the velocity before the step", DYNAMICS,
-     "Ball(ball.position + velocity * dt", "Ball(ball.position + ball.velocity * dt", "test_physics.py -k random_states"),
-    ("a contact pulls", NORMALS, "return [jnp.maximum(first / pivot, 0.0)]", "return [first / pivot]", "test_physics.py -k random_states"),
+    ("the ball moves with the velocity before the step", BALL,
+     "position = ball.position + velocity * dt", "position = ball.position + ball.velocity * dt", "test_physics.py -k random_states"),
+    ("a contact pulls", NORMALS, "return [jnp.maximum(first_linear / pivot, 0.0)]", "return [first_linear / pivot]", "test_physics.py -k random_states"),
     ("an exported policy has a wrong normaliser", EXPORT,
      "networks.act(policy, jnp",
      "networks.act(policy._replace(normalizer=policy.normalizer._replace(mean=0.0 * policy.normalizer.mean)), jnp", "test_deploy.py -k onnx_equals"),

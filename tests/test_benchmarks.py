@@ -26,7 +26,7 @@ def script(name: str):
     return module
 
 
-rank, simulators = map(script, ("rank", "simulators"))
+endless, rank, simulators = map(script, ("endless", "rank", "simulators"))
 
 
 def outcome(name: str, strength: float, lasted: float) -> ConditionOutcome:
@@ -50,6 +50,22 @@ def test_the_interval_is_that_of_the_mean(rank) -> None:
     assert mean == pytest.approx(values.mean(), abs=1e-3)
     np.testing.assert_allclose([low, high], [mean - half, mean + half], atol=0.15 * half)
     assert rank.interval([None], ".1f") == "-" and rank.interval([2.0, 2.0], ".1f") == "2.0"
+
+
+def test_one_world_spans_all_conditions_without_an_end(endless) -> None:
+    config = load_run_config(resource_path(POLICIES["robust"])).env
+    suite = Path(endless.__file__).with_name("endless.yaml")
+    nominal, *conditions = endless.load_suite(suite, config)
+    world = endless.spanning_world([nominal, *conditions])
+    assert nominal.ranges.keys() == config.commands.keys()
+    for condition in conditions:
+        for name in condition.ranges.keys() - config.commands.keys():
+            low, high = getattr(world.randomization, name)
+            for end in (*condition.range(name), *nominal.range(name)):
+                assert np.all(low <= end) and np.all(end <= high), (condition, name)
+    heavy = next(c for c in conditions if c.perturbation.name == "ball of 5 g")
+    factor, _ = heavy.range("ball_mass")
+    assert factor * config.robot.ball.mass == pytest.approx(0.005, rel=1e-3)
 
 
 @pytest.mark.parametrize("policy", ["pretrained", "ur5e"])

@@ -46,6 +46,11 @@ def test_brax_makes_the_environment():
     np.testing.assert_allclose(state.obs[:, 28], 0.7, rtol=1e-6)
 
 
+def test_folder_without_a_checkpoint_gives_one_sentence(tmp_path):
+    with pytest.raises(UserError, match="no checkpoint of brax's PPO; give"):
+        load_brax_policy(tmp_path)
+
+
 def test_unknown_settings_are_refused():
     with pytest.raises(UserError, match="bounce_ball: unknown key debug"):
         brax.envs.get_environment("bounce_ball", debug=True)
@@ -78,8 +83,9 @@ def test_randomization_by_brax_acts_on_the_physics():
     )
 
 
-def test_brax_draws_the_links_where_mujoco_has_them():
-    """The page of `brax.io.html` shows every geom of the model at the links' poses."""
+def test_brax_draws_the_links_where_mujoco_has_them(opengl):
+    """The page of `brax.io.html` shows every geom of the model at the links' poses, and a picture
+    shows the ball."""
     env = brax.envs.get_environment("bounce_ball")
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))
     data = mujoco.MjData(env.mj_model)
@@ -89,6 +95,25 @@ def test_brax_draws_the_links_where_mujoco_has_them():
     np.testing.assert_allclose(drawn["states"]["x"][0]["pos"], data.xpos[1:], atol=1e-6)
     np.testing.assert_allclose(drawn["states"]["x"][0]["rot"], data.xquat[1:], atol=1e-6)
     assert sum(map(len, drawn["geoms"].values())) == env.mj_model.ngeom
+    physics = state.pipeline_state.task.physics
+    raised = physics._replace(qpos=physics.qpos.at[8].add(0.2))
+    moved = state.pipeline_state.replace(task=state.pipeline_state.task._replace(physics=raised))
+    first, second = env.render([state.pipeline_state, moved], 60, 80, camera="overview")
+    assert first.shape == (60, 80, 3) and not np.array_equal(first, second)
+
+
+def test_torchrl_walks_the_state(need):
+    """Its `BraxEnv` makes a tensor of each array, and drops what holds none; a step of the state
+    that comes back is traced as that of the state itself."""
+    jax_utils = need("torchrl.envs.libs.jax_utils")
+    env = brax.envs.get_environment("bounce_ball")
+    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+    tensors = jax_utils._object_to_tensordict(state, "cpu", ())
+    back = jax_utils._tensordict_to_object(tensors, state)
+    jax.tree.map(np.testing.assert_array_equal, jax.tree.leaves(back), jax.tree.leaves(state))
+    stepped, expected = (jax.eval_shape(env.step, x, jnp.zeros(6)) for x in (back, state))
+    assert jax.tree.structure(stepped) == jax.tree.structure(expected)
+    np.testing.assert_array_equal(back.pipeline_state.q, state.pipeline_state.q)
 
 
 @pytest.mark.slow
@@ -210,3 +235,18 @@ def test_device_put_replicated_exists_only_in_the_context(monkeypatch):
         assert jax.device_put_replicated is ppo.replicate
         raise KeyError
     assert not hasattr(jax, "device_put_replicated")
+    own = object()
+    monkeypatch.setattr(jax, "device_put_replicated", own, raising=False)
+    with ppo.device_put_replicated():
+        assert jax.device_put_replicated is own
+    assert jax.device_put_replicated is own
+
+
+def test_replicate_copies_arrays_numbers_and_keys():
+    tree = {"a": np.arange(3, dtype=np.int8), "b": 2.5, "key": jax.random.key(3)}
+    copies = ppo.replicate(tree, jax.local_devices()[:1])
+    assert copies["a"].dtype == jnp.int8
+    np.testing.assert_array_equal(copies["a"], [[0, 1, 2]])
+    np.testing.assert_array_equal(copies["b"], [2.5])
+    data, expected = jax.random.key_data(copies["key"]), jax.random.key_data(tree["key"])
+    np.testing.assert_array_equal(data, expected[None])

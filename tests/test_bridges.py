@@ -114,22 +114,25 @@ def test_ur_rtde_bridge() -> None:
     class Socket:
         """Datagrams of the camera."""
 
-        sent = 0
+        sent, bad = 0, [b"", b"hello", b"0.5 0.4", b"nan nan nan nan", b"0.5 0 0.5 0.01 77"]
 
         def recv(self, size: int) -> bytes:
             picture = world.picture()
+            if world.ticks > RATE and self.bad:
+                return self.bad.pop()
             if picture is None or picture[0] == self.sent:
                 raise BlockingIOError
             self.sent = picture[0]
             return " ".join(map(str, [*picture[1], world.time - picture[0]])).encode()
 
     camera = bridge["Camera"].__new__(bridge["Camera"])
-    camera.socket, camera.newest = Socket(), {}
+    camera.socket, camera.newest, camera.ignored = Socket(), {}, 0
     control, receive = Control(), Receive()
     wished = {"target_height": 0.5}
     reasons = bridge["bounce"](policy, control, receive, camera, wished, SECONDS)
     assert control.stopped and world.ticks == SECONDS * RATE
     check(world, reasons)
+    assert camera.ignored == 5
     # Only a lost ball starts it again by itself.
     receive.broken = True
     reasons = bridge["bounce"](policy, control, receive, camera, wished, SECONDS)

@@ -15,13 +15,14 @@ import pytest
 
 import bounce_mjx
 from bounce_mjx.deploy.export import export_onnx
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import UserError, warn_once
+from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.learning.ppo import PPO, TrainingState, policy_of
-from bounce_mjx.runs import files
+from bounce_mjx.runs import checkpoints, files
 from bounce_mjx.runs.checkpoints import read_policy, read_training, save_checkpoint
-from bounce_mjx.runs.config import TrainConfig, load_run_config, read_preset
+from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import (
     best_checkpoint,
     create_run,
@@ -29,6 +30,8 @@ from bounce_mjx.runs.folders import (
     latest_checkpoint,
     stored_checkpoints,
 )
+from bounce_mjx.runs.records import verify
+from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.tasks.bounce import BounceConfig
 from bounce_mjx.tasks.bounce_ball import BounceBall
 
@@ -109,26 +112,77 @@ def test_orbax_alone_reads_a_checkpoint(written: Path, state: TrainingState) -> 
         np.testing.assert_array_equal(theirs[name], leaf)
 
 
-def test_the_latest_and_the_best_checkpoint_are_kept(tmp_path: Path, state) -> None:
-    """Each save opens the folder anew, as after a restart."""
+def report_of(mean_return: float) -> Report:
+    return Report((Result("stable", "%", 0.0, ">= 99", False),), {"mean_return": mean_return})
+
+
+def test_the_newest_checkpoint_and_the_one_that_is_named_are_kept(tmp_path: Path, state) -> None:
     run, items = create_run(CONFIG.model_copy(update={"log_dir": tmp_path})), items_of(state)
-    kept = []
-    for steps, score in (
-        (10, (True, 3, 0.5, 1.0)),
-        (20, ()),
-        (30, (True, 4, 0.1, 0.0)),
-        (40, (False, 5, 1.0, 9.0)),
-        (50, ()),
-        (50, (True, 3, 0.5, 2.0)),
-        (60, (True, 4, 0.1, 0.0)),
-        (70, ()),
-    ):
-        save_checkpoint(run, CONFIG, steps, items, score=score)
-        kept.append(sorted(checkpoint.steps for checkpoint in stored_checkpoints(run)))
-        assert latest_checkpoint(run).steps == kept[-1][-1]
-    assert kept == [[10], [10, 20], [30], [30, 40], [30, 50], [30, 51], [60], [60, 70]]
-    assert best_checkpoint(run).steps == 60
-    assert {path.name for path in (run / "checkpoints").iterdir()} == {"60", "70"}
+    stored = []
+    for steps, kept in ((10, None), (20, 10), (20, 10), (30, 21), (40, None)):
+        number = save_checkpoint(run, CONFIG, steps, items, kept=kept)
+        stored.append(sorted(checkpoint.steps for checkpoint in stored_checkpoints(run)))
+        assert latest_checkpoint(run).steps == number == stored[-1][-1]
+        assert verify(latest_checkpoint(run)).steps == steps
+    assert stored == [[10], [10, 20], [10, 21], [21, 30], [40]]
+    assert [path.name for path in (run / "checkpoints").iterdir()] == ["40"]
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory, state: TrainingState) -> Path:
+    """A run whose first checkpoint is the best one, and whose second one is the newest."""
+    run = create_run(CONFIG.model_copy(update={"log_dir": tmp_path_factory.mktemp("two")}))
+    items = items_of(state)
+    save_checkpoint(run, CONFIG, 64, items, report=report_of(2.0))
+    save_checkpoint(run, CONFIG, 128, items, report=report_of(1.0), kept=64)
+    return run
+
+
+def test_the_best_checkpoint_has_the_best_evaluation(two: Path) -> None:
+    assert (best_checkpoint(two).steps, latest_checkpoint(two).steps) == (64, 128)
+    for number in (64, 128):
+        assert find_checkpoint(two / f"checkpoints/{number}").steps == number
+
+
+@pytest.mark.parametrize("wrong", [64, 128])
+def test_the_intact_checkpoint_takes_the_place_of_a_damaged_one(
+    wrong: int, two: Path, tmp_path: Path, capsys
+) -> None:
+    """Whichever of its files is damaged; a damaged one that the user names is refused."""
+    other = 192 - wrong
+    for file in sorted(p for p in (two / f"checkpoints/{wrong}").rglob("*") if p.is_file()):
+        run = shutil.copytree(two, tmp_path / "run")
+        damaged = run / file.relative_to(two)
+        damaged.write_bytes(damaged.read_bytes() + b"more")
+        for find in (best_checkpoint, latest_checkpoint, find_checkpoint):
+            assert find(run).steps == other, file
+        warn_once.cache_clear()
+        with pytest.raises(UserError, match=f"checkpoints/{wrong} is damaged"):
+            read_policy(find_checkpoint(run / f"checkpoints/{wrong}"), CONFIG)
+        shutil.rmtree(run)
+    said = capsys.readouterr().err.splitlines()
+    assert all(f"{wrong} is damaged" in line and "another one is used" in line for line in said)
+
+
+@pytest.mark.parametrize("name", ["old[1]", "a\\b", "[", "* ?%20"])
+def test_a_run_may_have_any_path(name: str, tmp_path: Path, state: TrainingState) -> None:
+    """Orbax takes brackets for a pattern, and tensorstore a backslash for a slash."""
+    run = write_run(tmp_path / name, state)
+    save_checkpoint(run, CONFIG, 128, items_of(state))
+    assert_identical(load_both(run, state), (policy_of(state, OBSERVATION.size), state))
+
+
+def test_a_checkpoint_that_is_not_read_as_it_was_given_replaces_no_other(
+    tmp_path: Path, state: TrainingState, monkeypatch
+) -> None:
+    run = write_run(tmp_path, state)
+    lost = lambda folder, template: jax.tree.map(np.zeros_like, template)  # noqa: E731
+    monkeypatch.setattr(checkpoints, "_read_item", lost)
+    with pytest.raises(checkpoints.NotSavedError, match="cannot be written"):
+        save_checkpoint(run, CONFIG, 128, items_of(state))
+    monkeypatch.undo()
+    assert [path.name for path in (run / "checkpoints").iterdir()] == ["64"]
+    assert_identical(load_both(run, state), (policy_of(state, OBSERVATION.size), state))
 
 
 def test_a_checkpoint_without_a_manifest_is_read_with_a_warning(run, state, capsys) -> None:

@@ -15,10 +15,10 @@ from bounce_mjx.commands import eval as eval_command
 from bounce_mjx.commands.main import main as console_script
 from bounce_mjx.config.command_line import flags_of
 from bounce_mjx.resources import resource_path
-from bounce_mjx.runs.config import TrainConfig, read_preset, train_config
+from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import choose_checkpoint
-from bounce_mjx.tasks.registry import find_task
-from bounce_mjx.training.command import TrainCommand
+from bounce_mjx.runs.settings import Choice, read_preset, stack
+from bounce_mjx.training.command import fields_of_command
 from bounce_mjx.viewers.simulation import Simulation
 from tiny_runs import STEPS, TINY, TRAIN_SCRIPT, shared_run
 
@@ -49,11 +49,16 @@ MISTAKES = (
     ("train --config nope", "no preset is named nope", "cpu, default, finetune"),
     ("train --robot nope", "no robot is named nope", "iiwa, panda, peitian, ur5e"),
     ("train --mjcf a.xml", "a.xml", "does not exist", "give the path"),
-    ("train --log-dir exp[lr]", "exp[lr] has a square bracket"),
     ("eval --target-height -1", "--target-height is -1.0", ">= 0.001"),
     ("eval --json nowhere/a.json", "nowhere/a.json", "make it"),
     ("evl", "unknown command evl", "did you mean eval?", "bounce-mjx --help"),
     ("--num-envs 3", "unknown command --num-envs", "choose train, eval"),
+    ("eval pretraned", "there is no checkpoint folder and no policy pretraned; did you mean"),
+    ("eval miror", "no policy miror; did you mean mirror?"),
+    ("export robst_small", "no policy robst_small; did you mean robust_small?"),
+    ("play ur5", "no policy ur5; did you mean ur5e?"),
+    ("train --warm-start robust_smal", "did you mean robust_small?"),
+    ("train --resume latst", "there is no checkpoint folder latst; did you mean latest?"),
     ("eval pretrained --robot ur5e", "give mirror"),
     ("eval mirror --task catch", "target_height"),
     ("eval mirror --robot nope", "no robot is named nope"),
@@ -92,6 +97,9 @@ def test_a_mistake_is_one_sentence(refused: Refuse, monkeypatch, case: tuple[str
     refused(line.format(run=shared_run() if "{run}" in line else None), *words)
 
 
+ALIASES = b"a0: &a0 [1, 2]\n" + b"".join(
+    b"a%d: &a%d [*a%d, *a%d]\n" % (i, i, i - 1, i - 1) for i in range(1, 40)
+)
 BAD_YAML = {
     "no YAML": (b"ppo: [1\nseed: {", "cannot be read", "line 2", "configs/default.yaml"),
     "key twice": (
@@ -99,10 +107,22 @@ BAD_YAML = {
         "the key ppo appears twice, in lines 1 and 3; join the two",
     ),
     "unknown key": (b"zzz: 3", "unknown key zzz", "known keys here are", "total_steps"),
+    "many values": (b"a: [" + b"1," * 20000 + b"]", "it has more than 20,000 values"),
+    "aliases": (ALIASES, "it has more than 20,000 values"),
     "deep near miss": (
         b"env: {reward: {height: {wieght: 3}}}",
         "env.reward.height.wieght",
         "did you mean env.reward.height.weight?",
+    ),
+    "aliases of aliases": (
+        b"a: &a [1, 2, 3, 4, 5, 6, 7, 8, 9]\nb: &b [*a, *a, *a, *a, *a, *a, *a, *a, *a]\n"
+        b"c: &c [*b, *b, *b, *b, *b, *b, *b, *b, *b]\nd: &d [*c, *c, *c, *c, *c, *c, *c, *c, *c]\n"
+        b"e: [*d, *d, *d, *d, *d, *d, *d, *d, *d]",
+        "it has more than 20,000 values",
+    ),
+    "too many keys": (
+        "\n".join(f"key{i}: 1" for i in range(10_001)).encode(),
+        "it has more than 20,000 values",
     ),
 }
 
@@ -185,7 +205,7 @@ def test_the_help_of_a_training_is_one_screen_and_the_whole_help_has_every_flag(
     assert "--num-envs INT          Environments that run in parallel (default: 512)" in pages[0]
     shown = {*re.findall(r"^  (--[\w.-]+)", pages[1], re.MULTILINE)}
     shown |= {*re.findall(r"^  --.+, (--no-[\w.-]+)", pages[1], re.MULTILINE)}
-    known = {*flags_of(train_config(find_task("bounce"), TrainCommand))}
+    known = {*flags_of(fields_of_command(stack(Choice())))}
     assert shown == known
     assert pages[1].index("\nppo:\n") < pages[1].index("--learning-rate FLOAT")
 

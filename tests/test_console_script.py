@@ -7,6 +7,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import jax
@@ -15,8 +16,10 @@ import pytest
 import yaml
 
 import bounce_mjx
+from bounce_mjx import lazy
 from bounce_mjx.commands import main as console_script
 from bounce_mjx.commands import train as train_command
+from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.interrupt import StopRequest
 
 CHECKOUT = Path(__file__).parent.parent
@@ -45,6 +48,51 @@ def test_an_output_that_cannot_be_written_is_dropped(args: list[str], status: in
     os.close(output)
     assert done.returncode == status
     assert not done.stderr and not done.stdout
+
+
+def test_a_device_on_which_jax_does_not_start_is_named(monkeypatch, capsys) -> None:
+    """Also where a checkpoint could therefore not be read."""
+    monkeypatch.setenv("JAX_PLATFORMS", "nope")
+    for wrap in (False, True):
+        with pytest.raises(SystemExit) as exit_info, exit_on_user_error():
+            try:
+                raise RuntimeError("Unable to initialize backend 'nope': it is not known")
+            except RuntimeError as error:
+                if wrap:
+                    raise UserError("the checkpoint is damaged") from error
+                raise
+        assert exit_info.value.code == 2
+        sentence = capsys.readouterr().err
+        assert sentence.startswith("error: JAX does not start on JAX_PLATFORMS=nope (Unable to")
+        assert sentence.endswith("; unset it, or name platforms of this machine, such as cpu\n")
+    with pytest.raises(RuntimeError, match="another"), exit_on_user_error():
+        raise RuntimeError("another")
+
+
+def test_a_sentence_has_no_codes_that_a_terminal_would_obey(capsys) -> None:
+    with pytest.raises(SystemExit), exit_on_user_error():
+        raise UserError("there is no run a\x1b]0;title\x07 of\nB\udcff")
+    assert capsys.readouterr().err == "error: there is no run a\\x1b]0;title\\x07 of B\\udcff\n"
+
+
+def test_an_import_of_mjx_drops_its_own_lines_alone(monkeypatch, capsys) -> None:
+    """Not those of another thread, and the output is restored also where two threads import."""
+
+    def import_module(name: str) -> str:
+        print("Failed to import warp")
+        other = threading.Thread(target=print, args=("meanwhile",))
+        other.start()
+        other.join()
+        return name
+
+    monkeypatch.setattr(lazy.importlib, "import_module", import_module)
+    threads = [threading.Thread(target=lazy.import_mjx) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    print("after")
+    assert capsys.readouterr().out == "meanwhile\nmeanwhile\nafter\n"
 
 
 def test_version(capsys) -> None:
@@ -124,6 +172,7 @@ def test_each_help_is_light() -> None:
 import contextlib, io, sys
 before = set(sys.modules)
 import bounce_mjx
+from bounce_mjx import lazy
 from bounce_mjx.commands.main import COMMANDS, main
 for name in COMMANDS:
     with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
@@ -218,6 +267,50 @@ def test_ctrl_c_while_a_command_is_imported(tmp_path: Path, start: str, moment: 
     assert not list(tmp_path.iterdir())
 
 
+def test_ctrl_c_while_its_handler_changes_is_not_lost() -> None:
+    """Python drops a signal that it has seen and that then gets the default action."""
+    code = """
+import os, signal
+from bounce_mjx.interrupt import StopRequest, end_on_ctrl_c
+change = signal.signal
+def changed(*args):
+    os.kill(os.getpid(), signal.SIGINT)
+    return change(*args)
+signal.signal = changed
+change(signal.SIGINT, signal.default_int_handler)
+end_on_ctrl_c()
+print("lost")
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
+
+
+@pytest.mark.parametrize("is_read", [True, False])
+def test_a_slow_reader_of_an_output_that_does_not_block(is_read: bool) -> None:
+    """Costs lines, and not the process; a reader that is only late gets every line."""
+    code = """
+import sys
+from bounce_mjx.errors import exit_on_user_error
+with exit_on_user_error():
+    for i in range(5000):
+        print(f"{i:099d}")
+print("done", file=sys.stderr)
+"""
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    with os.fdopen(reader, "rb") as lines:
+        process = subprocess.Popen(
+            [sys.executable, "-c", code], stdout=writer, stderr=subprocess.PIPE
+        )
+        os.close(writer)
+        read = lines.read() if is_read else b""
+        assert process.communicate(timeout=60)[1] == b"done\n" and process.returncode == 0
+        read += lines.read()
+    numbers = [int(line) for line in read.splitlines()]
+    assert numbers == list(range(len(numbers)))
+    assert len(numbers) == 5000 if is_read else 0 < len(numbers) < 5000
+
+
 def test_the_innermost_request_receives_the_signal() -> None:
     """A viewer ends, and the command that shows it continues."""
     with StopRequest() as outer:
@@ -240,7 +333,7 @@ USUAL_SPELLINGS = {
 @pytest.mark.parametrize("flags", USUAL_SPELLINGS)
 def test_usual_spellings_of_flags(flags: str) -> None:
     expected, *path = USUAL_SPELLINGS[flags]
-    value = train_command.read_command(flags.split())
+    value = train_command.read_command(flags.split()).config
     for name in path:
         value = getattr(value, name)
     assert value == expected

@@ -2,6 +2,7 @@
 
 import inspect
 import math
+import re
 import runpy
 import subprocess
 import sys
@@ -29,9 +30,8 @@ from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import load_model
 from bounce_mjx.runs import checkpoints
 from bounce_mjx.runs.checkpoints import save_checkpoint
-from bounce_mjx.runs.config import TrainConfig, load_run_config, train_config
+from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import find_checkpoint, save_config
-from bounce_mjx.tasks.registry import find_task
 from bounce_mjx.world.sensing import Sensing
 
 CHECKOUT = Path(__file__).resolve().parent.parent
@@ -54,6 +54,8 @@ QUANTITIES = EnvConfig().observation.quantities()
 # sinks only by micrometres.
 STIFF = {"servo_gain": (100.0, 100.0), "servo_damping": (10.0, 10.0)}
 LEVEL = {
+    # Exported without a simulation of own play.
+    "action": {"base": "target"},
     "action_scale": 1e-5,
     "ball_init_pos": (0.58856, 0.01, 1.0),
     "reset": {"ball_position": 0.0, "joint_angles": 0.0, "joint_velocities": 0.0},
@@ -98,7 +100,7 @@ def input_name(quantity: str) -> str:
 
 def make_run(folder: Path, env: dict, task: str = "bounce") -> Path:
     """Writes a run with a random policy; its first input never varied in the training."""
-    config = train_config(find_task(task))(task=task, env=env, ppo={"hidden_layers": (24, 8)})
+    config = TrainConfig(task=task, env=env, ppo={"hidden_layers": (24, 8)})
     size = config.env.layout.size
     rng = np.random.default_rng(0)
     std = rng.uniform(0.5, 1.5, size).astype(np.float32)
@@ -163,7 +165,7 @@ FUNCTIONS = {
     "powers": lambda x: x**2 + x**3 + jnp.square(x) + 1.0 / x**2,
     "rounding": lambda x: jnp.floor(x) + jnp.ceil(x) + jnp.sign(x) + x % 0.3,
     "limits": lambda x: jnp.clip(x, -0.5, 0.5) + jax.lax.clamp(-0.3, x, 0.7) + jnp.maximum(x, 0.1),
-    "activations": lambda x: jax.nn.relu(x) + jax.nn.silu(x) + jax.nn.sigmoid(x),
+    "activations": lambda x: jax.nn.relu(x) + jax.nn.silu(x) + jax.nn.sigmoid(x) + jax.nn.elu(x),
     "no gradient": lambda x: jax.lax.stop_gradient(x) + jnp.copy(x),
     "whole numbers": lambda i: jnp.abs(i) + i * 2 - jnp.minimum(i, 1) + jnp.sign(-i) + i * i,
     "reductions": lambda i, x: jnp.sum(i) + i.max() - i.min() + jnp.mean(x) + x.max() - x.min(),
@@ -270,6 +272,9 @@ def test_metadata_describes_the_training_and_survives_the_file() -> None:
     assert metadata.control_dt == config.control_dt and metadata.torque_limits == (None,) * 6
     assert metadata.commands == {"target_height": CommandRange((0.4, 0.6), "m")}
     assert metadata.servo_stiffness == (20000.0,) * 6 and metadata.servo_damping == (200.0,) * 6
+    assert (metadata.task, metadata.robot, metadata.action_base) == ("bounce", "AIR4-560", "target")
+    # In a control step of 10 ms at 2 rad/s.
+    np.testing.assert_allclose(metadata.largest_step, 0.02)
 
 
 def test_servo_targets_lead_the_measured_angles_as_in_the_environment() -> None:
@@ -282,7 +287,7 @@ def test_servo_targets_lead_the_measured_angles_as_in_the_environment() -> None:
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))
     for step in range(12):
         pipeline = state.pipeline_state
-        angles = np.asarray(pipeline.physics.qpos[:6]) + 0.004 * step
+        angles = np.asarray(pipeline.physics.qpos[:6]) + 0.001 * step
         physics = pipeline.physics._replace(qpos=pipeline.physics.qpos.at[:6].set(angles))
         state = state.replace(pipeline_state=pipeline._replace(physics=physics))
         for _ in range(2):
@@ -472,11 +477,13 @@ def test_a_policy_needs_only_what_it_sees(tmp_path: Path) -> None:
         "ball_quaternion": 1,
         "action": 1,
     }
-    policy = load_policy(make_run(tmp_path / "run", {"observation": observation}))
+    # A target that varies would have to be seen.
+    env = {"observation": observation, "target_height_range": (0.5, 0.5)}
+    policy = load_policy(make_run(tmp_path / "run", env))
     assert policy.needs == ("ball_position",)
     policy.step({"ball_position": (0.1, 0.2, 0.3)})
-    policy.step({"ball_position": (0.4, 0.5, 0.6)})
-    expected = [0.4, 0.5, 0.6, 0.1, 0.2, 0.3, 1.0, 0.0, 0.0, 0.0]
+    policy.step({"ball_position": (0.12, 0.22, 0.32)})
+    expected = [0.12, 0.22, 0.32, 0.1, 0.2, 0.3, 1.0, 0.0, 0.0, 0.0]
     np.testing.assert_array_equal(policy.observation[:10], expected)
     with pytest.raises(UserError, match="call step with joint_angles first"):
         policy.servo_targets(np.zeros(6))
@@ -508,8 +515,7 @@ def test_load_policy_refuses_other_files(tmp_path: Path) -> None:
     model = onnx.load_from_string(shipped)
     broken |= {
         "ball_colour": edited(model, "observation", "ball_velocity", "ball_colour"),
-        "format is 1, not 3": edited(model, "format", "3", "1"),
-        "Kalman filter, .* 0.1.0": edited(model, "velocity", "measured", "filter"),
+        "format is 1, not 4; export the policy again": edited(model, "format", "4", "1"),
     }
     del model.metadata_props[:]
     broken["lacks format"] = model.SerializeToString()
@@ -540,7 +546,7 @@ def test_no_servo_targets_for_a_wrong_action(policies) -> None:
 # All dependencies of the project except NumPy and onnxruntime.
 BLOCKED = (
     "jax jaxlib mujoco flax optax orbax pydantic pydantic_core tensorstore yaml rich onnx "
-    "matplotlib scipy brax gymnasium torch"
+    "packaging matplotlib scipy brax gymnasium torch"
 )
 
 
@@ -566,14 +572,23 @@ try:
     load_policy(sys.argv[1])
 except UserError as error:
     print(error)
+from bounce_mjx.commands.main import main
+main(["doctor"])
+main(["eval"])
 """
     done = subprocess.run(
         [sys.executable, "-c", script, str(tmp_path)], capture_output=True, text=True
     )
-    assert done.returncode == 0, done.stderr
-    shapes, refusal = done.stdout.splitlines()
+    shapes, refusal, *doctor = done.stdout.splitlines()
     assert shapes == "(6,) (6,) True"
     assert "must be exported, for which" in refusal and "bounce-mjx export" in refusal
+    said = dict(line.split(": ", 1) for line in doctor[1:-1])
+    assert said["devices"] == "none (No module named 'jax')"
+    assert f"onnxruntime {onnxruntime.__version__}" in said["packages"]
+    # The other commands say what they need.
+    assert done.returncode == 2
+    reason = r"\(No module named '\w+'\); install it with: .+\n"
+    assert re.fullmatch(f"error: bounce-mjx eval cannot be imported {reason}", done.stderr)
 
 
 @pytest.mark.slow

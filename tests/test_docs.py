@@ -25,15 +25,16 @@ from bounce_mjx import commands as commands_package
 from bounce_mjx.commands import main as console_script
 from bounce_mjx.config import command_line as cli
 from bounce_mjx.config.files import dump_config
-from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.config.settings import StrictModel, fields_in
 from bounce_mjx.resources import resource_path
-from bounce_mjx.runs.config import TrainConfig, read_preset, train_config
+from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.settings import Choice, read_preset, stack
 from bounce_mjx.task import term_names, weighted_terms
 from bounce_mjx.tasks.bounce import Bounce
 from bounce_mjx.tasks.bounce_rewards import BounceReward, RewardInputs
 from bounce_mjx.tasks.registry import find_task
 from bounce_mjx.training import hosts
-from bounce_mjx.training.command import Start, TrainCommand, changed
+from bounce_mjx.training.command import fields_of_command
 from bounce_mjx.world.randomization import TERMS
 
 CHECKOUT = Path(__file__).resolve().parent.parent
@@ -165,15 +166,14 @@ def test_shown_commands_are_understood(command, monkeypatch: pytest.MonkeyPatch)
 def known_flags() -> set[str]:
     """The flags of every command of the package, and of the maintainers' one."""
     ship = runpy.run_path(str(CHECKOUT / "benchmarks/ship.py"))
-    flags = {"--help", "--help-all", *cli.flags_of(ship["ShipCommand"])}
-    flags |= set(cli.flags_of(train_config(Bounce, TrainCommand)))
+    flags = {"--help", "--help-all", *cli.flags_of(fields_in(ship["ShipCommand"]))}
+    flags |= set(cli.flags_of(fields_of_command(stack(Choice()))))
     for info in pkgutil.iter_modules(commands_package.__path__):
         module = importlib.import_module(f"bounce_mjx.commands.{info.name}")
         for name, member in vars(module).items():
             is_command = inspect.isclass(member) and issubclass(member, StrictModel)
             if is_command and name.endswith("Command"):
-                has_task = "env" in member.model_fields
-                flags |= set(cli.flags_of(train_config(Bounce, member) if has_task else member))
+                flags |= set(cli.flags_of(fields_in(member)))
     for task in (Bounce, find_task("examples/dribble_task.py:Dribble")):
         flags |= {f"--{name}".replace("_", "-") for name in task.Config().commands}
     return flags
@@ -320,7 +320,7 @@ def short_training(folder: Path) -> Callable:
     def train(*given, callbacks=(), **settings):
         calls.append(settings)
         if len(calls) > 1:
-            return changed(Start().base(), settings)
+            return stack(Choice()).config(settings)
         return real(*given, callbacks=callbacks, **settings | short, log_dir=folder)
 
     return train
@@ -376,8 +376,6 @@ def test_tables_of_figures_are_as_drawn() -> None:
         assert figures["drawn"](text, known) == text, f"python benchmarks/figures.py writes {page}"
         shown |= {name for _, name in figures["TABLE"].findall(text)}
     assert shown == known.keys()
-    assert (CHECKOUT / "benchmarks/RESULTS.md").read_text("utf-8").count("\n") <= 150
-    assert (CHECKOUT / "benchmarks/notes.md").read_text("utf-8").count("\n") <= 300
 
 
 def test_robot_page_has_every_term_of_the_randomisation() -> None:
@@ -385,3 +383,18 @@ def test_robot_page_has_every_term_of_the_randomisation() -> None:
     section = page.split("## Randomised quantities\n")[1].split("\n## ")[0]
     rows = re.findall(r"^\| \w+ \| (`.+) \|$", section, re.MULTILINE)
     assert sorted(name for row in rows for name in re.findall(r"`(\w+)`", row)) == sorted(TERMS)
+
+
+def test_each_promise_has_its_place_and_its_test() -> None:
+    """The rows of "What we promise" in CONTRIBUTING.md."""
+    section = (CHECKOUT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    section = section.split("## What we promise\n")[1].split("\n## ")[0]
+    rows = re.findall(r"^\| (.+) \| (`.+`) \| (`.+`) \|$", section, re.MULTILINE)
+    assert len(rows) >= 40
+    for promise, places, tests in rows:
+        for place in re.findall(r"`([^`]+)`", places):
+            assert (CHECKOUT / "src/bounce_mjx" / place).is_file(), f"{promise}: {place}"
+        for test in re.findall(r"`([^`]+)`", tests):
+            file, _, name = test.partition("::")
+            text = (CHECKOUT / "tests" / file).read_text(encoding="utf-8")
+            assert name in text, f"{promise}: {test}"

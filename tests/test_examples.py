@@ -8,11 +8,21 @@ from pathlib import Path
 
 import pytest
 
-from bounce_mjx.runs.config import read_preset
+from bounce_mjx.runs.settings import read_preset
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 # Three environments, whose compiled step the examples share.
 SMALL = ["--num-envs", "3", "--steps"]
+
+
+def last_value_is_the_reward(names: dict) -> bool:
+    """The distribution of the return at the last step of an episode has the reward as its mean."""
+    torch = names["torch"]
+    rewards, inputs = torch.tensor([-0.33, 0.0, 7.21]), torch.zeros(3, names["num_inputs"])
+    distribution = names["target_distribution"](rewards, torch.zeros(3), inputs)
+    torch.testing.assert_close(distribution.sum(-1), torch.ones(3))
+    torch.testing.assert_close(distribution @ names["support"], rewards, atol=1e-4, rtol=0.0)
+    return True
 
 
 @pytest.mark.slow
@@ -25,6 +35,7 @@ SMALL = ["--num-envs", "3", "--steps"]
         ("sbx_ppo.py", [*SMALL, "96"], ["sbx"], lambda names: names["model"].num_timesteps == 96),
         ("torchrl_ppo.py", [*SMALL, "96"], ["torchrl"], r"batch=0, reward=-?\d"),
         ("cleanrl_ppo.py", [*SMALL, "192"], ["torch"], r"iteration=\d, episodic_return=-?\d"),
+        ("fasttd3.py", [*SMALL, "60", "--batch-size", "8"], ["torch"], last_value_is_the_reward),
     ],
 )
 def test_example_runs(example, arguments, libraries, shown, need, monkeypatch, capsys, tmp_path):

@@ -16,7 +16,7 @@ from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import RecordEpisodeStatistics
 
-from bounce_mjx.adapters.gymnasium import environments
+from bounce_mjx.adapters.gymnasium import batch, environments
 from bounce_mjx.adapters.gymnasium.registration import ENV_ID, TASK_ID, TASKS
 from bounce_mjx.errors import UserError
 from bounce_mjx.tasks.registry import find_task, registered_tasks
@@ -59,10 +59,14 @@ def test_the_time_limit_is_that_of_the_config() -> None:
         (gymnasium.make, {"control_dt": 0.02}, 1000),
         (gymnasium.make_vec, {"episode_seconds": 30}, 3000),
         (gymnasium.make, {"episode_seconds": 30, "max_episode_steps": 2500}, 2500),
+        (gymnasium.make, {"max_episode_steps": 3000}, 2000),
+        (gymnasium.make, {"episode_seconds": 0.1, "max_episode_steps": 50}, 10),
     ):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            assert make(TASK_ID, **settings).spec.max_episode_steps == steps
+            env = make(TASK_ID, **settings)
+        assert env.spec.max_episode_steps == steps
+        assert type(env.spec).from_json(env.spec.to_json()).max_episode_steps == steps
 
 
 def falling_actions(steps: int) -> np.ndarray:
@@ -157,10 +161,13 @@ def test_options_choose_the_target_and_the_environments(single, vectorised):
     drawn = single.reset(seed=1)[0]
     observation, _ = vectorised.reset(seed=[1, 2, None], options={"target_height": 0.5})
     np.testing.assert_array_equal(observation[:, TARGET], 0.5)
+    assert vectorised.np_random_seed[:2] == (1, 2)
     # Only the target differs from the drawn episode.
     np.testing.assert_allclose(observation[0, :TARGET], drawn[:TARGET], atol=1e-6)
     mask = np.array([False, True, False])
-    after, _ = vectorised.reset(options={"reset_mask": mask, "target_height": 0.7})
+    chosen = {"reset_mask": mask, "target_height": 0.7}
+    after, _ = vectorised.reset(seed=[7, np.int64(8), 9], options=chosen)
+    assert vectorised.np_random_seed[:2] == (1, 8)
     np.testing.assert_array_equal(after[:, TARGET], np.float32([0.5, 0.7, 0.5]))
     np.testing.assert_array_equal((after == observation).all(axis=1), ~mask)
     # An episode's steps keep its target.
@@ -175,7 +182,14 @@ def test_wrong_arguments_and_options_give_one_sentence(vectorised):
     for arguments, sentence in (
         ({"render_mode": "human"}, "render_mode is 'human'"),
         ({"max_episode_steps": 3000}, "must be from 1 to the 2000 steps .* episode_seconds makes"),
+        ({"max_episode_steps": 2.5}, "max_episode_steps is 2.5, but must be a whole number"),
         ({"num_envs": 0}, "num_envs is 0, but must"),
+        ({"num_envs": 1.5}, "num_envs is 1.5, but must be a whole number"),
+        ({"width": 64.0}, "width is 64.0, but must be a whole number"),
+        (
+            {"autoreset_mode": "same_step"},
+            "'same_step'; choose one of 'NextStep'",
+        ),
         ({"target_hight_range": (0, 1)}, "keyword argument 'target_hight_range'; did you mean"),
         ({"render_mode": "rgb_array", "camera": "top"}, "no camera 'top'; its .* overview, side"),
     ):
@@ -190,18 +204,113 @@ def test_wrong_arguments_and_options_give_one_sentence(vectorised):
     ):
         with pytest.raises(UserError, match=sentence):
             vectorised.reset(options=options)
+    single = environments.TaskEnv()
+    for env, option in ((vectorised, "target_hight"), (single, "reset_mask")):
+        with pytest.raises(TypeError, match=f"unexpected option '{option}'"):
+            env.reset(options={option: np.ones(1, bool)})
+
+
+def test_spaces_and_attributes(single, vectorised):
+    action, observation = single.action_space, single.observation_space
+    assert action == gymnasium.spaces.Box(-1.0, 1.0, (6,))
+    assert observation == gymnasium.spaces.Box(-np.inf, np.inf, (29,))
+    assert vectorised.single_action_space == action
+    assert vectorised.single_observation_space == observation
+    assert vectorised.action_space.shape == (NUM_ENVS, 6)
+    for env in (single, vectorised):
+        assert env.unwrapped.mj_model.nu == 6 and env.metadata["render_fps"] == 100
+    assert single.get_wrapper_attr("dt") == vectorised.dt == 0.01
+    assert vectorised.call("dt") == vectorised.get_attr("dt") == (0.01,) * NUM_ENVS
+
+
+def test_equal_environments_share_their_programs():
+    first, second = make_vec(), make_vec(AutoresetMode.SAME_STEP)
+    assert first.task is second.task
+    assert first.task is not make_vec(physics_dt=0.002).task
+
+
+def test_returned_arrays_belong_to_the_user(vectorised):
+    observation, _ = vectorised.reset(seed=0)
+    following, reward, *_, info = vectorised.step(NOTHING)
+    twin = copy.deepcopy(vectorised)
+    for array in (observation, following, reward, info["bounced"], info["_bounced"]):
+        array[:] = 7.0
+    assert data_equivalence(vectorised.step(NOTHING), twin.step(NOTHING), exact=True)
+    twin.close()
+
+
+def test_wrappers_work_on_the_vector(vectorised, need):
+    """The observations and rewards of Gymnasium's wrappers on its own vector; and tensors."""
+    wrappers = gymnasium.wrappers.vector
+
+    def steps(env):
+        env = wrappers.NormalizeReward(
+            wrappers.NormalizeObservation(wrappers.RecordEpisodeStatistics(env))
+        )
+        return [env.reset(seed=1), *map(env.step, falling_actions(STEPS))]
+
+    made = [lambda: gymnasium.make(ENV_ID, max_episode_steps=LIMIT)] * NUM_ENVS
+    for left, right in zip(steps(vectorised), steps(SyncVectorEnv(made)), strict=True):
+        assert_same(left, right, 1e-2)
+    torch = need("torch")
+    need("array_api_compat")
+    tensors = wrappers.NumpyToTorch(vectorised)
+    tensors.reset(seed=0)
+    following, reward, *_ = tensors.step(torch.zeros(NUM_ENVS, 6))
+    assert following.dtype is torch.float32 and following.shape == (NUM_ENVS, 29)
+    assert isinstance(reward, torch.Tensor)
+
+
+def test_pictures_show_the_state(single, vectorised):
+    single.reset(seed=0)
+    first = single.render()
+    assert first.shape == (480, 640, 3) and first.dtype == np.uint8
+    # The arm is orange.
+    red, green, blue = first.reshape(-1, 3).astype(int).T
+    assert ((red > 150) & (green > 50) & (green < 150) & (blue < 80)).sum() > 2000
+    for _ in range(8):
+        single.step(np.ones(6, np.float32))
+    assert (np.abs(single.render().astype(int) - first).max(axis=-1) > 60).sum() > 300
+    vectorised.reset(seed=0)
+    pictures = vectorised.render()
+    assert [picture.shape for picture in pictures] == [(64, 96, 3)] * NUM_ENVS
+    assert not np.array_equal(pictures[0], pictures[1])
 
 
 def test_use_before_reset_or_with_a_wrong_action_gives_one_sentence(vectorised):
-    single, vector = environments.TaskEnv(), make_vec()
+    single, vector = environments.TaskEnv(episode_seconds=0.01), make_vec()
     for env in (single, vector):
-        with pytest.raises(UserError, match="before its reset"):
+        with pytest.raises(UserError, match="before its reset") as caught:
             env.step(env.action_space.sample())
+        assert isinstance(caught.value, gymnasium.error.ResetNeeded)
         env.reset(seed=0)
-    with pytest.raises(UserError, match=r"shape \(1, 5\), but must have \(1, 6\)"):
-        single.step(np.zeros(5))
-    with pytest.raises(UserError, match=r"shape \(6,\), but must have \(3, 6\)"):
-        vector.step(np.zeros(6))
+    for env, action, shapes in (
+        (single, np.zeros(5), r"shape \(5,\), but must have \(6,\)"),
+        (vector, np.zeros(6), r"shape \(6,\), but must have \(3, 6\)"),
+        (single, "left", r"must be an array of numbers \(6,\)"),
+    ):
+        with pytest.raises(UserError, match=shapes):
+            env.step(action)
+    assert single.step(np.zeros(6))[3]
+    with pytest.raises(gymnasium.error.ResetNeeded, match="episode has ended; call reset"):
+        single.step(np.zeros(6))
+
+
+def test_np_random_decides_the_episodes(single):
+    """Gymnasium's generator is the only source of randomness: one set by the user, the seed of an
+    environment that was not given one, and a state put back, each repeat the episodes."""
+    env = single.unwrapped
+    first = [env.reset(seed=5)[0], env.reset()[0]]
+    assert not np.array_equal(*first)
+    env.np_random, _ = gymnasium.utils.seeding.np_random(5)
+    np.testing.assert_array_equal([env.reset()[0], env.reset()[0]], first)
+    env.np_random = None
+    unseeded = env.reset()[0]
+    np.testing.assert_array_equal(env.reset(seed=env.np_random_seed)[0], unseeded)
+    state = env.np_random.bit_generator.state
+    later = env.reset()[0]
+    env.np_random.bit_generator.state = state
+    np.testing.assert_array_equal(env.reset()[0], later)
 
 
 def test_copies_and_pickles_continue_the_episodes(vectorised, single):
@@ -256,8 +365,8 @@ def test_skrl_wraps_the_vector(need, vectorised):
 
 def test_process_forked_after_jax_ran_refuses_to_hang(monkeypatch):
     env = environments.TaskEnv()
-    monkeypatch.setattr(environments, "_jax_process", 1)
-    with pytest.raises(UserError, match='context="forkserver"'):
+    monkeypatch.setattr(batch, "_jax_process", 1)
+    with pytest.raises(UserError, match='set_start_method."forkserver".*context="forkserver"'):
         env.reset()
 
 

@@ -84,6 +84,8 @@ def test_spaces_and_settings(env, gymnax):
     assert env.action_space().contains(actions) and not env.action_space().contains(2.0 * actions)
     with pytest.raises(UserError, match="unknown key target_hight_range"):
         GymnaxBounceBall(target_hight_range=(0.3, 0.4))
+    with pytest.raises(UserError, match="reward.heigth; did you mean reward.height"):
+        GymnaxBounceBall(reward={"heigth": {"weight": 2.0}})
 
 
 def test_gymnax_own_wrapper_logs_episodes(gymnax):

@@ -4,20 +4,44 @@ import re
 import runpy
 from pathlib import Path
 
+import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 
+from bounce_mjx.env.env import world_model
 from bounce_mjx.errors import UserError
-from bounce_mjx.identify.fit import Fit, Noise, Problem, _eliminate, certainty, minimise
+from bounce_mjx.identify.doctor import examine
+from bounce_mjx.identify.fit import (
+    Fit,
+    Noise,
+    Problem,
+    _bounded_step,
+    _eliminate,
+    certainty,
+    minimise,
+)
+from bounce_mjx.identify.following import find_settled, follow
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.reading import read_csv
-from bounce_mjx.identify.simulation import make_targets
+from bounce_mjx.identify.simulation import compensated, make_targets
 from bounce_mjx.identify.stages import Identified, _check_frame, identify
 from bounce_mjx.identify.unknowns import Layout
 from bounce_mjx.identify.windows import Windows, cut
-from bounce_mjx.identify.world import compare, estimates, to_yaml
+from bounce_mjx.identify.world import compare, describe_doubts, estimates, to_yaml
+from bounce_mjx.physics import (
+    Control,
+    PhysicsParameters,
+    PhysicsState,
+    edited_model,
+    make_engine,
+)
+from bounce_mjx.physics.edited import EditedModel
 from bounce_mjx.reports.identification import identification_page
-from bounce_mjx.runs.config import read_preset
+from bounce_mjx.robot.model import find_addresses
+from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.world.actuation import Actuators
 from bounce_mjx.world.named import read_world
 
 BENCHMARK = Path(__file__).parent.parent / "benchmarks" / "identify.py"
@@ -74,8 +98,7 @@ def test_targets_are_late_and_lagged(latency: float, lag: float) -> None:
     random = np.random.default_rng(1)
     log = flight_log()
     log = log._replace(servo_targets=random.normal(size=log.servo_targets.shape))
-    w = windows_of(log)
-    found = make_targets(log, w, 0.001)(latency, lag)
+    found = make_targets(log, 0.001 * np.arange(501))(latency, lag)
     fine = np.arange(0.0, 0.5, 1e-5) + 0.5e-5
     index = np.searchsorted(log.target_times, fine - latency, side="right") - 1
     late = log.servo_targets[np.maximum(index, 0)]
@@ -107,7 +130,8 @@ def linear_problem(log: Log, random: np.random.Generator) -> Problem:
         by_gain = 1e-2 * vectors[:, None, None, places["servo_gain"]] * gain * ramp
         return measured_rows(w, starts[:, :, None, :6] + by_late + by_gain)
 
-    return Problem(simulate, w, layout, Noise(np.full(6, 1e-3), np.full(3, 2e-3)))
+    noise = Noise(np.full(6, 1e-3), np.full(3, 2e-3))
+    return Problem(simulate, w, layout, sensors=noise, noise=noise)
 
 
 @pytest.mark.slow
@@ -137,26 +161,48 @@ def test_intervals_know_that_residuals_of_a_window_are_correlated() -> None:
     np.testing.assert_allclose(np.mean(deviations), np.std(estimates), rtol=0.35)
 
 
+def identified(layout: Layout, log: Log, vector: np.ndarray, covariance: np.ndarray) -> Identified:
+    """An identified robot with these unknowns, whose windows say nothing more."""
+    windows, noise = windows_of(log), Noise(np.full(6, 1e-3), np.full(3, 2e-3))
+    predicted = np.zeros((len(windows.angles), windows.angles[0].size + windows.balls[0].size))
+    errors = {"joint_angles": 1.0, "ball_position": 1.0}
+    return Identified(
+        layout=layout,
+        windows=windows,
+        noise=noise,
+        fit=Fit(vector, np.zeros(0), predicted),
+        information=np.linalg.inv(covariance),
+        covariance=covariance,
+        before=errors,
+        after=errors,
+        held_out=errors,
+        dropped=0,
+        counted=noise,
+        following_errors=np.full(6, 1e-3),
+        joint_errors=np.full(6, 1e-3),
+    )
+
+
 def test_a_world_has_the_range_of_each_joint_and_axis(tmp_path: Path) -> None:
     """And a log is compared with that of each, not with the range of all."""
     log, layout, path = flight_log(), Layout(6, True, 0.001), tmp_path / "world.yaml"
     vector, places = layout.mean.copy(), layout.slices
-    vector[places["servo_gain"]] = 0.8 + 0.07 * np.arange(6)
+    gains = 0.8 + 0.07 * np.arange(6)
+    vector[places["servo_gain"]] = np.log(gains)
     vector[places["paddle_tilt"]] = -0.08, 0.04
-    fit = Fit(vector, np.zeros(0))
-    spread, noise = (
-        np.diag((0.1 * layout.deviation) ** 2),
-        Noise(np.full(6, 1e-3), np.full(3, 2e-3)),
-    )
-    found = Identified(layout, windows_of(log), noise, fit, None, spread, {}, {"ball": 1.0}, {}, 0)
+    found = identified(layout, log, vector, np.diag((0.1 * layout.deviation) ** 2))
     path.write_text(to_yaml(found, log, NAMES, None), encoding="utf-8")
     config = read_preset(Path("default"), world=path).env
     assert np.shape(config.randomization.restitution) == (2,)
-    for name in ("servo_gain", "paddle_tilt"):
-        low, high = np.array(getattr(config.randomization, name))
-        np.testing.assert_allclose(0.5 * (low + high), vector[places[name]], rtol=2e-3)
-        width = 2.0 * 1.5 * 1.96 * 0.1 * layout.deviation[places[name]]
-        np.testing.assert_allclose(high - low, width, rtol=2e-2)
+    low, high = np.array(config.randomization.paddle_tilt)
+    np.testing.assert_allclose(0.5 * (low + high), vector[places["paddle_tilt"]], rtol=2e-3)
+    width = 2.0 * 1.5 * 1.96 * 0.1 * layout.deviation[places["paddle_tilt"]]
+    np.testing.assert_allclose(high - low, width, rtol=2e-2)
+    # The interval of a factor is one of its logarithm.
+    low, high = np.array(config.randomization.servo_gain)
+    half = 1.96 * 0.1 * layout.deviation[places["servo_gain"]]
+    np.testing.assert_allclose(high, gains * (1.0 + 1.5 * np.expm1(half)), rtol=2e-3)
+    np.testing.assert_allclose(low, gains * (1.0 + 1.5 * np.expm1(-half)), rtol=2e-3)
     assert compare(read_world(path), found, NAMES) == []
     # The latency of the ball is that until its arrival, in what is printed and in the file.
     late = found._replace(stamp_age=0.012)
@@ -168,7 +214,8 @@ def test_a_world_has_the_range_of_each_joint_and_axis(tmp_path: Path) -> None:
     assert compare(read_world(path), late, NAMES) == []
     other = vector.copy()
     other[places["paddle_tilt"]] = 0.04, -0.08
-    changed = compare(read_world(path), late._replace(fit=fit._replace(vector=other)), NAMES)
+    moved = late._replace(fit=found.fit._replace(vector=other))
+    changed = compare(read_world(path), moved, NAMES)
     assert [line.split(" is ")[0] for line in changed] == ["paddle_tilt x", "paddle_tilt y"]
 
 
@@ -195,26 +242,131 @@ def test_a_ball_beside_the_paddle_is_refused(shift) -> None:
 
 def unseen() -> Identified:
     """A log that shows nothing: all deviations are those of the prior."""
-    layout, windows = Layout(6, False, 0.001), windows_of(flight_log())
-    spread = np.diag(layout.deviation**2)
-    predicted = np.zeros((len(windows.angles), windows.angles[0].size + windows.balls[0].size))
-    known = Fit(layout.mean, np.zeros(0), predicted), np.linalg.inv(spread), spread
-    errors = {"joint_angles": 1.234567, "ball_position": 1.0}
-    return Identified(layout, windows, None, *known, errors, errors, errors, 0)
+    layout = Layout(6, False, 0.001)
+    return identified(layout, flight_log(), layout.mean, np.diag(layout.deviation**2))
 
 
 @pytest.mark.slow
 def test_the_page_begins_with_the_answer() -> None:
-    """What the log leaves open comes last."""
-    found = unseen()
-    page = identification_page(found, "log.csv", NAMES, Path("world.yaml"))
+    """What the log leaves open comes after it, and the log itself last."""
+    found, log = unseen(), flight_log()
+    checkups = examine([log], NAMES)
+    page = identification_page(found, [log], checkups, NAMES, Path("world.yaml"), ["A doubt."])
     parts = "<b>Found:", "<b>How sure:", "<b>What to do:", "<h2>Estimates", "<h2>What the log"
     assert sorted(parts, key=page.index) == [*parts]
-    assert "do not train with this world yet" in page
-    right = found._replace(held_out={"joint_angles": 1.0})
-    better = identification_page(right, "log.csv", NAMES, Path("world.yaml"))
+    assert "do not train with this world: A doubt." in page
+    better = identification_page(found, [log], checkups, NAMES, Path("world.yaml"), [])
     assert "bounce-mjx identify LOG --check world.yaml" in better
     assert all(entry.label in page for entry in estimates(found, NAMES))
+
+
+def test_what_is_not_shown_is_as_well_known_as_before() -> None:
+    """Also where residuals that the model lacks would widen its interval."""
+    layout = Layout(6, True, 0.001)
+    wide = identified(layout, flight_log(), layout.mean, np.diag((4.0 * layout.deviation) ** 2))
+    for entry in estimates(wide, NAMES):
+        if entry.label.startswith(("paddle_offset", "encoder_bias", "servo_offset")):
+            deviation = layout.unknowns[entry.label.split(" ")[0]].deviation
+            assert entry.high - entry.value == pytest.approx(1.96 * deviation)
+            assert not entry.seen
+
+
+def test_a_model_that_does_not_explain_a_log_is_named() -> None:
+    """A joint's error counts beyond its encoder's noise, and beyond a share of its motion."""
+    found = unseen()
+    assert describe_doubts(found, NAMES) == []
+    errors = np.array([1e-3, 1e-3, 0.02, 1e-3, 1e-3, 1e-3])
+    (doubt,) = describe_doubts(found._replace(joint_errors=errors), NAMES)
+    assert "does not explain the angles of Joint3" in doubt and "20 mrad" in doubt
+    bounces = int(np.sum(found.windows.has_ball))
+    (doubt,) = describe_doubts(found._replace(dropped=bounces - 1), NAMES)
+    assert doubt.startswith(f"In {bounces - 1} of {bounces} windows")
+
+
+def test_a_bounded_step_is_the_best_one_within_its_bounds() -> None:
+    """Against SciPy's minimiser of the same quadratic."""
+    random = np.random.default_rng(5)
+    root, slope = random.normal(size=(9, 5)), 5.0 * random.normal(size=5)
+    hessian = root.T @ root + 0.1 * np.eye(5)
+    room = np.stack([-random.uniform(0.0, 1.0, 5), random.uniform(0.0, 1.0, 5)])
+    found = _bounded_step(hessian, slope, room)
+    best = minimize(
+        lambda x: 0.5 * x @ hessian @ x + slope @ x,
+        np.zeros(5),
+        jac=lambda x: hessian @ x + slope,
+        bounds=room.T,
+        method="L-BFGS-B",
+        options={"ftol": 1e-14, "gtol": 1e-10},
+    )
+    np.testing.assert_allclose(found, best.x, atol=1e-6)
+    # Another active set than that of the free step, clipped.
+    clipped = np.clip(-np.linalg.solve(hessian, slope), *room)
+    assert np.max(np.abs(found - clipped)) > 1e-3
+
+
+@pytest.mark.parametrize("has_lift", [False, True])
+def test_whitening_is_the_inverse_root_of_the_covariance(has_lift: bool) -> None:
+    """Of the pictures after a bounce whose velocity, and with lift whose spin, deviates."""
+    random = np.random.default_rng(6)
+    problem = linear_problem(flight_log(), random)._replace(has_lift=has_lift)
+    w, weights = problem.windows, problem.weights()
+    errors = random.normal(size=w.measured.shape) * problem.deviations
+    white = w.split(problem.whiten(w.measured + errors, weights))[1]
+    s = int(np.flatnonzero(w.has_ball)[0])
+    used = w.picture_weights[s] > 0.0
+    columns = problem.bounce_columns()[s][used]
+    scaled = w.split(errors / problem.deviations)[1][s][used]
+    for axis in range(3):
+        covariance = np.eye(int(np.sum(used))) + columns[:, axis] @ columns[:, axis].T
+        expected = scaled[:, axis] @ np.linalg.solve(covariance, scaled[:, axis])
+        assert np.sum(white[s, used, axis] ** 2) == pytest.approx(expected, rel=1e-6)
+
+
+def test_following_finds_delay_and_offsets() -> None:
+    """Of joints that follow 15.5 ms late; an outlier changes nothing."""
+    random = np.random.default_rng(7)
+    times = np.arange(0.0, 10.0, 0.004)
+    waves = np.sin(np.outer(times, [1.0, 1.7, 2.3]))
+    late = np.sin(np.outer(times - 0.0155, [1.0, 1.7, 2.3]))
+    offsets = np.array([0.002, -0.001, 0.0])
+    angles = late + offsets + 3e-4 * random.normal(size=late.shape)
+    angles[500, 1] += 0.5
+    log = flight_log()._replace(
+        times=times, target_times=times, joint_angles=angles, servo_targets=waves
+    )
+    found = follow(log, find_settled(log))
+    assert found.delay == pytest.approx(0.0155, abs=1e-4)
+    np.testing.assert_allclose(found.offsets, offsets, atol=1e-4)
+    np.testing.assert_allclose(found.errors, 3e-4, rtol=0.1)
+
+
+def test_a_controller_that_carries_the_arm_lets_no_servo_sag() -> None:
+    """The forces of gravity and of its compensation cancel; and a share of it that is a parameter
+    is the same in the fused engine and on C."""
+    config = compensated(read_preset(Path("default")).env)
+    model = world_model(config, visual=False)
+    addresses, data = find_addresses(model), mujoco.MjData(model)
+    dofs = list(addresses.arm_qvel)
+    data.qpos[list(addresses.arm_qpos)] = config.default_joint_angles
+    mujoco.mj_forward(model, data)
+    assert np.max(np.abs(data.qfrc_bias[dofs])) > 1.0
+    np.testing.assert_allclose(data.qfrc_gravcomp[dofs], data.qfrc_bias[dofs], atol=1e-9)
+    ball = addresses.balls[0].body
+    assert model.body_gravcomp[ball] == 0.0
+    engine = make_engine(model, "fused")
+    links = np.concatenate(EditedModel(model).link_bodies()).tolist()
+    start = PhysicsState(jnp.asarray(data.qpos, float), jnp.asarray(data.qvel, float))
+    for share in (0.0, 1.0):
+        entries = {f"body_gravcomp[{b}]": np.float32(share) for b in links}
+        parameters = PhysicsParameters(entries=entries)
+        edited = edited_model(model, parameters)
+        other = mujoco.MjData(edited)
+        other.qpos[:] = data.qpos
+        other.ctrl[list(addresses.actuators)] = config.default_joint_angles
+        mujoco.mj_step(edited, other)
+        control = Control(jnp.asarray(other.ctrl, float))
+        after = engine.step(parameters, start, control, 1)
+        np.testing.assert_allclose(after.qvel, other.qvel, atol=2e-5)
 
 
 @pytest.mark.slow
@@ -236,3 +388,18 @@ def test_a_hidden_robot_is_identified(tmp_path: Path) -> None:
     assert found.before["ball_position"] > 2.0
     assert all(0.8 < error < 1.2 for error in found.after.values())
     assert all(error < 1.3 for error in found.held_out.values())
+
+
+def test_a_servo_holds_its_joint_beside_the_target() -> None:
+    """By servo_offset, in the world of a training."""
+    config = read_preset(Path("default")).env
+    model = world_model(config, visual=False)
+    actuators, qpos = Actuators(config, model), jnp.asarray(model.qpos0)
+    offsets = jnp.array([0.01, 0.0, -0.02, 0.0, 0.0, 0.003])
+    before, action = actuators.first(qpos), jnp.full(6, 0.5)
+    plain, other = (
+        actuators.next(before, qpos, action, world, None)[0]
+        for world in ({}, {"servo_offset": offsets})
+    )
+    servos = list(find_addresses(model).actuators)
+    np.testing.assert_allclose((other.ctrl - plain.ctrl)[np.array(servos)], offsets, atol=1e-7)

@@ -2,7 +2,6 @@
 
 import concurrent.futures
 import dataclasses
-import errno
 import io
 import itertools
 import json
@@ -32,10 +31,12 @@ from bounce_mjx.runs.folders import (
     latest_checkpoint,
     lock_run,
     named_run,
+    stored_checkpoints,
 )
+from bounce_mjx.runs.settings import Choice, stack
 from bounce_mjx.training import job
 from bounce_mjx.training.events import Event
-from bounce_mjx.training.ppo_trainer import Snapshot
+from bounce_mjx.training.trainer import Snapshot
 from tiny_runs import contents
 
 BLOCK = 64
@@ -158,14 +159,13 @@ def iterations_of(checkpoint: Checkpoint) -> int:
 
 def fail(monkeypatch: pytest.MonkeyPatch, *saves: int) -> None:
     """Lets some saves, by number from 1, find a full disk."""
-    save, count = checkpoints.save_checkpoint, itertools.count(1)
+    usage, count = shutil.disk_usage, itertools.count(1)
 
-    def full(*args) -> None:
-        if next(count) in saves:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        save(*args)
+    def free(path: Path) -> object:
+        found = usage(path)
+        return found._replace(free=0) if next(count) in saves else found
 
-    monkeypatch.setattr(checkpoints, "save_checkpoint", full)
+    monkeypatch.setattr(shutil, "disk_usage", free)
 
 
 def test_a_resumed_training_knows_the_best_policy(tmp_path: Path) -> None:
@@ -188,7 +188,7 @@ def test_results_that_are_newer_than_the_checkpoint_do_not_count(tmp_path: Path)
 def test_what_a_killed_process_was_writing_is_removed(tmp_path: Path) -> None:
     run = train(tmp_path, {1: 1.0})
     folder, (latest,) = run / "checkpoints", (run / "checkpoints").iterdir()
-    shutil.copytree(latest, folder / "128.orbax-checkpoint-tmp")
+    shutil.copytree(latest, folder / ".unfinished/128")
     assert latest_checkpoint(run).folder == latest
     train(tmp_path, {1: 1.0, 2: 2.0}, run)
     assert [path.name for path in folder.iterdir()] == ["128"]
@@ -231,6 +231,11 @@ def test_a_training_stops_once_its_results_have_a_margin(tmp_path: Path) -> None
         said=(shown := io.StringIO()),
     )
     assert f"{run} has met all results, 192 steps; add --total-steps N" in shown.getvalue()
+    # Results are not needed to resume.
+    (run / "results.json").write_text("damaged")
+    layers = stack(Choice(resume=run))
+    assert not layers.config({"total_steps": 10**6}).stop_when_solved
+    assert layers.config().stop_when_solved
     assert latest_checkpoint(run).steps == 192
     train(tmp_path, RETURNS, run, margins=margins)
     assert latest_checkpoint(run).steps == 256
@@ -264,7 +269,13 @@ def test_a_callback_sees_blocks_and_evaluations_and_ends_the_training(tmp_path: 
         def close(self) -> None:
             seen.append("closed")
 
-    run = train(tmp_path, {1: 5.0, 2: 9.0, 3: 7.0}, callbacks=[Tracker()])
+    said = io.StringIO()
+    run = train(tmp_path, {1: 5.0, 2: 9.0, 3: 7.0}, callbacks=[Tracker()], said=said)
+    ends = "a callback ended the training after 128 steps; continue with: bounce-mjx train --resume"
+    assert ends in said.getvalue()
+    # The first block, during which other programs are compiled, says nothing about those to come.
+    blocks = [line for line in said.getvalue().splitlines() if "steps/s" in line]
+    assert [" left" in line for line in blocks] == [False, True]
     blocks = [(64, 0.0, False), (64, 5.0, True), (128, 0.0, False), (128, 9.0, True)]
     assert seen == [3 * BLOCK, *blocks, "closed"]
     results = results_of(run)
@@ -354,11 +365,79 @@ def test_a_training_holds_the_lock_of_its_run(tmp_path: Path) -> None:
 
 
 def test_a_training_goes_on_while_it_cannot_save(tmp_path: Path, monkeypatch) -> None:
-    """It says so, and saves its newest state once there is room again."""
-    fail(monkeypatch, 2)
-    run = train(tmp_path, RETURNS, said=(said := io.StringIO()))
+    """It says so once, saves its newest state once there is room again, and says that."""
+    fail(monkeypatch, 2, 3)
+    returns = {iteration: float(iteration) for iteration in range(1, 6)}
+    run = train(tmp_path, returns, said=(said := io.StringIO()))
     assert said.getvalue().count("cannot be written (No space left on device)") == 1
+    assert said.getvalue().count("the state is saved again, after 256 steps") == 1
+    assert iterations_of(latest_checkpoint(run)) == 5
+
+
+def test_an_error_of_orbax_does_not_end_a_training(tmp_path: Path, monkeypatch) -> None:
+    """Nor does one that is no OSError."""
+    write, count = checkpoints.seal, itertools.count(1)
+
+    def breaks(folder: Path) -> None:
+        if next(count) == 2:
+            raise ValueError("NOT_FOUND:\nError reading")
+        write(folder)
+
+    monkeypatch.setattr(checkpoints, "seal", breaks)
+    run = train(tmp_path, RETURNS, said=(said := io.StringIO()))
+    assert "cannot be written (NOT_FOUND: Error reading); training continues" in said.getvalue()
     assert iterations_of(latest_checkpoint(run)) == 4
+
+
+def test_a_folder_that_is_moved_during_a_training_is_not_made_again(tmp_path: Path) -> None:
+    """The training goes on, and saves once the folder is back."""
+    moved = tmp_path / "moved"
+
+    class Moved(CountingTrainer):
+        def run(self):
+            if self.state == 1:
+                (run,) = (tmp_path / "runs").iterdir()
+                while not (run / "results.json").exists():
+                    time.sleep(0.01)
+                self.place = run.rename(moved), run
+            if self.state == 3:
+                assert not list((tmp_path / "runs").iterdir())
+                moved.rename(self.place[1])
+            return super().run()
+
+    run = train(tmp_path / "runs", RETURNS, trainer=Moved, said=(said := io.StringIO()))
+    assert "cannot be written (it was moved or removed)" in said.getvalue()
+    assert iterations_of(latest_checkpoint(run)) == 4 and (run / "config.yaml").is_file()
+
+
+def test_a_named_checkpoint_is_the_one_that_is_resumed(tmp_path: Path) -> None:
+    """What was trained after it counts no more, even if it was better."""
+    run = train(tmp_path, {1: 9.0, 2: 1.0})
+    with pytest.raises(UserError, match="there is no checkpoint folder"):
+        train(tmp_path, RETURNS, run / "checkpoints/192")
+    train(tmp_path, {1: 9.0, 2: 3.0, 3: 2.0}, run / "checkpoints/64")
+    assert evaluated_steps(run) == [64, 128, 192]
+    values = [e["stable"] for e in results_of(run)["evaluations"]]
+    assert len(values) == 3 and iterations_of(best_checkpoint(run)) == 1
+    newest = latest_checkpoint(run)
+    train(tmp_path, {1: 9.0, 2: 3.0, 3: 2.0, 4: 5.0}, newest.folder)
+    assert iterations_of(best_checkpoint(run)) == 1 and iterations_of(latest_checkpoint(run)) == 4
+
+
+@pytest.mark.parametrize("wrong", ["best", "newest"])
+def test_a_resumed_training_goes_on_from_what_is_intact(tmp_path: Path, wrong: str, capsys) -> None:
+    """Results, checkpoints and what is resumed agree on the best policy that is left."""
+    run = train(tmp_path, {1: 9.0, 2: 1.0})
+    steps = 64 if wrong == "best" else 128
+    (run / f"checkpoints/{steps}/record/metadata").write_text("")
+    train(tmp_path, {1: 9.0, 2: 1.0, 3: 0.5}, run)
+    assert f"checkpoints/{steps} is damaged" in capsys.readouterr().err
+    best = 2 if wrong == "best" else 1
+    assert results_of(run)["best_steps"] == best * BLOCK
+    assert iterations_of(best_checkpoint(run)) == best
+    assert evaluated_steps(run) == [64, 128, 192]
+    stored = {iterations_of(checkpoint) for checkpoint in stored_checkpoints(run)}
+    assert stored == {best, 3}
 
 
 def test_a_policy_that_could_not_be_saved_is_not_the_best(tmp_path: Path, monkeypatch) -> None:

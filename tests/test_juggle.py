@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 from bounce_mjx import task
+from bounce_mjx.errors import UserError
 from bounce_mjx.robot.model import find_addresses, load_model
-from bounce_mjx.tasks.juggle import REST, Config, Juggle
+from bounce_mjx.tasks.juggle import Config, Juggle, Rewards
 
 JUGGLE = Juggle(Config())
 HOME = np.array(JUGGLE.config.home)
+REST = 0.0225
 
 
 def landing_times(z: np.ndarray, speed: np.ndarray) -> np.ndarray:
@@ -134,6 +136,27 @@ def test_the_reward_of_turns_is_greatest_half_a_period_apart() -> None:
         rewards = [turn(delay, flown) for delay in (0.2, 0.4, 0.5, 0.6, 0.8)]
         assert rewards[0] < rewards[1] < rewards[2] > rewards[3] > rewards[4]
         assert rewards[2] == pytest.approx(JUGGLE.config.reward.turn.weight, rel=1e-3)
+
+
+def test_a_term_without_a_formula_is_refused() -> None:
+    """A subclass that adds a term to the reward has to compute it."""
+
+    class MoreRewards(Rewards):
+        far: task.Near = task.Near()
+
+    class MoreConfig(Config):
+        reward: MoreRewards = MoreRewards()
+
+    class JuggleMore(Juggle):
+        Config = MoreConfig
+
+    still = jnp.zeros((2, 3))
+    step = task.Step(
+        truth(still, still), {"target_height": jnp.float32(0.5)}, jnp.zeros(6), jnp.zeros(6)
+    )
+    juggle = JuggleMore(MoreConfig())
+    with pytest.raises(UserError, match="lacks the term of the reward far"):
+        jax.eval_shape(lambda: juggle.step((jnp.zeros(2, bool), 1.0), step))
 
 
 def test_the_policy_sees_the_ball_that_lands_next() -> None:

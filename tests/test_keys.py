@@ -15,37 +15,24 @@ import pytest
 from rich.console import Console
 
 from arms import ARM
-from bounce_mjx.config.settings import StrictModel, merged
+from bounce_mjx.config.settings import merged
 from bounce_mjx.config.validation import validate
 from bounce_mjx.env.env import Env, State
 from bounce_mjx.errors import UserError
+from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.ppo import PPO
 from bounce_mjx.physics import Control
 from bounce_mjx.robot.model import fingerprint
-from bounce_mjx.runs.config import TrainConfig, train_config
+from bounce_mjx.runs.config import TrainConfig, fields_of
 from bounce_mjx.tasks.registry import find_task
 from bounce_mjx.training.evaluators import Evaluators
-from bounce_mjx.training.job import Job
-from bounce_mjx.training.ppo_trainer import PPOTrainer, episode_steps
+from bounce_mjx.training.job import open_job
+from bounce_mjx.training.ppo_trainer import episode_steps
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import Term
 from test_ppo import TwoStates
 
-CONFIG = train_config(find_task("bounce"))
-
-
-def keys(group: type[StrictModel], prefix: str = "") -> dict[str, Any]:
-    """The fields of a config by their dotted keys."""
-    found = {}
-    for name, field in group.model_fields.items():
-        if isinstance(field.annotation, type) and issubclass(field.annotation, StrictModel):
-            found |= keys(field.annotation, f"{prefix}{name}.")
-        else:
-            found[prefix + name] = field
-    return found
-
-
-KEYS = keys(CONFIG)
+KEYS = fields_of(find_task("bounce").Config)
 
 # Other values, where neither half of the default nor one more of it is one.
 VALUES = {
@@ -163,7 +150,7 @@ def of_step(config: TrainConfig) -> tuple:
 def of_learning(config: TrainConfig) -> tuple:
     """The program of an iteration in a small environment, and the time limit."""
     small = {"num_envs": 16, "rollout_length": 2, "num_minibatches": 2, "hidden_layers": (16,)}
-    changed = {name: x for name, x in config.ppo if x != getattr(CONFIG().ppo, name)}
+    changed = {name: x for name, x in config.ppo if x != getattr(PPOConfig(), name)}
     # A batch stays divisible.
     small |= {name: 2 * small[name] for name in changed if name in small}
     ppo = config.ppo.model_copy(update=small)
@@ -176,17 +163,11 @@ def of_run(config: TrainConfig) -> tuple:
     """What a run resolves: its blocks, evaluations, seeds and folder."""
     blocks, measured = [], []
     with contextlib.ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
-        job = Job(config, Console(quiet=True), None, (), stack, PPOTrainer)
-        job.open()
-
-        def run_block() -> None:
+        job = open_job(config, Console(quiet=True), stack)
+        patch.setattr(job, "healthy", list)
+        while not job.is_finished():
             blocks.append(job.steps)
             job.steps += job.block_steps
-
-        answers = {"_stopping": lambda: False, "_is_due": lambda: False, "_healthy": list}
-        for name, answer in (answers | {"_run_block": run_block}).items():
-            patch.setattr(job, name, answer)
-        job.train()
         nothing = types.SimpleNamespace(compile=lambda: None)
         patch.setattr(Evaluators, "_lower", lambda _: nothing)
         patch.setattr(Evaluators, "_measure", lambda *given, **_: measured.append(given[2]))
@@ -205,9 +186,7 @@ PARTS["env.robot.limits"] = PARTS["env."]
 @functools.cache
 def resolved(of_part: Callable, values: str) -> tuple:
     """Programs and values of a config from its settings, which are Python's text."""
-    given = eval(values)
-    kind = train_config(find_task(given.get("task", "bounce")))
-    return of_part(validate(kind, given, "my.yaml"))
+    return of_part(validate(TrainConfig, eval(values), "my.yaml"))
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -219,7 +198,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory):
 
 @pytest.mark.parametrize("kind", [of_reset, of_step, of_learning, of_run])
 def test_equal_settings_have_equal_programs(kind: Callable) -> None:
-    assert kind(CONFIG()) == kind(CONFIG())
+    assert kind(TrainConfig()) == kind(TrainConfig())
 
 
 @pytest.mark.slow

@@ -43,7 +43,7 @@ def rolled_out(smooth: bool, world: dict) -> Rollout:
         robot={"limits": limits},
         action={"base": "target"},
         action_scale=0.04,
-        max_joint_velocity=100.0,
+        max_joint_velocity=50.0,
         randomization=world,
     )
     rng = np.random.default_rng(0)

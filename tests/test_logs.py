@@ -1,5 +1,6 @@
 """Logs of a robot: what the recorder writes, what the reader refuses, and the excitation."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +11,13 @@ from bounce_mjx.deploy.recorder import Recorder
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.contacts import ContactChecker
 from bounce_mjx.identify import Topics
+from bounce_mjx.identify.doctor import examine
 from bounce_mjx.identify.excitation import excite
 from bounce_mjx.identify.log import Log, align_clocks, check
 from bounce_mjx.identify.reading import read_bag, read_csv, read_log
 from bounce_mjx.identify.world import measure_camera
 from bounce_mjx.robot.model import find_addresses, load_model
-from bounce_mjx.runs.config import read_preset
+from bounce_mjx.runs.settings import read_preset
 
 JOINTS = ("left", "right")
 RANGES = np.array([[-1.0, 1.0], [0.0, 0.0]])
@@ -434,3 +436,233 @@ def test_a_ball_in_two_frames_is_refused(tmp_path: Path) -> None:
     ]
     with pytest.raises(UserError, match=r"of /ball in .+ are in the frames base, camera_link"):
         read_bag(bag.write(tmp_path / "bag"), JOINTS, TOPICS)
+
+
+ARM = tuple(f"Joint{i}" for i in range(1, 7))
+
+
+def sound_log(seconds: float = 30.0) -> Log:
+    """Six joints that follow their commands 25 ms late, each with a motion of its own, and a ball
+    that bounces every 0.6 s."""
+    random = np.random.default_rng(0)
+    times = np.arange(0.0, seconds, 0.01)
+
+    def path(at: np.ndarray) -> np.ndarray:
+        rates = np.array([0.7, 1.1, 1.6, 2.3, 3.1, 4.3])
+        return 0.2 * np.sin(np.outer(at, rates) + rates) + 0.05 * np.sin(np.outer(at, rates[::-1]))
+
+    pictures = np.arange(0.0, seconds, 1.0 / 120.0)
+    since = pictures % 0.6 - 0.3
+    height = 0.1 + 0.5 * 9.81 * (0.3**2 - since**2)
+    balls = np.stack([np.full_like(height, 0.6), np.zeros_like(height), height], axis=1)
+    balls += 1e-3 * random.normal(size=balls.shape)
+    angles = path(times - 0.025) + 1e-3 * random.normal(size=(len(times), 6))
+    return Log("here", times, angles, times, path(times), pictures, balls, pictures)
+
+
+def with_angles(change):
+    """A log in whose angles [T, n] something is changed in place."""
+
+    def changed_log(log: Log) -> Log:
+        angles = log.joint_angles.copy()
+        change(angles)
+        return log._replace(joint_angles=angles)
+
+    return changed_log
+
+
+def with_targets(change):
+    def changed_log(log: Log) -> Log:
+        return log._replace(servo_targets=change(log.servo_targets.copy()))
+
+    return changed_log
+
+
+def mirrored(angles: np.ndarray) -> None:
+    angles[:, 2] *= -1.0
+
+
+def shifted(angles: np.ndarray) -> None:
+    angles[:, 3] += 0.05
+
+
+def swapped_columns(angles: np.ndarray) -> None:
+    angles[:, [1, 4]] = angles[:, [4, 1]]
+
+
+def wrapped(angles: np.ndarray) -> None:
+    angles[:, 0] = (angles[:, 0] + 2.0 * np.pi) % (2.0 * np.pi) - np.pi
+
+
+def turned(angles: np.ndarray) -> None:
+    angles[:, 3] += 2.0 * np.pi
+
+
+def still_encoder(angles: np.ndarray) -> None:
+    angles[:, 4] = angles[0, 4]
+
+
+def lost_connection(angles: np.ndarray) -> None:
+    angles[1500:1600] = angles[1500]
+
+
+def degrees(angles: np.ndarray) -> None:
+    angles[:, 2] = np.degrees(angles[:, 2])
+
+
+def geared(angles: np.ndarray) -> None:
+    angles[:, 5] *= 0.5
+
+
+def stopped(angles: np.ndarray) -> None:
+    angles[:, 1] = np.minimum(angles[:, 1], 0.12)
+
+
+def reversed_joints(angles: np.ndarray) -> None:
+    angles[:] = angles[:, ::-1].copy()
+
+
+def follows_next_row(log: Log) -> Log:
+    return log._replace(
+        times=log.times[:-1],
+        joint_angles=log.joint_angles[:-1],
+        target_times=log.times[:-1],
+        servo_targets=log.joint_angles[1:],
+    )
+
+
+def drifting(log: Log) -> Log:
+    return log._replace(target_times=1.01 * log.target_times)
+
+
+def upside_down(log: Log) -> Log:
+    return log._replace(ball_positions=log.ball_positions * [1.0, 1.0, -1.0])
+
+
+def other_axes(log: Log) -> Log:
+    return log._replace(ball_positions=log.ball_positions[:, [0, 2, 1]])
+
+
+def in_feet(log: Log) -> Log:
+    return log._replace(ball_positions=3.281 * log.ball_positions)
+
+
+def held_pictures(log: Log) -> Log:
+    balls = log.ball_positions.copy()
+    balls[1::2] = balls[: len(balls[1::2]) * 2 : 2]
+    return log._replace(ball_positions=balls)
+
+
+FAULTS = {
+    "mirrored": (with_angles(mirrored), "Joint3"),
+    "zero": (with_angles(shifted), "Joint4"),
+    "zero by a turn": (with_angles(turned), "Joint4"),
+    "swapped": (with_angles(swapped_columns), "Joint2"),
+    "swapped, all": (with_angles(reversed_joints), "Joint1"),
+    "wrapped": (with_angles(wrapped), "Joint1"),
+    "frozen": (with_angles(still_encoder), "Joint5"),
+    "frozen, all": (with_angles(lost_connection), "all joints"),
+    "unit": (with_angles(degrees), "Joint3"),
+    "scale": (with_angles(geared), "Joint6"),
+    "saturated": (with_angles(stopped), "Joint2"),
+    "hand guided": (with_targets(lambda x: np.repeat(x[:1], len(x), 0)), "all joints"),
+    "late": (lambda log: log._replace(target_times=log.target_times - 2.0), "all joints"),
+    "early": (lambda log: log._replace(target_times=log.target_times + 0.15), "all joints"),
+    "targets are angles": (lambda log: log._replace(servo_targets=log.joint_angles), "all joints"),
+    "targets are angles, next": (follows_next_row, "all joints"),
+    "drift": (drifting, "the stamps"),
+    "ball axes": (upside_down, "the ball"),
+    "ball axes, turned": (other_axes, "the ball"),
+    "ball unit": (in_feet, "the ball"),
+    "repeated pictures": (held_pictures, "the ball"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_of_a_log_is_named_with_its_place(name: str) -> None:
+    """And a sound log has none."""
+    assert examine([sound_log()], ARM)[0].findings == ()
+    plant, where = FAULTS[name]
+    (checkup,) = examine([plant(sound_log())], ARM)
+    found = [(fault.kind, fault.where) for fault in checkup.faults]
+    assert (name.split(" by ")[0].split(",")[0], where) in found
+    # No other joint is blamed.
+    places = {where, "Joint5"} if name == "swapped" else {where}
+    assert {place for _, place in found} <= places or name == "swapped, all"
+
+
+def test_the_same_log_twice_is_named() -> None:
+    log = sound_log()
+    once, again = examine([log, log._replace(source="copy")], ARM)
+    assert not once.findings
+    (fault,) = again.faults
+    assert fault.kind == "repeated log" and "copy has the same angles as here" in fault.text
+
+
+def test_targets_of_the_controller_itself_show_no_latency() -> None:
+    """As a Universal Robot's target_q: the angles follow at once."""
+    log = sound_log()
+    later = np.stack(
+        [np.interp(log.times - 0.025, log.times, column) for column in log.servo_targets.T], axis=1
+    )
+    (finding,) = examine([log._replace(servo_targets=later)], ARM)[0].findings
+    assert finding.kind == "no latency" and not finding.is_fault
+
+
+def test_a_spike_is_left_out_and_counted(tmp_path: Path) -> None:
+    good, path = recorded(tmp_path / "good.csv"), tmp_path / "log.csv"
+    lines = good.read_text().splitlines()
+    # The column of the first joint's angle.
+    place = lines[0].split(",").index("joint_angles.left [rad]")
+    spiked = with_cell(50, place, "0.55")(lines)
+    path.write_text("\n".join(spiked))
+    log, whole = log_of(path), log_of(good)
+    (note,) = log.notes
+    assert "1 of the 120 joint angles" in note and "row 51 is a spike" in note
+    np.testing.assert_array_equal(log.times, np.delete(whole.times, 49))
+
+
+def test_a_far_ball_beside_a_repeated_one_is_left_out(tmp_path: Path) -> None:
+    good, path = recorded(tmp_path / "good.csv"), tmp_path / "log.csv"
+    lines = good.read_text().splitlines()
+    place = lines[0].split(",").index("ball_position.x [m]")
+    lines = with_cell(9, place, "99")(lines)
+    path.write_text("\n".join([*lines[:4], lines[3], *lines[4:]]))
+    log = log_of(path)
+    assert any("is farther away than 20 m" in note for note in log.notes)
+    assert np.max(log.ball_positions) < 20.0
+
+
+@pytest.mark.parametrize("start", [2.6e5, 1.7e9])
+def test_times_of_32_bits_are_refused_by_their_reason(start: float, tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    with Recorder(path, JOINTS) as recorder:
+        for k in range(ROWS):
+            time = float(np.float32(start + 0.01 * k))
+            recorder.step({"time": time, "joint_angles": [0.001 * k, 0.0]}, [0.001 * k, 0.0])
+    with pytest.raises(UserError, match="as a 32-bit number rounds them; write seconds as 64-bit"):
+        read_csv(path, JOINTS)
+
+
+@pytest.mark.parametrize(
+    "change, sentence",
+    [
+        (lambda lines: ["# recorded by me", *lines], "begins with the comment # recorded by me"),
+        (lambda lines: [f"# {lines[0]}", *lines[1:]], "begins with the comment # time"),
+        (lambda lines: [x.replace(",", " ") for x in lines], "separated by spaces"),
+        (
+            lambda lines: [lines[0], *(x.replace("1700", "2026-11-27T", 1) for x in lines[1:])],
+            "time holds 2026-11-27T",
+        ),
+        (
+            lambda lines: [lines[0].replace("joint_angles.", "joint_angles_"), *lines[1:]],
+            "write joint_angles.left for joint_angles_left",
+        ),
+    ],
+)  # fmt: skip
+def test_a_table_of_another_form_is_refused_by_its_reason(change, sentence, tmp_path: Path) -> None:
+    lines = recorded(tmp_path / "good.csv").read_text().splitlines()
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(change(lines)))
+    with pytest.raises(UserError, match=re.escape(sentence)):
+        read_csv(path, JOINTS)

@@ -12,7 +12,7 @@ from bounce_mjx.baselines.mirror import MirrorLaw, observing
 from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import judge
-from bounce_mjx.runs.config import read_preset
+from bounce_mjx.runs.settings import read_preset
 
 GRAVITY = 9.81
 
@@ -30,7 +30,7 @@ def test_the_inverse_kinematics_are_those_of_mujoco(env: Env) -> None:
     home = np.array(law._pose(jnp.asarray(env.config.default_joint_angles)))
     for change in ([0.05, -0.04, 0.03, 0.1, -0.05], [-0.1, 0.05, -0.03, -0.05, 0.15]):
         wished = home + change
-        data.qpos[list(at.arm_qpos)] = law._joints(jnp.asarray(wished))
+        data.qpos[list(at.arm_qpos)] = law._joint_angles(jnp.asarray(wished))
         mujoco.mj_kinematics(env.mj_model, data)
         np.testing.assert_allclose(data.geom_xpos[at.paddle_geom], wished[:3], atol=2e-3)
         # The face whose normal points upwards.

@@ -30,11 +30,18 @@ REFUSED = {
         'biasprm="0 -20000 -200"/>',
         "Joint2",
     ),
+    "position nan": ('name="Link1" pos="0 0 0.1"', 'name="Link1" pos="0 0 nan"', "nan in body_pos"),
+    "mass inf": ('mass="0.0027"', 'mass="inf"', "inf in body_mass"),
+    "gravity nan": ('gravity="0 0 -9.81"', 'gravity="0 0 nan"', "nan in gravity"),
+    "armature inf": ('armature="0.02"', 'armature="inf"', "inf in dof_armature"),
+    "damping negative": ('armature="0.02"', 'damping="-1"', "-1 in dof_damping"),
+    "dry friction negative": ('armature="0.02"', 'frictionloss="-1"', "-1 in dof_frictionloss"),
+    "armature negative": ('armature="0.02"', 'armature="-0.1"', "-0.1 in dof_armature"),
 }
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_models_without_position_servos_are_refused(tmp_path, name):
+def test_models_that_cannot_be_simulated_are_refused(tmp_path, name):
     old, new, text = REFUSED[name]
     assert old in XML
     mjcf = tmp_path / "robot.xml"
@@ -43,6 +50,17 @@ def test_models_without_position_servos_are_refused(tmp_path, name):
         load_model(mjcf, 0.001)
     assert "\n" not in str(error.value)
     assert str(mjcf) in str(error.value)
+
+
+@pytest.mark.parametrize("memory", ["1K", "900T"])
+def test_the_memory_that_a_file_asks_for_is_ignored(memory, tmp_path):
+    """Too little of it ends a step, and too much the process."""
+    path = tmp_path / "robot.xml"
+    path.write_text(XML.replace("<worldbody>", f'<size memory="{memory}"/><worldbody>', 1))
+    model = load_model(path, 0.001)
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data)
+    assert data.time == 0.001
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """The live page: what its controls do, and that no client can do more."""
 
+import contextlib
 import dataclasses
 import io
 import re
@@ -151,6 +152,9 @@ def test_keys_act(page) -> None:
     client.control("push the ball right")
     assert client.sliders["height, m"] == (0.3, 0.8, 0.01)
     assert client.lines == ["s", "ball", "target", "paddle"]
+    # A ball above or below the usual range is shown too: uPlot widens ends that are only soft.
+    assert client.height_axis["min"]["soft"] == 0.0 and "hard" not in client.height_axis["min"]
+    assert client.height_axis["max"]["soft"] > 0.8 and "hard" not in client.height_axis["max"]
     client.set(client.control("height, m"), 0.5)
     client.press("target height up")
     wait_until(lambda: did["target"][-1] == pytest.approx(0.55))
@@ -162,6 +166,51 @@ def test_keys_act(page) -> None:
     client.press("pause")
     wait_until(lambda: stands_still(did))
     client.press("pause")
+
+
+NAN, INFINITY, HUGE = float("nan"), float("inf"), 2**63 - 1
+# For each control what a page may not send it, and at the end a value that it may have.
+HOSTILE = {
+    "robots": (1e308, -1e308, 40, HUGE, -HUGE, NAN, INFINITY, "many", "nan", [1], None, True, 2),
+    "speed": (1e9, -1e9, NAN, INFINITY, -INFINITY, "fast", "nan", {}, b"", 0.5),
+    "height, m": (1e9, -1.0, NAN, -INFINITY, "high", "inf", [0.5, 0.6], 0.6),
+    "speed, m/s": (1e9, NAN, INFINITY, "nan", None, 1.0),
+    "pause": (0.0, "yes", None, [], NAN, False),
+    "push": ("sideways", "", 3, None, [], "x" * 2000, "ball up"),
+}
+FOREIGN = (
+    [1, 2, 3],
+    None,
+    {},
+    {"type": "NoSuchMessage"},
+    {"type": "GuiUpdateMessage", "uuid": ["a"], "updates": {"value": 1}},
+    {"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": 1}},
+    {"type": "CommandTriggerMessage", "uuid": "a", "more": 1},
+    {"type": "FileTransferPart", "transfer_uuid": "a", "part_index": 0, "content": b"a"},
+    {"type": "GetRenderResponseMessage", "payload": b"", "render_uuid": "a"},
+)
+
+
+def test_no_client_can_end_the_server_or_leave_a_range(page, capfd) -> None:
+    """Whatever a client sends, the simulation gets values within the ranges of the controls, the
+    next client is served, and nothing is printed."""
+    client, did = page
+    controls = {label: client.control(label) for label in HOSTILE}
+    for label, (*values, _) in HOSTILE.items():
+        for value in values:
+            client.set(controls[label], value)
+    for message in FOREIGN:
+        client.send(message)
+    with contextlib.closing(Client(client.address)) as other:
+        for label, (*_, value) in HOSTILE.items():
+            other.set(other.control(label), value)
+        wait_until(lambda: did["push"] and did["shown"][-1] == 2 and did["speed"][-1] == 0.5)
+        wait_until(lambda: did["target"][-1] == pytest.approx(0.6))
+    np.testing.assert_allclose(did["push"], [(0.0, 0.0, 1.0)])
+    assert set(did["shown"]) <= {1, 2}
+    assert all(speed == 0.0 or 0.1 <= speed <= 4.0 for speed in did["speed"])
+    assert all(target is None or 0.3 <= target <= 0.8 for target in did["target"])
+    assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.slow

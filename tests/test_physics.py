@@ -1,5 +1,7 @@
 """The fused engine steps as MuJoCo's C engine and as MJX, and refuses what it does not compute."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,6 +26,7 @@ from against_c import (
 )
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics import Control, PhysicsState, make_engine, mjx_engine
+from bounce_mjx.physics.convergence import solver_warning
 from bounce_mjx.physics.support import unsupported_feature
 from bounce_mjx.robot.model import Addresses, find_addresses
 
@@ -367,6 +370,60 @@ def test_auto_takes_fused_unless_it_lacks_a_feature_which_it_names(mj_model):
         engine = make_engine(edited(old, new), "auto")
         assert engine.name == "mjx" and feature in engine.reason
         assert engine.reason.count("(") == engine.reason.count(")")
+
+
+OTHER_ACTUATORS = {
+    "a filtered servo": '<position name="act2" joint="Joint2" timeconst="0.05"/>',
+    "a velocity servo": '<velocity name="act2" joint="Joint2" kv="200"/>',
+    "an integrated one": '<intvelocity name="act2" joint="Joint2" kp="50" actrange="-1 1"/>',
+    "a motor": '<motor name="act2" joint="Joint2"/>',
+    "a constant gain": '<general name="act2" joint="Joint2" gainprm="100" biastype="none"/>',
+    "an offset": '<general name="act2" joint="Joint2" gainprm="9" biastype="affine" '
+    'biasprm="1 -9"/>',
+    "a damper": '<damper name="act2" joint="Joint2" kv="50" ctrlrange="0 1"/>',
+    "a cylinder": '<cylinder name="act2" joint="Joint2"/>',
+    "a muscle": '<muscle name="act2" joint="Joint2" lengthrange="0 1"/>',
+}
+SECOND_SERVO = '<position name="act2" joint="Joint2"/>'
+
+
+@pytest.mark.parametrize("kind", OTHER_ACTUATORS)
+def test_an_actuator_that_is_no_position_servo_is_refused_by_every_engine(kind):
+    """Its control is no target position; both engines would step it otherwise than C."""
+    model = edited(SECOND_SERVO, OTHER_ACTUATORS[kind])
+    for choice in ("auto", "fused", "mjx"):
+        with pytest.raises(UserError, match="an actuator on Joint2 that is not a position servo"):
+            make_engine(model, choice)
+
+
+def test_an_actuator_with_a_state_is_refused_by_every_engine():
+    """As no engine carries it from one control step to the next."""
+    site = (
+        "</actuator>",
+        '<position site="paddle_home" gear="0 0 1 0 0 0" timeconst="1"/></actuator>',
+    )
+    for choice in ("auto", "mjx"):
+        with pytest.raises(UserError, match="actuator_dyntype"):
+            make_engine(edited(*site), choice)
+
+
+SOLVER = 'iterations="4" ls_iterations="8"'
+
+
+@pytest.mark.parametrize(
+    ("settings", "named"),
+    [
+        ('iterations="1"', 'with iterations="1" \\('),
+        ('iterations="4" ls_iterations="8" tolerance="1"', 'with tolerance="1" \\('),
+        (SOLVER, None),
+        ("", None),
+        ('solver="PGS"', None),
+    ],
+)
+def test_a_solver_that_stops_early_is_named(settings, named):
+    """With its setting and no other; C then computes something else than the fused engine."""
+    warning = solver_warning(edited(SOLVER, settings))
+    assert warning is None if named is None else re.search(named, warning)
 
 
 MJX_ONLY = {

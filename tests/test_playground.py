@@ -76,6 +76,8 @@ def test_playground_has_the_other_tasks(task):
     assert registry.get_default_config(name).episode_length == limit
     parameters = manipulation_params.brax_ppo_config(name)
     bounce = manipulation_params.brax_ppo_config(ENV_NAME)
+    assert bounce.batch_size * bounce.num_minibatches == bounce.num_envs == 4096
+    assert manipulation_params.brax_ppo_config("PandaPickCube", "jax").num_envs != 4096
     assert parameters.episode_length == limit and parameters.num_timesteps != bounce.num_timesteps
     keys = jax.random.split(jax.random.PRNGKey(0), 2)
     model, axes = registry.get_domain_randomizer(name)(env.mjx_model, keys)
@@ -103,6 +105,15 @@ def test_randomization_by_playground_acts_on_the_physics():
     np.testing.assert_allclose(entries[f"body_mass[{ball}]"], model.body_mass[:, ball])
     # Outside the randomised worlds, the model is the environment's own.
     assert env.mjx_model.body_mass.shape == (env.mj_model.nbody,)
+
+
+def test_torchrl_wraps_playgrounds_environment(need):
+    libs = need("torchrl.envs")
+    env = libs.MujocoPlaygroundEnv(ENV_NAME, batch_size=[2], device="cpu")
+    env.set_seed(0)
+    observation = env.reset()["observation"]
+    assert env.observation_spec["observation"].shape == observation.shape == (2, 29)
+    assert env.action_spec.shape == (2, 6)
 
 
 def test_wrong_settings_of_playground_give_one_sentence():

@@ -1,32 +1,45 @@
 """Learning curves, pictures, the report of a run, and the TensorBoard log."""
 
 import base64
-import errno
 import json
 import math
 import re
+import resource
 import shutil
+import time
 import xml.etree.ElementTree
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from matplotlib.figure import Figure
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboardX import SummaryWriter
 
+from bounce_mjx import BounceBall
 from bounce_mjx.commands import plot as plot_command
 from bounce_mjx.commands import report as report_command
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.reports import figures
 from bounce_mjx.reports import page as report_page
-from bounce_mjx.reports.curves import group_runs, mean_and_band, read_curves
+from bounce_mjx.reports.curves import (
+    Group,
+    LoggedCurve,
+    RunCurves,
+    group_runs,
+    mean_and_band,
+    read_curves,
+)
 from bounce_mjx.reports.figures import curves_figure
-from bounce_mjx.runs.config import TrainConfig, read_preset, train_config
+from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import save_config
 from bounce_mjx.runs.progress import load_results
+from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.task import Curve, term_names
+from bounce_mjx.task.shown import Hits
 from bounce_mjx.tasks.bounce import Bounce, BounceReward
 from bounce_mjx.training.events import Event
 from bounce_mjx.training.log import TensorBoardLog
@@ -135,6 +148,29 @@ def test_the_band_is_one_deviation_around_the_mean(runs: list[Path]) -> None:
     assert [n for n in lengths if n] == [4, 4, 5, 5]  # the mean, and each seed to its end
 
 
+@pytest.mark.parametrize(
+    ("first", "last", "lowest"), [(-900.0, -20.0, -900.0), (-50.0, 300.0, -50.0), (5.0, 90.0, 0.0)]
+)
+def test_a_panel_shows_its_whole_curve(first: float, last: float, lowest: float) -> None:
+    """Also a return that is negative throughout; one that is not begins at 0."""
+    steps = np.arange(1.0, 11.0)
+    curves = {"episode/return": LoggedCurve(steps, np.linspace(first, last, 10))}
+    figure = curves_figure([Group("one run", [RunCurves(Path("run"), curves, None)])])
+    bottom, top = figure.axes[0].get_ylim()
+    assert top > last and (bottom == 0.0 if lowest == 0.0 else bottom < lowest)
+
+
+def test_hits_beside_the_paddle_are_drawn(env: BounceBall) -> None:
+    """A ball bounces off an edge too, up to its radius beside the face."""
+    half_x, half_y, _ = env.mj_model.geom_size[env.addresses.paddle_geom]
+    points = np.array([[half_x + 0.018, 0.0, 0.0], [0.0, -half_y - 0.03, 0.0]])
+    axes = Figure().subplots()
+    figures.draw_hits(axes, env, Hits("hits", np.ones((2, 1), bool)), points)
+    (right, left), (top, bottom) = axes.get_xlim(), axes.get_ylim()
+    for x, y, _ in 100.0 * points:
+        assert min(left, right) < y < max(left, right) and min(top, bottom) < x < max(top, bottom)
+
+
 def test_plot_of_several_runs(trained: Path, tmp_path: Path) -> None:
     other = shutil.copytree(trained, tmp_path / "other")
     save_config(other, read_preset(trained / "config.yaml").model_copy(update={"seed": 1}))
@@ -169,7 +205,7 @@ def check_report(run: Path) -> str:
     for phase, seconds in results.seconds.items():
         assert re.search(rf">{phase}</td><td class=\"\">{seconds:.1f}</td>", page)
     config = re.search(r"<pre>(.*)</pre>", page, re.DOTALL)[1]
-    shown = train_config(Bounce).model_validate(yaml.safe_load(config))
+    shown = TrainConfig.model_validate(yaml.safe_load(config))
     assert shown == read_preset(run / "config.yaml")
     return page
 
@@ -238,15 +274,35 @@ def test_tensorboard_reads_everything_back(trained: Path) -> None:
     assert logged_values == {e["steps"]: pytest.approx(e["stable"]) for e in evaluations}
 
 
-def test_a_full_disk_costs_points(tmp_path: Path, monkeypatch) -> None:
-    def fail(_: object) -> None:
-        raise OSError(errno.ENOSPC, "no space")
-
+def test_a_full_disk_costs_points(tmp_path: Path) -> None:
+    """The log stays one file, which TensorBoard reads to its end."""
     log = TensorBoardLog()
     log.start(tmp_path, TrainConfig())
-    (lost,) = tmp_path.glob("events*")
-    monkeypatch.setattr(log._writers[tmp_path], "write_event", fail)
     log(Event(tmp_path, TrainConfig(), 64, {"episode/return": 2.5}))
-    log(Event(tmp_path, TrainConfig(), 128, {"episode/return": 3.5}))
-    lost.unlink()
-    assert logged(tmp_path, "episode/return") == {128: 3.5}
+    (file,) = tmp_path.iterdir()
+    free, (_, limit) = file.stat().st_size + 9, resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (free, limit))
+    try:
+        log(Event(tmp_path, TrainConfig(), 128, {"episode/return": 3.5}))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+    log(Event(tmp_path, TrainConfig(), 192, {"episode/return": 4.5}))
+    assert list(tmp_path.iterdir()) == [file]
+    assert logged(tmp_path, "episode/return") == {64: 2.5, 192: 4.5}
+
+
+def test_a_clock_that_is_set_back_changes_no_curve(tmp_path: Path, monkeypatch) -> None:
+    """The points that a killed training logged after its checkpoint do not count."""
+    save_config(tmp_path, TrainConfig())
+    killed = TensorBoardLog()
+    for steps, value in ((64, 1.0), (128, 2.0), (192, 3.0)):
+        killed(Event(tmp_path, TrainConfig(), steps, {"episode/return": value}))
+    hour_ago = time.time() - 3600.0
+    monkeypatch.setattr(time, "time", lambda: hour_ago)
+    resumed = TensorBoardLog(64)
+    resumed.start(tmp_path, TrainConfig())
+    resumed(Event(tmp_path, TrainConfig(), 128, {"episode/return": 20.0}))
+    curve = read_curves(tmp_path).curves["episode/return"]
+    assert (curve.steps.tolist(), curve.values.tolist()) == ([64, 128], [1.0, 20.0])
+    log = EventAccumulator(str(tmp_path)).Reload()
+    assert [event.step for event in log.Scalars("episode/return")] == [64, 128]

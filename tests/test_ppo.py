@@ -106,9 +106,10 @@ def test_learning_rate_stays_in_its_limits(rate_config):
     np.testing.assert_allclose(adapted(rate_config, 0.0, 9.9e-3), 1e-2, rtol=1e-6)
     np.testing.assert_allclose(adapted(rate_config, 0.01, 5e-3, limit=2e-3), 2e-3, rtol=1e-6)
     np.testing.assert_allclose(adapted(rate_config, 1.0, 1.01e-5), 1e-5, rtol=1e-6)
-    # Without a target it is fixed.
+    # Without a target it is fixed, whatever its limits.
     fixed = rate_config.model_copy(update={"target_kl": 0.0})
-    np.testing.assert_allclose([adapted(fixed, kl) for kl in (0.0, 1.0)], 1e-3, rtol=1e-6)
+    kept = [adapted(fixed, kl, limit=limit) for kl in (0.0, 1.0) for limit in (1e-2, 1e-4)]
+    np.testing.assert_allclose(kept, 1e-3, rtol=1e-6)
 
 
 class TwoStates:
@@ -207,6 +208,58 @@ def test_settings_that_no_training_can_have_are_refused():
     config = two_state_config(critic_metrics=("n_bounces", "n_bounce"))
     with pytest.raises(UserError, match="names n_bounce, .* choose from .*n_bounces"):
         ppo.PPO(config, TwoStates(1.0), episode_steps=2)
+    # Limits that would change the rate after one minibatch.
+    for rate in (0.02, 1e-6):
+        with pytest.raises(ValueError, match=f"learning_rate {rate} is not within min_learning"):
+            two_state_config(learning_rate=rate, target_kl=0.01)
+        assert two_state_config(learning_rate=rate).learning_rate == rate
+
+
+class Point:
+    """A point in the plane that an action moves: no more than `AnyEnv` asks for."""
+
+    class task:  # noqa: N801
+        curves = ()
+        critic_metrics = ()
+
+    observation_size = 2
+    action_size = 2
+
+    def reset(self, rng):
+        start = jax.random.normal(rng, (2,))
+        return State(start, start, jnp.zeros(()), jnp.zeros(()))
+
+    def step(self, state, action):
+        point = state.pipeline_state + 0.1 * action
+        return state.replace(pipeline_state=point, obs=point, reward=-jnp.sum(point**2))
+
+
+class Scheduled(ppo.PPO):
+    """A loss of its own, which tells no KL divergence, and a schedule of its own."""
+
+    def loss(self, params, samples):
+        total, _ = super().loss(params, samples)
+        return total, {"loss/own": total}
+
+    def next_learning_rate(self, learning_rate, metrics, iteration):
+        return 1e-3 * 0.5**iteration
+
+
+def test_any_environment_and_any_loss_train() -> None:
+    config = two_state_config(num_envs=64, target_kl=0.01)
+    trainer = Scheduled(config, Point(), episode_steps=8)
+    _, metrics = jax.jit(lambda key: trainer.run(trainer.init(key), 3))(jax.random.key(0))
+    # Nothing adapts what a schedule says.
+    np.testing.assert_allclose(metrics["policy/learning_rate"], [1e-3, 5e-4, 2.5e-4], rtol=1e-6)
+    assert np.all(np.isfinite(metrics["loss/own"])) and not np.any(metrics["fault"])
+    assert np.all(metrics["reward"] < 0.0)
+
+    class Silent(Scheduled):
+        next_learning_rate = ppo.PPO.next_learning_rate
+
+    silent = Silent(config, Point(), episode_steps=8)
+    with pytest.raises(UserError, match="the loss of Silent returns no metric policy/kl"):
+        jax.eval_shape(lambda key: silent.run(silent.init(key), 1), jax.random.key(0))
 
 
 def test_episodes_do_not_all_time_out_together():
@@ -307,7 +360,7 @@ def test_settings_of_an_own_algorithm_are_keys(tmp_path):
     (tmp_path / "own.py").write_text(OWN)
     name = f"{tmp_path / 'own.py'}:Own"
     flags = ["--config", "cpu", "--algorithm", name, "--own-cost", "2"]
-    config = read_command(flags, "cpu").training
+    config = read_command(flags, "cpu").config
     assert find_algorithm(config.algorithm)(config.ppo, BounceBall(), 100).config.own_cost == 2.0
     run = create_run(config.model_copy(update={"log_dir": tmp_path / "runs"}))
     assert load_run_config(run, algorithm=name).ppo.own_cost == 2.0

@@ -18,15 +18,11 @@ from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import make_networks, networks_of
 from bounce_mjx.resources import ARM_POLICIES, POLICIES, TASK_POLICIES, resource_path
 from bounce_mjx.runs.checkpoints import read_policy
-from bounce_mjx.runs.config import (
-    TrainConfig,
-    in_world,
-    load_run_config,
-    read_preset,
-    runs_folder,
-)
+from bounce_mjx.runs.config import TrainConfig, load_run_config, runs_folder
 from bounce_mjx.runs.folders import best_checkpoint, choose_checkpoint, pretrained_checkpoint
 from bounce_mjx.runs.progress import load_results
+from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.runs.worlds import in_world
 from bounce_mjx.tasks.registry import find_task
 
 FOLDER = resource_path("pretrained")
@@ -52,16 +48,19 @@ RELEASES = sorted((Path(__file__).parent / "releases").iterdir())
 
 
 @pytest.mark.parametrize("release", RELEASES, ids=lambda path: path.name)
-def test_what_a_release_wrote_is_loaded(release: Path) -> None:
-    """The promise in CHANGELOG.md: a run's config, results and checkpoint, and an exported policy.
-    The last two give the same action."""
+def test_what_a_release_wrote_is_loaded(release: Path, tmp_path: Path) -> None:
+    """The promise in CHANGELOG.md: a run's config, results and checkpoint. Its ONNX file of an
+    earlier format is refused, and a new export gives the checkpoint's action."""
     config, results = load_run_config(release), load_results(release)
     assert results is not None and results.best.passed
+    with pytest.raises(UserError, match="its format is 3, not 4; export the policy again"):
+        load_policy(release / "policy.onnx")
     env = BounceBall(config.env)
     observation = np.asarray(env.reset(jax.random.PRNGKey(0)).obs)
     networks = make_networks(config.ppo, env.observation_size, env.action_size)
     expected = networks.act(read_policy(best_checkpoint(release), config), observation)
-    deployed = load_policy(release / "policy.onnx")
+    (tmp_path / "policy.onnx").write_bytes(export_onnx(best_checkpoint(release)))
+    deployed = load_policy(tmp_path / "policy.onnx")
     measured = {name: observation[env.layout[name]] for name in deployed.needs}
     np.testing.assert_allclose(deployed.step(measured), expected, atol=1e-5)
 
@@ -124,7 +123,11 @@ def test_its_training_command_gives_its_config(shipped: dict, monkeypatch) -> No
     assert (python, script) == ("python", "train_jax.py")
     command = read_command(flags)
     config = read_preset(FOLDER / "config.yaml")
-    assert (command.env, command.ppo, command.seed) == (config.env, config.ppo, shipped["seed"])
+    assert (command.config.env, command.config.ppo, command.config.seed) == (
+        config.env,
+        config.ppo,
+        shipped["seed"],
+    )
     assert shipped["device"]
 
 

@@ -159,8 +159,7 @@ def test_killed_at_any_moment(tmp_path: Path, straight: Path) -> None:
     saved = 0
 
     def written() -> list[int]:
-        """A value that changes whenever something is written to the folder of the latest
-        checkpoint."""
+        """A value that changes whenever a checkpoint comes or goes."""
         return [p.stat().st_mtime_ns for p in log_dir.glob("*/checkpoints")]
 
     def steps_saved() -> int:
@@ -174,7 +173,7 @@ def test_killed_at_any_moment(tmp_path: Path, straight: Path) -> None:
             assert process.is_alive() and time.monotonic() < deadline
             time.sleep(0.0002)
 
-    for moment in ("start", "any", "*orbax-checkpoint-tmp*", "replaced/*", "any"):
+    for moment in ("start", "any", "*.orbax-checkpoint-tmp", "*[0-9]", "any"):
         before = written()
         process = processes.Process(target=_train_in_silence, args=(args,))
         process.start()
@@ -185,7 +184,7 @@ def test_killed_at_any_moment(tmp_path: Path, straight: Path) -> None:
             time.sleep(random_seconds(0.0, 1.0))
         else:
             wait_until(lambda before=before: written() != before)
-            wait_until(lambda end=moment: any(log_dir.glob(f"*/checkpoints/{end}")))
+            wait_until(lambda end=moment: any(log_dir.glob(f"*/checkpoints/.unfinished/{end}")))
         process.kill()
         process.join()
         if steps_saved():
@@ -218,8 +217,7 @@ def test_a_reader_reads_the_next_checkpoint_where_a_training_replaces_one(run: P
     def save() -> None:
         for steps in itertools.count(STEPS):
             marked = jax.tree.map(lambda leaf, steps=steps: np.full_like(leaf, steps), policy)
-            # Each is better than the one before.
-            save_checkpoint(run, config, steps, {"policy": marked}, score=(True, 5, 1.0, steps))
+            save_checkpoint(run, config, steps, {"policy": marked})
             if ended.wait(0.02):
                 return
 

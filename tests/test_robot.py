@@ -25,8 +25,8 @@ from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.adopt import adopt, check_as_alone
 from bounce_mjx.robot.arm import build_arm, compile_spec, locate, read_spec
 from bounce_mjx.robot.config import RobotConfig
-from bounce_mjx.robot.model import find_addresses, joint_names
-from bounce_mjx.runs.config import read_preset
+from bounce_mjx.robot.model import find_addresses, joint_names, load_model
+from bounce_mjx.runs.settings import read_preset
 from random_worlds import random_parameters
 
 FINGERS = "".join(
@@ -86,8 +86,30 @@ BROKEN = {
     "loop": (
         mjcf(arm(), motors(ARM_JOINTS), '<equality><joint joint1="j2" joint2="j3"/></equality>'),
         "tool",
-        "equality constraint",
+        "unnamed equality constraint (joint: j2, j3) on the arm",
         "serial",
+    ),
+    "joints coupled by an unnamed tendon": (
+        mjcf(
+            arm(),
+            motors(ARM_JOINTS),
+            '<tendon><fixed><joint joint="j2" coef="1"/><joint joint="j3" coef="-1"/></fixed>'
+            "</tendon>",
+        ),
+        "tool",
+        "the unnamed tendon (j2, j3) on the arm",
+    ),
+    "servos that reach no pose": (
+        mjcf(
+            arm(),
+            "".join(
+                f'<position joint="{name}" kp="500" kv="20" ctrlrange="2.9 3.5"/>'
+                for name in ARM_JOINTS.split()
+            ),
+        ),
+        "tool",
+        "no reachable pose",
+        "widen the ctrlrange of the servos, which narrows j1 from -3 to 3 to 2.9 to 3, j2",
     ),
     "joints coupled by a tendon": (
         mjcf(
@@ -139,11 +161,13 @@ def written(tmp_path_factory) -> dict[str, Path]:
     small = folder / "small.xml"
     hand = f'<body pos="0 0 0.05"><geom size=".02" mass=".1"/>{FINGERS}</body>'
     table = '<geom type="plane" size="1 1 1"/><body><freejoint/><geom size=".1"/></body>'
+    # A shape of the world that touches.
+    table += '<geom type="box" size=".4 .4 .02" pos="0 0 -.02"/>'
     more = '<keyframe><key qpos="1 0 0 1 0 0 0 0 0 0 0 0 0 0 0"/></keyframe>'
     small.write_text(
-        mjcf(table + arm(tip=hand), motors(f"{ARM_JOINTS} left"), more).replace(
-            "<worldbody>", '<option timestep="0.005" gravity="0 0 -1.6"/><worldbody>'
-        )
+        mjcf(table + arm(tip=hand), motors(f"{ARM_JOINTS} left"), more)
+        .replace("<worldbody>", '<option timestep="0.005" gravity="0 0 -1.6"/><worldbody>')
+        .replace('<motor joint="j2"', '<motor jointinparent="j2"')
     )
     configs = {}
     for name, path, site in (("small", small, "tool"), ("ur5e", ur5e(), "attachment_site")):
@@ -313,6 +337,66 @@ def test_an_adopted_arm_moves_as_its_file(style, tmp_path) -> None:
             mujoco.mj_forward(m, data)
             accelerations.append([data.joint(name).qacc[0] for name in names])
         np.testing.assert_allclose(*accelerations, rtol=1e-7)
+
+
+def test_names_of_the_scene_may_be_those_of_the_arm(tmp_path) -> None:
+    """Of bodies, joints and geoms; also of the further balls, and of an unnamed holder."""
+    text = styled().replace("<body ", '<body name="ball_link2" ', 1)
+    text = text.replace('name="b"', 'name="ball_link"').replace('joint="b"', 'joint="ball_link"')
+    for name in ("blocker", "ball", "scene/floor", "paddle"):
+        text = text.replace(
+            '<geom class="touching"/>', f'<geom name="{name}" class="pictured"/>', 1
+        )
+    for name in ("ball_link", "paddle", "end_effector"):
+        text = text.replace("<body pos", f'<body name="{name}" pos', 1)
+    (tmp_path / "arm.xml").write_text(text)
+    config = RobotConfig(site="tool")
+    model = load_model(tmp_path / "arm.xml", 0.001, robot=config, num_balls=3)
+    at = find_addresses(model)
+    # The ball and the paddle are the scene's, and each joint keeps its servo.
+    assert [ball.body for ball in at.balls] == [
+        model.body(name).id for name in ("ball_link", "ball_link2", "ball_link3")
+    ]
+    assert model.geom_type[at.paddle_geom] == mujoco.mjtGeom.mjGEOM_BOX
+    assert joint_names(model) == ("a", "ball_link_of_arm", "c", "d", "e")
+    changes = build_arm(tmp_path / "arm.xml", config).changes
+    assert any("paddle to paddle_of_arm" in change for change in changes)
+
+
+def test_an_arm_in_degrees_has_the_start_pose_of_the_same_arm_in_radians(tmp_path) -> None:
+    """Though the last joint turns a flat paddle in its plane, where every angle scores alike."""
+    flat = {"position": (0.0, 0.0, 0.03), "quaternion": (1.0, 0.0, 0.0, 0.0)}
+    config = RobotConfig.model_validate({"site": "tool", "paddle": flat})
+    radians = mjcf(arm(limits="-2.9 2.9"), motors(ARM_JOINTS))
+    degrees = mjcf(arm(limits="-166.1578 166.1578"), motors(ARM_JOINTS))
+    poses = []
+    for text in (radians, degrees.replace("radian", "degree")):
+        (tmp_path / "arm.xml").write_text(text)
+        poses.append(adopt(tmp_path / "arm.xml", config, 0.01, is_mount_given=True).pose)
+    np.testing.assert_allclose(poses[0].angles, poses[1].angles, atol=1e-3)
+    # In front of the arm, in its plane.
+    np.testing.assert_allclose(poses[0].paddle[1], 0.0, atol=1e-6)
+
+
+def test_adopt_prints_each_servo_and_each_change_of_the_world(tmp_path, capsys) -> None:
+    option = '<option gravity="0 0 -1.6" density="1.2" wind="1 0 0"/>'
+    flat = "--paddle.position 0 0 0.03 --paddle.quaternion 1 0 0 0"
+    text = mjcf(arm(), motors(ARM_JOINTS)).replace("<worldbody>", f"{option}<worldbody>")
+    # What does not move with the arm may be constrained, and a path have a line break.
+    post = '<body name="post"><geom size=".1"/></body></worldbody>'
+    joined = '<equality><connect body1="world" body2="post" anchor="0 0 0"/></equality></mujoco>'
+    text = text.replace("</worldbody>", post).replace("</mujoco>", joined)
+    (tmp_path / "my\narm.xml").write_text(text)
+    line = f"--site tool --out {tmp_path}/arm.yaml {flat}"
+    adopt_command.main([f"{tmp_path}/my\narm.xml", *line.split()])
+    said = capsys.readouterr().out
+    robot = read_preset(tmp_path / "arm.yaml").env.robot
+    for name, stiffness, damping in zip(
+        ARM_JOINTS.split(), robot.servo_stiffness, robot.servo_damping, strict=True
+    ):
+        numbers = f"kp {stiffness:.4g}, kv {damping:.4g}, force limit 100"
+        assert re.search(rf"  {name}: .* rad, inertia .*, {re.escape(numbers)}\n", said)
+    assert "gravity [0.0, 0.0, -1.6], wind [1.0, 0.0, 0.0], density 1.2" in said
 
 
 @pytest.mark.slow

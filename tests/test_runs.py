@@ -9,23 +9,21 @@ import re
 import shutil
 import threading
 import unittest.mock
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from bounce_mjx import Run
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import fingerprint, load_model
-from bounce_mjx.runs import config as run_configs
 from bounce_mjx.runs import folders
-from bounce_mjx.runs.config import (
-    TrainConfig,
-    load_run_config,
-    preset_files,
-    read_preset,
-)
+from bounce_mjx.runs import presets as presets_module
+from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.files import to_json
 from bounce_mjx.runs.folders import (
     best_checkpoint,
@@ -36,7 +34,10 @@ from bounce_mjx.runs.folders import (
     named_run,
     save_config,
 )
+from bounce_mjx.runs.presets import preset_files
 from bounce_mjx.runs.progress import Progress, load_results
+from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.training import run as training_run
 from tiny_runs import contents
 
 CATCH = resource_path("configs/catch/cpu.yaml")
@@ -104,7 +105,7 @@ def test_latest_is_a_name_for_every_command(runs: Path, monkeypatch) -> None:
     monkeypatch.chdir(runs)
     assert named_run(Path("latest"), runs) == named_run(None, runs) == runs / "2026-01-02"
     command = train_command.read_command(["--resume", "latest", "--log-dir", str(runs)])
-    assert command.resume == runs / "2026-01-02"
+    assert command.layers.resume == runs / "2026-01-02"
     (runs / "latest").mkdir()
     assert named_run(Path("latest"), runs) == Path("latest")
 
@@ -121,9 +122,28 @@ def test_the_newest_run_is_not_the_greatest_name(tmp_path: Path) -> None:
         shutil.rmtree(named_run(None, tmp_path))
 
 
+def test_a_run_is_opened_by_its_path_and_reads_its_policy_once(trained: Path, monkeypatch) -> None:
+    """A program may ask for the policy in each of its steps."""
+    run, reads = Run(str(trained)), []
+    monkeypatch.setattr(training_run, "read_actor", counted(training_run.read_actor, reads))
+    observation = np.zeros(run.config.env.layout.size, np.float32)
+    actions = [run.policy(observation) for _ in range(2)]
+    assert run.folder == trained and run.results == load_results(trained).best
+    assert run.checkpoint == find_checkpoint(str(trained)) == find_checkpoint(trained)
+    assert actions[0].shape == (6,) and np.array_equal(*actions) and len(reads) == 1
+
+
+def counted(function: Callable, calls: list) -> Callable:
+    def count(*arguments):
+        calls.append(arguments)
+        return function(*arguments)
+
+    return count
+
+
 def test_a_run_without_a_checkpoint_is_told_as_such(runs: Path) -> None:
     for find in (latest_checkpoint, best_checkpoint, find_checkpoint):
-        with pytest.raises(UserError, match="2026-01-03 has no checkpoint, because the first"):
+        with pytest.raises(UserError, match="2026-01-03 has no checkpoint, .*; start again"):
             find(runs / "2026-01-03")
 
 
@@ -155,13 +175,14 @@ def test_a_run_has_a_copy_of_its_robot(robot_run: Path, tmp_path: Path, monkeypa
     moved = tmp_path / "moved"
     robot_run.rename(moved)
     monkeypatch.chdir(tmp_path)
-    for run in (moved, Path("moved")):
+    (tmp_path / "other").mkdir()
+    for run in (moved, Path("moved"), Path("other/../moved")):
         env = load_run_config(run).env
         assert env.mjcf == moved / "robot/mjcf/my robot.xml"
         assert load_model(env.mjcf, 0.001).nmesh == 1
-    before = contents(moved)
-    save_config(moved, load_run_config(moved))
-    assert contents(moved) == before
+        before = contents(moved)
+        save_config(run, load_run_config(run))
+        assert contents(moved) == before
     # The config is a preset too, for a new run.
     assert read_preset(moved / "config.yaml").env.mjcf == env.mjcf
 
@@ -225,8 +246,8 @@ def test_a_task_has_its_own_preset_of_a_name(tmp_path: Path, monkeypatch) -> Non
         file = tmp_path / "configs" / f"{name}.yaml"
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(f"seed: {seed}")
-    monkeypatch.setattr(run_configs, "resource_path", lambda name: tmp_path / name)
-    monkeypatch.setattr(run_configs, "has_accelerator", lambda: False)
+    monkeypatch.setattr(presets_module, "resource_path", lambda name: tmp_path / name)
+    monkeypatch.setattr(presets_module, "has_accelerator", lambda: False)
     assert read_preset(None).seed == read_preset(Path("cpu"), task="bounce").seed == 2
     assert read_preset(Path("seed")).seed == 3
     assert read_preset(None, task=f"{DRIBBLE}:Dribble").seed == 1
@@ -236,7 +257,7 @@ def test_a_task_has_its_own_preset_of_a_name(tmp_path: Path, monkeypatch) -> Non
 def presets(tmp_path: Path, monkeypatch) -> Path:
     """A working directory on a machine without an accelerator, with a preset of the user's."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(run_configs, "has_accelerator", lambda: False)
+    monkeypatch.setattr(presets_module, "has_accelerator", lambda: False)
     (tmp_path / "my.yaml").write_text("ppo: {learning_rate: 0.001}")
     return tmp_path
 
@@ -278,10 +299,10 @@ def test_files_of_the_user_lie_on_each_other(presets: Path) -> None:
     }
     for flags, rate in orders.items():
         command = train_command.read_command(flags.split())
-        assert command.ppo.learning_rate == rate and command.ppo.discount == 0.9
-        assert command.ppo.num_envs == read_preset(None).ppo.num_envs
-        cpu, *given = preset_files(command.config, command.task)
-        assert cpu == resource_path("configs/cpu.yaml")
+        assert command.config.ppo.learning_rate == rate and command.config.ppo.discount == 0.9
+        assert command.config.ppo.num_envs == read_preset(None).ppo.num_envs
+        cpu, named, given = preset_files(command.flags.config, command.config.task)
+        assert (cpu, named) == (resource_path("configs/cpu.yaml"), None)
         assert " ".join(map(str, given)) == flags.replace("--config=", "").replace("--config ", "")
     (presets / "more.yaml").write_text("base: randomized")
     with pytest.raises(UserError, match="more.yaml lies on my.yaml, so its base is not used"):

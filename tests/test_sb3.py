@@ -5,13 +5,16 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, VecVideoRecorder
 
 from bounce_mjx.adapters.gymnasium.registration import ENV_ID
 from bounce_mjx.adapters.sb3 import Sb3VecEnv
+from bounce_mjx.adapters.torch.policy import to_policy
 from bounce_mjx.errors import UserError
+from bounce_mjx.learning.policy import make_networks
 
 torch.set_num_threads(1)
 NUM_ENVS = 3
@@ -67,10 +70,31 @@ def test_sb3_checks_pass() -> None:
 def test_attributes_are_common_and_stay(envs):
     assert envs.get_attr("dt", [0, 2]) == [0.01, 0.01]
     assert not envs.has_attr("gravity") and envs.env_is_wrapped(Monitor, 1) == [True]
-    for refused in (envs.set_attr, envs.env_method):
-        with pytest.raises(UserError, match="no attributes to set and no methods; give settings"):
-            refused("dt", 0.02)
-    assert Sb3VecEnv(2, task="catch")._envs.episode_steps == 300
+    with pytest.raises(UserError, match="'dt', which is fixed by the settings; give these to"):
+        envs.set_attr("dt", 0.02)
+    with pytest.raises(UserError, match="would change only some of the 3 .* omit indices"):
+        envs.set_attr("lap", 1, [0])
+    for lap in (1, 2):
+        envs.set_attr("lap", lap)
+        assert envs.get_attr("lap", [0, 2]) == envs.env_method("get_wrapper_attr", "lap")[:2]
+    assert envs.get_attr("lap") == [2] * NUM_ENVS
+
+
+def test_methods_of_single_environments(envs):
+    start = envs.reset()
+    high = {"target_height": 0.7}
+    ((observation, info),) = envs.env_method("reset", indices=1, seed=3, options=high)
+    assert observation[TARGET] == np.float32(0.7) and info == {}
+    after = envs.step(np.zeros((NUM_ENVS, 6)))[0]
+    np.testing.assert_array_equal(after[[0, 2], TARGET], start[[0, 2], TARGET])
+    single = gymnasium.make(ENV_ID)
+    np.testing.assert_allclose(observation, single.reset(seed=3, options=high)[0], atol=1e-6)
+    with pytest.raises(UserError, match="'jump'; the environments have the methods reset, render"):
+        envs.env_method("jump")
+
+
+def test_the_time_limit_is_that_of_the_task() -> None:
+    assert Sb3VecEnv(2, task="catch").episode_steps == 300
 
 
 PPO_SETTINGS = {"n_steps": 16, "batch_size": 24, "n_epochs": 1}
@@ -104,6 +128,19 @@ def test_algorithm_trains_and_loads(envs, library, algorithm, settings, need, tm
     expected, _ = model.predict(observation, deterministic=True)
     given, _ = make.load(tmp_path / "model").predict(observation, deterministic=True)
     np.testing.assert_array_equal(given, expected)
+
+
+def test_a_network_of_sb3_becomes_a_policy(envs):
+    """Its default activation is tanh."""
+    model = PPO("MlpPolicy", envs, policy_kwargs={"net_arch": [8, 4]}, device="cpu", seed=0)
+    parts = model.policy
+    mlp = torch.nn.Sequential(*parts.mlp_extractor.policy_net, parts.action_net)
+    policy = to_policy(mlp, torch.zeros(29), torch.ones(29), parts.log_std)
+    assert policy.config.activation == "tanh" and policy.config.hidden_layers == (8, 4)
+    observation = np.random.default_rng(0).normal(size=(16, 29)).astype(np.float32)
+    expected, _ = model.predict(observation, deterministic=True)
+    given = make_networks(policy.config, 29, 6).act(policy.policy, observation)
+    np.testing.assert_allclose(given, expected, atol=1e-5)
 
 
 def test_videos_tile_the_first_environments(opengl, need, tmp_path):

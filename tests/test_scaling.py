@@ -108,7 +108,12 @@ def test_eight_devices_train_as_one(alone: Path, tmp_path: Path, monkeypatch: py
 @pytest.mark.parametrize(
     ("num_devices", "num_envs", "num_seeds", "sentence"),
     [
-        (64, 4096, 1, "num_devices is 64, but there are"),
+        (
+            64,
+            4096,
+            1,
+            "but the number of devices here is 8; give --num-devices 8",
+        ),
         (3, 4096, 1, "num_envs 4096 cannot be divided among 3 devices; choose a power of two"),
         (4, 4098, 1, "num_envs 4098 cannot be divided among 4 devices"),
         (2, 4096, 3, "num_seeds 3 cannot be divided among 2 devices; choose a multiple of 2"),
@@ -158,8 +163,8 @@ def test_two_processes_train_as_one(alone: Path, tmp_path: Path, monkeypatch: py
 )
 def test_flags_tell_whether_there_are_other_hosts(flags: str, several: bool) -> None:
     command = read_command(flags.split())
-    assert command.on_several_hosts == several
-    assert command.host_timeout == (7 if "7" in flags else 300)
+    assert command.flags.on_several_hosts == several
+    assert command.flags.host_timeout == (7 if "7" in flags else 300)
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from scipy import stats
 from scipy.interpolate import CubicHermiteSpline
 
 from bounce_mjx import BounceBall, EnvConfig
+from bounce_mjx.env.env import _instant
 from bounce_mjx.physics import PhysicsState
 from bounce_mjx.world import noise
 
@@ -86,7 +87,7 @@ def watching(camera: bool, velocity: str):
             physics = PhysicsState(jnp.asarray(qpos[0]), jnp.asarray(qvel[0]))
             pipeline = start.pipeline_state._replace(physics=physics)
             # The first memory must also have the ball of the trajectory.
-            memory = env._sensors.first(pipeline, env.kinematics(pipeline))
+            memory = env._sensors.first(_instant(pipeline, env.kinematics(pipeline)))
             pipeline = pipeline._replace(sensing=memory)
             start = start.replace(pipeline_state=pipeline, obs=env.observe(pipeline))
 
@@ -101,7 +102,7 @@ def watching(camera: bool, velocity: str):
 
             physics = PhysicsState(jnp.asarray(qpos[1:]), jnp.asarray(qvel[1:]))
             _, seen = jax.lax.scan(step, start, (jnp.asarray(actions), physics))
-            return start.pipeline_state.world, pipeline.clock.phases[0], start.obs, *seen
+            return start.pipeline_state.world, pipeline.clock.camera_phase, start.obs, *seen
 
         return jax.vmap(of_one)(keys, ranges)
 

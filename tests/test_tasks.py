@@ -10,19 +10,27 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
 import rest_task
 from bounce_mjx import load_policy, task
+from bounce_mjx.commands.eval import EvalCommand
 from bounce_mjx.commands.main import main
+from bounce_mjx.commands.play import PlayCommand
+from bounce_mjx.commands.run_options import parse_with_commands
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.env.env import Env
+from bounce_mjx.env.vector import VectorStep
 from bounce_mjx.errors import UserError
-from bounce_mjx.runs.config import CONFIG_FILE, load_run_config, read_preset
+from bounce_mjx.learning.metrics import rollout_metrics, step_metrics
+from bounce_mjx.runs.config import CONFIG_FILE, load_run_config
 from bounce_mjx.runs.folders import create_run
+from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.tasks import registry
 from bounce_mjx.tasks.registry import find_task, task_name
+from bounce_mjx.training.command import read_command
 from tiny_runs import TINY
 
 CHECKOUT = Path(__file__).parent.parent
@@ -70,6 +78,66 @@ def test_a_task_without_events_goes_through_every_command(
     assert again.metadata == policy.metadata
     sizes = {"joint_angles": 6, "joint_velocities": 6, "ball_position": 3, "ball_velocity": 3}
     assert policy.step({name: np.zeros(sizes[name]) for name in policy.needs}).shape == (6,)
+
+
+def test_a_command_that_the_policy_does_not_see_is_refused() -> None:
+    bounce = find_task("bounce").Config
+    unseen = {"target_height": 0}
+    with pytest.raises(UserError, match="not see the command target_height, which varies from 0.4"):
+        Env(bounce(observation=unseen))
+    # A fixed one, or one that a quantity of the task may show.
+    Env(bounce(observation=unseen, target_height_range=(0.5, 0.5)))
+    Env(bounce(observation=unseen | {"apex_error": 1}))
+
+
+RADIUS, HALF_HEIGHT = 0.03, 0.01
+
+
+@pytest.fixture
+def large(tmp_path: Path) -> Path:
+    """The project's robot with a larger ball and a thicker paddle."""
+    spec = mujoco.MjSpec.from_file(str(CHECKOUT / "mjcf/bounce_ball.xml"))
+    spec.geom("ball").size[0] = RADIUS
+    spec.geom("blocker").size[2] = HALF_HEIGHT
+    (tmp_path / "large.xml").write_text(spec.to_xml())
+    return tmp_path / "large.xml"
+
+
+def test_tasks_have_the_geometry_of_the_model(large: Path) -> None:
+    """A ball that is laid on the paddle does not start within it, a throw aims at its rest, a
+    flight ends there, and balls touch that overlap."""
+    tasks = {name: find_task(name) for name in ("balance", "catch", "juggle", "track")}
+    balance, catch, juggle, track = (task(task.Config(mjcf=large)) for task in tasks.values())
+    x, y, home = balance.geometry.paddle_home
+    np.testing.assert_allclose((x, y, home), task.PADDLE_HOME, atol=5e-5)
+    rest = home + RADIUS + HALF_HEIGHT
+    assert balance.throw(jnp.full(4, 0.5), {})[0][2] == pytest.approx(rest + 0.003)
+    position, velocity = catch.throw(jnp.array([0.0, 0.0, 0.5, 0.5, 0.5]), {})
+    # A parabola is again at the height from which it rose.
+    assert position[2] == pytest.approx(rest) and velocity[2] == pytest.approx(0.5 * 9.81 * 0.65)
+
+    speed = jnp.zeros(6)
+
+    def truth(balls: jax.Array, velocities: jax.Array) -> task.Kinematics:
+        paddle = jnp.array([x, y, home])
+        return task.Kinematics(speed, balls, None, speed, velocities, None, paddle)
+
+    def touched(distance: float, radius: float | None = None) -> bool:
+        balls = jnp.array([[x, -0.5 * distance, 0.5], [x, 0.5 * distance, 0.5]])
+        state = jnp.array([False, False]), 1.0
+        step = task.Step(
+            truth(balls, jnp.zeros((2, 3))), {"target_height": 0.5}, speed, speed, radius
+        )
+        return bool(juggle.step(state, step).metrics["touched"])
+
+    assert touched(0.059) and not touched(0.061)
+    # In an episode with other balls.
+    assert touched(0.039, 0.02) and not touched(0.041, 0.02)
+    for flown in (juggle, track):
+        height = flown.config.home[2] + RADIUS + HALF_HEIGHT
+        assert flown._ground() == pytest.approx(height)
+    with pytest.raises(UserError, match=r"a ball of the radius 0.03 m rests on .* 0.0898 m"):
+        Env(find_task("bounce").Config(mjcf=large, ball_init_pos=(0.59, 0.0, 0.07)))
 
 
 @pytest.mark.parametrize("name", ["balance", "catch", "juggle", "track"])
@@ -157,7 +225,7 @@ def test_another_file_than_the_runs_is_told(
     assert load_run_config(run_folder, f"{changed}:Dribble").env.reward.apex.weight == 4.0
     assert "changed.py:Dribble differs from the task that" in capsys.readouterr().err
     flags[-1] = f"{mine}:Dribble"
-    assert read_command(flags).env == config.env
+    assert read_command(flags).config.env == config.env
 
 
 def test_a_config_file_cannot_name_code(mine: Path, tmp_path: Path) -> None:
@@ -219,12 +287,67 @@ def test_a_robot_serves_another_task() -> None:
     np.testing.assert_allclose(above, [0.0, 0.0, 0.2], atol=0.08)
 
 
+NAMED_LIKE_FLAGS = """
+import rest_task
+from bounce_mjx import task
+
+class Sized(rest_task.Rest):
+    class Config(rest_task.Rest.Config):
+        report: float = 0.5
+        \"\"\"A setting whose name a flag of train has.\"\"\"
+        seed: int = 3
+        \"\"\"A setting whose name another setting has.\"\"\"
+
+        @property
+        def commands(self):
+            names = "size", "zoom", "episodes", "copy", "help", "model_config", "depth"
+            return {name: task.Command(0.0, 1.0) for name in names}
+"""
+
+
+def test_a_task_may_name_a_command_or_a_setting_like_a_flag(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The flag that stands in no group stays, and the other one has its group."""
+    (tmp_path / "sized.py").write_text(NAMED_LIKE_FLAGS)
+    task_flag = ["--task", f"{tmp_path / 'sized.py'}:Sized"]
+    env = find_task(task_flag[1]).Config()
+    flags = "--commands.size 0.5 --size 64 64 --copy 0.25 --commands.help 1 --depth 1".split()
+    command, values = parse_with_commands(PlayCommand, [*task_flag, *flags], prog="play")
+    assert command.viewing.size == (64, 64)
+    assert values(env) == {"size": 0.5, "copy": 0.25, "help": 1.0, "depth": 1.0}
+    flags = "--episodes 7 --commands.episodes 0.5 --model-config 1 --size 0.1".split()
+    command, values = parse_with_commands(EvalCommand, [*task_flag, *flags], prog="eval")
+    assert command.episodes == 7
+    assert values(env) == {"episodes": 0.5, "model_config": 1.0, "size": 0.1}
+    flags = "--no-report --env.report 0.25 --seed 8 --env.seed 9".split()
+    command = read_command([*task_flag, *flags])
+    assert (command.flags.report, command.config.seed) == (False, 8)
+    assert (command.config.env.report, command.config.env.seed) == (0.25, 9)
+
+
 class _Rising(rest_task.Rest):
     class Config(rest_task.Rest.Config):
         commands: ClassVar = {"height": task.Command(0.4, 0.4)}
 
     def next_command(self, state: tuple, command: task.Values) -> task.Values:
         return {"height": command["height"] + 0.01}
+
+
+def test_the_log_has_each_metric_of_a_task() -> None:
+    """Also one that no curve names, as its mean over the steps; but not what the world samples."""
+    ended = jnp.array([False, True, False, True])
+    shown = {"apex_error": jnp.array([0.2, 0.0, 0.4, 0.0]), "apexes": jnp.array([1.0, 0, 1.0, 0])}
+    metrics = shown | {"low": jnp.array([1.0, 0.0, 0.0, 2.0]), "world/mass": jnp.ones(4)}
+    metrics |= dict.fromkeys(("non_finite", "too_fast"), jnp.zeros(4))
+    zero = jnp.zeros(4)
+    result = VectorStep(zero, zero, zero, ended, ~ended, metrics, zero, zero)
+    curve = task.Curve("task/error", "apex_error", over="apexes")
+    sums = [step_metrics(result, groups=2, curves=[curve])] * 3
+    logged = rollout_metrics(jax.tree.map(lambda *steps: jnp.stack(steps), *sums))
+    of_task = {name: float(x) for name, x in logged.items() if name.startswith("task/")}
+    expected = {"task/error": 0.3, "task/low": 0.75, "task/non_finite": 0.0, "task/too_fast": 0.0}
+    assert of_task == pytest.approx(expected)
 
 
 @pytest.mark.slow

@@ -19,12 +19,13 @@ from torch import nn
 
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.adapters.torch import TorchVectorEnv
-from bounce_mjx.adapters.torch.policy import to_policy, write_run
+from bounce_mjx.adapters.torch.packing import Layout
+from bounce_mjx.adapters.torch.policy import TorchPolicy, to_policy, write_run
 from bounce_mjx.adapters.torch.rsl_rl_env import RslRlVecEnv
 from bounce_mjx.adapters.torch.skrl_env import SkrlEnv
 from bounce_mjx.env import vector
 from bounce_mjx.errors import UserError
-from bounce_mjx.learning.policy import Policy, make_networks
+from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.runs.checkpoints import read_policy
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import find_checkpoint, runs_in
@@ -34,6 +35,7 @@ torch.set_num_threads(1)
 NUM_ENVS = 4
 # Each test includes both a fall (the ball reaches the floor after 0.3 s) and time-outs.
 EPISODE_STEPS = 20
+REWARD_SCALE = 0.25
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
@@ -44,7 +46,7 @@ def task() -> BounceBall:
 
 @pytest.fixture(scope="module")
 def env(task) -> TorchVectorEnv:
-    return TorchVectorEnv(task, NUM_ENVS, seed=3)
+    return TorchVectorEnv(task, NUM_ENVS, seed=3, reward_scale=REWARD_SCALE)
 
 
 def random_actions(steps: int) -> torch.Tensor:
@@ -53,22 +55,77 @@ def random_actions(steps: int) -> torch.Tensor:
 
 
 def test_actions_and_results_share_the_memory_of_jax(env, monkeypatch):
+    """All tensors of a step are views of one array."""
     seen, arrays = [], []
     env.reset()
     step = env._jit_step
 
     def spy(carried, action):
         seen.append(action.unsafe_buffer_pointer())
-        carried, result = step(carried, action)
-        arrays.extend(result)
-        return carried, result
+        carried, block = step(carried, action)
+        arrays.append(block)
+        return carried, block
 
     monkeypatch.setattr(env, "_jit_step", spy)
     # PyTorch aligns a tensor as JAX needs it unless it is a part of another tensor.
     action = torch.zeros(NUM_ENVS, 6)
-    for tensor, array in zip(env.step(action), arrays, strict=True):
-        assert tensor.data_ptr() == array.unsafe_buffer_pointer()
+    result = env.step(action)
     assert seen == [action.data_ptr()]
+    (block,) = arrays
+    parts = [(x.data_ptr() - block.unsafe_buffer_pointer(), x.nbytes) for x in result]
+    starts, sizes = zip(*parts, strict=True)
+    assert starts[0] == 0 and starts[-1] + sizes[-1] == block.nbytes
+    # Each begins at the first word after the one before.
+    assert list(starts[1:]) == [a + -(-size // 4) * 4 for a, size in parts[:-1]]
+
+
+def test_arrays_pass_in_one_block():
+    """Of every type, and bools whose number is not a multiple of a word's bytes."""
+    rng = np.random.default_rng(0)
+    arrays = {
+        "floats": jnp.asarray(rng.normal(size=(3, 5)), jnp.float32).at[0, 0].set(jnp.nan),
+        "flags": jnp.asarray(rng.random((2, 3)) < 0.5),
+        "integers": jnp.asarray([-1, 2**31 - 1], jnp.int32),
+        "last": jnp.asarray([1e-42, -0.0, jnp.inf], jnp.float32),
+        "nothing": jnp.zeros((4, 0)),
+    }
+    layout = Layout(jax.eval_shape(lambda: arrays))
+    block = jax.jit(layout.pack)(arrays)
+    assert block.nbytes == 4 * (15 + 2 + 2 + 3 + 0)
+    for name, array in layout.unpack(block).items():
+        assert array.dtype == arrays[name].dtype
+        np.testing.assert_array_equal(array, arrays[name])
+    shared = torch.from_dlpack(block)
+    for name, view in layout.views(shared).items():
+        assert view.untyped_storage().data_ptr() == shared.data_ptr()
+        np.testing.assert_array_equal(view.numpy(), arrays[name])
+
+
+def test_clock_is_a_copy(env):
+    env.reset()
+    clock = env.clock
+    clock += 5
+    assert torch.equal(env.clock, torch.zeros(NUM_ENVS, dtype=torch.int32))
+    given = torch.arange(NUM_ENVS)
+    env.clock = given
+    given += 7
+    env.step(torch.zeros(NUM_ENVS, 6))
+    assert env.clock.tolist() == [1, 2, 3, 4]
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+def test_step_waits_for_nothing_on_cuda(task):
+    env = RslRlVecEnv(TorchVectorEnv(task, NUM_ENVS))
+    action = torch.zeros(NUM_ENVS, 6, device="cuda")
+    env.step(action)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        with jax.transfer_guard("disallow"):
+            observations, rewards, dones, extras = env.step(action)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert {t.device.type for t in (rewards, dones, extras["time_outs"])} == {"cuda"}
+    assert observations["policy"].device == action.device
 
 
 def test_tensors_of_a_step_outlive_the_following_steps(env):
@@ -95,7 +152,8 @@ def test_steps_equal_vector_steps(task, env):
         key, reset_key = jax.random.split(key)
         state, expected = step(state, jnp.asarray(action.numpy()), reset_key)
         result = env.step(action)
-        for name in ("observation", "final_observation", "reward", "terminated", "truncated"):
+        np.testing.assert_allclose(result.reward, REWARD_SCALE * expected.reward, atol=1e-4)
+        for name in ("observation", "final_observation", "terminated", "truncated"):
             np.testing.assert_allclose(
                 getattr(result, name).numpy(), getattr(expected, name), atol=2e-4, err_msg=name
             )
@@ -142,6 +200,8 @@ def test_rsl_rl_gets_time_outs_and_terminal_observations(env):
     after, rewards, dones, extras = vec_env.step(torch.zeros(NUM_ENVS, 6))
     assert extras["time_outs"].tolist() == dones.tolist() == [True, False, False, False]
     assert rewards.shape == (NUM_ENVS,)
+    terms = [mean for name, mean in extras["log"].items() if name.startswith("task/reward/")]
+    torch.testing.assert_close(REWARD_SCALE * sum(terms), rewards.mean())
     assert after["policy"].shape == (NUM_ENVS, 29) and after["critic"].shape == (NUM_ENVS, 1)
     assert vec_env.get_observations() is after
     # In one step of 10 ms nothing moves far, but a reset draws another target height.
@@ -149,6 +209,21 @@ def test_rsl_rl_gets_time_outs_and_terminal_observations(env):
     torch.testing.assert_close(terminal[:, 28], before[:, 28])
     assert torch.equal(terminal[1:], after["policy"][1:])
     assert terminal[0, 28] != after["policy"][0, 28]
+
+
+def test_rsl_rl_scripts_find_what_they_touch(env):
+    """The attributes and methods that the scripts of mjlab and Isaac Lab use."""
+    vec_env = RslRlVecEnv(env)
+    assert vec_env.unwrapped is vec_env and vec_env.render_mode is None
+    assert (vec_env.step_dt, vec_env.physics_dt) == (0.01, 0.001)
+    assert vec_env.seed(7) == 7
+    first, extras = vec_env.reset()
+    assert extras == {} and vec_env.get_observations() is first
+    later, _ = vec_env.reset()
+    assert not torch.equal(later["policy"], first["policy"])
+    vec_env.seed(7)
+    torch.testing.assert_close(vec_env.reset()[0]["policy"], first["policy"])
+    vec_env.close()
 
 
 def test_skrl_gets_terminal_observations(env):
@@ -168,7 +243,6 @@ class Trained(NamedTuple):
     """What an example leaves behind."""
 
     out: Path
-    policy: Policy
     act: Callable[[torch.Tensor], torch.Tensor]
     """Observations [B, 29] -> the mean actions of the library's own network."""
 
@@ -188,7 +262,7 @@ def trained(request, tmp_path_factory) -> Trained:
             inputs = {"observations": names["seen"](observation)}
             return names["models"]["policy"].act(inputs)[1]["mean_actions"]
 
-    return Trained(out, names["policy"], act)
+    return Trained(out, act)
 
 
 def run_example(name: str, out: Path) -> dict[str, Any]:
@@ -229,23 +303,49 @@ def test_rsl_rl_exports_the_policy(trained):
         np.testing.assert_allclose(given[0], action, rtol=1e-4, atol=1e-5)
 
 
-def linear_policy(sizes: list[int], activation: type[nn.Module] = nn.SiLU) -> Policy:
-    layers = [x for a, b in itertools.pairwise(sizes) for x in (nn.Linear(a, b), activation())]
+def linear_network(sizes: list[int], activation: nn.Module) -> nn.Sequential:
+    layers = [x for a, b in itertools.pairwise(sizes) for x in (nn.Linear(a, b), activation)]
+    return nn.Sequential(*layers[:-1])
+
+
+def linear_policy(sizes: list[int], activation: nn.Module | None = None) -> TorchPolicy:
     mean, std = torch.zeros(sizes[0]), torch.ones(sizes[0])
-    return to_policy(nn.Sequential(*layers[:-1]), mean, std, torch.zeros(sizes[-1]))
+    network = linear_network(sizes, activation or nn.SiLU())
+    return to_policy(network, mean, std, torch.zeros(sizes[-1]))
 
 
 def test_another_network_is_refused(task, tmp_path):
-    with pytest.raises(UserError, match="layers Linear, ELU, Linear, but"):
-        linear_policy([29, 8, 6], nn.ELU)
+    with pytest.raises(UserError, match="layers Linear, GELU, Linear, but"):
+        linear_policy([29, 8, 6], nn.GELU())
+    with pytest.raises(UserError, match="an ELU with another alpha than 1"):
+        linear_policy([29, 8, 6], nn.ELU(0.5))
+    mixed = nn.Sequential(nn.Linear(2, 2), nn.Tanh(), nn.Linear(2, 2), nn.ReLU(), nn.Linear(2, 1))
+    with pytest.raises(UserError, match="with one of SiLU, ReLU, Tanh or ELU between them"):
+        to_policy(mixed, torch.zeros(2), torch.ones(2), torch.zeros(1))
     with pytest.raises(UserError, match="give the environment of the training"):
         write_run(tmp_path, task, linear_policy([28, 8, 6]), steps=0)
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("activation", [nn.SiLU(), nn.ReLU(), nn.Tanh(), nn.ELU()])
+def test_a_policy_acts_as_its_network_in_pytorch(activation):
+    """The activations that `ppo.activation` knows, at inputs of both signs."""
+    network = linear_network([3, 4, 4, 2], activation)
+    mean, std = torch.tensor([1.0, -2.0, 0.5]), torch.tensor([0.5, 2.0, 1.0])
+    policy = to_policy(network, mean, std, torch.zeros(2))
+    observation = torch.randn(16, 3)
+    with torch.no_grad():
+        expected = network((observation - mean) / std).clamp(-1.0, 1.0)
+    networks = make_networks(policy.config, 3, 2)
+    given = networks.act(policy.policy, jnp.asarray(observation.numpy()))
+    np.testing.assert_allclose(given, expected, atol=1e-5)
+
+
 def test_a_written_policy_is_read(task, tmp_path):
-    policy = linear_policy([29, 8, 12, 6])
+    policy = linear_policy([29, 8, 12, 6], nn.Tanh())
     run = write_run(tmp_path, task, policy, steps=64, seed=7)
     config = load_run_config(run)
     assert config.env == task.config and config.seed == 7
-    jax.tree.map(np.testing.assert_array_equal, read_policy(find_checkpoint(run), config), policy)
+    assert config.ppo.activation == "tanh"
+    read = read_policy(find_checkpoint(run), config)
+    jax.tree.map(np.testing.assert_array_equal, read, policy.policy)

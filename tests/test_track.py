@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 
 from bounce_mjx import task
+from bounce_mjx.env.env import Env
 from bounce_mjx.tasks import paths
 from bounce_mjx.tasks.track import Config, Track
+from bounce_mjx.world.randomization import RandomizationConfig
 
 CONFIG = Config()
 TRACK = Track(CONFIG)
 SIZE, DT = CONFIG.path_size, CONFIG.control_dt
+INTERVAL = RandomizationConfig(command_interval=(0.5, 0.5))
 NOT_STEPS = [i for i in range(len(paths.NAMES)) if i != paths.STEPS]
 
 
@@ -27,12 +30,11 @@ def command(path: float = 0, speed: float = 0.3, course: float = 0.2, phase: flo
 def followed(start: dict, steps: int) -> jax.Array:
     """The point [steps, 3] of an episode that starts with drawn commands."""
 
-    def advance(carry, _):
-        now, offset = carry
-        now = TRACK.next_command((jnp.array(True), offset), now)
-        return (now, paths.offset(now, SIZE, now["phase"])), paths.point(now)
+    def advance(now, _):
+        now = TRACK.next_command(jnp.array(True), now)
+        return now, paths.point(now)
 
-    return jax.lax.scan(advance, (start, jnp.zeros(3)), None, steps)[1]
+    return jax.lax.scan(advance, TRACK.first_command(start), None, steps)[1]
 
 
 def from_middle(start: dict, seconds: float) -> np.ndarray:
@@ -125,6 +127,30 @@ def test_a_jump_of_the_point_has_no_velocity() -> None:
     )
 
 
+def test_every_sampled_path_has_its_middle_at_home() -> None:
+    """Also the tenth one of an episode."""
+    env = Env(CONFIG.model_copy(update={"randomization": INTERVAL}))
+
+    @jax.jit
+    @jax.vmap
+    def middles(key: jax.Array) -> jax.Array:
+        start = env.reset(key)
+        actuation, physics = start.pipeline_state.actuation, start.pipeline_state.physics
+
+        def pass_time(state, _):
+            state = env.finish_step(state, jnp.zeros(6), actuation, physics)
+            now = state.pipeline_state.command
+            return state, paths.point(now) - paths.offset(now, SIZE, now["phase"])
+
+        return jax.lax.scan(pass_time, start, None, 500)[1]
+
+    found = np.asarray(middles(jax.random.split(jax.random.key(0), 50)))
+    assert len(np.unique(np.round(found[0], 4), axis=0)) > 8
+    assert np.abs(found[..., :2] - CONFIG.home[:2]).max() < 0.0201
+    heights = found[..., 2] - CONFIG.home[2]
+    assert 0.3999 < heights.min() < heights.max() < 0.5001
+
+
 def truth_of(ball: jax.Array, velocity: jax.Array, paddle: jax.Array) -> task.Kinematics:
     zero = jnp.zeros(6)
     return task.Kinematics(zero, ball, jnp.zeros(4), zero, velocity, jnp.zeros(3), paddle)
@@ -141,7 +167,7 @@ def rewards_at(seconds: float, shift: float = 0.0, lift: float = 0.0) -> dict[st
     end = task.flight(ball, speed, CONFIG.home[2] + 0.0225).end
     truth = truth_of(ball, speed, end.at[2].set(CONFIG.home[2]))
     step = task.Step(truth, now, jnp.zeros(6), jnp.zeros(6))
-    return TRACK.step((jnp.array(True), offset), step).reward
+    return TRACK.step(jnp.array(True), step).reward
 
 
 @pytest.mark.parametrize("seconds", [0.2, -0.1])
@@ -160,7 +186,7 @@ def test_rewards_are_greatest_without_an_error(seconds: float) -> None:
 def apex_metrics(ball: tuple[float, float, float]) -> task.TaskStep:
     truth = truth_of(jnp.array(ball), jnp.array([0.3, 0.0, -0.01]), jnp.array(CONFIG.home))
     step = task.Step(truth, command(), jnp.zeros(6), jnp.zeros(6))
-    return TRACK.step((jnp.array(True), jnp.zeros(3)), step)
+    return TRACK.step(jnp.array(True), step)
 
 
 def test_an_apex_is_measured_against_the_point_now() -> None:

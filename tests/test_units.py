@@ -12,9 +12,8 @@ from bounce_mjx import task
 from bounce_mjx.config.validation import validate
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
-from bounce_mjx.runs.config import train_config
-from bounce_mjx.tasks.registry import find_task
-from bounce_mjx.training.first_block import fault_of
+from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.training.faults import first_block_fault
 from bounce_mjx.world.config import Command
 
 WRONG = """
@@ -43,6 +42,20 @@ robot: {site: s, paddle: {half_size: [50, 65, 3.5]}}     # mm
 robot: {site: s, paddle: {mass: 100}}                    # g
 robot: {site: s, ball: {radius: 19}}                     # mm
 robot: {limits: {velocity: [180], acceleration: [9]}}    # degrees a second
+robot: {limits: {torque: [0.001, 1, 1, 1, 1, 1]}}        # kN m
+ball_init_pos: [0.589, 0.589, 0.45]                      # beside the paddle
+max_joint_velocity: 60                                   # turns a minute
+reward: {controlled_upward: {max_ideal_velocity: 0.3}}   # below min_ideal_velocity
+randomization: {gravity_tilt: [-1, 1]}                   # degrees
+randomization: {joint_frictionloss: [0, 1000]}           # mN m
+randomization: {torque_limit: [0.001, 0.002]}            # kN m
+randomization: {link_mass: [1000, 1001]}                 # g, where a factor is due
+randomization: {ball_mass: [0.0027, 0.003]}              # kg, where a factor is due
+randomization: {armature: [0.001, 0.002]}                # kg m^2, where a factor is due
+randomization: {servo_gain: [1000, 1001]}                # N m/rad, where a factor is due
+randomization: {servo_damping: [0.001, 0.002]}           # where a factor is due
+randomization: {command_interval: [0.01, 0.02]}          # one control step
+action: {base: target, max_lead: 0.001}                  # less than an action moves
 action: {max_lead: 0.3}                                  # does nothing with the base measured
 randomization: {push_interval: [1, 2]}                   # does nothing without push_speed
 max_joint_velocity: true                                 # a switch is no number
@@ -52,8 +65,7 @@ target_height_range: [true, 2]                           # and in a list
 
 
 def config(name: str, **env):
-    kind = train_config(find_task(name))
-    return validate(kind, {"task": name, "env": env}, "my.yaml").env
+    return validate(TrainConfig, {"task": name, "env": env}, "my.yaml").env
 
 
 def names(values: dict, prefix: str = "") -> list[str]:
@@ -114,6 +126,8 @@ bounce: {robot: {site: s, ball: {radius: 0.12, mass: 0.62}}}
 bounce: {robot: {site: s, ball: {radius: 0.01, mass: 0.033}}}
 bounce: {robot: {site: s, ball: {radius: 0.15, mass: 0.02}}}
 bounce: {randomization: {ball_radius: [1.1, 6.3], ball_mass: [0.5, 230]}}
+# a soft paddle
+bounce: {randomization: {restitution: [0.5, 0.6]}}
 # a slow robot with a slow camera, and a fast one
 bounce: {randomization: {action_latency: [0.1, 0.3], camera_rate: [15, 30]}}
 bounce: {physics_dt: 0.0005, control_dt: 0.001}
@@ -144,7 +158,7 @@ class Mistyped(task.Task):
 
         @property
         def commands(self) -> dict[str, Command]:
-            return {"height": Command(0.4, 0.6, "m")}
+            return {"height": Command(0.4, 0.6, "m", hidden=True)}
 
     @property
     def curves(self) -> tuple[task.Curve, ...]:
@@ -189,6 +203,10 @@ def test_a_mistyped_name_in_a_task_is_one_sentence(wrong: str, reason: str, monk
 def test_a_task_has_its_own_config() -> None:
     with pytest.raises(UserError, match="the task Other has no Config of its own"):
         type("Other", (Mistyped,), {})
+    # Nor another task's, whose environments it would change.
+    with pytest.raises(UserError, match="the task Other has the Config of Mistyped, .* extends"):
+        type("Other", (Mistyped,), {"Config": Mistyped.Config})
+    assert type(Env(Mistyped.Config()).task) is Mistyped
 
 
 def first_block(ended=64.0, too_fast=0.0, non_finite=0.0, height=1.0, fault=0.0) -> dict:
@@ -200,7 +218,7 @@ def first_block(ended=64.0, too_fast=0.0, non_finite=0.0, height=1.0, fault=0.0)
     return {name: np.broadcast_to(value, (2, 4)) for name, value in named.items()}
 
 
-FIRST = train_config(find_task("bounce"))(ppo={"num_envs": 8, "rollout_length": 8})
+FIRST = TrainConfig(ppo={"num_envs": 8, "rollout_length": 8})
 LATE, NAN = np.array([0.0, 0.0, 3.0, 3.0]), np.array([1.0, 1.0, 1.0, np.nan])
 
 
@@ -226,10 +244,10 @@ LATE, NAN = np.array([0.0, 0.0, 3.0, 3.0]), np.array([1.0, 1.0, 1.0, np.nan])
     ],
 )
 def test_a_first_block_without_a_chance_is_refused(block: dict, reason: str | None) -> None:
-    found = fault_of(block, FIRST)
+    found = first_block_fault(block, FIRST)
     assert re.search(reason, found) if reason else found is None
 
 
 def test_a_short_time_limit_is_no_fault() -> None:
     short = FIRST.model_copy(update={"env": config("bounce", episode_seconds=0.05)})
-    assert fault_of(first_block(ended=16.0), short) is None
+    assert first_block_fault(first_block(ended=16.0), short) is None

@@ -55,7 +55,7 @@ def test_the_value_network_keeps_the_terms_of_both_worlds_and_is_blind_to_new_on
     world = tmp_path / "world.yaml"
     world.write_text(yaml.safe_dump(WORLD))
     args = ["--warm-start", str(first), "--world", str(world), "--config", "cpu"]
-    command = train_command.read_command(args).training
+    command = train_command.read_command(args).config
     assert command.ppo.critic_metrics == ("n_bounces", "world/*")
     env = Env(command.env)
     names = names_of_critic_metrics(command.ppo, env)
@@ -97,7 +97,7 @@ def test_a_training_starts_with_the_policy_of_the_run(first: Path, tmp_path: Pat
 
 def test_the_small_robust_policy_can_be_trained_further() -> None:
     args = "--warm-start robust_small --config finetune --world fast_servo".split()
-    command = train_command.read_command(args).training
+    command = train_command.read_command(args).config
     assert str(command.warm_start) == "robust_small"
     assert command.env.randomization.terms and command.env.randomization.share == 1.0
     params, _ = read_start(command, Env(command.env))
@@ -106,12 +106,16 @@ def test_the_small_robust_policy_can_be_trained_further() -> None:
     jax.tree.map(np.testing.assert_array_equal, params.policy, own.params)
 
 
-def test_the_latest_run_is_that_of_the_task_wherever_the_new_one_lies(
+def test_the_latest_run_is_that_beside_the_new_one_or_else_of_the_task(
     tmp_path: Path, monkeypatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     run = tmp_path / "runs/bounce_ball/2026-01-01_00-00-00"
     shutil.copytree(pretrained_checkpoint("robust_small").run, run)
-    command = train_command.read_command("--warm-start latest --log-dir new".split())
-    assert command.warm_start == best_checkpoint(run).folder
-    assert command.log_dir == Path("new")
+    config = train_command.read_command("--warm-start latest --log-dir new".split()).config
+    assert config.warm_start == best_checkpoint(run).folder
+    assert config.log_dir == Path("new")
+    # But where the new one's folder has runs, it is one of those, as with --resume.
+    other = shutil.copytree(run, tmp_path / "mine/2025-01-01_00-00-00")
+    config = train_command.read_command("--warm-start latest --log-dir mine".split()).config
+    assert config.warm_start == best_checkpoint(other).folder

@@ -83,6 +83,7 @@ class Client:
         self.texts: list[str] = []
         self.sliders: dict[str, tuple[float, float, float]] = {}
         self.lines: list[str] = []
+        self.height_axis: object = None
 
     def control(self, label: str) -> str:
         """The identifier of a control or of a key's command, by its label."""
@@ -110,6 +111,7 @@ class Client:
                 self.sliders[props["label"]] = props["min"], props["max"], props["step"]
             if message["type"] == "GuiUplotMessage":
                 self.lines += [line["label"] for line in props["series"]]
+                self.height_axis = props["scales"]["y"]["range"]
             updates = message.get("updates", {})
             self.texts += [part["content"] for part in (props, updates) if "content" in part]
             if "text" in updates:
@@ -207,9 +209,11 @@ class LeanConfig(WorldConfig):
 
     @property
     def commands(self) -> dict[str, task.Command]:
-        angle = task.Command(-0.2, 0.2, "rad", least=-0.3, greatest=0.3, step=0.1)
+        angle = task.Command(-0.2, 0.2, "rad", least=-0.3, greatest=0.3, step=0.1, hidden=True)
         pace = task.Command(2.0, 2.0, span=(1.0, 3.0), step=1.0)
-        gait = task.Command(0.0, 2.0, "", 0.0, 2.0, step=1.0, names=("walk", "slow run"))
+        gait = task.Command(
+            0.0, 2.0, "", 0.0, 2.0, step=1.0, names=("walk", "slow run"), hidden=True
+        )
         return {"lean_angle": angle, "pace": pace, "gait": gait}
 
 

@@ -2,13 +2,18 @@
 
 import contextlib
 import difflib
+import functools
 import io
 import os
+import select
 import shlex
 import sys
 from collections.abc import Iterable, Iterator
 
 from bounce_mjx.interrupt import leave
+
+# Time for a slow reader of an output that does not block.
+_PATIENCE_SECONDS = 1.0
 
 
 class UserError(Exception):
@@ -55,8 +60,8 @@ def install_command(*words: str) -> str:
 @contextlib.contextmanager
 def exit_on_user_error() -> Iterator[None]:
     """Reports a `UserError` as one sentence on stderr and exits with status 2; Ctrl-C exits with
-    status 130. Neither prints a traceback, and nor does an output that cannot encode a path, or
-    that cannot be written any more: see `_Output`."""
+    status 130. Neither prints a traceback, and nor does a device on which JAX does not start, an
+    output that cannot encode a path, or one that cannot be written any more: see `_Output`."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         # Not where a test or a notebook has put its own stream.
@@ -69,24 +74,63 @@ def exit_on_user_error() -> Iterator[None]:
             setattr(sys, name, lasting)
     try:
         yield
-    except UserError as error:
-        print(f"error: {shorten(reason_of(error), 3000)}", file=sys.stderr)
+    except (UserError, RuntimeError) as error:
+        refusal = _refused_device(error)
+        if refusal is None and not isinstance(error, UserError):
+            raise
+        print(f"error: {_printable(refusal or reason_of(error))}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         leave()
 
 
+def _refused_device(error: BaseException | None) -> str | None:
+    """Why JAX does not start, if an error or its cause says so; it may look like another one, such
+    as a checkpoint that cannot be read."""
+    while error is not None:
+        reason = str(error)
+        if isinstance(error, RuntimeError) and reason.startswith("Unable to initialize backend"):
+            platforms = os.environ.get("JAX_PLATFORMS", "")
+            return (
+                f"JAX does not start on JAX_PLATFORMS={platforms} ({shorten(reason, 300)}); unset "
+                "it, or name platforms of this machine, such as cpu"
+            )
+        error = error.__cause__
+    return None
+
+
+def _printable(text: str) -> str:
+    """A sentence without the codes that a terminal would obey, which a file's name may hold."""
+    letters = (x if x.isprintable() else x.encode("unicode_escape").decode() for x in text)
+    return shorten("".join(letters), 3000)
+
+
 class _Output(io.FileIO):
     """Standard output or error, which drops everything from the first bytes that cannot be written:
-    the disk is full, or the reader, such as head, or the terminal is gone."""
+    the disk is full, or the reader, such as head, or the terminal is gone. Of an output that does
+    not block, it drops what a slow reader leaves no room for."""
 
-    def write(self, data: memoryview) -> int | None:
+    _is_slow = False
+
+    def write(self, data: memoryview) -> int:
         try:
-            return super().write(data)
+            written = super().write(data)
+            if written is None and not self._is_slow:
+                select.select([], [self], [], _PATIENCE_SECONDS)
+                written = super().write(data)
         except OSError:
             # Also for the output of C++.
             os.dup2(os.open(os.devnull, os.O_WRONLY), self.fileno())
             return len(data)
+        # A training must not wait again and again for a reader that has stopped.
+        self._is_slow = written is None
+        return len(data) if written is None else written
+
+
+@functools.cache
+def warn_once(sentence: str) -> None:
+    """Prints a warning on stderr, unless this process has printed it before."""
+    print(f"warning: {sentence}", file=sys.stderr)
 
 
 def reason_of(error: Exception) -> str:

@@ -9,7 +9,7 @@ import threading
 import time
 import types
 from collections.abc import Callable
-from typing import NoReturn, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 Result = TypeVar("Result")
 
@@ -30,7 +30,19 @@ def end_on_ctrl_c() -> None:
     a KeyboardInterrupt into another exception."""
     # A shell script starts processes in the background with SIGINT ignored.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        _handle(signal.SIGINT, signal.SIG_DFL)
+
+
+def _handle(number: int, handler: Any) -> Any:
+    """Sets the handler of a signal, and returns the one before. The signal waits meanwhile: Python
+    would drop one that it has seen and whose handler is then the default action."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        return signal.signal(number, handler)
+    signal.pthread_sigmask(signal.SIG_BLOCK, [number])
+    try:
+        return signal.signal(number, handler)
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, [number])
 
 
 class StopRequest:
@@ -50,7 +62,7 @@ class StopRequest:
         # Only the main thread may install signal handlers.
         if threading.current_thread() is threading.main_thread():
             self._previous = {
-                number: signal.signal(number, self._handle)
+                number: _handle(number, self._request)
                 for number in _SIGNALS
                 if signal.getsignal(number) is not signal.SIG_IGN
             }
@@ -58,7 +70,7 @@ class StopRequest:
 
     def __exit__(self, *_) -> None:
         for number, handler in self._previous.items():
-            signal.signal(number, handler)
+            _handle(number, handler)
 
     def wait_for(self, future: concurrent.futures.Future) -> bool:
         """Waits until the future is done, and returns True; returns False as soon as a stop is
@@ -68,7 +80,7 @@ class StopRequest:
                 return True
         return False
 
-    def _handle(self, number: int, frame: types.FrameType | None) -> None:
+    def _request(self, number: int, frame: types.FrameType | None) -> None:
         if self._requested_at is None:
             self._requested_at = time.monotonic()
         # A terminal that goes away asks only once, but its shell and the kernel both say so.

@@ -8,6 +8,8 @@ printed, without the seconds that JAX takes to import. Such a module has
 import contextlib
 import importlib
 import io
+import sys
+import threading
 import types
 from typing import TYPE_CHECKING, Any
 
@@ -19,9 +21,27 @@ class _Lazy(types.ModuleType):
         return getattr(importlib.import_module(self.__name__), name)
 
 
+class _OthersOutput(io.TextIOBase):
+    """Standard output for all threads but the one that made it, whose lines are dropped."""
+
+    def __init__(self):
+        self._thread, self._stdout = threading.get_ident(), sys.stdout
+
+    def write(self, text: str) -> int:
+        """Writes a text of another thread."""
+        if threading.get_ident() == self._thread:
+            return len(text)
+        return self._stdout.write(text)
+
+
+_importing = threading.Lock()
+
+
 def import_mjx() -> types.ModuleType:
-    """MJX; it would print a line for each optional package that is missing."""
-    with contextlib.redirect_stdout(io.StringIO()):
+    """MJX; it would print a line for each optional package that is missing. What other threads
+    print meanwhile is printed."""
+    # Two threads that redirect the output at once may not restore it.
+    with _importing, contextlib.redirect_stdout(_OthersOutput()):
         return importlib.import_module("mujoco.mjx")
 
 

@@ -1,6 +1,7 @@
 """Stable-Baselines3's `VecEnv` over a whole batch; SBX uses it too. It needs the extra `sb3`."""
 
-from typing import Any, NoReturn
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,8 @@ with needed("Stable-Baselines3", "bounce_mjx[sb3]"):
     from stable_baselines3.common.monitor import Monitor
     from stable_baselines3.common.vec_env import VecEnv
 
-from bounce_mjx.adapters.gymnasium.environments import TaskVectorEnv
+from bounce_mjx.adapters.gymnasium.batch import Batch
+from bounce_mjx.adapters.gymnasium.environments import TaskEnv, TaskVectorEnv
 
 _SHOWN = 4
 
@@ -41,21 +43,26 @@ class Sb3VecEnv(VecEnv):
         self._actions: np.ndarray | None = None
         self.render_mode = self._envs.render_mode
         self.spec: gymnasium.envs.registration.EnvSpec | None = None
-        self.task, self.dt, self.mj_model = self._envs.task, self._envs.dt, self._envs.mj_model
         super().__init__(
-            num_envs, self._envs.single_observation_space, self._envs.single_action_space
+            self._envs.num_envs,
+            self._envs.single_observation_space,
+            self._envs.single_action_space,
         )
         self.metadata["render_fps"] = self._envs.metadata["render_fps"]
+
+    @property
+    def _batch(self) -> Batch:
+        return self._envs._batch
+
+    task = TaskEnv.task
+    mj_model = TaskEnv.mj_model
+    dt = TaskEnv.dt
+    episode_steps = TaskEnv.episode_steps
 
     def reset(self) -> np.ndarray:
         """Starts a new episode in every environment: observations [B, N], float32. It uses the
         seeds of `seed` and the options of `set_options` once."""
-        given = [self._envs.checked_commands(options) for options in self._options]
-        commands = {
-            name: np.array([one.get(name, np.nan) for one in given])
-            for name in self._envs.config.commands
-        }
-        observation = self._envs.restart(self._seeds, np.ones(self.num_envs, bool), commands)
+        observation = self._restart(range(self.num_envs), self._seeds, self._options)
         self._reset_seeds()
         self._reset_options()
         return observation
@@ -82,7 +89,7 @@ class Sb3VecEnv(VecEnv):
 
     def get_images(self) -> list[np.ndarray | None]:
         """Pictures of the first four environments, each [height, width, 3], uint8."""
-        return [self._envs.draw(i) for i in range(min(self.num_envs, _SHOWN))]
+        return self._drawn(range(min(self.num_envs, _SHOWN)))
 
     def close(self) -> None:
         """Frees the renderer."""
@@ -92,24 +99,75 @@ class Sb3VecEnv(VecEnv):
         """A common attribute of the environments, once for each index."""
         return [getattr(self, attr_name)] * len(self._get_indices(indices))
 
-    def set_attr(self, *_: Any, **__: Any) -> NoReturn:
-        """Refuses, as does `env_method`: the environments are one program.
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Sets an attribute of all environments, to be read by `get_attr`.
 
         Raises:
-          UserError: always.
+          UserError: `indices` leaves some out, although the environments share their attributes, or
+            the attribute is one of the environments' own, which follow from their settings.
         """
-        raise UserError(
-            "environments of a batch have no attributes to set and no methods; give settings "
-            "to Sb3VecEnv, and the commands of the next reset to set_options"
-        )
+        if len(self._get_indices(indices)) != self.num_envs:
+            raise UserError(
+                f"set_attr of {attr_name} would change only some of the {self.num_envs} "
+                "environments, which share their attributes; omit indices"
+            )
+        if hasattr(type(self), attr_name):
+            raise UserError(
+                f"set_attr got {attr_name!r}, which is fixed by the settings; give these to "
+                "Sb3VecEnv, and the commands of the next reset to set_options"
+            )
+        setattr(self, attr_name, value)
 
-    env_method = set_attr
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Calls a method of single environments: `reset`, `render` or `get_wrapper_attr`.
+
+        Returns:
+          The results of the environments with these indices.
+
+        Raises:
+          UserError: there is no such method.
+        """
+        methods: dict[str, Callable[..., list[Any]]] = {
+            "reset": self._reset_some,
+            "render": self._drawn,
+            "get_wrapper_attr": lambda chosen, name: self.get_attr(name, chosen),
+        }
+        if method_name not in methods:
+            raise UserError(
+                f"env_method got {method_name!r}; the environments have the methods "
+                f"{', '.join(methods)}"
+            )
+        chosen = list(self._get_indices(indices))
+        return methods[method_name](chosen, *method_args, **method_kwargs)
 
     def env_is_wrapped(
         self, wrapper_class: type[gymnasium.Wrapper], indices: Any = None
     ) -> list[bool]:
         """True for `Monitor`, whose statistics the infos have."""
         return [issubclass(wrapper_class, Monitor)] * len(self._get_indices(indices))
+
+    def _reset_some(
+        self, chosen: list[int], seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> list[tuple[np.ndarray, dict[str, Any]]]:
+        seeds = [seed if i in chosen else None for i in range(self.num_envs)]
+        observation = self._restart(chosen, seeds, [options or {}] * self.num_envs)
+        return [(observation[i], {}) for i in chosen]
+
+    def _restart(
+        self, chosen: Iterable[int], seeds: Sequence[int | None], options: Sequence[dict[str, Any]]
+    ) -> np.ndarray:
+        mask = np.isin(np.arange(self.num_envs), list(chosen))
+        given = [self._batch.checked_commands(one) for one in options]
+        commands = {
+            name: np.array([one.get(name, np.nan) for one in given])
+            for name in self._batch.config.commands
+        }
+        return self._envs.restart(seeds, mask, commands)
+
+    def _drawn(self, chosen: Iterable[int]) -> list[np.ndarray | None]:
+        return [self._envs.draw(i) for i in chosen]
 
 
 def _row(info: dict[str, Any], index: int) -> dict[str, Any]:

@@ -1,9 +1,10 @@
 """Writes the config of an unknown arm: `bounce-mjx adopt my_arm.xml`."""
 
+import math
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import yaml
 
@@ -11,9 +12,12 @@ from bounce_mjx.config.command_line import Flag, parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.robot.config import PaddleConfig, RobotConfig
-from bounce_mjx.runs.config import train_config
+from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.tasks.registry import DEFAULT, find_task
 from bounce_mjx.world.config import WorldConfig
+
+if TYPE_CHECKING:
+    from bounce_mjx.robot.adopt import Adoption
 
 
 class AdoptCommand(StrictModel):
@@ -58,15 +62,15 @@ def main(args: Sequence[str]) -> None:
         **task.Config.settings_at((x, y, z)),
     }
     values = ({} if command.task == DEFAULT else {"task": command.task}) | {"env": values}
-    config = validate(train_config(task), values, str(command.mjcf))
+    config = validate(TrainConfig, values, str(command.mjcf))
     env = Env(config.env)
-    print(f"paddle: level at x {x:.3f}, y {y:.3f}, z {z:.3f} m; the reach is {pose.reach:.2f} m")
-    kind = "kept" if adoption.config.servo_stiffness is None else "made from the reflected inertia"
-    print(f"servos: {kind}; action scale {adoption.action_scale:g} rad")
-    print("changes to the model:", *adoption.arm.changes, sep="\n  ")
+    for line in describe(adoption):
+        print(line)
     print(f"physics: {env.engine.name} ({env.engine.reason})")
     out = command.out or Path(f"{command.mjcf.stem}.yaml")
     head = f"An arm with a paddle: bounce-mjx adopt {command.mjcf} --site {adoption.config.site}"
+    # A path may have a line break, which would end the comment.
+    head = " ".join(head.splitlines())
     text = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)
     write_output(out, f"# {head}\n{text}")
     print(f"config: {out}")
@@ -74,3 +78,30 @@ def main(args: Sequence[str]) -> None:
     flags = shlex.join([*named, "--robot", str(out)])
     print(f"see it: bounce-mjx view {flags} --actions zero")
     print(f"train it: bounce-mjx train {flags}")
+
+
+def describe(adoption: "Adoption") -> list[str]:
+    """Lines about an adopted arm: its pose, its servos, and the changes to the user's model."""
+    pose = adoption.pose
+    x, y, z = (round(coordinate, 6) + 0.0 for coordinate in pose.paddle.tolist())
+    strength = f"{pose.acceleration:.0f} m/s^2 upward in addition to holding the arm"
+    if math.isinf(pose.acceleration):
+        strength = "no force limit"
+    kind = "kept" if adoption.config.servo_stiffness is None else "made from the reflected inertia"
+    lines = [
+        f"paddle: level at x {x:.3f}, y {y:.3f}, z {z:.3f} m; the reach is {pose.reach:.2f} m",
+        f"manipulability: {pose.manipulability:.3f} (smallest singular value, 0.25 m per radian)",
+        f"strength: {strength}",
+        f"servos: {kind}; action scale {adoption.action_scale:g} rad",
+    ]
+    for name, angle, inertia, servo in zip(
+        adoption.arm.joint_names, pose.angles, pose.inertia, adoption.servos, strict=True
+    ):
+        limit = "no force limit"
+        if servo.force_limit is not None:
+            limit = f"force limit {servo.force_limit:.4g}"
+        lines.append(
+            f"  {name}: {angle:+.3f} rad, inertia {inertia:.3g}, kp {servo.stiffness:.4g}, "
+            f"kv {servo.damping:.4g}, {limit}"
+        )
+    return [*lines, "changes to the model:", *(f"  {change}" for change in adoption.arm.changes)]

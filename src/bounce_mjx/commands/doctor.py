@@ -1,5 +1,6 @@
 """Prints what a report of a problem needs: `bounce-mjx doctor`."""
 
+import argparse
 import importlib.metadata
 import os
 import platform
@@ -9,23 +10,24 @@ from importlib import import_module
 from pathlib import Path
 
 import bounce_mjx
-from bounce_mjx.config.command_line import parse
-from bounce_mjx.config.settings import StrictModel
-from bounce_mjx.errors import install_command, reason_of
+from bounce_mjx.errors import UserError, install_command, reason_of
 
 _DISTRIBUTION = "bounce_mjx"
 # Versions on which the results of simulation and training depend.
-_PACKAGES = "jax jaxlib mujoco mujoco-mjx numpy flax optax tensorstore".split()
+_PACKAGES = "jax jaxlib mujoco mujoco-mjx numpy flax optax tensorstore onnxruntime".split()
 _VARIABLES = ("JAX_", "XLA_", "MUJOCO_GL", "CUDA_VISIBLE_DEVICES")
 
 
-class DoctorCommand(StrictModel):
-    """Prints versions, devices, the cache, and what each extra lacks, to paste into an issue."""
+_ABOUT = "Prints versions, devices, the cache, and what each extra lacks, to paste into an issue."
 
 
 def main(args: Sequence[str]) -> None:
-    """Runs the command line."""
-    parse(DoctorCommand, args, prog="bounce-mjx doctor")
+    """Runs the command line, also where any package is missing, as on a robot: even pydantic, with
+    which the other commands read theirs."""
+    parser = argparse.ArgumentParser("bounce-mjx doctor", description=_ABOUT)
+    _, unknown = parser.parse_known_args(args)
+    if unknown:
+        raise UserError(f"unknown argument {unknown[0]} (see {parser.prog} --help)")
     print("```")
     for name, text in describe():
         print(f"{name}: {text}", flush=True)
@@ -46,7 +48,13 @@ def describe() -> Iterator[tuple[str, str]]:
     viewers = "bounce_mjx.viewers"
     yield "pictures", _try(lambda: import_module(f"{viewers}.offscreen").choose_backend())
     yield "videos", _try(lambda: import_module(f"{viewers}.video").find_ffmpeg())
-    for extra, packages in sorted(extras().items()):
+    try:
+        needed = sorted(extras().items())
+    except ImportError as error:
+        # Without packaging, which reads what an extra needs.
+        yield "extras", f"unknown ({reason_of(error)})"
+        return
+    for extra, packages in needed:
         missing = [package for package in packages if version_of(package) is None]
         command = install_command(f"{_DISTRIBUTION}[{extra}]")
         state = f"lacks {', '.join(missing)} ({command})" if missing else "installed"

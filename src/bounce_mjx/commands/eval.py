@@ -65,9 +65,11 @@ def main(args: Sequence[str]) -> None:
     checks += [("limits", limit_shares, describe_limits)] * command.limits
     recorded = RECORDED_EPISODES if checks else 0
     with console.status("evaluating"):
-        report, engine = evaluate_policy(policy, config.env, actor, options, recorded)
+        report, engine, warning = evaluate_policy(policy, config.env, actor, options, recorded)
     length = f"{command.episodes:,} episodes of {config.env.episode_seconds:g} s"
     print(f"physics: {engine}  {length}")
+    if warning is not None:
+        print(f"warning: {warning}")
     console.print(results_table(report, "the results"))
     print(details_line(report))
     found = {}

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import Finite, Positive, StrictModel
-from bounce_mjx.runs.config import read_preset
+from bounce_mjx.runs.settings import read_preset
 
 
 class ExciteCommand(StrictModel):

@@ -10,7 +10,7 @@ from bounce_mjx.config.settings import NonNegative, StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
 from bounce_mjx.identify import Topics
-from bounce_mjx.runs.config import read_preset
+from bounce_mjx.runs.settings import read_preset
 
 
 class IdentifyCommand(StrictModel):
@@ -23,6 +23,11 @@ class IdentifyCommand(StrictModel):
     configs/robots/ (ur5e, panda or iiwa); the project's own arm by default."""
     out: Path = Path("world.yaml")
     """YAML file for the world; the page about it has the same name with .html."""
+    inspect: bool = False
+    """Look at the logs alone: name their faults and draw them on the page, without a fit."""
+    force: bool = False
+    """Fit logs with faults, and write a world that does not explain them, with that sentence in
+    it."""
     check: Path | None = None
     """World that was identified earlier; compare the logs with it, and write nothing."""
     camera_rotation: NonNegative = 0.0
@@ -35,14 +40,23 @@ class IdentifyCommand(StrictModel):
 
 
 def main(args: Sequence[str]) -> None:
-    """Runs the command line; exits with 1 if --check finds another robot, 2 on a mistake."""
+    """Runs the command line; exits with 1 if --check finds another robot, 2 on a mistake, a faulty
+    log, or a world that does not explain it."""
     command = parse(IdentifyCommand, args, prog="bounce-mjx identify")
     if not command.logs:
         raise UserError("no log is given; name the CSV files or bags to identify from")
+    from bounce_mjx.identify.doctor import describe, examine
     from bounce_mjx.identify.reading import read_log
     from bounce_mjx.identify.stages import identify, join
-    from bounce_mjx.identify.world import compare, estimates, sentences, to_yaml
-    from bounce_mjx.reports.identification import identification_page
+    from bounce_mjx.identify.world import (
+        compare,
+        describe_doubts,
+        estimates,
+        sentences,
+        to_yaml,
+        total_delay,
+    )
+    from bounce_mjx.reports.identification import identification_page, inspection_page
     from bounce_mjx.robot.model import joint_names, load_model
     from bounce_mjx.runs.files import check_output, write_output
     from bounce_mjx.training.setup import set_up_jax
@@ -63,8 +77,23 @@ def main(args: Sequence[str]) -> None:
     log = join(logs)
     for warning in log.notes:
         print(f"warning: {warning}")
+    checkups = examine(logs, names)
+    for line in describe(logs, checkups):
+        print(line)
+    faults = [fault for checkup in checkups for fault in checkup.faults]
+    if known is None:
+        write_output(page, inspection_page(logs, checkups))
+    if command.inspect:
+        print(str(page))
+        sys.exit(2 if faults else 0)
+    if faults and not command.force:
+        raise UserError(
+            f"the logs have {len(faults)} faults, which a fit would blame on the robot; mend them, "
+            f"or fit them all the same with --force{'' if known else f' ({page} draws them)'}"
+        )
     set_up_jax(config)
     found = identify(config, log, command.camera_rotation, lambda line: print(f"  {line}"))
+    print(total_delay(found, model))
     for entry in estimates(found, names):
         seen = "" if entry.seen else "  (not shown by the log)"
         interval = f"{entry.low:.5g} to {entry.high:.5g} {entry.unit}".rstrip()
@@ -76,10 +105,14 @@ def main(args: Sequence[str]) -> None:
         for line in changed or [f"the robot still matches {command.check}"]:
             print(line)
         sys.exit(1 if changed else 0)
-    files = {
-        command.out: to_yaml(found, log, names, command.robot and str(command.robot)),
-        page: identification_page(found, log.source, names, command.out),
-    }
-    for path, content in files.items():
-        write_output(path, content)
-        print(str(path))
+    doubts = [*map(str, faults), *describe_doubts(found, names)]
+    write_output(page, identification_page(found, logs, checkups, names, command.out, doubts))
+    print(str(page))
+    if doubts and not command.force:
+        raise UserError(
+            f"{command.out} is not written, because no world explains the log: {doubts[0]} "
+            "Read the page, or write the world all the same with --force"
+        )
+    robot = command.robot and str(command.robot)
+    write_output(command.out, to_yaml(found, log, names, robot, doubts))
+    print(str(command.out))

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 
 import bounce_mjx
-from bounce_mjx.errors import UserError, exit_on_user_error, suggest
+from bounce_mjx.errors import UserError, exit_on_user_error, needed, suggest
 from bounce_mjx.interrupt import end_on_ctrl_c
 
 COMMANDS = {
@@ -64,4 +64,6 @@ def main(args: Sequence[str] | None = None) -> None:
             os.environ["MUJOCO_GL"] = "disabled"
             importlib.import_module("mujoco")
             os.environ["MUJOCO_GL"] = opengl
-        importlib.import_module(f"bounce_mjx.commands.{name}").main(rest)
+        with needed(f"bounce-mjx {name}", "bounce_mjx"):
+            command = importlib.import_module(f"bounce_mjx.commands.{name}")
+        command.main(rest)

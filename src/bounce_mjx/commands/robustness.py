@@ -12,7 +12,8 @@ from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import config as evaluation
 from bounce_mjx.resources import POLICIES, resource_path
-from bounce_mjx.runs import config as run_configs
+from bounce_mjx.runs.presets import named_file
+from bounce_mjx.runs.worlds import in_world
 
 
 class RobustnessCommand(OneActorCommand):
@@ -42,6 +43,7 @@ def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 0 if all conditions meet all judged results, 1 if one does
     not, 2 on a mistake."""
     command = parse(RobustnessCommand, args, prog="bounce-mjx robustness")
+    from bounce_mjx.env.env import model_nominals
     from bounce_mjx.evaluation.robustness import RobustnessReport, measure_conditions
     from bounce_mjx.evaluation.suite import load_suite, read_suite
     from bounce_mjx.reports import robustness
@@ -56,11 +58,12 @@ def main(args: Sequence[str]) -> None:
     console = stdout()
     checkpoint = command.choose(command.checkpoint)
     config = command.config_of(checkpoint)
-    path = run_configs.named_file(command.suite, "configs")
+    path = named_file(command.suite, "configs")
     suite, version, world, assumed = str(path), read_suite(path).version, None, {}
     if command.world is not None:
-        there, named = run_configs.in_world(config, command.world)
-        world, assumed = there.env, named.double_assumed()
+        there, named = in_world(config, command.world)
+        world = there.env
+        assumed = named.double_assumed(model_nominals(there.env))
     conditions = load_suite(path, config.env, world, assumed)
     if command.assumed:
         # The suite's own conditions follow.

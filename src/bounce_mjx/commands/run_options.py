@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import pydantic
 from pydantic import Field
 
-from bounce_mjx.config.command_line import Flag, flag_of, parse
-from bounce_mjx.config.settings import StrictModel
-from bounce_mjx.errors import UserError
+from bounce_mjx.config.command_line import Flag, flag_names, parse
+from bounce_mjx.config.settings import StrictModel, fields_in
+from bounce_mjx.errors import UserError, suggest
 from bounce_mjx.runs import config as run_configs
 from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.runs.worlds import in_world
 from bounce_mjx.tasks.registry import DEFAULT, find_task, registered_tasks
-from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.config import Command, WorldConfig
 
 if TYPE_CHECKING:
     from bounce_mjx.runs.folders import Checkpoint
@@ -63,6 +65,8 @@ class ActorCommand(RunCommand):
 
         if str(path) == MIRROR and not os.path.isdir(path):
             return MIRROR_LAW
+        if path is not None and not os.path.isdir(path) and (near := suggest(str(path), [MIRROR])):
+            raise UserError(f"there is no checkpoint folder and no policy {path}; {near}")
         if self.robot is not None:
             raise UserError("--robot is for the mirror law; omit it, or give mirror as checkpoint")
         return choose_checkpoint(path, self.folder)
@@ -78,7 +82,7 @@ class ActorCommand(RunCommand):
 
         if checkpoint is not MIRROR_LAW:
             return self.config(checkpoint.run)
-        config = run_configs.read_preset(Path("default"), self.robot, self.task)
+        config = read_preset(Path("default"), self.robot, self.task)
         return config.model_copy(update={"env": observing(config.env)})
 
 
@@ -106,7 +110,7 @@ class WorldCommand(ActorCommand):
           UserError: as `ActorCommand.config_of` and `in_world`.
         """
         config = super().config_of(checkpoint)
-        return config if self.world is None else run_configs.in_world(config, self.world)[0]
+        return config if self.world is None else in_world(config, self.world)[0]
 
 
 def parse_with_commands(
@@ -123,25 +127,35 @@ def parse_with_commands(
     Raises:
       UserError: a flag has a bad value, or no task has it.
     """
-    task, fields = parse(RunCommand, args, prog=prog, is_first=True).task, {}
+    task = parse(RunCommand, args, prog=prog, is_first=True).task
+    commands: dict[str, Command] = {}
     # Without --task, the run may be of any task.
     for name in [task] if task else registered_tasks():
-        for key, command in find_task(name).Config().commands.items():
-            kind = (str if command.names else float) | None
-            flag = Flag(metavar="|".join(command.names) or command.unit.upper() or None)
-            about = Field(None, description="Command of the task, if the run's has it.")
-            if key not in command_class.model_fields:
-                fields[key] = Annotated[kind, flag], about
+        commands |= find_task(name).Config().commands
+    # A command may have a name that pydantic takes for its own, such as copy.
+    keys = {f"command_{i}": name for i, name in enumerate(commands)}
+    fields = {}
+    for key, name in keys.items():
+        names, unit = commands[name].names, commands[name].unit
+        kind = (str if names else float) | None
+        flag = Flag(name=name, metavar="|".join(names) or unit.upper() or None)
+        about = Field(None, description="Command of the task, if the run's has it.")
+        fields[key] = Annotated[kind, flag], about
+    group = pydantic.create_model("Commands", __base__=StrictModel, **fields)
     own_class = pydantic.create_model(
-        command_class.__name__, __base__=command_class, __doc__=command_class.__doc__, **fields
+        command_class.__name__,
+        __base__=command_class,
+        __doc__=command_class.__doc__,
+        commands=(group, group()),
     )
     command = parse(own_class, args, prog=prog)
-    given = {name: getattr(command, name) for name in fields}
-    given = {name: value for name, value in given.items() if value is not None}
+    given = {keys[key]: x for key, x in command.commands if x is not None}
+    of_all = flag_names(fields_in(own_class))
+    flags = {name: of_all[f"commands.{key}"] for key, name in keys.items()}
 
     def values(env: WorldConfig) -> dict[str, float]:
         for name in given.keys() - env.commands.keys():
-            raise UserError(f"{flag_of(name)} is not a command of the run's task; omit it")
-        return {name: env.commands[name].checked(x, flag_of(name)) for name, x in given.items()}
+            raise UserError(f"{flags[name]} is not a command of the run's task; omit it")
+        return {name: env.commands[name].checked(x, flags[name]) for name, x in given.items()}
 
     return command, values

@@ -4,15 +4,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-import pydantic
-
 from bounce_mjx.commands.run_options import ActorCommand
-from bounce_mjx.config.command_line import parse, stdout
-from bounce_mjx.config.settings import StrictModel
-from bounce_mjx.runs.config import read_preset, train_config
+from bounce_mjx.config.command_line import flag_names, parse, read_flags, stdout, typed
+from bounce_mjx.config.files import flat
+from bounce_mjx.config.settings import StrictModel, fields_in
+from bounce_mjx.runs.settings import Choice, stack
 from bounce_mjx.tasks.registry import DEFAULT
 from bounce_mjx.viewers.options import ViewerOptions
-from bounce_mjx.world.config import WorldConfig
+
+PROG = "bounce-mjx view"
 
 
 class ViewCommand(StrictModel):
@@ -27,16 +27,23 @@ class ViewCommand(StrictModel):
     """Config of a robot: the file that bounce-mjx adopt wrote, or the name of one in
     configs/robots/ (ur5e, panda or iiwa)."""
     viewing: ViewerOptions = ViewerOptions()
-    env: pydantic.SerializeAsAny[WorldConfig]
 
 
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 2 on a mistake."""
-    # The task and the robot decide the other flags.
-    first = parse(ActorCommand, args, prog="bounce-mjx view", is_first=True)
-    env = read_preset(Path("default"), first.robot, first.task).env
-    own_class = train_config(env.task, ViewCommand)
-    command = parse(own_class, args, prog="bounce-mjx view", default=own_class(env=env))
+    # The task and the robot decide the other flags, which are those of the environment.
+    first = parse(ActorCommand, args, prog=PROG, is_first=True)
+    preset = Choice(config=(Path("default"),), robot=first.robot, task=first.task)
+    layers = stack(preset)
+    of_env = {key: field for key, field in layers.fields.items() if key.startswith("env.")}
+    fields = fields_in(ViewCommand) | of_env
+    names = flag_names(fields)
+    defaults = flat(ViewCommand().model_dump()) | flat(layers.config().model_dump())
+    about = ViewCommand.__doc__ or ""
+    given = read_flags(fields, args, prog=PROG, description=about, defaults=defaults)
+    command = typed(ViewCommand, given, names, PROG)
+    said = {key: value for key, value in given.items() if key in of_env}
+    env = layers.config(said, names, PROG).env
     from bounce_mjx.baselines.mirror import MirrorLaw, observing
     from bounce_mjx.training.setup import set_up_jax
     from bounce_mjx.viewers import simulation
@@ -47,7 +54,7 @@ def main(args: Sequence[str]) -> None:
         "zero": simulation.make_zero_controller,
         "mirror": lambda env: simulation.make_policy_controller(MirrorLaw(env)),
     }
-    env = observing(command.env) if command.actions == "mirror" else command.env
+    env = observing(env) if command.actions == "mirror" else env
     set_up_jax(env)
     shown = Shown(env, make_controller[command.actions], f"{command.actions} actions")
     show([shown], command.viewing, commands={}, console=stdout())

@@ -3,7 +3,7 @@
 import argparse
 import re
 import types
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, NoReturn, TypeVar
 
@@ -57,8 +57,6 @@ def parse(
     prog: str,
     description: str | None = None,
     default: CommandT | None = None,
-    shown: Sequence[str] | None = None,
-    epilog: str | None = None,
     is_first: bool = False,
 ) -> CommandT:
     """Reads a command line into a config.
@@ -66,40 +64,89 @@ def parse(
     Args:
       description: what the command does; by default, the type's docstring.
       default: values for the flags that are not given; by default, the type's own default values.
-      shown: dotted keys of the flags that --help lists; by default, all.
-      epilog: the end of the help.
       is_first: reads the flags that must be known before the others, which it leaves alone.
 
     Raises:
       UserError: a flag is unknown or has a bad value.
     """
-    values = (default or command_class.model_construct()).model_dump()
+    values = {} if default is None else flat(default.model_dump())
     fields = fields_in(command_class)
-    parser = _Parser(
+    given = read_flags(
+        fields,
+        args,
         prog=prog,
         # Python's option -OO leaves out docstrings.
         description=description or command_class.__doc__ or "",
+        defaults=values or flat(command_class.model_construct().model_dump()),
+        is_first=is_first,
+    )
+    return typed(command_class, values | given, flag_names(fields), prog)
+
+
+def typed(
+    command_class: type[CommandT], given: Mapping[str, Any], flags: Mapping[str, str], prog: str
+) -> CommandT:
+    """A command line from the given values.
+
+    Args:
+      given: by the dotted keys of the settings; those of other settings are left out.
+      flags: the flag of each setting by its dotted key, for errors.
+
+    Raises:
+      UserError: a value is out of range.
+    """
+    values: dict[str, Any] = {}
+    for key in given.keys() & fields_in(command_class).keys():
+        values = merged(values, nested(key, given[key]))
+    try:
+        return command_class.model_validate(values)
+    except pydantic.ValidationError as error:
+        text = describe(error, fields_in(command_class), flags)
+        raise UserError(f"{text} (see {prog} --help)") from error
+
+
+def read_flags(
+    fields: Mapping[str, FieldInfo],
+    args: Sequence[str],
+    *,
+    prog: str,
+    description: str,
+    defaults: Mapping[str, Any],
+    shown: Sequence[str] | None = None,
+    epilog: str | None = None,
+    is_first: bool = False,
+) -> dict[str, Any]:
+    """The given values of a command line by the dotted keys of their settings, not yet validated.
+
+    Args:
+      fields: the settings by dotted key.
+      defaults: values for the help, by dotted key.
+      shown: dotted keys of the flags that --help lists; by default, all.
+      epilog: the end of the help.
+      is_first: reads the flags that must be known before the others, which it leaves alone.
+
+    Raises:
+      UserError: a flag is unknown or lacks its value.
+    """
+    parser = _Parser(
+        prog=prog,
+        description=description,
         epilog=epilog,
         allow_abbrev=False,
         add_help=not is_first,
         argument_default=argparse.SUPPRESS,
         formatter_class=lambda prog: argparse.HelpFormatter(prog, max_help_position=26, width=100),
     )
-    _add_arguments(parser, fields, flat(values), shown)
+    _add_arguments(parser, fields, defaults, shown)
     words = [re.sub(r"^--[^=]+", lambda flag: flag[0].replace("_", "-"), word) for word in args]
     words = [re.sub(r"^--(.+)=false$", r"--no-\1", word, flags=re.I) for word in words]
     words = [re.sub(r"^(--.+)=true$", r"\1", word, flags=re.I) for word in words]
     given, unknown = parser.parse_known_intermixed_args(words)
     if unknown and not is_first:
         flag = unknown[0].partition("=")[0]
-        advice = "; ".join(filter(None, [unknown[0], suggest(flag, flags_of(command_class))]))
+        advice = "; ".join(filter(None, [unknown[0], suggest(flag, flags_of(fields))]))
         parser.error(f"unknown argument {advice}")
-    for key, value in vars(given).items():
-        values = merged(values, nested(key, _plain(fields[key].annotation, value)))
-    try:
-        return command_class.model_validate(values)
-    except pydantic.ValidationError as error:
-        parser.error(describe(error, fields, {key: _flag(key, x) for key, x in fields.items()}))
+    return {key: _plain(fields[key].annotation, value) for key, value in vars(given).items()}
 
 
 class _Parser(argparse.ArgumentParser):
@@ -111,19 +158,35 @@ def _mark(field: FieldInfo) -> Flag:
     return next((mark for mark in field.metadata if isinstance(mark, Flag)), Flag())
 
 
-def _flag(key: str, field: FieldInfo) -> str:
-    """The flag of a setting: --reset.joint-angles of env.reset.joint_angles."""
-    return flag_of(_mark(field).name or re.sub(r"^(env|ppo|viewing)\.", "", key))
+def flag_names(fields: Mapping[str, FieldInfo]) -> dict[str, str]:
+    """The flag of each setting by its dotted key: --reset.joint-angles of env.reset.joint_angles.
+    Where another setting has that flag, it has the whole key, such as --env.seed, because a task's
+    author may give a setting or a command any name."""
+    flags, taken = {}, {"--help", "--help-all"}
+    # A setting that stands in no group keeps its flag.
+    for key in sorted(fields, key=lambda key: "." in key):
+        group, _, name = key.rpartition(".")
+        whole = f"{group}." if group else ""
+        whole = flag_of(whole + (_mark(fields[key]).name or name))
+        short = re.sub(r"^--(env|ppo|viewing|commands)\.", "--", whole)
+        flag = whole if short in taken else short
+        taken |= {flag, _negated(flag)} if fields[key].annotation is bool else {flag}
+        flags[key] = flag
+    return flags
+
+
+def _negated(flag: str) -> str:
+    return flag.replace("--", "--no-", 1)
 
 
 def _add_arguments(
     parser: argparse.ArgumentParser,
-    fields: dict[str, FieldInfo],
-    defaults: dict[str, Any],
+    fields: Mapping[str, FieldInfo],
+    defaults: Mapping[str, Any],
     shown: Sequence[str] | None,
 ) -> None:
     """Adds the arguments, in groups; `defaults` are by dotted name."""
-    parser.usage, groups = f"{parser.prog} [FLAGS]", {}
+    parser.usage, groups, flags = f"{parser.prog} [FLAGS]", {}, flag_names(fields)
     for key, field in fields.items():
         mark = _mark(field)
         text = " ".join((field.description or "").split()).replace("%", "%%")
@@ -148,7 +211,7 @@ def _add_arguments(
             parser.usage += f" {own['metavar']}"
             group.add_argument(key, **own)
         else:
-            group.add_argument(_flag(key, field), dest=key, **own)
+            group.add_argument(flags[key], dest=key, **own)
 
 
 def _is_list(kind: Any) -> bool:
@@ -180,14 +243,12 @@ def _form(kind: Any) -> str:
     return " ".join(k.__name__.upper() for k in kinds if isinstance(k, type) and k not in hidden)
 
 
-def flags_of(command_class: type[pydantic.BaseModel]) -> list[str]:
-    """The flags of a command."""
+def flags_of(fields: Mapping[str, FieldInfo]) -> list[str]:
+    """The flags of settings."""
     flags = []
-    for key, field in fields_in(command_class).items():
-        if not _mark(field).is_positional:
-            flags.append(_flag(key, field))
-            if field.annotation is bool:
-                flags.append(flags[-1].replace("--", "--no-", 1))
+    for key, flag in flag_names(fields).items():
+        if not _mark(fields[key]).is_positional:
+            flags += [flag, _negated(flag)] if fields[key].annotation is bool else [flag]
     return flags
 
 

@@ -1,5 +1,7 @@
 """Settings as YAML."""
 
+import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -8,9 +10,29 @@ import yaml
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError, shorten
 
+# A config has at most a thousand values.
+_MAX_VALUES = 20_000
+
 
 class _Loader(yaml.SafeLoader):
-    """Refuses YAML in which a key appears twice, of which the last would count."""
+    """Refuses YAML in which a key appears twice, of which the last would count, and YAML that has
+    very many values, also by aliases of aliases."""
+
+    def __init__(self, stream: str):
+        super().__init__(stream)
+        self._count = 0
+        self._counts: dict[yaml.Node, int] = {}
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node:
+        before, is_alias = self._count, self.check_event(yaml.AliasEvent)
+        node = super().compose_node(parent, index)
+        # An alias inside its own anchor has no end.
+        self._count += self._counts.get(node, _MAX_VALUES) if is_alias else 1
+        if self._count > _MAX_VALUES:
+            raise yaml.YAMLError(f"it has more than {_MAX_VALUES:,} values")
+        if not is_alias:
+            self._counts[node] = self._count - before
+        return node
 
     def compose_mapping_node(self, anchor: str | None) -> yaml.MappingNode:
         node = super().compose_mapping_node(anchor)
@@ -53,6 +75,27 @@ def read_mapping(path: Path, kind: str, example: str) -> dict[str, Any]:
 def dump_config(config: StrictModel) -> str:
     """The whole config as YAML, for `read_preset`."""
     return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+
+
+def dump_with_sources(plain: dict[str, Any], sources: Mapping[str, str], prefix: str = "") -> str:
+    """Nested settings as YAML, each with a comment that names its source.
+
+    Args:
+      sources: by dotted key.
+      prefix: dotted key of the group, with a dot.
+    """
+    lines, indent = [], "  " * prefix.count(".")
+    for name, value in plain.items():
+        key = prefix + name
+        if key not in sources:
+            lines.append(f"{indent}{name}:\n")
+            lines.append(dump_with_sources(value, sources, f"{key}."))
+        else:
+            # YAML marks the end of a single word.
+            text = yaml.safe_dump(value, default_flow_style=True, width=math.inf).split("\n")[0]
+            line = f"{indent}{name}: {text}"
+            lines.append(f"{line:<48}  # {sources[key]}\n")
+    return "".join(lines)
 
 
 def differing_keys(one: StrictModel, other: StrictModel) -> set[str]:

@@ -17,11 +17,14 @@ ConfigT = TypeVar("ConfigT", bound=StrictModel)
 _UNIT = re.compile(r", (1/m|s/m|m/s\^2|m/s|rad/s|rad|m|s|kg|Hz|N m)(?=[.;]| \()")
 
 
-def validate(config_class: type[ConfigT], values: dict[str, Any], source: str) -> ConfigT:
+def validate(
+    config_class: type[ConfigT], values: dict[str, Any], source: str, group: str = ""
+) -> ConfigT:
     """Builds a config from plain values.
 
     Args:
       source: origin of the values, for the error.
+      group: dotted key of the config in a larger one, for the error.
 
     Raises:
       UserError: a key is unknown or a value is out of range.
@@ -29,28 +32,33 @@ def validate(config_class: type[ConfigT], values: dict[str, Any], source: str) -
     try:
         return config_class.model_validate(values)
     except pydantic.ValidationError as error:
-        raise UserError(f"{shorten(source)}: {describe(error, fields_in(config_class))}") from error
+        fields = fields_in(config_class, f"{group}." if group else "")
+        raise UserError(f"{shorten(source)}: {describe(error, fields, group=group)}") from error
 
 
 def describe(
     error: pydantic.ValidationError,
     fields: Mapping[str, FieldInfo],
     flags: Mapping[str, str] = MappingProxyType({}),
+    group: str = "",
 ) -> str:
     """The first mistake of a validation error as part of a sentence, in pydantic's words.
 
     Args:
       fields: the settings by dotted name.
       flags: of a command line, the flag of each setting by its dotted name.
+      group: dotted key, in `fields`, of what was validated.
     """
-    first = error.errors()[0]
-    key = ".".join(part for part in first["loc"] if isinstance(part, str))
+    first, key = error.errors()[0], key_of(error, group)
     if first["type"] in ("extra_forbidden", "invalid_key"):
-        group, _, name = key.rpartition(".")
+        place, _, name = key.rpartition(".")
+        by_name = {other.rpartition(".")[2]: other for other in reversed(fields)}
         near = [other for other in fields if other.rpartition(".")[2] == name]
-        near += difflib.get_close_matches(key, fields, n=1, cutoff=0.8)
-        group = f"{group}." if group else ""
-        here = {x.removeprefix(group).split(".")[0] for x in fields if x.startswith(group)}
+        groups = {x[:i] for x in fields for i, letter in enumerate(x) if letter == "."}
+        near += difflib.get_close_matches(key, [*fields, *sorted(groups)], n=1, cutoff=0.8)
+        near += [by_name[x] for x in difflib.get_close_matches(name, by_name, n=1, cutoff=0.8)]
+        place = f"{place}." if place else ""
+        here = {x.removeprefix(place).split(".")[0] for x in fields if x.startswith(place)}
         advice = f"known keys here are {', '.join(sorted(here))}"
         advice = f"did you mean {near[0]}?" if near else advice
         return f"unknown key {shorten(key)}; {advice}"
@@ -64,6 +72,12 @@ def describe(
         reason += f" {unit_of(fields[key].description or '')}".rstrip()
     given = shorten(str(first["input"]))
     return f"{flags.get(key, key)} is {given}, but {reason.replace('input should', 'must', 1)}"
+
+
+def key_of(error: pydantic.ValidationError, group: str = "") -> str:
+    """The dotted key of the first mistake; that of a group for a rule that joins its settings."""
+    parts = [part for part in error.errors()[0]["loc"] if isinstance(part, str)]
+    return ".".join([group, *parts] if group else parts)
 
 
 def unit_of(text: str) -> str:

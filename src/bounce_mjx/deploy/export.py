@@ -4,6 +4,8 @@ It has a separate input for each part of the observation. The runtime checks the
 the inputs; a single vector would hide a wrong order.
 """
 
+import functools
+import math
 from collections.abc import Callable, Sequence
 
 import jax
@@ -11,7 +13,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from bounce_mjx.baselines.mirror import upper_face
 from bounce_mjx.deploy.graph import onnx_graph
 from bounce_mjx.deploy.metadata import (
     FORMAT,
@@ -27,10 +28,15 @@ from bounce_mjx.deploy.metadata import (
     Metadata,
     to_entries,
 )
+from bounce_mjx.env.env import Env, State
 from bounce_mjx.errors import UserError, needed
+from bounce_mjx.evaluation.episodes import reset_episodes
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.robot.arm import joint_name
-from bounce_mjx.robot.model import find_addresses, joint_names, load_model
+from bounce_mjx.robot.config import RobotConfig
+from bounce_mjx.robot.geometry import upper_face
+from bounce_mjx.robot.model import find_addresses, joint_names, load_model, scene_spec
+from bounce_mjx.robot.torques import largest_torques
 from bounce_mjx.runs.checkpoints import read_actor
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import Checkpoint
@@ -43,6 +49,10 @@ _OPSET, _IR_VERSION = 17, 8
 
 # An input and the output cannot share a name.
 _INPUT_NAMES = {"action": "past_actions"}
+
+_OWN_ROBOT = "AIR4-560"
+# Episodes and control steps of a policy's own play, and the margin of its largest step.
+_OWN_EPISODES, _OWN_STEPS, _MARGIN = 64, 300, 1.25
 
 _ACTION = (
     "servo target of joint i in rad = clip(base[i] + action_scale * action[i], joint_ranges[i]), "
@@ -69,8 +79,11 @@ def export_onnx(checkpoint: Checkpoint) -> bytes:
         import onnx
     config = load_run_config(checkpoint.run)
     checkpoint, policy, _ = read_actor(checkpoint, config)
-    metadata = policy_metadata(config, checkpoint.steps)
     networks = make_networks(config.ppo, config.env.layout.size, config.env.num_joints)
+    metadata = policy_metadata(config, checkpoint.steps)
+    if config.env.action.base == "measured":
+        step = largest_step(config.env, functools.partial(networks.act, policy))
+        metadata = metadata._replace(largest_step=(step,) * len(metadata.joint_names))
     names = [part.name for part in _inputs(config.env)]
 
     def act(histories: dict[str, jax.Array]) -> jax.Array:
@@ -91,7 +104,8 @@ def export_onnx(checkpoint: Checkpoint) -> bytes:
 
 
 def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
-    """Metadata of a run's policy.
+    """Metadata of a run's policy. The largest step of its commands is that of actions that add to
+    the last target; `largest_step` measures the one of actions that add to the measured angles.
 
     Args:
       steps: environment steps of the training.
@@ -101,9 +115,11 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         servo, or a command has the name of a measurement.
     """
     env, given = config.env, config.env.robot.limits
-    limits = None
+    limits, largest_steps = None, [env.action_scale] * env.num_joints
     if given.velocity is not None:
         limits = CommandLimits(given.velocity, given.acceleration, given.jerk)
+        largest_steps = [speed * env.control_dt for speed in given.velocity]
+    displacement = env.randomization.joint_start or (0.0, 0.0)
     if taken := env.commands.keys() & UNITS.keys():
         raise UserError(
             f"the command {min(taken)} has the name of a measurement; give it another name in "
@@ -114,21 +130,24 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
     chain, paddle, normal = _hinges(m, env.default_joint_angles)
     servos = list(addresses.actuators)
     gear = m.actuator_gear[servos, 0]
-    torques = m.actuator_forcerange[servos, 1] * gear
+    torques = largest_torques(m, addresses.arm_joints, addresses.actuators)
     return Metadata(
         format=FORMAT,
+        task=config.task,
         steps=steps,
+        robot=_OWN_ROBOT if env.mjcf is None else scene_spec(env.mjcf, RobotConfig())[0].modelname,
         joint_names=joint_names(m),
         num_balls=env.num_balls,
         ball=BallBounds(*env.ball_bounds),
         observation=_inputs(env),
-        position="measured",
         velocity=env.observation.velocity,
-        estimator=None,
         control_dt=env.control_dt,
         action=_ACTION if limits is None else _ACTION + _LIMITED,
+        action_base=env.action.base,
         action_scale=env.action_scale,
         max_lead=env.action.max_lead if env.action.base == "target" else None,
+        largest_step=tuple(largest_steps),
+        max_joint_velocity=env.max_joint_velocity,
         limits=limits,
         joint_ranges=tuple(
             (low, high) if low < high else None
@@ -136,8 +155,9 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         ),
         servo_stiffness=tuple((m.actuator_gainprm[servos, 0] * gear**2).tolist()),
         servo_damping=tuple((-m.actuator_biasprm[servos, 2] * gear**2).tolist()),
-        torque_limits=tuple(np.where(m.actuator_forcelimited[servos], torques, None).tolist()),
+        torque_limits=tuple(np.where(np.isfinite(torques), torques, None).tolist()),
         default_joint_angles=env.default_joint_angles,
+        start_noise=env.reset.joint_angles + float(np.max(np.abs(displacement))),
         commands={
             name: CommandRange((command.low, command.high), command.unit)
             for name, command in env.commands.items()
@@ -152,6 +172,42 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         paddle=paddle,
         paddle_normal=normal,
     )
+
+
+def largest_step(config: WorldConfig, act: Callable[[jax.Array], jax.Array]) -> float:
+    """Largest change of a joint's command from one control step to the next in the policy's own
+    play, with a margin, rad; at least the `action_scale`.
+
+    Where an action adds to the measured angle, the arm's own motion adds to the step.
+
+    Args:
+      act: observations [B, observation_size] -> actions [B, n].
+    """
+    env = Env(config)
+    servos = jnp.array(env.addresses.actuators)
+    gears = jnp.array(env.mj_model.actuator_gear[servos, 0])[:, None]
+
+    def advance(carry: tuple[State, jax.Array, jax.Array], _: None) -> tuple:
+        states, last, running = carry
+        actions = act(states.obs.T).T
+        now = states.pipeline_state
+        control, _ = jax.vmap(env.control, in_axes=-1, out_axes=-1)(now, actions)
+        commands = control.ctrl[servos] / gears
+        steps = jnp.where(running, jnp.max(jnp.abs(commands - last), axis=0), 0.0)
+        states = jax.vmap(env.step, in_axes=-1, out_axes=-1)(states, actions)
+        return (states, commands, running & (states.done == 0.0)), jnp.max(steps)
+
+    @jax.jit
+    def play(key: jax.Array) -> jax.Array:
+        states = reset_episodes(env, key, _OWN_EPISODES)
+        angles = states.pipeline_state.physics.qpos[jnp.array(env.addresses.arm_qpos)]
+        start = states, angles, jnp.ones(_OWN_EPISODES, bool)
+        length = min(_OWN_STEPS, config.episode_steps)
+        return jnp.max(jax.lax.scan(advance, start, None, length)[1])
+
+    largest = _MARGIN * float(play(jax.random.key(0))) / config.action_scale
+    # In quarters of the scale, which do not differ from one machine to another.
+    return 0.25 * config.action_scale * max(4, math.ceil(4.0 * largest - 1e-3))
 
 
 def _inputs(env: WorldConfig) -> tuple[Input, ...]:

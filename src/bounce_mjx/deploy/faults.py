@@ -1,28 +1,27 @@
-"""What must hold in each control step while an arm follows a policy."""
+"""What an arm does with its commands, and what is seen of its ball: each fault here is a row of the
+table in docs/real-robot.md."""
 
 import math
 from collections.abc import Iterator
 
 import numpy as np
 
-from bounce_mjx.deploy.metadata import Metadata
+from bounce_mjx.deploy.metadata import Metadata, largest_term, least_term
 from bounce_mjx.deploy.motion import paddle_position
-from bounce_mjx.deploy.network import Measurements
+from bounce_mjx.deploy.samples import Measurements
 
-# Share of `action_scale` by which an arm must have been asked to move, to be stuck if it rests.
-_STUCK_SHARE = 0.25
-# Time for which it rests at least, and for which the latest commands have arrived by then, s.
-_STUCK_SECONDS, _ASKED_SECONDS = 0.3, 0.25
-# Range of an angle at rest without noise, rad.
-_STILL = 1e-3
+# Time of a joint's motion that is compared with the training's arms, s.
+_COMPARED = 0.25
+# Latencies of these arms: their distance, and the largest beyond the training's, s.
+_APART, _LATER = 0.01, 0.02
+# Motion beside all these arms that is too much: a share of what the commands moved meanwhile, a
+# share of `action_scale`, and the encoders' noise in standard deviations. In 32 episodes of each of
+# four policies, at most 0.65 of it was beside the nearest arm.
+_OF_COMMANDS, _OF_SCALE, _OF_NOISE = 0.25, {"target": 0.2, "measured": 0.1}, 3.0
+# Distance from all these arms that is too far, rad.
+_OFFSET = 0.05
 # What a resting joint may be off its command beside the encoder's bias: its load, rad.
 _SAG = 0.01
-# Time by which an arm may be later than in the training's worlds, s.
-_LATER = 0.05
-# Largest noise, in standard deviations.
-_LARGEST_NOISE = 8.0
-# Of a joint, for a policy without limits: the training ends an episode there, rad/s.
-_FASTEST = 6.283
 # A ball so far below the paddle, or beside it without coming nearer, is lost; one so far above it
 # flies, m.
 _BELOW, _BESIDE, _FLYING = 0.1, 0.9, 0.05
@@ -35,112 +34,106 @@ Fault = tuple[str, str]
 """Code and reason."""
 
 
-def largest_term(metadata: Metadata, term: str, default: float = 0.0, end: int = 1) -> float:
-    """Largest absolute value of a randomisation term over axes and joints; with the end 0, its
-    least one."""
-    found = [r for name, r in metadata.randomization.items() if name.split("[")[0] == term]
-    values = [max(map(abs, r)) if end else r[0] for r in found]
-    return (max if end else min)(values, default=default)
-
-
 def picture_age(metadata: Metadata) -> float:
     """Age beyond which a picture is too old: the training's largest latency and five of its longest
     intervals, s."""
-    rate = largest_term(metadata, "camera_rate", 1.0 / metadata.control_dt, end=0)
+    rate = least_term(metadata, "camera_rate", 1.0 / metadata.control_dt)
     return min(max(largest_term(metadata, "ball_latency") + 5.0 / rate, 0.1), 1.0)
+
+
+def arm_responses(metadata: Metadata) -> np.ndarray:
+    """What a policy's commands do in the training's worlds: weights [A, K] of the last K commands,
+    the newest first, in the next measured angle, for arms of all latencies and lags.
+
+    An arm is a servo, a first-order lag of the time constant damping / stiffness, behind the lag
+    and the latency of the randomisation.
+    """
+    dt, latency = metadata.control_dt, largest_term(metadata, "action_latency")
+    lag = float(np.max(np.divide(metadata.servo_damping, metadata.servo_stiffness)))
+    slower = largest_term(metadata, "servo_damping", 1.0) / least_term(metadata, "servo_gain", 1.0)
+    slowest = lag * slower + largest_term(metadata, "servo_lag")
+    latencies = np.arange(0.0, latency + _LATER + 1e-9, _APART) / dt
+    lags = np.linspace(lag, slowest, 3 if slowest > 1.5 * lag else 1)
+    length = math.ceil(latencies[-1] + 4.0 * slowest / dt) + 1
+    steps = np.arange(length)
+    responses = []
+    for delay in latencies:
+        for time_constant in lags:
+            # The share of a step of the command that the arm has gone after a number of steps.
+            gone = 1.0 - np.exp(-np.maximum(steps + 1.0 - delay, 0.0) * dt / time_constant)
+            responses.append(np.diff(gone, prepend=0.0) / gone[-1])
+    return np.array(responses)
 
 
 class Watch:
     """Compares the control steps of an arm and its balls with what the training's worlds can hold.
     The functions that yield faults take the steps one after another."""
 
-    def __init__(self, metadata: Metadata, max_picture_age: float, max_seconds: float):
+    def __init__(self, metadata: Metadata, max_picture_age: float):
         """Bounds of a policy's worlds.
 
         Args:
           max_picture_age: of the ball's picture, s.
-          max_seconds: time from one control step to the next, s.
         """
-        self._metadata, self._max_age, self._max_seconds = metadata, max_picture_age, max_seconds
-        limits, dt = metadata.limits, metadata.control_dt
-        self._fastest = _FASTEST if limits is None else 1.2 * np.array(limits.velocity)
-        noise = 1.5 * _LARGEST_NOISE * largest_term(metadata, "ball_position_noise")
-        self._fastest_motion = metadata.ball.speed + noise / dt
+        self._metadata, self._max_age, dt = metadata, max_picture_age, metadata.control_dt
         self.offset = _SAG + largest_term(metadata, "encoder_bias")
         """Distance of a resting joint from its command, rad."""
-        # What the slowest arm of the training's worlds would have done; any faster one moves more.
-        self._still = _STILL + 0.8 * _LARGEST_NOISE * largest_term(metadata, "joint_angle_noise")
-        visible = max(_STUCK_SHARE * metadata.action_scale, 0.6 * self._still)
-        slow = largest_term(metadata, "servo_damping", 1.0) / largest_term(
-            metadata, "servo_gain", 1.0, end=0
-        )
-        lag = slow * np.max(np.divide(metadata.servo_damping, metadata.servo_stiffness))
-        kept = math.exp(-dt / (lag + largest_term(metadata, "servo_lag") + 1e-6))
-        late = math.ceil((largest_term(metadata, "action_latency") + _LATER) / dt - 1e-6)
-        steps = max(round(_STUCK_SECONDS / dt) - late, math.ceil(_ASKED_SECONDS / dt))
-        since = np.arange(steps)[:, None] - np.arange(steps)
-        pull = np.tril((1.0 - kept) * kept ** np.abs(since))
-        settled = np.sum(pull, axis=1)
-        # The mean command that moves this arm until each of the window's first K steps, as weights
-        # of those steps [K, K], and its distance from the angle by which no arm moves visibly [K].
-        self._weights, self._room = pull / settled[:, None], visible / settled
-        # Control steps that a stuck joint rests.
-        self._window = steps + late
+        noise = largest_term(metadata, "joint_angle_noise")
+        self._least = _OF_SCALE[metadata.action_base] * metadata.action_scale + _OF_NOISE * noise
+        self._arms = arm_responses(metadata)
+        self._compared = math.ceil(_COMPARED / dt)
 
     def rest(self, angles: np.ndarray, command: np.ndarray) -> None:
         """The arm has rested at these angles [J], commanded to be there [J]."""
-        self._past = np.repeat([[angles], [command]], self._window + 1, axis=1)
+        arms, length = self._arms.shape
+        self._commands = np.tile(command, (length + self._compared, 1))
+        self._beside = np.tile(angles - command, (self._compared, arms, 1))
 
     def begin(self) -> None:
         """An episode begins."""
-        self._time: float | None = None
+        self._time = 0.0
         self._pictures: list[tuple[np.ndarray, float]] = []
 
     def arm_faults(self, angles: np.ndarray, command: np.ndarray) -> Iterator[Fault]:
-        """A joint that no arm of the training would have rested, whatever its offset.
+        """A joint that does not move as any arm of the training would.
 
         Args:
           angles: measured [J], rad.
           command: at the end of the step before [J], rad.
         """
-        self._past = np.concatenate([self._past[:, 1:], [[angles], [command]]], axis=1)
-        angles, commands = self._past
-        # Later commands have not reached the latest arm.
-        lead = (commands[1 : len(self._room) + 1] - np.mean(angles, axis=0)).T
-        mean = lead @ self._weights.T
-        least, most = np.max(mean - self._room, axis=1), np.min(mean + self._room, axis=1)
-        is_explained = np.maximum(least, -self.offset) <= np.minimum(most, self.offset)
-        is_stuck = (np.ptp(angles, axis=0) < self._still) & ~is_explained
-        if np.any(is_stuck):
-            largest = np.max(np.abs(lead[is_stuck]))
-            yield "joint_stuck", f"a joint is stuck {largest:.3g} rad from its command"
+        self._commands = np.concatenate([command[None], self._commands[:-1]])
+        beside = angles - self._arms @ self._commands[: self._arms.shape[1]]
+        self._beside = np.concatenate([self._beside[1:], beside[None]])
+        high, low = np.max(self._beside, axis=0), np.min(self._beside, axis=0)
+        allowed = self._least + _OF_COMMANDS * np.ptp(self._commands, axis=0)
+        unlike = np.maximum((high - low) / allowed, np.maximum(high, -low) / _OFFSET)
+        least = np.min(unlike, axis=0)
+        if np.max(least) > 1.0:
+            joint = int(np.argmax(least))
+            away = np.min(np.abs(beside[:, joint]))
+            yield (
+                "joint_astray",
+                f"{self._metadata.joint_names[joint]} does not follow its commands, and is "
+                f"{away:.2g} rad beside them",
+            )
 
     def faults(self, measured: Measurements, command: np.ndarray) -> Iterator[Fault]:
         """The faults of a control step of an episode.
 
         Args:
           measured: `joint_angles` and what else a policy measures, as for `OnnxNetwork.step`, and
-            `time` [1]. Without `time` no step is late.
+            `time` [1].
           command: see `arm_faults`.
         """
-        angles, last = measured["joint_angles"], self._time
         if "time" in measured:
-            self._time = max(float(measured["time"][0]), -math.inf if last is None else last)
+            self._time = float(measured["time"][0])
         else:
-            self._time = (last or 0.0) + self._metadata.control_dt
-        if last is not None and (elapsed := self._time - last) > self._max_seconds:
-            yield "late_step", f"a control step came after {elapsed:.3g} s"
+            self._time += self._metadata.control_dt
         if "ball_position" in measured:
             age = float(measured["ball_age"][0]) if "ball_age" in measured else None
-            paddle = paddle_position(self._metadata, angles)
+            paddle = paddle_position(self._metadata, measured["joint_angles"])
             yield from self._ball_faults(measured["ball_position"].reshape(-1, 3), age, paddle)
-        speed = _longest(measured.get("ball_velocity", np.zeros(3)).reshape(-1, 3))
-        if speed > self._metadata.ball.speed:
-            yield "ball_speed", f"the ball has {speed:.3g} m/s"
-        velocities = np.abs(measured.get("joint_velocities", np.zeros(1)))
-        if np.any(velocities > self._fastest):
-            yield "joint_speed", f"a joint has {np.max(velocities):.3g} rad/s"
-        yield from self.arm_faults(angles, command)
+        yield from self.arm_faults(measured["joint_angles"], command)
 
     def _ball_faults(
         self, balls: np.ndarray, age: float | None, paddle: np.ndarray
@@ -154,19 +147,9 @@ class Watch:
             age = max(self._time - seen[-1][1], age or 0.0)
         if not -_SYNCHRONOUS <= age <= self._max_age:
             yield "old_picture", f"the picture of the ball is {1e3 * age:.0f} ms old"
-        if (distance := _longest(balls)) > self._metadata.ball.distance:
-            yield "ball_place", f"the ball is {distance:.3g} m from the base"
         beside, before = (
             np.linalg.norm((picture - paddle)[:, :2], axis=1) for picture in (balls, seen[0][0])
         )
         leaves = (beside > _BESIDE) & (beside >= before) & (len(seen) > _EARLIER)
         if np.any((paddle[2] - balls[:, 2] > _BELOW) | leaves):
             yield "ball_lost", "the ball is lost"
-        if len(seen) > 1:
-            between = max(seen[-1][1] - seen[-2][1], self._metadata.control_dt)
-            if (speed := _longest(balls - seen[-2][0]) / between) > self._fastest_motion:
-                yield "ball_speed", f"the ball has {speed:.3g} m/s"
-
-
-def _longest(vectors: np.ndarray) -> float:
-    return float(np.max(np.linalg.norm(vectors, axis=-1)))

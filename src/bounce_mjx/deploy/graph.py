@@ -49,6 +49,8 @@ _OPERATIONS = {
     "convert_element_type": ("fib", lambda g, e, x: g.cast(x, e.params["new_dtype"])),
     "dot_general": ("f", lambda g, e, x, y: g.product(e, x, y)),
     "eq": ("fib", "Equal"),
+    # Of the activation elu.
+    "expm1": ("f", lambda g, e, x: g.node("Sub", g.node("Exp", x), np.float32(1.0))),
     "ge": ("fi", "GreaterOrEqual"),
     "gt": ("fi", "Greater"),
     "integer_pow": ("f", lambda g, e, x: g.node("Pow", x, np.float32(e.params["y"]))),

@@ -1,7 +1,7 @@
 """`load_policy`: loads a policy by name, from an ONNX file, or from a run."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from bounce_mjx.deploy.policy import DeployedPolicy
@@ -12,7 +12,7 @@ from bounce_mjx.resources import POLICIES, resource_path
 def load_policy(
     policy: str | os.PathLike,
     task: str | None = None,
-    joint_names: Sequence[str] | None = None,
+    joint_names: Sequence[str] | Mapping[str, str] | None = None,
 ) -> DeployedPolicy:
     """Loads a policy that runs without JAX.
 
@@ -22,11 +22,13 @@ def load_policy(
         `bounce-mjx export`; or a run's folder or a checkpoint in it, which is first exported with
         JAX.
       task: FILE.py:CLASS, for a run of a task in a file, which is code.
-      joint_names: the robot's own names of the joints, in the policy's order, such as
-        `fr3_joint1`; they replace those in `metadata.joint_names`.
+      joint_names: the driver's names of the joints in the driver's order, such as `fr3_joint1`;
+        angles, velocities, actions and commands then have this order. A name belongs to the joint
+        whose name it ends with; for others, a mapping from the driver's names to the policy's.
 
     Raises:
-      UserError: there is no such policy, the file is damaged, or a name is missing or given twice.
+      UserError: there is no such policy, the file is damaged, or the names are not those of the
+        policy's robot.
     """
     path, source = Path(policy), str(policy)
     if policy in POLICIES:
@@ -41,8 +43,7 @@ def load_policy(
         ) from error
     loaded = DeployedPolicy(model, source)
     if joint_names is not None:
-        names = check_names(joint_names, loaded.metadata.joint_names, "joint_names")
-        loaded.metadata = loaded.metadata._replace(joint_names=names)
+        loaded.use_joints(joint_names)
     return loaded
 
 

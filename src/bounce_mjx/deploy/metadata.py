@@ -4,9 +4,10 @@ Every entry is JSON under the name of its field in `Metadata`.
 """
 
 import json
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
-FORMAT = 3
+FORMAT = 4
 """Version of the entries; readers refuse other versions."""
 
 UNITS = {
@@ -31,12 +32,21 @@ PER_BALL = {
 
 Vector = tuple[float, float, float]
 
-# Entries that older files lack, and the values that these files imply.
-_LATER = {"limits": "null", "num_balls": "1", "ball": '{"distance": 3.0, "speed": 20.0}'}
 IS_FIRST, MEASURED, NEXT = "step/is_first", "measured/", "next/"
 """Names in the graph of a policy whose task remembers measurements: an input, which is true in the
 first step; what precedes a quantity's newest value; and what precedes an output for the input of
 the same name in the next step."""
+
+
+# Fields with a number for each joint.
+_PER_JOINT = (
+    "largest_step",
+    "joint_ranges",
+    "servo_stiffness",
+    "servo_damping",
+    "torque_limits",
+    "default_joint_angles",
+)
 
 
 class Input(NamedTuple):
@@ -101,8 +111,12 @@ class Metadata(NamedTuple):
     """All information needed to act with the network."""
 
     format: int
+    task: str
+    """Name of the task that the policy was trained in."""
     steps: int
     """Number of environment steps in the training."""
+    robot: str
+    """Name of the arm, as its MJCF file states it."""
     joint_names: tuple[str, ...]
     """Order of the joints in every array of J joints."""
     num_balls: int
@@ -111,21 +125,23 @@ class Metadata(NamedTuple):
     """Bounds of each ball."""
     observation: tuple[Input, ...]
     """The inputs of the network, each [N, history, size]."""
-    position: Literal["measured"]
-    """Source of ball_position; a policy of 0.1 may see the ball through a Kalman filter."""
     velocity: Literal["measured", "differences"]
     """Source of ball_velocity: `measured`, or `differences` of the measured positions."""
-    estimator: dict[str, float] | None
-    """Constants of that filter; None without one."""
     control_dt: float
     """Time between two actions, s."""
     action: str
     """Meaning of the output [N, J], in words."""
+    action_base: Literal["measured", "target"]
+    """What an action adds to: the measured angle, or the last servo target."""
     action_scale: float
     """Change of the servo target at the action 1, rad."""
     max_lead: float | None
-    """Largest distance from the measured angle to the last servo target, to which an action adds,
-    rad; None if it adds to the measured angle."""
+    """Largest distance from the measured angle to the last servo target, rad; None if an action
+    adds to the measured angle."""
+    largest_step: tuple[float, ...]
+    """Largest change of each joint's command from one control step to the next, rad."""
+    max_joint_velocity: float
+    """Speed of a joint at which the training ends an episode, rad/s."""
     limits: CommandLimits | None
     """Limits of the commands, which then move between two actions (`robot.setpoints`); None for a
     servo target that jumps."""
@@ -139,6 +155,8 @@ class Metadata(NamedTuple):
     """Largest torque of each servo, N m; None for a servo without a limit."""
     default_joint_angles: tuple[float, ...]
     """Joint angles at the start of an episode, rad."""
+    start_noise: float
+    """Largest distance of a joint from them at the start of an episode, rad."""
     commands: dict[str, CommandRange]
     """The commands of the policy, by name."""
     randomization: dict[str, tuple[float, float]]
@@ -162,22 +180,28 @@ def measurement_sizes(metadata: Metadata) -> dict[str, int]:
     return {name: sizes.get(name, 1) for name in (*UNITS, *metadata.commands)}
 
 
+def largest_term(metadata: Metadata, term: str, default: float = 0.0) -> float:
+    """Largest absolute value of a randomisation term over axes and joints."""
+    ranges = [x for name, x in metadata.randomization.items() if name.split("[")[0] == term]
+    return max((max(map(abs, ends)) for ends in ranges), default=default)
+
+
+def least_term(metadata: Metadata, term: str, default: float) -> float:
+    """Lowest end of a randomisation term over axes and joints."""
+    ranges = [x for name, x in metadata.randomization.items() if name.split("[")[0] == term]
+    return min((low for low, _ in ranges), default=default)
+
+
 def to_entries(metadata: Metadata) -> dict[str, str]:
-    """JSON texts of the metadata by field name, without the entries that older files lack and imply
-    alike."""
-    plain = _plain(metadata)
-    texts = {name: json.dumps(value, allow_nan=False) for name, value in plain.items()}
-    return {name: text for name, text in texts.items() if _LATER.get(name) != text}
+    """JSON texts of the metadata by field name."""
+    return {name: json.dumps(x, allow_nan=False) for name, x in _plain(metadata).items()}
 
 
 def from_entries(entries: dict[str, str]) -> Metadata:
     """Metadata from the entries of `to_entries`; ValueError for another format."""
     # A file of another format lacks entries too, but the format is the reason.
     if "format" in entries and (given := json.loads(entries["format"])) != FORMAT:
-        raise ValueError(f"its format is {given}, not {FORMAT}")
-    if '"filter"' in (entries.get("position"), entries.get("velocity")):
-        raise ValueError("it sees the ball through a Kalman filter, for which use bounce-mjx 0.1.0")
-    entries = _LATER | entries
+        raise ValueError(f"its format is {given}, not {FORMAT}; export the policy again")
     missing = [name for name in Metadata._fields if name not in entries]
     if missing:
         raise ValueError(f"its metadata lacks {missing[0]}")
@@ -191,6 +215,25 @@ def from_entries(entries: dict[str, str]) -> Metadata:
         "chain": tuple(Hinge(**hinge) for hinge in values["chain"]),
     }
     return Metadata(**values | groups)
+
+
+def in_driver_order(metadata: Metadata, names: Sequence[str], order: Sequence[int]) -> Metadata:
+    """The metadata with the joints in a driver's order.
+
+    Args:
+      names: the driver's names of the joints [J], in its order.
+      order: index of each of them among the policy's joints [J].
+    """
+
+    def ordered(values: Sequence[Any]) -> tuple[Any, ...]:
+        return tuple(values[i] for i in order)
+
+    limits = metadata.limits
+    if limits is not None:
+        limits = CommandLimits(*(None if x is None else ordered(x) for x in limits))
+    per_joint = {name: ordered(getattr(metadata, name)) for name in _PER_JOINT}
+    chain = tuple(link._replace(joint=list(order).index(link.joint)) for link in metadata.chain)
+    return metadata._replace(joint_names=tuple(names), limits=limits, chain=chain, **per_joint)
 
 
 def _plain(value: Any) -> Any:

@@ -5,21 +5,23 @@ import numpy as np
 from bounce_mjx.deploy.metadata import Metadata
 from bounce_mjx.robot.setpoints import Setpoint, command, joint_limits, next_setpoint
 
-# [k, i, j]: the matrix of the cross product with the unit vector k.
-_CROSS = np.cross(np.eye(3), np.eye(3)[:, None])
-
 
 class Motion:
     """Commands of the joints, one control step after the other: within the arm's limits if the
-    policy has them, else a target for the whole control step."""
+    policy has them, else a target for the whole control step.
+
+    Every command but the first is made by `aim`, which no target moves farther than
+    `Metadata.largest_step` from the last one.
+    """
 
     def __init__(self, metadata: Metadata):
-        self._duration = metadata.control_dt
+        self._duration, self._largest_step = metadata.control_dt, np.array(metadata.largest_step)
         self.ranges = np.array(
             [(-np.inf, np.inf) if x is None else x for x in metadata.joint_ranges]
         ).T
         """Lower and upper ends [2, J] of the joints' ranges, rad."""
         self._limits = joint_limits(metadata.limits, *self.ranges)
+        self._still = np.zeros(len(metadata.joint_names))
         self.start: Setpoint | None = None
         """The command at the start of the control step, before the mean that limits the jerk."""
         self.end: Setpoint | None = None
@@ -27,9 +29,11 @@ class Motion:
 
     def rest(self, angles: np.ndarray | None) -> None:
         """The arm rests, with its servos at these angles [J]; None: at those of the next step."""
-        still = np.zeros(self.ranges.shape[1])
         self.start = None
-        self.end = None if angles is None else Setpoint(np.array(angles, float), still, still)
+        self.end = None if angles is None else self._resting(np.array(angles, float))
+
+    def _resting(self, position: np.ndarray) -> Setpoint:
+        return Setpoint(position, self._still, self._still)
 
     def begin(self, angles: np.ndarray | None = None) -> None:
         """Begins a control step where the last one ended, the first one at the measured angles
@@ -63,16 +67,33 @@ class Motion:
         return not (np.any(self.end.velocity) or np.any(self.end.acceleration))
 
     def aim(self, target: np.ndarray) -> None:
-        """Moves the joints toward a target [J], to be there at the end of the control step."""
+        """Moves the joints toward a target [J], to be there at the end of the control step if the
+        largest step, the range and the limits allow it."""
+        start = self.start.position
+        target = np.minimum(
+            np.maximum(target, start - self._largest_step), start + self._largest_step
+        )
         # An arm beyond its range comes back by its own speed.
         low, high = self.ranges
-        low, high = np.minimum(low, self.start.position), np.maximum(high, self.start.position)
-        target = np.clip(target, low, high)
+        low, high = np.minimum(low, start), np.maximum(high, start)
+        target = np.minimum(np.maximum(target, low), high)
         if self._limits is None:
-            still = np.zeros(len(target))
-            self.end = Setpoint(target, still, still)
+            self.end = self._resting(target)
         else:
             self.end = next_setpoint(self._limits, self.start, target, self._duration, np)
+
+    def braking_path(self) -> np.ndarray:
+        """Joint angles [K, J] (rad) at the ends of the control steps in which the commands brake
+        from the end of this one, and at this one's; the last are those where they rest."""
+        position, velocity, _ = self.end
+        if self._limits is None or not np.any(velocity):
+            return position[None]
+        slower = self._limits.acceleration * self._duration
+        steps = int(np.ceil(np.max(np.abs(velocity) / slower)))
+        speeds = np.abs(velocity) - slower * np.arange(steps + 1)[:, None]
+        velocities = np.sign(velocity) * np.maximum(speeds, 0.0)
+        moved = np.cumsum(0.5 * self._duration * (velocities[1:] + velocities[:-1]), axis=0)
+        return position + np.vstack([self._still, moved])
 
     def at(self, times: np.ndarray) -> np.ndarray:
         """Commands [M, J] at times [M] since the start of the control step, s."""
@@ -85,10 +106,19 @@ class Motion:
 def paddle_position(metadata: Metadata, joint_angles: np.ndarray) -> np.ndarray:
     """World position [..., 3] (m) of the paddle's centre at joint angles [..., J] (rad), by
     Rodrigues' formula for the hinges' rotations."""
-    position = np.array(metadata.paddle)
-    for link in reversed(metadata.chain):
-        angles = (joint_angles[..., link.joint] - link.reference)[..., None, None]
-        turn = np.tensordot(link.axis, _CROSS, 1)
-        rotation = np.eye(3) + np.sin(angles) * turn + (1.0 - np.cos(angles)) * (turn @ turn)
-        position = link.position + (rotation @ position[..., None])[..., 0]
-    return position
+    joints = [link.joint for link in metadata.chain]
+    turned = joint_angles[..., joints] - [link.reference for link in metadata.chain]
+    # One number for each hinge, or one array of a batch. Python's numbers are the fastest for one.
+    numbers = (np.moveaxis(f(turned), -1, 0) for f in (np.cos, np.sin))
+    cosines, sines = (x.tolist() if x.ndim == 1 else x for x in numbers)
+    x, y, z = metadata.paddle
+    for i in reversed(range(len(joints))):
+        (a, b, c), (left, ahead, up) = metadata.chain[i].axis, metadata.chain[i].position
+        cosine, sine = cosines[i], sines[i]
+        along = (1.0 - cosine) * (a * x + b * y + c * z)
+        x, y, z = (
+            left + cosine * x + sine * (b * z - c * y) + along * a,
+            ahead + cosine * y + sine * (c * x - a * z) + along * b,
+            up + cosine * z + sine * (a * y - b * x) + along * c,
+        )
+    return np.stack([x, y, z], axis=-1)

@@ -2,18 +2,19 @@
 of the measurements. The world's quantities are the NumPy twin of `world/sensing.py`; a test
 compares the two."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from bounce_mjx.deploy.metadata import IS_FIRST, MEASURED, NEXT, Metadata, from_entries
 from bounce_mjx.deploy.motion import paddle_position
+from bounce_mjx.deploy.samples import Measurements
 from bounce_mjx.errors import UserError, needed
-
-Measurements = dict[str, np.ndarray]
 
 _LOG_ERRORS_ONLY = 3
 _TYPES = {"tensor(float)": np.float32, "tensor(int32)": np.int32, "tensor(bool)": np.bool_}
+_PER_JOINT = {"joint_angles", "joint_velocities", "servo_lead", "past_actions"}
 # Smallest difference between the times of two pictures, s.
 _SAME_PICTURE = 1e-4
 # Shortest time between two pictures in a difference quotient, s.
@@ -37,23 +38,39 @@ class OnnxNetwork:
         )
         entries = self._session.get_modelmeta().custom_metadata_map
         self.metadata: Metadata = from_entries(entries)
-        self._inputs = [i.name for i in self._session.get_inputs()]
+        self._inputs = {i.name: i for i in self._session.get_inputs()}
         self._remembered = {
             output.name.removeprefix(NEXT): np.zeros((1, *output.shape[1:]), _TYPES[output.type])
             for output in self._session.get_outputs()
             if output.name != "action"
         }
+        self._outputs = ["action", *(f"{NEXT}{name}" for name in self._remembered)]
         own = [part for part in self.metadata.observation if part.name not in self._remembered]
-        self._lengths = {part.name: part.history for part in own}
-        measured = {n.removeprefix(MEASURED) for n in self._inputs if n.startswith(MEASURED)}
-        self.reads = measured | self._lengths.keys()
+        self._sizes = {part.name: (part.history, part.size) for part in own}
+        self._measured = [n.removeprefix(MEASURED) for n in self._inputs if n.startswith(MEASURED)]
+        self.reads = {*self._measured, *self._sizes}
         """Names of the quantities that the action depends on."""
+        self._order: np.ndarray | None = None
         self.reset()
+
+    def use_order(self, order: Sequence[int]) -> None:
+        """Takes and gives the joints in another order.
+
+        Args:
+          order: index of each joint among the network's joints.
+        """
+        self._order = np.array(order)
 
     def reset(self) -> None:
         """Forgets the past."""
-        self._histories: Measurements | None = None
+        self._is_first = True
         self._memory = self._remembered
+        self._histories = {name: np.zeros(size) for name, size in self._sizes.items()}
+        self._rows = {
+            name: np.zeros((1, *given.shape[1:]), _TYPES[given.type])
+            for name, given in self._inputs.items()
+            if name not in self._memory
+        }
         balls = np.zeros(3 * self.metadata.num_balls)
         self._picture: tuple[np.ndarray, np.ndarray, float] | None = None
         self._unknown = {
@@ -75,37 +92,47 @@ class OnnxNetwork:
         Raises:
           UserError: the network gives no finite action.
         """
-        known = self._unknown | measured
-        newest = known | {
-            "action": action,
-            "past_actions": action,
-            "paddle_position": paddle_position(self.metadata, known["joint_angles"]),
-            "ball_picture": known["ball_position"],
-        }
-        if self.metadata.velocity == "differences":
-            newest["ball_velocity"] = self._difference(known)
-        past = self._histories
-        self._histories = {
-            name: np.tile(newest[name], (length, 1))
-            if past is None
-            else np.concatenate([newest[name][None], past[name][:-1]])
-            for name, length in self._lengths.items()
-        }
-        rows = self._histories | {f"{MEASURED}{name}": value for name, value in newest.items()}
-        rows = {name: row[None].astype(np.float32) for name, row in rows.items()}
-        rows |= {IS_FIRST: np.array([past is None])} | self._memory
-        names = ["action", *(f"{NEXT}{name}" for name in self._memory)]
-        result, *values = self._session.run(names, {name: rows[name] for name in self._inputs})
-        if not np.all(np.isfinite(result)):
+        newest = self._newest(measured, action)
+        for name, history in self._histories.items():
+            if self._is_first:
+                history[:] = newest[name]
+            else:
+                history[1:] = history[:-1]
+                history[0] = newest[name]
+            self._rows[name][0] = history
+        for name in self._measured:
+            self._rows[MEASURED + name][0] = newest[name]
+        if IS_FIRST in self._rows:
+            self._rows[IS_FIRST][0] = self._is_first
+        result, *values = self._session.run(self._outputs, self._rows | self._memory)
+        self._is_first = False
+        if not np.isfinite(result).all():
             raise UserError("the network returned an action that is not finite; stop the robot")
         self._memory = dict(zip(self._memory, values, strict=True))
-        return result[0].astype(float)
+        action = result[0].astype(float)
+        return action if self._order is None else action[self._order]
+
+    def _newest(self, measured: Measurements, action: np.ndarray) -> Measurements:
+        """The newest value of each quantity, with the joints in the network's order."""
+        newest = self._unknown | measured | {"past_actions": action}
+        if self._order is not None:
+            for name in newest.keys() & _PER_JOINT:
+                ordered = np.empty_like(newest[name])
+                ordered[self._order] = newest[name]
+                newest[name] = ordered
+        newest["action"], newest["ball_picture"] = newest["past_actions"], newest["ball_position"]
+        if "paddle_position" in self.reads:
+            paddle = paddle_position(self.metadata, newest["joint_angles"])
+            newest["paddle_position"] = paddle
+        if self.metadata.velocity == "differences":
+            newest["ball_velocity"] = self._difference(newest)
+        return newest
 
     @property
     def observation(self) -> np.ndarray:
         """Inputs of the network at the last step in one vector, with the newest value of each
         quantity first; empty before the first step."""
-        if self._histories is None:
+        if self._is_first:
             return np.zeros(0)
         values = self._histories | self._memory
         return np.concatenate([values[part.name].ravel() for part in self.metadata.observation])

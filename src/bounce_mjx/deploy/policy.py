@@ -5,17 +5,26 @@ from typing import Any
 
 import numpy as np
 
-from bounce_mjx.deploy.metadata import PER_BALL, UNITS, Metadata, measurement_sizes
+from bounce_mjx.deploy.metadata import (
+    PER_BALL,
+    UNITS,
+    Metadata,
+    in_driver_order,
+    measurement_sizes,
+)
 from bounce_mjx.deploy.motion import Motion
-from bounce_mjx.deploy.network import Measurements, OnnxNetwork
+from bounce_mjx.deploy.network import OnnxNetwork
+from bounce_mjx.deploy.samples import Measurements, Samples
 from bounce_mjx.deploy.supervisor import Supervisor
 from bounce_mjx.errors import MissingPackage, UserError
 
 _MAX_PAUSE = 1.0
-# Measurements beyond it are not of a robot.
-_LARGEST = 1e6
-# Joint angles outside their range, rad, and commands outside theirs, that no world can hold.
+# Measurements and times beyond them are not of a robot.
+_LARGEST, _LARGEST_TIME = 1e6, 1e15
+# A command outside its range that no world can hold, at least.
 _OUTSIDE = 0.5
+# Resolution of a time as a share of a control step.
+_FINE = 0.25
 
 
 class DeployedPolicy:
@@ -43,7 +52,14 @@ class DeployedPolicy:
             """Measurements that a step accepts, and their units."""
             self.motion = Motion(self.metadata)
             """Commands of the joints; a `Supervisor` also moves them without the policy."""
+            self.samples = Samples(self.metadata)
+            """The last sample, with which the next one is compared."""
             self._sizes = measurement_sizes(self.metadata)
+            balls = self.metadata.num_balls
+            self._defaults = {
+                "ball_quaternion": np.tile([1.0, 0.0, 0.0, 0.0], balls),
+                "ball_angular_velocity": np.zeros(3 * balls),
+            }
             self.needs = self._needs()
             """Measurements required in every step."""
             # A network that fails or gives no numbers fails here, and not on the robot.
@@ -64,6 +80,21 @@ class DeployedPolicy:
             ) from error
         self.reset()
 
+    def use_joints(self, names: Sequence[str] | Mapping[str, str]) -> None:
+        """Takes and gives the joints in a driver's order from now on, and resets the policy.
+
+        Args:
+          names: as `joint_names` of `load_policy`.
+
+        Raises:
+          UserError: they are not those of the policy's robot.
+        """
+        order = _joint_order(names, self.metadata)
+        self._network.use_order(order)
+        self.metadata = in_driver_order(self.metadata, tuple(names), order)
+        self.motion, self.samples = Motion(self.metadata), Samples(self.metadata)
+        self.reset()
+
     def reset(self, targets: np.ndarray | None = None) -> None:
         """Forgets the past. The next step fills the whole history with its measurements.
 
@@ -78,6 +109,10 @@ class DeployedPolicy:
         if targets is not None:
             targets = _array("the targets", targets, count, "rad", _LARGEST)
         self._network.reset()
+        if targets is None:
+            self.samples.forget()
+        else:
+            self.samples.rest(targets)
         self._measured: Measurements = {}
         self._first: float | None = None
         self.step_number = -1
@@ -103,35 +138,55 @@ class DeployedPolicy:
             action. A call several control steps late fills the missed steps with interpolated
             measurements and the last action.
 
+            One sample that cannot be true is bridged (`Samples`): the last one holds.
+
         Returns:
           Action [J], from -1 to 1; `servo_targets` converts it.
 
         Raises:
           UserError: a required measurement is missing; a measurement is unknown, has the wrong
             shape, is not finite, or is what no world of the training can hold, mostly in another
-            unit or frame; or the time is more than 1 s from the last. The policy's state does
-            not change. Or the network gives no finite action; then call `reset`.
+            unit or frame; the second sample in a row, or the first one, cannot be true; or the
+            time is 1 s or more from the last. The policy's state does not change. Or the network
+            gives no finite action; then call `reset`.
         """
-        measured = self.check(measurements)
-        self._refuse_impossible(measured)
+        return self.act(self.read(measurements))
+
+    def read(
+        self, measurements: Mapping[str, Any], needs: Sequence[str] | None = None
+    ) -> Measurements:
+        """The measurements of a sample as arrays, with the last ones in place of those that cannot
+        be true.
+
+        Args:
+          needs: those that may not be missing; by default, `needs`.
+
+        Raises:
+          UserError: as `step`.
+        """
+        return self.samples.take(self.check(measurements, needs))
+
+    def act(self, measured: Measurements) -> np.ndarray:
+        """The action of `step` for the measurements of `read`."""
+        steps = self.steps_since(measured)
+        if steps == 0:
+            return self._action.copy()
         angles = measured.get("joint_angles")
         if angles is not None and self.metadata.max_lead is not None:
             last = angles if self.motion.end is None else self.motion.end.position
-            measured["servo_lead"] = last - angles
-        time = float(measured.pop("time")[0]) if "time" in measured else None
-        steps = self._steps_since(time)
-        if steps == 0:
-            return self._action.copy()
+            measured = measured | {"servo_lead": last - angles}
         for left in reversed(range(steps)):
-            between = {
-                name: value + left / steps * (self._measured.get(name, value) - value)
-                for name, value in measured.items()
-            }
+            between = measured
+            if left:
+                between = {
+                    name: value + left / steps * (self._measured.get(name, value) - value)
+                    for name, value in measured.items()
+                }
             action = self._network.step(between, self._action)
         self._measured, self._action = measured, action
         self.step_number += steps
-        if self._first is None and time is not None:
-            self._first = time - self.step_number * self.metadata.control_dt
+        if self._first is None and "time" in measured:
+            self._first = float(measured["time"][0]) - self.step_number * self.metadata.control_dt
         if angles is not None:
             self.motion.begin(angles)
             self._act(action)
@@ -230,79 +285,125 @@ class DeployedPolicy:
         """Copies of the measurements as arrays, with defaults for optional ones.
 
         Args:
-          needs: those that may not be missing; by default, `needs`.
+          needs: as for `read`.
 
         Raises:
-          UserError: as `step`.
+          UserError: one is missing, unknown, of another shape, not finite, or a command in another
+            unit.
         """
-        needs = self.needs if needs is None else needs
-        for name in needs:
+        for name in self.needs if needs is None else needs:
             if name not in measurements:
                 raise UserError(
-                    f"the measurement {name} is missing; this policy needs {', '.join(needs)} in "
-                    "every step"
+                    f"the measurement {name} is missing; this policy needs "
+                    f"{', '.join(self.needs if needs is None else needs)} in every step"
                 )
-        count = self.metadata.num_balls
-        checked = {"ball_quaternion": np.tile([1.0, 0.0, 0.0, 0.0], count)}
-        checked["ball_angular_velocity"] = np.zeros(3 * count)
+        checked = dict(self._defaults)
         for name, value in measurements.items():
             if name not in self.units:
                 raise UserError(
                     f"{name} is not a measurement; a step takes {', '.join(self.units)}"
                 )
-            limit, rows = (np.inf if name == "time" else _LARGEST), count if name in PER_BALL else 1
-            checked[name] = _array(
-                f"the measurement {name}", value, self._sizes[name], self.units[name], limit, rows
-            )
+            limit = _LARGEST_TIME if name == "time" else _LARGEST
+            rows = self.metadata.num_balls if name in PER_BALL else 1
+            label = "the measurement " + name
+            checked[name] = _array(label, value, self._sizes[name], self.units[name], limit, rows)
         if self.metadata.velocity != "measured":
             checked.pop("ball_velocity", None)
+        for name, (ends, unit) in self.metadata.commands.items():
+            if name in checked:
+                _check_command(name, float(checked[name][0]), ends, unit or "no unit")
+        if "time" in measurements:
+            self._check_resolution(measurements["time"])
         return checked
 
-    def _steps_since(self, time: float | None) -> int:
-        """Control steps since the last step, at least 0."""
-        if time is None or self._first is None:
+    def _check_resolution(self, time: Any) -> None:
+        """Raises UserError for a time whose type cannot tell one control step from the next."""
+        kind = getattr(time, "dtype", None)
+        if kind is None or str(kind).endswith("64"):
+            return
+        spacing = float(np.spacing(np.ravel(np.abs(time))[0]))
+        if spacing > _FINE * self.metadata.control_dt:
+            raise UserError(
+                f"the time {np.ravel(time)[0]} s is a {kind}, whose next number is {spacing:.3g} s "
+                "later; give 64 bits, or the seconds since the start"
+            )
+
+    def steps_since(self, measured: Measurements) -> int:
+        """Control steps from the last step to the time of the measurements, at least 0.
+
+        Raises:
+          UserError: the time is 1 s or more from the last step's.
+        """
+        if "time" not in measured or self._first is None:
             return 1
-        dt = self.metadata.control_dt
+        time, dt = float(measured["time"][0]), self.metadata.control_dt
         elapsed = time - self._first - self.step_number * dt
-        if abs(elapsed) > _MAX_PAUSE:
+        if abs(elapsed) > _MAX_PAUSE - 1e-6:
             raise UserError(
                 f"the time {time} s is {elapsed:.3g} s after the last step's; call reset after a "
-                f"pause of more than {_MAX_PAUSE:g} s, and give seconds"
+                f"pause of {_MAX_PAUSE:g} s, and give seconds"
             )
         return max(0, round((time - self._first) / dt) - self.step_number)
 
-    def _refuse_impossible(self, measured: Measurements) -> None:
-        """Raises UserError for a measurement that no world of the training can hold."""
-        farthest, places = self.metadata.ball.distance, measured.get("ball_position", np.zeros(3))
-        distance = np.max(np.linalg.norm(places.reshape(-1, 3), axis=1))
-        ranges = [("the distance of ball_position", distance, 0.0, farthest, farthest, "m")]
-        ranges += [
-            (name, measured[name][0], *ends, max(np.ptp(ends), _OUTSIDE), unit or "no unit")
-            for name, (ends, unit) in self.metadata.commands.items()
-            if name in measured
+
+def _joint_order(names: Sequence[str] | Mapping[str, str], metadata: Metadata) -> list[int]:
+    """Index among the policy's joints of each of a driver's joints.
+
+    Raises:
+      UserError: the names are not those of the policy's robot.
+    """
+    own = metadata.joint_names
+    if isinstance(names, Mapping):
+        order = [own.index(name) if name in own else -1 for name in names.values()]
+    else:
+        order = [
+            own.index(name) if name in own else _last_of(own, name) for name in dict.fromkeys(names)
         ]
-        angles = measured.get("joint_angles", ())
-        joints = zip(self.metadata.joint_names, angles, *self.motion.ranges, strict=False)
-        ranges += [("the angle of " + joint, *given, _OUTSIDE, "rad") for joint, *given in joints]
-        for name, value, low, high, room, unit in ranges:
-            if not low - room <= value <= high + room:
-                raise UserError(
-                    f"{name} is {value:.3g}, but the training had {low:.3g} to {high:.3g} "
-                    f"({unit}); give this unit, the robot's frame, and the policy's order"
-                )
+    if len(names) != len(own) or sorted(order) != list(range(len(own))):
+        raise UserError(
+            f"joint_names has {', '.join(names)}, but the policy is for {metadata.robot}, whose "
+            f"joints are {', '.join(own)}; give the names of this robot, each once, or a mapping "
+            "from the driver's names to these"
+        )
+    return order
+
+
+def _last_of(own: Sequence[str], name: str) -> int:
+    """Index of the only joint whose name ends a driver's name; -1 if there is none."""
+    found = [i for i, joint in enumerate(own) if name.endswith(joint)]
+    return found[0] if len(found) == 1 else -1
+
+
+def _check_command(name: str, value: float, ends: tuple[float, float], unit: str) -> None:
+    """Raises UserError for a command that no world of the training can hold."""
+    low, high = ends
+    room = max(high - low, _OUTSIDE)
+    if not low - room <= value <= high + room:
+        raise UserError(
+            f"{name} is {value:.3g}, but the training had {low:.3g} to {high:.3g} ({unit}); give "
+            "this unit"
+        )
 
 
 def _array(label: str, value: Any, size: int, unit: str, limit: float, rows: int = 1) -> np.ndarray:
     """A user's numbers, which may come in rows, as an array [size]; UserError for another shape or
-    numbers beyond a limit."""
+    kind, or numbers beyond a limit. Hidden entries of a masked array are not finite."""
     count = "one number" if size == 1 else f"{size} numbers"
+    if isinstance(value, np.ma.MaskedArray):
+        value = np.ma.filled(value.astype(float), np.nan)
     try:
-        array = np.atleast_1d(np.array(value, float))
+        given = np.asarray(value)
+        # Text, truth values, dates and complex numbers are no measurements.
+        if given.dtype.kind not in "fiuO":
+            raise TypeError
+        array = given.astype(float)
     except (TypeError, ValueError, OverflowError) as error:
         raise UserError(f"{label} is {str(value)[:100]!r}; give {count} ({unit})") from error
-    if array.shape not in ((size,), (rows, size // rows)):
+    if array.shape not in ((size,), (rows, size // rows)) and not (size == 1 and not array.shape):
         raise UserError(f"{label} has the shape {list(array.shape)}; give {count} ({unit})")
-    wrong = ~(np.isfinite(array) & (np.abs(array) <= limit + 1e-6))
-    if np.any(wrong):
-        raise UserError(f"{label} holds {array[wrong].flat[0]}; give finite numbers ({unit})")
-    return array.ravel()
+    array = array.reshape(size)
+    sizes = np.abs(array)
+    if not sizes.max() <= limit + 1e-6:
+        wrong = array[~(sizes <= limit + 1e-6)]
+        raise UserError(f"{label} holds {wrong[0]}; give finite numbers ({unit})")
+    return array

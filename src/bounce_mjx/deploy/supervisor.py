@@ -8,6 +8,7 @@ import numpy as np
 
 from bounce_mjx.deploy.faults import Fault, Watch, picture_age
 from bounce_mjx.deploy.motion import paddle_position
+from bounce_mjx.deploy.samples import UnconfirmedSample
 from bounce_mjx.errors import UserError
 
 if TYPE_CHECKING:
@@ -22,8 +23,9 @@ _HOME_SPEED = 0.3
 
 
 class Supervisor:
-    """Gives an arm's commands, and stops the arm when a measurement, the arm or a command breaks a
-    rule (`deploy.faults`); `DeployedPolicy.supervise` creates it.
+    """Gives an arm's commands, and stops the arm when a measurement cannot be true
+    (`deploy.samples`), when the arm does not follow, or the ball is lost (`deploy.faults`), or when
+    the paddle would leave the box; `DeployedPolicy.supervise` creates it.
 
     Call `commands` once each control step, in every state:
 
@@ -56,13 +58,14 @@ class Supervisor:
         self._box, self._most_idle = np.array(box, float), max_steps_late
         if self._box.shape != (2, 3) or not np.all(self._box[0] < self._box[1]):
             raise UserError(f"the box is {box}; give its lowest and its highest x, y and z, m")
-        self._watch = Watch(metadata, age, max_steps_late * metadata.control_dt)
+        self._has_box = bool(np.any(np.isfinite(self._box)))
+        self._watch = Watch(metadata, age)
         self.state: State = "homing"
         self.fault: str | None = None
         """Code of the rule that was broken, such as `ball_lost`; `measurement` for a measurement
         that the policy refuses, `stopped` after `stop`."""
         self.reason: str | None = None
-        """Why the arm has stopped or brakes."""
+        """Why the arm has stopped or brakes, or what it waits for before it goes home."""
         self._is_moving_home = False
 
     def start(self) -> None:
@@ -96,9 +99,11 @@ class Supervisor:
             raise UserError(f"the arm is {self.state}; restart it when it has stopped")
         self.state, self.fault, self.reason = "homing", None, None
         self._is_moving_home = False
+        self._policy.samples.forget(self._policy.targets)
 
     def commands(self, measurements: Mapping[str, Any]) -> np.ndarray:
-        """Commands [M, J] of a control step at the robot's rate, rad.
+        """Commands [M, J] of a control step at the robot's rate, rad; none ([0, J]) until a first
+        sample is believed (`Samples`), so that nothing is sent.
 
         Args:
           measurements: as for `DeployedPolicy.step`. Before `start`, only the joint angles are
@@ -110,26 +115,43 @@ class Supervisor:
           UserError: the first joint angles are wrong, so that no command is known.
         """
         policy = self._policy
-        if self.state not in ("braking", "stopped"):
-            step = self._follow if self.state == "running" else self._go_home
-            try:
-                step(measurements)
-            except UserError as error:
-                if policy.targets is None:
-                    raise
-                self.stop(str(error), "measurement")
-        if self.state in ("braking", "stopped"):
+        try:
+            if self.state == "running":
+                self._follow(measurements)
+            elif self.state in ("homing", "ready"):
+                self._go_home(measurements)
+            elif policy.targets is None:
+                self._find_arm(measurements)
+        except UserError as error:
             if policy.targets is None:
-                policy.reset(self._angles(measurements))
+                raise
+            self.stop(str(error), getattr(error, "fault", "measurement"))
+        if policy.targets is None:
+            return np.zeros((0, len(policy.metadata.joint_names)))
+        if self.state in ("braking", "stopped"):
             policy.motion.hold()
             if self.state == "braking" and policy.motion.is_still:
                 self.state = "stopped"
         return policy.commands(self._rate)
 
     def _angles(self, measurements: Mapping[str, Any]) -> np.ndarray:
-        """The measured joint angles [J], whatever else is measured."""
-        given = {k: v for k, v in measurements.items() if k == "joint_angles"}
-        return self._policy.check(given, ("joint_angles",))["joint_angles"]
+        """The joint angles [J], whatever else is measured."""
+        given = {k: v for k, v in measurements.items() if k in ("joint_angles", "time")}
+        return self._policy.read(given, ("joint_angles",))["joint_angles"]
+
+    def _find_arm(self, measurements: Mapping[str, Any]) -> np.ndarray | None:
+        """The joint angles [J] from which the arm goes home, and at which its commands then rest;
+        None before they are believed."""
+        policy = self._policy
+        try:
+            angles = self._angles(measurements)
+        except UnconfirmedSample as error:
+            self.reason = str(error)
+            return None
+        # A small distance is the arm's load, and needs no step of the command.
+        if policy.targets is None or not self._are_near(policy.targets, angles):
+            policy.reset(angles)
+        return angles
 
     def _stop_at(self, faults: Iterable[Fault]) -> bool:
         """Brakes at the first of the faults, and says whether there is one."""
@@ -140,14 +162,17 @@ class Supervisor:
 
     def _go_home(self, measurements: Mapping[str, Any]) -> None:
         """A step of the way home."""
-        policy, angles = self._policy, self._angles(measurements)
-        home = np.array(policy.metadata.default_joint_angles)
-        if not self._is_moving_home:
-            # A small distance is the arm's load, and needs no step of the command.
-            if policy.targets is None or not self._are_near(policy.targets, angles):
-                policy.reset(angles)
+        policy, home = self._policy, np.array(self._policy.metadata.default_joint_angles)
+        if self._is_moving_home:
+            angles = self._angles(measurements)
+        else:
+            angles = self._find_arm(measurements)
+            if angles is None:
+                if policy.targets is not None:
+                    policy.motion.hold()
+                return
             self._watch.rest(angles, policy.targets)
-            self._is_moving_home = True
+            self._is_moving_home, self.reason = True, None
         if self._stop_at(self._watch.arm_faults(angles, policy.targets)):
             return
         if np.abs(policy.targets - home).max() > _HOME_TOLERANCE:
@@ -162,21 +187,32 @@ class Supervisor:
 
     def _follow(self, measurements: Mapping[str, Any]) -> None:
         """A step of the policy."""
-        policy = self._policy
-        measured = policy.check(measurements, dict.fromkeys((*policy.needs, "joint_angles")))
+        policy, motion = self._policy, self._policy.motion
+        measured = policy.read(measurements, (*policy.needs, "joint_angles"))
+        late = policy.steps_since(measured) - 1
+        if late > self._most_idle:
+            self.stop(f"a control step came {late} steps late", "late_step")
+            return
         if self._stop_at(self._watch.faults(measured, policy.targets)):
             return
         last = policy.step_number
-        policy.step(measurements)
+        policy.act(measured)
         self._idle = self._idle + 1 if policy.step_number == last else 0
         if self._idle:
-            policy.motion.hold()
-        target = paddle_position(policy.metadata, policy.targets)
-        outside = np.max([self._box[0] - target, target - self._box[1]])
+            motion.hold()
+        outside = self._outside()
         if self._idle > self._most_idle:
             self.stop(f"{self._idle} calls in a row are no new step", "no_step")
         elif outside > 0.0:
-            self.stop(f"the paddle's command is {outside:.3g} m outside the box", "box")
+            self.stop(f"the paddle would come to rest {outside:.3g} m outside the box", "box")
         else:
             return
-        policy.motion.withdraw()
+        motion.withdraw()
+
+    def _outside(self) -> float:
+        """How far the paddle would be outside of the box if the commands braked from the end of
+        this control step, m."""
+        if not self._has_box:
+            return -math.inf
+        path = paddle_position(self._policy.metadata, self._policy.motion.braking_path())
+        return float(np.max([self._box[0] - path, path - self._box[1]]))

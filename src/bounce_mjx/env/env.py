@@ -1,6 +1,7 @@
 """`Env`: one environment, which is a world and a task. It and `State` match brax's by structure."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -15,15 +16,23 @@ from bounce_mjx.physics.engine import Engine, make_engine
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
 from bounce_mjx.robot import model as robot_model
 from bounce_mjx.robot.balls import BALLS_APART
+from bounce_mjx.robot.geometry import read_geometry
 from bounce_mjx.task.rewards import check_names
 from bounce_mjx.task.task import Start, Step, Task, TaskStep
 from bounce_mjx.world import noise
-from bounce_mjx.world.actuation import Actuation, Actuators, recurs
+from bounce_mjx.world.actuation import Actuation, Actuators
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.noise import Clock
 from bounce_mjx.world.observation import Kinematics
-from bounce_mjx.world.randomization import TERMS, Ranges, World, physics_parameters, sample_world
-from bounce_mjx.world.sensing import Sensing, Sensors
+from bounce_mjx.world.randomization import (
+    TERMS,
+    Ranges,
+    World,
+    nominal_values,
+    physics_parameters,
+    sample_world,
+)
+from bounce_mjx.world.sensing import Instant, Sensing, Sensors
 
 # MuJoCo's mjMAXVAL: a coordinate beyond it has diverged and counts as non-finite.
 _MAX_COORDINATE = 1e10
@@ -40,6 +49,21 @@ class Redraw(NamedTuple):
     """Time since the commands were sampled [], s."""
     ranges: dict[str, tuple[jax.Array, jax.Array]]
     """The range of each command."""
+
+
+class ResetDraws(NamedTuple):
+    """Uniform random numbers of a reset: from -1 to 1 for the noise, from 0 to 1 for the others."""
+
+    joint_angles: jax.Array
+    """Noise of each joint angle [n]."""
+    joint_velocities: jax.Array
+    """Noise of each joint velocity [n]."""
+    ball_positions: jax.Array
+    """Noise of each ball's coordinates [B, 3]."""
+    commands: jax.Array
+    """Place of each command within its range [number of commands]."""
+    task: jax.Array
+    """The task's own numbers [num_draws]."""
 
 
 class EnvState(NamedTuple):
@@ -63,6 +87,10 @@ class EnvState(NamedTuple):
     actuation: Actuation = Actuation()
     sensing: Sensing | None = None
     """For an observation that differs from the true state of one instant."""
+
+
+# A ball that starts farther beside the paddle falls before the paddle is under it, m.
+_FARTHEST_BESIDE = 0.3
 
 
 @jax.tree_util.register_dataclass
@@ -111,25 +139,28 @@ class Env:
         """
         self.config = config
         self.task: Task = config.task(config)
-        if config.num_balls not in self.task.num_balls:
-            takes = " or ".join(map(str, self.task.num_balls))
-            raise UserError(
-                f"num_balls is {config.num_balls}, but the task {type(self.task).__name__} takes "
-                f"{takes}; set num_balls to {takes}"
-            )
+        self._check_seen()
+        self._check_num_balls()
         self.mj_model: mujoco.MjModel = world_model(config)
         self.engine: Engine = make_engine(self.mj_model, config.physics)
         self.layout = config.layout
         self.addresses = robot_model.find_addresses(self.mj_model)
-        self._check_start()
+        self._check_joint_angles()
+        self._check_heights()
+        self.task.geometry = read_geometry(self.mj_model, config.default_joint_angles)
+        self._check_rest()
         self._actuators = Actuators(config, self.mj_model)
         self._sensors = Sensors(config, self.mj_model, self.engine, self.task)
         self._randomize = randomize
+        self.nominals = nominal_values(self.mj_model, config.randomization.terms)
+        """Values of the terms of the randomisation in an episode that does not sample them."""
         self._fingerprint = robot_model.fingerprint(self.mj_model)
         self.dt = config.control_dt
         """Time of one control step, s."""
-        self.observation_size, self.action_size = self.layout.size, config.num_joints
-        """Lengths of the observation vector and of the action vector."""
+        self.observation_size = self.layout.size
+        """Length of the observation vector."""
+        self.action_size = config.num_joints
+        """Length of the action vector."""
         self.backend = self.engine.name
         """Name of the physics engine."""
         self.warmup_steps = config.randomization.warmup_steps
@@ -139,30 +170,80 @@ class Env:
         """Pickled as its settings; a copy is built again."""
         return type(self), (self.config, self._randomize)
 
-    def _check_start(self) -> None:
-        """Checks that the joint angles of a reset, and the heights over the paddle, fit the arm."""
-        config, model, acting = self.config, self.mj_model, robot_model.joint_names(self.mj_model)
-        angles, ranges = config.default_joint_angles, robot_model.joint_ranges(model)
-        if len(angles) != len(acting):
-            name = f"the MJCF file {config.mjcf}" if config.mjcf else "the model"
+    def _check_seen(self) -> None:
+        """Refuses a command that varies and that the policy does not see."""
+        observation = self.config.observation
+        if observation.lengths("task"):
+            # The task's own quantities may show any command.
+            return
+        for name, command in self.config.commands.items():
+            varies = command.low < command.high
+            if varies and not command.hidden and not getattr(observation, name, 0):
+                raise UserError(
+                    f"the policy does not see the command {name}, which varies from "
+                    f"{command.low:g} to {command.high:g}; give the observation a quantity {name}, "
+                    "fix the command, or mark it as hidden if it acts through others"
+                )
+
+    def _check_num_balls(self) -> None:
+        """Refuses a number of balls that the task does not take."""
+        num_balls = self.config.num_balls
+        if num_balls not in self.task.num_balls:
+            takes = " or ".join(map(str, self.task.num_balls))
             raise UserError(
-                f"default_joint_angles has {len(angles)} numbers, but {name} has {len(acting)} "
-                f"joints with an actuator ({', '.join(acting)}); give one number for each"
+                f"num_balls is {num_balls}, but the task {type(self.task).__name__} takes "
+                f"{takes}; set num_balls to {takes}"
             )
-        ranges = np.nan_to_num(ranges, posinf=_MAX_ANGLE, neginf=-_MAX_ANGLE)
-        for name, angle, low, high in zip(acting, angles, *ranges, strict=True):
+
+    def _check_joint_angles(self) -> None:
+        """Refuses joint angles of a reset that do not fit the arm."""
+        angles = self.config.default_joint_angles
+        joints = robot_model.joint_names(self.mj_model)
+        if len(angles) != len(joints):
+            name = f"the MJCF file {self.config.mjcf}" if self.config.mjcf else "the model"
+            raise UserError(
+                f"default_joint_angles has {len(angles)} numbers, but {name} has {len(joints)} "
+                f"joints with an actuator ({', '.join(joints)}); give one number for each"
+            )
+        ranges = robot_model.joint_ranges(self.mj_model)
+        lows, highs = np.nan_to_num(ranges, posinf=_MAX_ANGLE, neginf=-_MAX_ANGLE)
+        for joint, angle, low, high in zip(joints, angles, lows, highs, strict=True):
             if not low - _ROUNDING <= angle <= high + _ROUNDING:
                 raise UserError(
-                    f"default_joint_angles has {angle:g} for {name}, whose range is {low:.4g} to "
+                    f"default_joint_angles has {angle:g} for {joint}, whose range is {low:.4g} to "
                     f"{high:.4g}; give radians, or metres for a slide, within the range"
                 )
-        paddle = robot_model.data_at(model, angles).geom_xpos[self.addresses.paddle_geom, 2]
-        for name, height in config.heights.items():
-            if height <= paddle:
+
+    def _check_heights(self) -> None:
+        """Refuses heights of the config that are not over the paddle of a reset."""
+        data = robot_model.data_at(self.mj_model, self.config.default_joint_angles)
+        paddle_height = data.geom_xpos[self.addresses.paddle_geom, 2]
+        for name, height in self.config.heights.items():
+            if height <= paddle_height:
                 raise UserError(
                     f"{name} has the height {height:g} m, which is not over the paddle at "
-                    f"{paddle:.4g} m, where default_joint_angles hold it; change one of the two"
+                    f"{paddle_height:.4g} m, where default_joint_angles hold it; change one of the "
+                    "two"
                 )
+
+    def _check_rest(self) -> None:
+        """Refuses a start within or beside the paddle for the ball of a task that throws none."""
+        geometry = self.task.geometry
+        start_height = self.config.ball_init_pos[2]
+        rest_height = geometry.paddle_home[2] + geometry.rest_height
+        throws = type(self.task).throw is not Task.throw
+        x, y, _ = geometry.paddle_home
+        beside = np.linalg.norm(np.array(self.config.ball_init_pos)[:2] - (x, y))
+        if not throws and beside > _FARTHEST_BESIDE:
+            raise UserError(
+                f"ball_init_pos is {beside:.3g} m beside the paddle at ({x:.3g}, {y:.3g}) m, where "
+                "default_joint_angles hold it; start it over the paddle"
+            )
+        if not throws and start_height < rest_height - _ROUNDING:
+            raise UserError(
+                f"ball_init_pos has the height {start_height:g} m, but a ball of the radius "
+                f"{geometry.ball_radius:g} m rests on the paddle at {rest_height:.4g} m; raise it"
+            )
 
     @property
     def unwrapped(self) -> "Env":
@@ -172,13 +253,17 @@ class Env:
     def ranges(self, progress: jax.Array | float = 1.0) -> Ranges:
         """The ranges of the randomisation, and of the commands where they grow too; `progress` []
         is the share of the warm-up that has passed."""
-        randomization = self.config.randomization
-        ranges, first = randomization.ranges(progress), randomization.first_command_range
-        for name, command in self.config.commands.items() if first < 1.0 else ():
-            middle, half = (command.low + command.high) / 2.0, (command.high - command.low) / 2.0
+        ranges = self.config.randomization.ranges(progress, self.nominals)
+        first = self.config.randomization.first_command_range
+        if first == 1.0:
+            return ranges
+        for name, command in self.config.commands.items():
+            middle = (command.low + command.high) / 2.0
+            half = (command.high - command.low) / 2.0
             half *= first + (1.0 - first) * progress
-            ends = middle - half, middle + half
-            ranges[name] = tuple(jnp.asarray(end, jnp.float32) for end in ends)
+            low = jnp.asarray(middle - half, jnp.float32)
+            high = jnp.asarray(middle + half, jnp.float32)
+            ranges[name] = (low, high)
         return ranges
 
     def reset(
@@ -193,52 +278,39 @@ class Env:
           share: probability that each term is sampled; by default, the config's.
         """
         robot_model.check_unedited(self.mj_model, self._fingerprint)
-        given = self.ranges() if ranges is None else ranges
-        rng, world, clock = self._sample_world(rng, given, share)
-        own_parameters = MODEL_PARAMETERS
-        if self._randomize is not None:
-            rng, own_rng = jax.random.split(rng)
-            own_parameters = self._randomize(own_rng)
-        # One sample for all numbers: splitting keys for several would cost more than they do.
-        commands, size = self.config.commands, 2 * self.action_size + 3 * self.config.num_balls
-        count = size + len(commands) + self.task.num_draws
-        draws = jax.random.uniform(rng, (count,), minval=-1.0, maxval=1.0)
-        noises, command_draws, task_draws = jnp.split(draws, [size, size + len(commands)])
-        task_draws = 0.5 * (task_draws + 1.0)
-        ends = {name: given.get(name, (c.low, c.high)) for name, c in commands.items()}
-        command = {
-            name: low + (high - low) * 0.5 * (draw + 1.0)
-            for draw, (name, (low, high)) in zip(command_draws, ends.items(), strict=True)
-        }
-        redraw = None
-        if "command_interval" in world:
-            age = jnp.zeros((), draws.dtype)
-            redraw = Redraw(age, jax.tree.map(lambda end: jnp.asarray(end, draws.dtype), ends))
+        if ranges is None:
+            ranges = self.ranges()
+        rng, world, clock = self._sample_world(rng, ranges, share)
+        rng, randomized = self._sample_parameters(rng)
+        parameters = self._parameters(world, randomized)
+        draws = self._draw(rng)
 
-        physics = self._first_physics(noises, world, self.task.throw(task_draws, command))
+        command_ranges = self._command_ranges(ranges)
+        sampled = sample_commands(command_ranges, draws.commands)
+        physics = self._first_physics(draws, world, self.task.throw(draws.task, sampled))
+        truth = self._kinematics(physics, parameters)
+        first_command = self._first_command(sampled)
+        task = self.task.reset(Start(truth, first_command, draws.task))
+        command = self._next_command(task, first_command)
+
         state = EnvState(
             physics=physics,
             command=command,
-            last_action=jnp.zeros(self.action_size, draws.dtype),
-            parameters=self._parameters(world, own_parameters),
+            last_action=jnp.zeros(self.action_size, physics.qpos.dtype),
+            task=task,
+            parameters=parameters,
             world=world,
             clock=clock,
-            redraw=redraw,
+            redraw=self._first_redraw(world, command_ranges, physics.qpos.dtype),
             actuation=self._actuators.first(physics.qpos),
         )
-        truth = self.kinematics(state)
-        task = self.task.reset(Start(truth, command, task_draws))
-        following = self.task.next_command(task, command)
-        named = f"next_command of the task {type(self.task).__name__}"
-        check_names(named, "command", following, command)
-        state = state._replace(task=task, command=following)
         if self._sensors.are_needed:
-            state = state._replace(sensing=self._sensors.first(state, truth))
+            state = state._replace(sensing=self._sensors.first(_instant(state, truth)))
         return State(
             pipeline_state=state,
             obs=self.observe(state, truth),
-            reward=jnp.zeros((), draws.dtype),
-            done=jnp.zeros((), draws.dtype),
+            reward=jnp.zeros((), physics.qpos.dtype),
+            done=jnp.zeros((), physics.qpos.dtype),
             metrics=self._first_metrics(state, truth),
         )
 
@@ -246,16 +318,19 @@ class Env:
         """Advances one control step under the action [n], clipped to [-1, 1]. A NaN action ends the
         episode and acts as 0."""
         robot_model.check_unedited(self.mj_model, self._fingerprint)
-        now = state.pipeline_state
-        control, actuation = self.control(now, action)
-        physics = self.engine.step(now.parameters, now.physics, control, self.config.num_substeps)
+        before = state.pipeline_state
+        control, actuation = self.control(before, action)
+        num_substeps = self.config.num_substeps
+        physics = self.engine.step(before.parameters, before.physics, control, num_substeps)
         return self.finish_step(state, action, actuation, physics)
 
-    def control(self, now: EnvState, action: jax.Array) -> tuple[Control, Actuation]:
+    def control(self, before: EnvState, action: jax.Array) -> tuple[Control, Actuation]:
         """The part of a step before the physics: its inputs under the action [n] of `step`, and
         the memory of the actuation after the step."""
         action, _ = _clip_action(action)
-        return self._actuators.next(now.actuation, now.physics.qpos, action, now.world, now.clock)
+        return self._actuators.next(
+            before.actuation, before.physics.qpos, action, before.world, before.clock
+        )
 
     def finish_step(
         self, state: State, action: jax.Array, actuation: Actuation, physics: PhysicsState
@@ -275,80 +350,184 @@ class Env:
         physics, finite = _keep_finite(physics, before.physics)
         action, is_number = _clip_action(action)
         action = jnp.where(finite, action, before.last_action)
-        now = self._pass_time(
-            before._replace(physics=physics, last_action=action, actuation=actuation)
-        )
+        now = before._replace(physics=physics, last_action=action, actuation=actuation)
         truth = self.kinematics(now)
 
-        done = self.task.step(before.task, Step(truth, now.command, action, before.last_action))
-        command = self.task.next_command(done.state, now.command)
-        now = now._replace(task=done.state, command=command)
+        task_step = Step(
+            truth=truth,
+            command=before.command,
+            action=action,
+            last_action=before.last_action,
+            ball_radius=before.parameters.ball_radius,
+        )
+        result = self.task.step(before.task, task_step)
         ends = {
             "non_finite": ~(finite & is_number),
             "too_fast": jnp.any(jnp.abs(truth.joint_velocities) > self.config.max_joint_velocity),
         }
+
+        now = self._redraw_commands(now)
+        command = self.task.next_command(result.state, now.command)
+        now = now._replace(task=result.state, command=command)
+        if now.clock is not None:
+            now = now._replace(clock=noise.next_clock(now.clock))
         if now.sensing is not None:
-            now = now._replace(sensing=self._sensors.next(now, truth))
+            sensing = self._sensors.next(now.sensing, _instant(now, truth))
+            now = now._replace(sensing=sensing)
+
         dtype = truth.ball_position.dtype
-        metrics = _metrics(done, dtype) | {name: end.astype(dtype) for name, end in ends.items()}
+        metrics = _metrics(result, dtype)
+        metrics |= {name: end.astype(dtype) for name, end in ends.items()}
+        metrics |= self._privileged_metrics(now.world, truth)
+        ended = result.ended | ends["non_finite"] | ends["too_fast"]
         return state.replace(
             pipeline_state=now,
             obs=self.observe(now, truth),
-            reward=sum(done.reward.values()),
-            done=(done.ended | ends["non_finite"] | ends["too_fast"]).astype(dtype),
+            reward=sum(result.reward.values()),
+            done=ended.astype(dtype),
             # Wrappers add their own metrics, which a step must keep.
-            metrics=state.metrics | metrics | self._privileged_metrics(now.world, truth),
+            metrics=state.metrics | metrics,
         )
 
     def _sample_world(
-        self, rng: jax.Array, given: Ranges, share: float | None
+        self, rng: jax.Array, ranges: Ranges, share: float | None
     ) -> tuple[jax.Array, World, Clock | None]:
         """An unused key, the world of an episode, and its clock; the arguments are those of
         `reset`."""
-        ranges = {name: ends for name, ends in given.items() if name in TERMS}
-        if not (ranges or self._sensors.are_needed):
+        term_ranges = {name: ends for name, ends in ranges.items() if name in TERMS}
+        if not (term_ranges or self._sensors.are_needed):
             return rng, {}, None
-        terms, dtype = self.config.randomization, jnp.result_type(float)
+        dtype = jnp.result_type(float)
         rng, world_rng, clock_rng = jax.random.split(rng, 3)
-        share, shares = (terms.share, terms.shares or {}) if share is None else (share, {})
-        world = sample_world(ranges, world_rng, dtype, self.action_size, share, shares)
+        shares = {}
+        if share is None:
+            share = self.config.randomization.share
+            shares = self.config.randomization.shares or {}
+        world = sample_world(
+            term_ranges, world_rng, dtype, self.action_size, self.nominals, share, shares
+        )
         return rng, world, noise.first_clock(clock_rng, dtype)
 
+    def _sample_parameters(self, rng: jax.Array) -> tuple[jax.Array, PhysicsParameters]:
+        """An unused key, and the parameters that `randomize` samples."""
+        if self._randomize is None:
+            return rng, MODEL_PARAMETERS
+        rng, parameters_rng = jax.random.split(rng)
+        return rng, self._randomize(parameters_rng)
+
+    def _draw(self, rng: jax.Array) -> ResetDraws:
+        """The random numbers of a reset; consumes the key."""
+        num_joints = self.action_size
+        num_balls = self.config.num_balls
+        num_noises = 2 * num_joints + 3 * num_balls
+        num_commands = len(self.config.commands)
+        # One sample for all numbers: splitting keys for several would cost more than they do.
+        count = num_noises + num_commands + self.task.num_draws
+        draws = jax.random.uniform(rng, (count,), minval=-1.0, maxval=1.0)
+        noises, commands, task = jnp.split(draws, [num_noises, num_noises + num_commands])
+        return ResetDraws(
+            joint_angles=noises[:num_joints],
+            joint_velocities=noises[num_joints : 2 * num_joints],
+            ball_positions=noises[2 * num_joints :].reshape(num_balls, 3),
+            commands=0.5 * (commands + 1.0),
+            task=0.5 * (task + 1.0),
+        )
+
     def _first_physics(
-        self, draws: jax.Array, world: World, thrown: tuple[jax.Array, jax.Array] | None
+        self, draws: ResetDraws, world: World, thrown: tuple[jax.Array, jax.Array] | None
     ) -> PhysicsState:
         """The arm and the balls at a reset.
 
         Args:
-          draws: numbers from -1 to 1 for the angle and the velocity of each joint, and for the
-            balls' positions [2 n + 3 B].
-          thrown: the task's position and velocity of the ball [3], or of the balls [B, 3].
+          thrown: the task's position and velocity of the ball [3], or of the balls [B, 3]; None for
+            balls at rest at `ball_init_pos` and above it.
         """
-        config, addresses, model = self.config, self.addresses, self.mj_model
-        dtype, n, count = draws.dtype, self.action_size, config.num_balls
-        if thrown is None:
-            above = np.array([[0.0, 0.0, BALLS_APART * i] for i in range(count)])
-            thrown = np.array(config.ball_init_pos) + above, np.zeros((count, 3))
-        positions, velocities = (jnp.asarray(x, dtype).reshape(count, 3) for x in thrown)
-        positions = positions + config.reset.ball_position * draws[2 * n :].reshape(count, 3)
-        angles = jnp.asarray(config.default_joint_angles, dtype)
-        angles = angles + config.reset.joint_angles * draws[:n] + world.get("joint_start", 0.0)
-        positions = positions + world.get("ball_start", 0.0)
-
-        rates = config.reset.joint_velocities * draws[n : 2 * n]
+        dtype = draws.joint_angles.dtype
+        num_balls = self.config.num_balls
+        noise_widths = self.config.reset
         scatter = robot_model.scatter
-        qpos = scatter(model.qpos0, addresses.arm_qpos, angles)
-        qvel = scatter(np.zeros(model.nv), addresses.arm_qvel, rates)
-        for ball, position, velocity in zip(addresses.balls, positions, velocities, strict=True):
-            pose = jnp.concatenate([position, jnp.array([1.0, 0.0, 0.0, 0.0], dtype)])
-            qpos, qvel = scatter(qpos, ball.qpos, pose), scatter(qvel, ball.qvel[:3], velocity)
+
+        angles = jnp.asarray(self.config.default_joint_angles, dtype)
+        angles = angles + noise_widths.joint_angles * draws.joint_angles
+        angles = angles + world.get("joint_start", 0.0)
+        joint_velocities = noise_widths.joint_velocities * draws.joint_velocities
+        qpos = scatter(self.mj_model.qpos0, self.addresses.arm_qpos, angles)
+        qvel = scatter(np.zeros(self.mj_model.nv), self.addresses.arm_qvel, joint_velocities)
+
+        if thrown is None:
+            heights = np.array([[0.0, 0.0, BALLS_APART * i] for i in range(num_balls)])
+            thrown = np.array(self.config.ball_init_pos) + heights, np.zeros((num_balls, 3))
+        positions, velocities = (jnp.asarray(x, dtype).reshape(num_balls, 3) for x in thrown)
+        positions = positions + noise_widths.ball_position * draws.ball_positions
+        positions = positions + world.get("ball_start", 0.0)
+        level = jnp.array([1.0, 0.0, 0.0, 0.0], dtype)
+        for i, ball in enumerate(self.addresses.balls):
+            qpos = scatter(qpos, ball.qpos, jnp.concatenate([positions[i], level]))
+            qvel = scatter(qvel, ball.qvel[:3], velocities[i])
         return PhysicsState(qpos, qvel)
+
+    def _command_ranges(self, ranges: Ranges) -> Ranges:
+        """The range of each command: one of `ranges`, or the config's."""
+        return {
+            name: ranges.get(name, (command.low, command.high))
+            for name, command in self.config.commands.items()
+        }
+
+    def _first_command(self, sampled: dict[str, jax.Array]) -> dict[str, jax.Array]:
+        """The task's commands from their samples, each []."""
+        command = self.task.first_command(sampled)
+        named = f"first_command of the task {type(self.task).__name__}"
+        check_names(named, "command", command, sampled)
+        return command
+
+    def _next_command(self, task: Any, command: dict[str, jax.Array]) -> dict[str, jax.Array]:
+        """The commands of a reset from now on, each []; `task` is the task's state."""
+        following = self.task.next_command(task, command)
+        named = f"next_command of the task {type(self.task).__name__}"
+        check_names(named, "command", following, command)
+        return following
+
+    def _first_redraw(self, world: World, ranges: Ranges, dtype: jnp.dtype) -> Redraw | None:
+        """What later samples of the commands need; None if they stay for the whole episode."""
+        if "command_interval" not in world:
+            return None
+        kept = {}
+        for name, (low, high) in ranges.items():
+            kept[name] = (jnp.asarray(low, dtype), jnp.asarray(high, dtype))
+        return Redraw(age=jnp.zeros((), dtype), ranges=kept)
+
+    def _redraw_commands(self, state: EnvState) -> EnvState:
+        """The state with new commands after a control step in which their interval passes; its
+        clock is still that of the step."""
+        if state.redraw is None:
+            return state
+        age, ranges = state.redraw
+        clock = state.clock
+        is_due = noise.is_due(
+            state.world["command_interval"], clock.command_phase, clock.step, self.dt
+        )
+        # The clock's own counter has given the phases in this stream.
+        counter = noise.next_counter(clock.counter)
+        draws = noise.uniform(counter, noise.COMMAND, (len(ranges),), age.dtype)
+        in_order = {name: ranges[name] for name in self.config.commands}
+        new_command = self._first_command(sample_commands(in_order, draws))
+        command = {
+            name: jnp.where(is_due, new_command[name], value)
+            for name, value in state.command.items()
+        }
+        redraw = Redraw(age=jnp.where(is_due, 0.0, age + self.dt), ranges=ranges)
+        return state._replace(command=command, redraw=redraw)
 
     def _first_metrics(self, state: EnvState, truth: Kinematics) -> dict[str, jax.Array]:
         """The metrics of a reset, which are zero except for the privileged ones."""
         zero = jnp.zeros((), truth.joint_angles.dtype)
         # The names alone: no step is computed.
-        step = Step(truth, state.command, state.last_action, state.last_action)
+        step = Step(
+            truth=truth,
+            command=state.command,
+            action=state.last_action,
+            last_action=state.last_action,
+        )
         names = jax.eval_shape(lambda: _metrics(self.task.step(state.task, step), zero.dtype))
         metrics = dict.fromkeys([*names, "non_finite", "too_fast"], zero)
         metrics |= self._privileged_metrics(state.world, truth)
@@ -357,27 +536,14 @@ class Env:
             check_names(f"the curve {curve.tag}", "metric", {*metrics} | shown, metrics)
         return metrics
 
-    def _pass_time(self, state: EnvState) -> EnvState:
-        """The state after a control step has passed: the clock, and new commands if their interval
-        has passed."""
-        if state.clock is None:
-            return state
-        clock = noise.next_clock(state.clock)
-        if state.redraw is None:
-            return state._replace(clock=clock)
-        (age, ranges), command = state.redraw, {}
-        interval, phase = state.world["command_interval"], clock.phases[2]
-        now = recurs(interval, phase, state.clock.step, self.dt)
-        shares = noise.uniform(clock.counter, noise.COMMAND, (len(ranges),), age.dtype)
-        for i, name in enumerate(self.config.commands):
-            low, high = ranges[name]
-            command[name] = jnp.where(now, low + (high - low) * shares[i], state.command[name])
-        redraw = Redraw(jnp.where(now, 0.0, age) + self.dt, ranges)
-        return state._replace(clock=clock, command=command, redraw=redraw)
-
     def kinematics(self, state: EnvState) -> Kinematics:
         """True positions and velocities of one environment's state, read from its physics."""
-        addresses, (qpos, qvel) = self.addresses, (state.physics.qpos, state.physics.qvel)
+        return self._kinematics(state.physics, state.parameters)
+
+    def _kinematics(self, physics: PhysicsState, parameters: PhysicsParameters) -> Kinematics:
+        addresses = self.addresses
+        qpos = physics.qpos
+        qvel = physics.qvel
 
         def ball_rows(coordinates: jax.Array, entries: list[tuple[int, ...]]) -> jax.Array:
             rows = [jnp.stack([coordinates[i] for i in row]) for row in entries]
@@ -390,7 +556,7 @@ class Env:
             joint_velocities=jnp.stack([qvel[i] for i in addresses.arm_qvel]),
             ball_velocity=ball_rows(qvel, [ball.qvel[:3] for ball in addresses.balls]),
             ball_angular_velocity=ball_rows(qvel, [ball.qvel[3:] for ball in addresses.balls]),
-            paddle_position=self.engine.paddle_position(state.parameters, qpos),
+            paddle_position=self.engine.paddle_position(parameters, qpos),
         )
 
     def observe(self, state: EnvState, truth: Kinematics | None = None) -> jax.Array:
@@ -412,17 +578,18 @@ class Env:
 
     def with_world(self, state: EnvState, world: World) -> EnvState:
         """The state with other values of the terms of its world."""
-        own = MODEL_PARAMETERS
+        randomized = MODEL_PARAMETERS
         if self._randomize is not None:
-            given = jax.eval_shape(self._randomize, jax.random.PRNGKey(0))
-            pairs = zip(given, state.parameters, strict=True)
-            own = PhysicsParameters(*(None if x is None else value for x, value in pairs))
-        return state._replace(world=world, parameters=self._parameters(world, own))
+            forms = jax.eval_shape(self._randomize, jax.random.PRNGKey(0))
+            names = [name for name, form in forms._asdict().items() if form is not None]
+            randomized = PhysicsParameters(**{n: getattr(state.parameters, n) for n in names})
+        return state._replace(world=world, parameters=self._parameters(world, randomized))
 
-    def _parameters(self, world: World, own: PhysicsParameters) -> PhysicsParameters:
-        """The physics of a world, in which the parameters of `randomize` replace its own."""
-        pairs = zip(own, physics_parameters(world, self.mj_model), strict=True)
-        return PhysicsParameters(*(sampled if x is None else x for x, sampled in pairs))
+    def _parameters(self, world: World, randomized: PhysicsParameters) -> PhysicsParameters:
+        """The physics of a world, in which the parameters of `randomize` replace those of the
+        world's terms."""
+        given = {name: value for name, value in randomized._asdict().items() if value is not None}
+        return physics_parameters(world, self.mj_model)._replace(**given)
 
     def _privileged_metrics(self, world: World, truth: Kinematics) -> dict[str, jax.Array]:
         """Quantities that only a critic may see: `world/<term>` and, where the sensors differ from
@@ -432,11 +599,13 @@ class Env:
             hidden = ("joint_angles", "ball_position", "joint_velocities", "ball_velocity")
             hidden += ("ball_angular_velocity", "paddle_position")
             named |= {f"true/{name}": getattr(truth, name) for name in hidden}
-        return {
-            name if value.ndim == 0 else f"{name}_{i}": entry
-            for name, value in named.items()
-            for i, entry in enumerate(jnp.ravel(value) if value.ndim else (value,))
-        }
+        metrics = {}
+        for name, value in named.items():
+            if value.ndim == 0:
+                metrics[name] = value
+            else:
+                metrics |= {f"{name}_{i}": entry for i, entry in enumerate(jnp.ravel(value))}
+        return metrics
 
 
 def world_model(config: WorldConfig, visual: bool = True) -> mujoco.MjModel:
@@ -447,6 +616,33 @@ def world_model(config: WorldConfig, visual: bool = True) -> mujoco.MjModel:
     if config.friction is None:
         return mj_model
     return edited_model(mj_model, PhysicsParameters(contact_friction=np.float64(config.friction)))
+
+
+@functools.lru_cache(maxsize=8)
+def model_nominals(config: WorldConfig) -> dict[str, np.ndarray]:
+    """The `nominal_values` of all terms for a config, whose model it compiles."""
+    return nominal_values(world_model(config, visual=False), TERMS)
+
+
+def sample_commands(ranges: Ranges, draws: jax.Array) -> dict[str, jax.Array]:
+    """A sample [] of each command within its range, from numbers between 0 and 1 [number of
+    commands]."""
+    sampled = {}
+    for draw, (name, (low, high)) in zip(draws, ranges.items(), strict=True):
+        sampled[name] = low + (high - low) * draw
+    return sampled
+
+
+def _instant(state: EnvState, truth: Kinematics) -> Instant:
+    """What the sensors depend on in a state."""
+    return Instant(
+        truth=truth,
+        command=state.command,
+        last_action=state.last_action,
+        setpoint=state.actuation.setpoint,
+        world=state.world,
+        clock=state.clock,
+    )
 
 
 def _keep_finite(physics: PhysicsState, before: PhysicsState) -> tuple[PhysicsState, jax.Array]:
@@ -469,7 +665,8 @@ def _clip_action(action: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.where(is_number, jnp.clip(action, -1.0, 1.0), 0.0), is_number
 
 
-def _metrics(done: TaskStep, dtype: jnp.dtype) -> dict[str, jax.Array]:
+def _metrics(result: TaskStep, dtype: jnp.dtype) -> dict[str, jax.Array]:
     """The metrics of a task's step, each []."""
-    numbers = {name: jnp.asarray(value, dtype) for name, value in done.metrics.items()}
-    return {f"reward/{name}": value for name, value in done.reward.items()} | numbers
+    rewards = {f"reward/{name}": value for name, value in result.reward.items()}
+    numbers = {name: jnp.asarray(value, dtype) for name, value in result.metrics.items()}
+    return rewards | numbers

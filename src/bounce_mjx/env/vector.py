@@ -18,7 +18,7 @@ class AnyEnv(Protocol):
     task, which names what to log."""
 
     task: Task | type[Task]
-    """The task, of which a training run reads `curves` and `critic_metrics`."""
+    """The task, of which training reads `curves` and `critic_metrics`; both may be empty."""
 
     observation_size: int
     """Length of the observation vector."""
@@ -69,7 +69,14 @@ class VectorStep(NamedTuple):
 
 
 def reset(env: AnyEnv, key: jax.Array, num_envs: int, ranges: Any = None) -> VectorState:
-    """Starts `num_envs` episodes; consumes `key`."""
+    """Starts episodes.
+
+    Args:
+      env: the environment.
+      key: consumed.
+      num_envs: number of episodes, B.
+      ranges: ranges of the randomisation; None for the environment's own.
+    """
     states = first_states(env, key, num_envs, ranges)
     return VectorState(
         env=states,
@@ -80,15 +87,20 @@ def reset(env: AnyEnv, key: jax.Array, num_envs: int, ranges: Any = None) -> Vec
 
 
 def first_states(env: AnyEnv, key: jax.Array, num_envs: int, ranges: Any = None) -> State:
-    """Environment states at the start of `num_envs` episodes, the batch last; consumes `key`.
+    """Environment states at the start of episodes, the batch last.
 
     Args:
+      env: the environment.
+      key: consumed.
+      num_envs: number of episodes, B.
       ranges: ranges of the randomisation; None for the environment's own.
     """
-    given = () if ranges is None else (ranges,)
-    return jax.vmap(lambda key: env.reset(key, *given), out_axes=-1)(
-        jax.random.split(key, num_envs)
-    )
+
+    def first_state(key: jax.Array) -> State:
+        # Other environments have no ranges.
+        return env.reset(key) if ranges is None else env.reset(key, ranges)
+
+    return jax.vmap(first_state, out_axes=-1)(jax.random.split(key, num_envs))
 
 
 def ranges_after(env: AnyEnv, count: jax.Array | None, steps_each: int) -> Any:
@@ -117,6 +129,8 @@ def step(
     """Advances every environment, and resets every ended episode with a new sample.
 
     Args:
+      env: the environment.
+      state: before the step.
       action: [B, A].
       key: consumed by the resets; None with `fresh`.
       episode_steps: time limit of an episode in steps.
@@ -128,7 +142,8 @@ def step(
     if fresh is None:
         fresh = first_states(env, key, state.clock.shape[0], ranges)
     stepped = jax.vmap(env.step, in_axes=-1, out_axes=-1)(state.env, action.T)
-    clock, length = state.clock + 1, state.length + 1
+    clock = state.clock + 1
+    length = state.length + 1
     episode_return = state.episode_return + stepped.reward
     terminated = stepped.done > 0
     truncated = (clock >= episode_steps) & ~terminated

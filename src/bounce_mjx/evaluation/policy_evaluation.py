@@ -13,6 +13,7 @@ from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import Report, judge
 from bounce_mjx.evaluation.suite import neutral_commands
 from bounce_mjx.learning.policy import Actor, Policy
+from bounce_mjx.physics.convergence import solver_warning
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import RandomizationConfig
 
@@ -23,6 +24,8 @@ class PolicyEvaluation(NamedTuple):
     report: Report
     engine: str
     """fused, mjx or mujoco."""
+    warning: str | None
+    """Why MuJoCo's C engine computes something else than the fused one; None if it does not."""
 
 
 def evaluate_policy(
@@ -60,4 +63,5 @@ def evaluate_policy(
     evaluate = make(env, actor(env), options.episodes, recorded)
     key = jax.random.PRNGKey(options.seed)
     measured = evaluate(policy, key, ranges if commands else None)
-    return PolicyEvaluation(judge(env, *measured, commands), engine)
+    warning = solver_warning(env.mj_model) if on_c else None
+    return PolicyEvaluation(judge(env, *measured, commands), engine, warning)

@@ -13,6 +13,7 @@ from pydantic import Field
 from bounce_mjx.config.files import differing_keys, read_mapping
 from bounce_mjx.config.settings import Finite, StrictModel, merged, nested
 from bounce_mjx.config.validation import validate
+from bounce_mjx.env.env import model_nominals
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.tasks.registry import find_task
 from bounce_mjx.world.actuation import DEFAULT_PUSH_INTERVAL
@@ -151,6 +152,8 @@ def load_suite(
 def neutral_range(name: str, env: WorldConfig) -> Bounds | None:
     """Range of a term without effect on the world; None if the term has no such value."""
     value = _INTERVALS.get(name, TERMS[name].nominal)
+    if value is None and TERMS[name].has_nominal:
+        value = model_nominals(env).get(name)
     return None if value is None else _broadcast(name, env.num_joints, value, value)
 
 

@@ -5,31 +5,36 @@ matters in one window, are eliminated inside every step: the variable projection
 Pereyra (1973) in the linearised problem.
 """
 
-import itertools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from bounce_mjx.identify.simulation import Simulate
 from bounce_mjx.identify.unknowns import ARM, Layout
 from bounce_mjx.identify.windows import Windows
 
 # Deviation of the guessed starts, and the differences for their derivatives: angles (rad), joint
-# velocities (rad/s); the ball's position (m), velocity (m/s) and spin (rad/s).
-_START_DEVIATIONS = (0.01, 1.0, 1.0, 10.0, 10.0)
-_START_STEPS = (3e-3, 0.1, 0.01, 0.03, 5.0)
+# velocities (rad/s); the ball's position (m), velocity (m/s), spin (rad/s) and, relative to that of
+# all flights, drag.
+_START_DEVIATIONS = (0.01, 1.0, 1.0, 10.0, 10.0, 0.15)
+_START_STEPS = (3e-3, 0.1, 0.01, 0.03, 5.0, 0.05)
 # Entries of a start that are searched: a servo forgets a wrong velocity within milliseconds.
-_SEARCHED = (True, False, True, True, True)
+_SEARCHED = (True, False, True, True, True, False)
 # Levenberg and Marquardt's dampings, and shares of the change of the starts, that a step tries side
-# by side: the best damping for all, and the best share for each window.
+# by side: the best damping for all, and the best share for each window. With a share of 0, a wrong
+# slope of one window's start cannot spoil the step of all.
 _DAMPINGS = np.array([0.0, 1e-2, 0.3, 10.0])
-_SHARES = np.array([1.0, 0.3])
-_CONVERGED = 0.3
-# Residuals of pictures beyond this many standard deviations lose weight (Huber 1964).
+_SHARES = np.array([1.0, 0.3, 0.0])
+# Farthest that an angle of a start may be from its guess, a measurement, in deviations.
+_FARTHEST_START = 5.0
+# Decrease of the cost, and its share, at which a search ends.
+_CONVERGED, _CONVERGED_SHARE = 0.3, 2e-5
+# Residuals beyond this many standard deviations lose weight (Huber 1964).
 _HUBER = 3.0
-# Mean squared residual of the pictures of a window beyond which the ball was not in free flight.
-_NO_FLIGHT = 25.0
+NO_FLIGHT = 25.0
+"""Mean squared residual of a window's pictures beyond which the ball was not in free flight."""
 _WORST = 30.0
 # Largest leverage of a window, its share of the information along a direction: a window with all of
 # it leaves no residual to correct.
@@ -41,6 +46,14 @@ _DISAGREEMENT = 0.1
 # real paddle is not the same everywhere; and a simulated bounce depends by as much on where in a
 # physics step it begins, which makes the fit smooth only with this freedom.
 _BOUNCE_DEVIATION = (0.02, 0.02, 0.1)
+# The same of a ball with spin, which rubs and rolls in ways that the contact's friction lacks.
+_SPINNING_DEVIATION = (0.5, 0.5, 0.1)
+AIR_LIFT = 0.006
+"""Acceleration of a table-tennis ball across its flight, per spin (rad/s) and speed (m/s): a flight
+shows its product with the spin alone."""
+# Deviation of the spin of a flight that shows lift, rad/s, and of the acceleration by the spin
+# after a bounce from the model's, m/s^2.
+_SPIN_DEVIATION, _LIFT_DEVIATION = 150.0, 4.0
 
 
 class Noise(NamedTuple):
@@ -73,9 +86,13 @@ class Problem(NamedTuple):
     simulate: Simulate
     windows: Windows
     layout: Layout
+    sensors: Noise
     noise: Noise
+    """What counts as noise: the sensors', or the model's own errors where they are larger."""
     progress: Callable[[str], None] = lambda line: None
     """Called with a line about each step of a search."""
+    has_lift: bool = False
+    """Whether spin lifts the ball; the spin after a bounce then is as free as that before it."""
 
     @property
     def deviations(self) -> np.ndarray:
@@ -91,31 +108,58 @@ class Problem(NamedTuple):
         """Residuals [..., S, A n + 3 B] in units of the noise, times the roots of their weights,
         and without the common error of the pictures after a bounce.
 
-        A bounce that deviates from the model moves each picture after it, along each axis, by c =
-        time since the bounce * deviation / noise. The residuals' covariance is then I + c c', and
-        its inverse root is I - c c' (1 - 1 / sqrt(1 + |c|^2)) / |c|^2.
+        A bounce that deviates from the model moves each picture after it, along each axis, by the
+        columns C = time since the bounce * deviation of the velocity / noise and, with lift, time^2
+        / 2 * deviation of the acceleration / noise. The residuals' covariance is then I + C C'.
+        With C'C = V diag(l) V', its inverse root is I - C V diag((1 - 1 / sqrt(1 + l)) / l) V' C'.
         """
         w, root = self.windows, np.sqrt(weights)
         scaled = (predicted - w.measured) / self.deviations * root
         angles, balls = w.split(scaled)
-        since = np.nan_to_num(w.picture_times - w.bounces[:, None])
-        common = np.maximum(since, 0.0)[:, :, None] * _BOUNCE_DEVIATION / self.noise.balls
-        common = common * w.split(root)[1]
-        squared = np.maximum(np.sum(common**2, axis=1), 1e-12)
-        share = (1.0 - 1.0 / np.sqrt(1.0 + squared)) / squared
-        along = np.sum(common * balls, axis=-2)
-        white = balls - common * (share * along)[..., None, :]
+        columns = self.bounce_columns() * w.split(root)[1][..., None]
+        squares, vectors = np.linalg.eigh(np.einsum("sbak,sbal->sakl", columns, columns))
+        squares = np.maximum(squares, 1e-12)
+        shares = (1.0 - 1.0 / np.sqrt(1.0 + squares)) / squares
+        inner = np.einsum("saik,sak,sajk->saij", vectors, shares, vectors)
+        along = np.einsum("sbak,...sba->...sak", columns, balls)
+        white = balls - np.einsum("sbai,saij,...saj->...sba", columns, inner, along)
         return np.concatenate([x.reshape(*scaled.shape[:-1], -1) for x in (angles, white)], axis=-1)
 
+    def bounce_columns(self) -> np.ndarray:
+        """Shifts [S, B, 3, K] of the pictures, in units of their noise, by each way in which a
+        bounce may deviate from the model, by its standard deviation."""
+        since = np.nan_to_num(self.windows.picture_times - self.windows.bounces[:, None])
+        since = np.maximum(since, 0.0)[:, :, None]
+        columns = [since * _BOUNCE_DEVIATION / self.noise.balls]
+        if self.has_lift:
+            columns = [since * _SPINNING_DEVIATION / self.noise.balls]
+            columns.append(0.5 * since**2 * _LIFT_DEVIATION / self.noise.balls)
+        return np.stack(columns, axis=-1)
+
+    def scale_starts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Deviation, difference and whether it is searched, of each entry of a start [2 n + 10]."""
+        n = self.windows.angles.shape[2]
+        sizes = n, n, 3, 3, 3, 1
+        deviations = np.repeat(_START_DEVIATIONS, sizes)
+        searched = np.repeat(_SEARCHED, sizes)
+        if self.has_lift:
+            deviations[-4:-1] = _SPIN_DEVIATION
+            searched[-1] = True
+        return deviations, np.repeat(_START_STEPS, sizes), searched
+
     def weights(
-        self, pictures: np.ndarray | float = 1.0, windows: np.ndarray | float = 1.0
+        self,
+        pictures: np.ndarray | float = 1.0,
+        windows: np.ndarray | float = 1.0,
+        angles: np.ndarray | float = 1.0,
     ) -> np.ndarray:
-        """Weights [S, A n + 3 B]; those of the pictures [S, B] are multiplied by `pictures`, and
-        those of the windows [S, 1] by `windows`."""
+        """Weights [S, A n + 3 B]; those of the pictures [S, B] are multiplied by `pictures`, those
+        of the angles [S, A, n] by `angles`, and those of the windows [S, 1] by `windows`."""
         w = self.windows
-        angles = np.repeat(w.angle_weights, w.angles.shape[2], axis=1)
-        balls = np.repeat(w.picture_weights * pictures, 3, axis=1)
-        return np.concatenate([angles, balls], axis=1) * windows
+        of_angles = w.angle_weights[:, :, None] * angles * np.ones(w.angles.shape)
+        of_balls = np.repeat(w.picture_weights * pictures, 3, axis=1)
+        rows = [of_angles.reshape(len(of_angles), -1), of_balls]
+        return np.concatenate(rows, axis=1) * windows
 
 
 def minimise(
@@ -135,13 +179,15 @@ def minimise(
       free_states: which entries [D] of the starts may change; all by default.
     """
     layout, guess = problem.layout, problem.windows.starts
-    deviations, _, searched = _scale_starts(problem.windows)
+    deviations, _, searched = problem.scale_starts()
     unknowns = np.flatnonzero(layout.free(stages))
     entries = np.flatnonzero(searched if free_states is None else searched & free_states)
     scale, reach = layout.deviation[unknowns], deviations[entries]
     # The start of a window that does not count stays as it is.
     used = np.any(weights > 0.0, axis=1)
     num_tried, each = len(_DAMPINGS) * len(_SHARES), np.arange(len(guess))
+    is_angle = np.arange(len(deviations)) < layout.num_joints
+    farthest = np.where(is_angle, _FARTHEST_START * deviations, np.inf)
 
     def data_costs(white: np.ndarray, states: np.ndarray) -> np.ndarray:
         """Half the sum of squares of each candidate and window [C, S]."""
@@ -152,7 +198,7 @@ def minimise(
         return 0.5 * np.sum(((vectors - layout.mean) / layout.deviation) ** 2, axis=-1)
 
     for iteration in range(iterations):
-        vector, starts = fit[:2]
+        vector, starts = fit.vector, fit.starts
         line = _linearise(problem, vector, starts, unknowns, entries, weights)
         now = float(np.sum(data_costs(line.white[None], starts[None])) + prior_costs(vector))
         fit = Fit(vector, starts, line.predicted, weights, now)
@@ -161,14 +207,17 @@ def minimise(
         hessian = np.sum(reduced.informations, axis=0) + np.eye(len(unknowns))
         from_mean = (vector[unknowns] - layout.mean[unknowns]) / scale
         slope = np.sum(reduced.gradients, axis=0) + from_mean
+        room = (layout.bounds(vector) - vector)[:, unknowns] / scale
         vectors = np.repeat(vector[None], num_tried, axis=0)
         states = np.repeat(starts[None], num_tried, axis=0)
-        for i, (damping, share) in enumerate(itertools.product(_DAMPINGS, _SHARES)):
-            change = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), slope)
-            vectors[i, unknowns] += change * scale
-            vectors[i] = layout.clip(vectors[i])
-            change = (vectors[i, unknowns] - vector[unknowns]) / scale
-            states[i][:, entries] += share * reduced.states(change) * reach * used[:, None]
+        for d, damping in enumerate(_DAMPINGS):
+            damped = hessian + damping * np.diag(np.diag(hessian))
+            change = _bounded_step(damped, slope, room)
+            moved = reduced.states(change) * reach * used[:, None]
+            for i, share in enumerate(_SHARES, d * len(_SHARES)):
+                vectors[i, unknowns] += change * scale
+                states[i][:, entries] += share * moved
+                states[i] = np.clip(states[i], guess - farthest, guess + farthest)
         outcome = problem.simulate(vectors, states, np.tile(used, (num_tried, 1)))
         costs = data_costs(problem.whiten(outcome, weights), states)
         costs = np.where(np.isfinite(costs), costs, np.inf).reshape(len(_DAMPINGS), -1, len(starts))
@@ -179,9 +228,32 @@ def minimise(
         if now > totals[damping]:
             total = float(totals[damping])
             fit = Fit(vectors[best[0]], states[best, each], outcome[best, each], weights, total)
-        if not now - totals[damping] >= _CONVERGED:
+        if not now - totals[damping] >= max(_CONVERGED, _CONVERGED_SHARE * now):
             break
     return fit
+
+
+def cost_of(problem: Problem, fit: Fit, weights: np.ndarray) -> float:
+    """Half the sum of squared residuals and the prior's, of a fit whose starts are their guess."""
+    white = problem.whiten(problem.predict(fit.vector, fit.starts), weights)
+    from_mean = (fit.vector - problem.layout.mean) / problem.layout.deviation
+    return float(0.5 * np.sum(white**2) + 0.5 * np.sum(from_mean**2))
+
+
+def _bounded_step(hessian: np.ndarray, slope: np.ndarray, room: np.ndarray) -> np.ndarray:
+    """The change x [F] within bounds that minimises x' hessian x / 2 + slope' x.
+
+    By an active set (Stark and Parker 1995, "Bounded-variable least squares"): where one unknown
+    ends at its bound, the others are the best ones there.
+
+    Args:
+      room: smallest and largest change [2, F].
+    """
+    root = np.linalg.cholesky(hessian).T
+    target = -np.linalg.solve(root.T, slope)
+    low, high = np.minimum(room[0], 0.0), np.maximum(room[1], 0.0)
+    inside = lsq_linear(root, target, bounds=(low, np.maximum(high, low + 1e-12)), method="bvls")
+    return inside.x
 
 
 def certainty(problem: Problem, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
@@ -207,7 +279,7 @@ def certainty(problem: Problem, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
     (I - H_s)^-1/2 R' g_s. The result is C with each deviation widened to that of the sandwich,
     where that one is larger.
     """
-    layout, (deviations, _, searched) = problem.layout, _scale_starts(problem.windows)
+    layout, (deviations, _, searched) = problem.layout, problem.scale_starts()
     size, entries = len(fit.vector), np.flatnonzero(searched)
     scale, reach = layout.deviation, deviations[entries]
     vector = layout.interior(fit.vector, 2.0)
@@ -313,7 +385,7 @@ def _list_differences(
                 add([p], unknown.step, [rows])
             if unknown.ball_step:
                 add([p], unknown.ball_step, [pictures])
-    start_steps = size * _scale_starts(problem.windows)[1]
+    start_steps = size * problem.scale_starts()[1]
     columns = len(unknowns) + np.arange(len(entries))
     arm = np.flatnonzero(entries < n)
     if len(arm):
@@ -418,19 +490,23 @@ def _multiply(columns: np.ndarray) -> np.ndarray:
     return sum(np.swapaxes(part, 1, 2) @ part for part in parts)
 
 
-def _scale_starts(windows: Windows) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Deviation, difference and whether it is searched, of each entry of a start [2 n + 9]."""
-    n = windows.angles.shape[2]
-    sizes = n, n, 3, 3, 3
-    groups = _START_DEVIATIONS, _START_STEPS, _SEARCHED
-    return tuple(np.repeat(values, sizes) for values in groups)
+def angle_weights(problem: Problem, predicted: np.ndarray) -> np.ndarray:
+    """Weights [S, A, n] of the joint angles: less for outliers."""
+    size = np.abs(problem.windows.split(problem.whiten(predicted, problem.weights()))[0])
+    return np.minimum(1.0, _HUBER / np.maximum(size, 1e-9))
 
 
 def picture_weights(problem: Problem, predicted: np.ndarray) -> np.ndarray:
     """Weights [S, B] of the pictures: less for outliers, and 0 for all of a window whose ball was
     not in free flight, such as one in a hand."""
-    w = problem.windows
-    size = np.max(np.abs(w.split(problem.whiten(predicted, problem.weights()))[1]), axis=2)
-    count = np.maximum(np.sum(w.picture_weights, axis=1), 1.0)
-    mean = np.sum(np.minimum(size, _WORST) ** 2 * w.picture_weights, axis=1) / count
-    return np.minimum(1.0, _HUBER / np.maximum(size, 1e-9)) * (mean < _NO_FLIGHT)[:, None]
+    white = problem.windows.split(problem.whiten(predicted, problem.weights()))[1]
+    size = np.max(np.abs(white), axis=2)
+    flies = flight_errors(problem, predicted, problem.windows.picture_weights) < NO_FLIGHT
+    return np.minimum(1.0, _HUBER / np.maximum(size, 1e-9)) * flies[:, None]
+
+
+def flight_errors(problem: Problem, predicted: np.ndarray, pictures: np.ndarray) -> np.ndarray:
+    """Mean squared residual [S] of the pictures [S, B] that count, in units of their noise."""
+    white = problem.windows.split(problem.whiten(predicted, problem.weights()))[1]
+    size = np.minimum(np.max(np.abs(white), axis=2), _WORST)
+    return np.sum(size**2 * pictures, axis=1) / np.maximum(np.sum(pictures, axis=1), 1.0)

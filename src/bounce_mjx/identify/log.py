@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import median_filter
 from scipy.stats import theilslopes
 
 from bounce_mjx.errors import UserError
@@ -18,6 +19,12 @@ _MIN_ROWS = 100
 # from the log's middle beyond which one is wrong, s.
 _WRONG_ROWS = 0.05
 _FAR_IN_TIME = 3600.0
+# Step of stamps from which a 32-bit number has made them useless, and how exactly they keep to it
+# in a file of decimals, s.
+_COARSE_STAMP, _ROUNDED = 2e-3, 2e-4
+# Rows whose median an angle is compared with; distance from it beyond which it is a spike, rad, and
+# in multiples of what is usual about it.
+_SPIKE_ROWS, _SPIKE, _SPIKE_FACTOR = 7, 0.03, 10.0
 # Two pictures closer than this are one, s.
 _SAME_PICTURE = 1e-4
 # Stretches of a log in which the youngest picture is looked for; drift (s) over the log below which
@@ -28,6 +35,9 @@ _LARGEST_AGE = 1.0
 # Two quartz clocks drift by less; a stamp that drifts by more, s over the log, has another unit.
 _FASTEST_DRIFT = 2e-4
 _NO_CLOCK = 0.1
+
+JOINT_GAP = 0.1
+"""Time between two rows of joint angles beyond which a log has a gap, s."""
 
 
 class Log(NamedTuple):
@@ -69,6 +79,15 @@ class Rows(NamedTuple):
     values: np.ndarray
     """[R, k]; NaN for what was not measured."""
 
+    def chosen(self, index: np.ndarray) -> "Rows":
+        """Some of the rows, or all in another order."""
+        return self._replace(
+            numbers=self.numbers[index],
+            times=self.times[index],
+            arrivals=self.arrivals[index],
+            values=self.values[index],
+        )
+
     def without(
         self, wrong: np.ndarray, why: str, notes: list[str], refused: float = np.inf, advice=""
     ) -> "Rows":
@@ -91,7 +110,7 @@ class Rows(NamedTuple):
         if count >= max(refused * len(wrong), 2.0):
             raise UserError(sentence + advice)
         notes.append(sentence)
-        return Rows(*self[:2], *(array[~wrong] for array in self[2:]))
+        return self.chosen(~wrong)
 
 
 _ONE_CLOCK = _WRONG_ROWS, "; give each its own time, of one clock"
@@ -107,11 +126,14 @@ def make_log(source: str, angles: Rows, targets: Rows, balls: Rows) -> Log:
     """
     notes: list[str] = []
     angles, targets = (_in_order(rows, notes) for rows in (angles, targets))
-    order = np.argsort(balls.times, kind="stable")
-    balls = Rows(*balls[:2], *(array[order] for array in balls[2:]))
+    angles = angles.without(
+        _find_spikes(angles.values), "is a spike: the joint is elsewhere before and after", notes
+    )
+    balls = balls.chosen(np.argsort(balls.times, kind="stable"))
     # An arm may have been recorded alone, with a tracker that saw no ball. Trackers, and logs of
     # control steps, hold the last picture until the next.
-    balls = _clean(balls, notes, lambda rows: rows.values).without(
+    balls = _clean(balls, notes, lambda rows: rows.values)
+    balls = balls.without(
         np.any(np.abs(balls.values) > _FARTHEST_BALL, axis=1),
         f"is farther away than {_FARTHEST_BALL:g} m",
         notes,
@@ -121,9 +143,16 @@ def make_log(source: str, angles: Rows, targets: Rows, balls: Rows) -> Log:
     again = np.diff(balls.times, prepend=-np.inf) < _SAME_PICTURE
     balls = balls.without(again, "has the time stamp of another", notes)
     return Log(
-        source, angles.times, angles.values, targets.times, targets.values,
-        balls.times, balls.values, balls.arrivals, tuple(notes),
-    )  # fmt: skip
+        source=source,
+        times=angles.times,
+        joint_angles=angles.values,
+        target_times=targets.times,
+        servo_targets=targets.values,
+        picture_times=balls.times,
+        ball_positions=balls.values,
+        arrivals=balls.arrivals,
+        notes=tuple(notes),
+    )
 
 
 def _clean(
@@ -136,7 +165,8 @@ def _clean(
       told: what rows tell [R, k].
       refused: share of rows with gaps from which the log is refused.
     """
-    wrong = ~np.isfinite(np.column_stack(rows[3:])).all(axis=1)
+    numbers = np.column_stack([rows.times, rows.arrivals, rows.values])
+    wrong = ~np.isfinite(numbers).all(axis=1)
     rows = rows.without(wrong, f"lacks one of its {rows.values.shape[1]} numbers", notes, refused)
     same = np.all(np.diff(told(rows), axis=0, prepend=np.nan) == 0.0, axis=1)
     rows = rows.without(same, "repeats the one before", notes)
@@ -147,12 +177,44 @@ def _clean(
 
 def _in_order(rows: Rows, notes: list[str]) -> Rows:
     """The rows of a measurement of every control step: whole, once each, with increasing times."""
+    _check_digits(rows)
     rows = _clean(rows, notes, lambda rows: np.column_stack([rows.times, rows.values]), 1.0)
     early = np.diff(np.maximum.accumulate(rows.times), prepend=-np.inf) <= 0.0
     late = np.append(rows.times[:-1] >= np.minimum.accumulate(rows.times[::-1])[-2::-1], False)
     # A time that is too late makes all that follow early, and one too early all before it late.
     wrong = min(early, late[: len(early)], key=np.sum)
     return rows.without(wrong, "has a time out of order", notes, *_ONE_CLOCK)
+
+
+def _check_digits(rows: Rows) -> None:
+    """Refuses times that a 32-bit number has rounded.
+
+    Raises:
+      UserError: they are.
+    """
+    times = rows.times[np.isfinite(rows.times)]
+    if len(times) < _MIN_ROWS:
+        return
+    grid = float(np.spacing(np.float32(np.median(np.abs(times)))))
+    off = np.abs(times - grid * np.round(times / grid))
+    typical = float(np.median(np.abs(np.diff(times))))
+    # Simulated steps may be whole numbers of such a grid by themselves.
+    is_coarse = _COARSE_STAMP < grid < _FAR_IN_TIME and 0.1 * typical < grid
+    if is_coarse and np.all(off < _ROUNDED):
+        raise UserError(
+            f"the times of the {rows.name} are multiples of {grid:.3g} s, as a 32-bit number "
+            "rounds them; write seconds as 64-bit numbers, or since the start"
+        )
+
+
+def _find_spikes(angles: np.ndarray) -> np.ndarray:
+    """Which rows [R] of joint angles [R, n] no joint can have: far from the median of the rows
+    about them, although those agree with theirs."""
+    if len(angles) < _SPIKE_ROWS:
+        return np.zeros(len(angles), bool)
+    off = np.abs(angles - median_filter(angles, (_SPIKE_ROWS, 1), mode="nearest"))
+    around = median_filter(off, (2 * _SPIKE_ROWS + 1, 1), mode="nearest")
+    return np.any(off > np.maximum(_SPIKE, _SPIKE_FACTOR * around), axis=1)
 
 
 def align_clocks(log: Log) -> Log:

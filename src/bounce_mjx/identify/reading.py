@@ -62,6 +62,8 @@ def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
 
     def column(name: str, unit: str) -> np.ndarray:
         if name not in columns:
+            if (near := name.replace(".", "_")) in columns:
+                raise UserError(f"{path} has the column {near}; write {name} for {near}")
             raise UserError(
                 f"{path} has no column {name} [{unit}]; its columns are "
                 f"{', '.join(map(shorten, list(columns)[:30]))}; if the joints have other names, "
@@ -101,6 +103,7 @@ def _read_columns(path: Path) -> dict[str, tuple[str, np.ndarray]]:
     that holds none."""
     try:
         header, *lines = path.read_text("utf-8-sig").splitlines() or [""]
+        _check_form(path, header, lines)
         delimiter = max(",;\t", key=header.count)
         titles = next(csv.reader([header], delimiter=delimiter), [])
         lines = [line.replace('"', "") for line in lines]
@@ -125,6 +128,27 @@ def _read_columns(path: Path) -> dict[str, tuple[str, np.ndarray]]:
             raise UserError(f"{path} has two columns {shorten(name)}; leave one")
         columns[name] = (unit or "").strip(), numbers
     return columns
+
+
+def _check_form(path: Path, header: str, lines: Sequence[str]) -> None:
+    """Refuses tables that other programs write in another form.
+
+    Raises:
+      UserError: the first line is a comment, cells are separated by spaces, or times are dates.
+    """
+    if header.lstrip().startswith(("#", "%")):
+        raise UserError(
+            f"{path} begins with the comment {shorten(header.strip())}; begin with the columns' "
+            "titles, without a mark"
+        )
+    if not any(mark in header for mark in ",;\t") and "joint_angles" in header and " " in header:
+        raise UserError(f"the cells of {path} are separated by spaces; separate them by commas")
+    first = lines[0].split(",")[0].strip('" ') if lines else ""
+    if re.match(r"\d{4}-\d\d-\d\d", first):
+        raise UserError(
+            f"{path}: the column time holds {shorten(first)}; write it in seconds, such as by "
+            "Python's datetime.fromisoformat(text).timestamp()"
+        )
 
 
 def read_bag(path: Path, joint_names: Sequence[str], topics: Topics) -> Log:

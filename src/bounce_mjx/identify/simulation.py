@@ -15,29 +15,44 @@ from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.unknowns import CAMERA_ROTATION, Layout
 from bounce_mjx.identify.windows import Windows
 from bounce_mjx.physics import Control, PhysicsState, make_engine
+from bounce_mjx.physics.edited import EditedModel
+from bounce_mjx.physics.scalars import quaternion_matrix
 from bounce_mjx.robot.model import find_addresses, scatter
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import physics_parameters
 
-_LANES = 512
-"""Windows that are simulated at a time; more would not fit the processor's cache."""
+_LANES = 128
+"""Windows that one thread simulates at a time; more would not fit the processor's cache."""
 
 
 Simulate = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-"""(vectors of unknowns [C, P], states at the starts [C, S, 2 n + 9], which windows count [C, S]) ->
-what the sensors would have measured [C, S, A n + 3 B], as `Windows.measured`; a window that does
+"""(vectors of unknowns [C, P], states at the starts [C, S, 2 n + 10], which windows count [C, S])
+-> what the sensors would have measured [C, S, A n + 3 B], as `Windows.measured`; a window that does
 not count has the numbers of the first candidate, or 0 if that has none."""
 
 
-def make_simulator(config: WorldConfig, layout: Layout, log: Log, windows: Windows) -> Simulate:
+def make_simulator(
+    config: WorldConfig,
+    layout: Layout,
+    log: Log,
+    windows: Windows,
+    carried: float = 0.0,
+    lift: float = 0.0,
+) -> Simulate:
     """Builds the simulation of a log's windows in candidate worlds.
 
     Measured angles are the true ones plus `encoder_bias`, which the servos share. A measured ball
     is the true one, `ball_latency` before its time stamp, turned by the camera's rotation about
     the middle of all measured ones, plus `ball_position_bias`.
+
+    Args:
+      carried: share of the links' weight that the controller carries, if it is more than the
+        model's own.
+      lift: acceleration of the ball across its flight, per spin and speed.
     """
     run, n = _compile(config, layout.num_joints), layout.num_joints
-    send = make_targets(log, windows, layout.physics_dt)
+    count = int(windows.first.max()) + windows.steps
+    send = make_targets(log, windows.origin + windows.dt * np.arange(count + 1))
     shown = windows.balls[windows.picture_weights > 0.0]
     middle = np.mean(shown, axis=0) if len(shown) else np.zeros(3)
     steps = windows.first + np.arange(windows.steps)[:, None]
@@ -65,7 +80,14 @@ def make_simulator(config: WorldConfig, layout: Layout, log: Log, windows: Windo
         given = {k: np.moveaxis(v, 0, -1).astype(np.float32) for k, v in world.items()}
         first = starts[c, s].T.astype(np.float32)
         out = run(
-            given, first, targets, angle_times[:, s], picture_times[:, s], middle.astype(np.float32)
+            given,
+            first,
+            targets,
+            angle_times[:, s],
+            picture_times[:, s],
+            middle.astype(np.float32),
+            np.float32(carried),
+            np.float32(lift),
         )
         rows = [np.moveaxis(np.asarray(x), 2, 0).reshape(_LANES, -1) for x in out]
         return np.concatenate(rows, axis=1)[:count].astype(float)
@@ -84,25 +106,41 @@ def make_simulator(config: WorldConfig, layout: Layout, log: Log, windows: Windo
     return simulate
 
 
+def compensated(config: WorldConfig) -> WorldConfig:
+    """The robot with a controller that carries the arm's whole weight."""
+    robot = config.robot.model_copy(update={"gravity_compensation": 1.0})
+    return config.model_copy(update={"robot": robot})
+
+
+@lru_cache(8)
 def _compile(config: WorldConfig, n: int) -> Callable[..., tuple[jax.Array, jax.Array]]:
     """The part of a simulation that is compiled, which is the same for all logs: angles
     [A, n, L], rad, and balls [B, 3, L], m."""
-    model = world_model(config, visual=False)
+    own, model = (world_model(c, visual=False) for c in (config, compensated(config)))
     engine, addresses = make_engine(model, config.physics), find_addresses(model)
+    links = np.concatenate(EditedModel(model).link_bodies()).tolist()
     ball, dt = addresses.balls[0], config.physics_dt
     gears = model.actuator_gear[list(addresses.actuators), 0]
     shown_q = (*addresses.arm_qpos, *ball.qpos[:3])
     shown_v = (*addresses.arm_qvel, *ball.qvel[:3])
 
     def first_state(start: jax.Array) -> PhysicsState:
-        angles, velocities, position, ball_speeds = jnp.split(start, [n, 2 * n, 2 * n + 3])
+        ends = [n, 2 * n, 2 * n + 3, 2 * n + 9]
+        angles, velocities, position, ball_speeds, _ = jnp.split(start, ends)
         qpos = scatter(model.qpos0, shown_q, jnp.concatenate([angles, position]))
         moving, speeds = (*addresses.arm_qvel, *ball.qvel), (velocities, ball_speeds)
         return PhysicsState(qpos, scatter(np.zeros(model.nv), moving, jnp.concatenate(speeds)))
 
-    def advance(parameters, state, target, drag):
+    def advance(parameters, state, target, drag, lift):
         ctrl = scatter(np.zeros(model.nu), addresses.actuators, gears * target)
-        return engine.step(parameters, state, Control(ctrl, air_drag=drag), 1)
+        after = engine.step(parameters, state, Control(ctrl, air_drag=drag), 1)
+        speed, spin = (
+            jnp.stack([after.qvel[i] for i in x]) for x in (ball.qvel[:3], ball.qvel[3:])
+        )
+        turned = quaternion_matrix([after.qpos[i] for i in ball.qpos[3:]])
+        across = jnp.cross(jnp.stack(turned @ tuple(spin)), speed)
+        pushed = after.qvel.at[np.array(ball.qvel[:3])].add(dt * lift * across)
+        return after._replace(qvel=pushed)
 
     def at(path: jax.Array, speeds: jax.Array, times: jax.Array) -> jax.Array:
         """A path [T, k, L] at times [M, L], by the nearest step and its velocity."""
@@ -111,14 +149,24 @@ def _compile(config: WorldConfig, n: int) -> Callable[..., tuple[jax.Array, jax.
         return near + speed * (times - step * dt)[:, None]
 
     @jax.jit
-    def run(world, starts, targets, angle_times, picture_times, middle):
-        parameters = jax.vmap(lambda w: physics_parameters(w, model), -1, -1)(
+    def run(world, starts, targets, angle_times, picture_times, middle, carried, lift):
+        shares = {f"body_gravcomp[{b}]": jnp.maximum(carried, own.body_gravcomp[b]) for b in links}
+
+        def parameters_of(world):
+            return physics_parameters(world, model)._replace(entries=shares)
+
+        parameters = jax.vmap(parameters_of, -1, -1)(
             {k: v for k, v in world.items() if k != "encoder_bias"}
         )
         bias = world["encoder_bias"]
+        held = world["servo_offset"] - bias
+        # Spin also brakes a ball.
+        drag = world["air_drag"] * (1.0 + starts[2 * n + 9])
 
         def body(state, target):
-            after = jax.vmap(advance, -1, -1)(parameters, state, target - bias, world["air_drag"])
+            after = jax.vmap(advance, (-1, -1, -1, -1, None), -1)(
+                parameters, state, target + held, drag, lift
+            )
             positions = jnp.stack([state.qpos[i] for i in shown_q])
             return after, (positions, jnp.stack([state.qvel[i] for i in shown_v]))
 
@@ -133,9 +181,13 @@ def _compile(config: WorldConfig, n: int) -> Callable[..., tuple[jax.Array, jax.
     return run
 
 
-def make_targets(log: Log, windows: Windows, dt: float) -> Callable[[float, float], np.ndarray]:
-    """(latency, lag) -> the servo targets [T, n], rad, in each physics step, in float32."""
-    edges = windows.origin + dt * np.arange(int(windows.first.max()) + windows.steps + 1)
+def make_targets(log: Log, edges: np.ndarray) -> Callable[[float, float], np.ndarray]:
+    """(latency, lag) -> the servo targets [T, n], rad, in each physics step, in float32.
+
+    Args:
+      edges: times [T + 1] at which the physics steps begin, and the last one ends, s.
+    """
+    dt = float(edges[1] - edges[0])
     # The integral of the targets, each held until the next: its difference over a step is the
     # step's mean target, whatever the latency's share of a step.
     times = np.minimum(np.append(log.target_times, np.inf), edges[-1] + 1.0)

@@ -8,16 +8,35 @@ import mujoco
 import numpy as np
 from numpy.polynomial.polynomial import polyfit
 
-from bounce_mjx.env.env import world_model
+from bounce_mjx.env.env import model_nominals, world_model
 from bounce_mjx.errors import UserError
-from bounce_mjx.identify.fit import Fit, Noise, Problem, certainty, minimise, picture_weights
+from bounce_mjx.identify.fit import (
+    AIR_LIFT,
+    NO_FLIGHT,
+    Fit,
+    Noise,
+    Problem,
+    angle_weights,
+    certainty,
+    flight_errors,
+    minimise,
+    picture_weights,
+)
+from bounce_mjx.identify.following import (
+    Following,
+    does_move,
+    error_size,
+    find_settled,
+    follow,
+    held_out_error,
+    set_points,
+)
 from bounce_mjx.identify.log import Log, least_age
-from bounce_mjx.identify.simulation import make_simulator
+from bounce_mjx.identify.simulation import Simulate, make_simulator
 from bounce_mjx.identify.unknowns import Layout
 from bounce_mjx.identify.windows import GRAVITY, Windows, cut
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.world.config import WorldConfig
-from bounce_mjx.world.randomization import TERMS
 
 # Every fifth window is held out of the search until its last stage.
 _HELD_OUT = 5
@@ -28,6 +47,15 @@ _FRICTIONS = (0.01, 0.2)
 # Windows in which the first candidates are compared.
 _FEW = 13
 _LAGS = (0.001, 0.008, 0.016, 0.026, 0.038)
+# Servos that make a joint follow as late as measured: their gains, the share of the delay that is
+# the servo's own, and the share of the rest that is a lag.
+_GAINS = (1.0, 2.0, 4.0, 8.0, 30.0)
+_SERVO_SHARES = (0.1, 0.3, 0.6, 0.9)
+_LAG_SHARES = (0.0, 0.3, 0.6)
+# Candidates from which a search over a few windows begins, and decrease of the cost from which the
+# controller counts as carrying the arm's weight.
+_KEPT = 2
+_CARRIED = 10.0
 # Standard deviation of stamps about regular steps below which the steps count as regular, s.
 _JITTER = 5e-4
 BEFORE_BOUNCE = 0.012
@@ -58,6 +86,19 @@ class Identified(NamedTuple):
     """On the windows that the search had not seen."""
     dropped: int
     """Windows whose ball was not in free flight."""
+    counted: Noise | None = None
+    """What the fit counted as noise: the sensors', or the model's own errors where they are
+    larger."""
+    following: Following | None = None
+    """The simplest model: every joint follows its command late, with an offset."""
+    following_errors: np.ndarray = np.zeros(0)
+    """Its errors [n] in the windows that the search had not seen, rad."""
+    joint_errors: np.ndarray = np.zeros(0)
+    """Those of the identified world [n], rad."""
+    gravity_compensation: float = 0.0
+    """Share of the arm's weight that its controller carries, if more than the model's own."""
+    has_lift: bool = False
+    """Whether the flights show lift by spin."""
     stamp_age: float = 0.0
     """Time from a picture's stamp to its arrival, s: `ball_latency` in the fit is without it."""
 
@@ -69,16 +110,33 @@ class Identified(NamedTuple):
 
 def join(logs: Sequence[Log]) -> Log:
     """Several logs, one after another; no window spans two of them."""
-    parts, start = [], 0.0
-    names = "times", "target_times", "picture_times", "arrivals"
+    shifted, start = [], 0.0
     for log in logs:
         shift = start - min(log.times[0], log.target_times[0])
-        parts.append(log._replace(**{name: getattr(log, name) + shift for name in names}))
-        start = float(max(parts[-1].times[-1], parts[-1].target_times[-1])) + 1.0
-    source = ", ".join(log.source for log in logs)
-    arrays = zip(*(part[1:-1] for part in parts), strict=True)
-    notes = tuple(note for log in logs for note in log.notes)
-    return Log(source, *(np.concatenate(array) for array in arrays), notes)
+        shifted.append(
+            log._replace(
+                times=log.times + shift,
+                target_times=log.target_times + shift,
+                picture_times=log.picture_times + shift,
+                arrivals=log.arrivals + shift,
+            )
+        )
+        start = float(max(shifted[-1].times[-1], shifted[-1].target_times[-1])) + 1.0
+
+    def joined(field: str) -> np.ndarray:
+        return np.concatenate([getattr(log, field) for log in shifted])
+
+    return Log(
+        source=", ".join(log.source for log in logs),
+        times=joined("times"),
+        joint_angles=joined("joint_angles"),
+        target_times=joined("target_times"),
+        servo_targets=joined("servo_targets"),
+        picture_times=joined("picture_times"),
+        ball_positions=joined("ball_positions"),
+        arrivals=joined("arrivals"),
+        notes=tuple(note for log in logs for note in log.notes),
+    )
 
 
 def sensor_noise(log: Log) -> Noise:
@@ -143,38 +201,93 @@ def identify(
     if with_ball:
         _check_frame(windows, config, log.source)
     layout = Layout(config.num_joints, with_ball, config.physics_dt, camera_rotation)
-    simulate = make_simulator(config, layout, log, windows)
-    problem = Problem(simulate, windows, layout, sensor_noise(log), progress)
-    progress("arm")
-    stages, states, pictures, seen = ["arm"], windows.arm_state, 1.0, _training(problem)
-    fit = minimise(problem, _guess_arm(problem), stages, problem.weights(0.0, seen), 10, states)
+    sensors = sensor_noise(log)
+    settled, held_out = find_settled(log), _held_out_rows(log, windows)
+    following = follow(log, settled & ~held_out)
+    log = set_points(log, following.delay, config.physics_dt)
+    own, carried = (
+        Problem(
+            simulate=make_simulator(config, layout, log, windows, share),
+            windows=windows,
+            layout=layout,
+            sensors=sensors,
+            noise=sensors,
+            progress=progress,
+        )
+        for share in (0.0, 1.0)
+    )
+    progress(f"arm: {1e3 * following.delay:.1f} ms behind its commands")
+    problem, fit = own, Fit(layout.mean, windows.starts)
+    if does_move(log):
+        fits = [_search_arm(problem, config, log, following) for problem in (own, carried)]
+        problem, fit = _choose(own, carried, fits)
+        problem, fit = _fit_arm(problem, fit)
+    share = float(problem.simulate is carried.simulate)
+    stages, states = ["arm"], windows.arm_state
+    pictures, seen = np.ones_like(windows.picture_weights), _training(problem)
     if with_ball:
-        fit, pictures = _fit_ball(problem, fit)
+        lifted = make_simulator(config, layout, log, windows, share, AIR_LIFT)
+        problem, fit, pictures = _fit_ball(problem, fit, lifted)
         stages, states = ["arm", "flight", "bounce"], None
     progress("all")
-    fit = minimise(problem, fit, stages, problem.weights(pictures, seen), 3, states)
-    unseen = minimise(problem, fit, [], problem.weights(pictures, 1.0 - seen), 3, states)
-    fit = minimise(problem, unseen, stages, problem.weights(pictures), 3, states)
-    nominal = {name: TERMS[name].nominal for name in layout.terms if name in TERMS}
-    own = layout.vector({name: value for name, value in nominal.items() if value is not None})
-    before = fit._replace(predicted=problem.predict(own, fit.starts))
+    angles = angle_weights(problem, problem.predict(fit.vector, fit.starts))
+    fit = minimise(problem, fit, stages, problem.weights(pictures, seen, angles), 3, states)
+    unseen = minimise(problem, fit, [], problem.weights(pictures, 1.0 - seen, angles), 3, states)
+    fit = minimise(problem, unseen, stages, problem.weights(pictures, 1.0, angles), 3, states)
+    nominals = model_nominals(config)
+    known = {name: nominals[name] for name in layout.terms if name in nominals}
+    nominal_vector = layout.vector(known)
+    before = fit._replace(predicted=own.predict(nominal_vector, fit.starts))
+    information, covariance = certainty(problem, fit)
     counts = np.any(windows.split(fit.weights)[1] > 0.0, axis=(1, 2))
+    by_sensor = problem._replace(noise=sensors)
     return Identified(
-        layout,
-        windows,
-        problem.noise,
-        fit,
-        *certainty(problem, fit),
-        *(_measure_errors(problem, x) for x in (before, fit, unseen)),
-        int(np.sum(windows.has_ball & ~counts)),
-        least_age(log),
+        layout=layout,
+        windows=windows,
+        noise=sensors,
+        fit=fit,
+        information=information,
+        covariance=covariance,
+        before=_measure_errors(by_sensor, before),
+        after=_measure_errors(by_sensor, fit),
+        held_out=_measure_errors(by_sensor, unseen),
+        dropped=int(np.sum(windows.has_ball & ~counts)),
+        counted=problem.noise,
+        following=following,
+        following_errors=held_out_error(log, following, settled & held_out),
+        joint_errors=_joint_errors(windows, unseen),
+        gravity_compensation=share,
+        has_lift=problem.has_lift,
+        stamp_age=least_age(log),
     )
+
+
+def _held_out_rows(log: Log, windows: Windows) -> np.ndarray:
+    """Which joint angles [T] of a log are in windows that the search does not see."""
+    rows = np.zeros(len(log.times), bool)
+    for s in np.flatnonzero(~_is_seen(len(windows.first))):
+        used = windows.angle_times[s, windows.angle_weights[s] > 0.0]
+        if len(used):
+            times = log.times - windows.zero[s]
+            rows |= (times > used[0] - 1e-6) & (times < used[-1] + 1e-6)
+    return rows
+
+
+def _joint_errors(windows: Windows, fit: Fit) -> np.ndarray:
+    """Root mean square [n] of the angles' residuals where they count, rad."""
+    angles, weights = windows.split(fit.predicted)[0], windows.split(fit.weights)[0]
+    counts = np.any(weights > 0.0, axis=2)
+    return error_size((angles - windows.angles)[counts])
+
+
+def _is_seen(count: int) -> np.ndarray:
+    """Which windows [S] the search sees."""
+    return np.arange(count) % _HELD_OUT != _HELD_OUT - 1
 
 
 def _training(problem: Problem) -> np.ndarray:
     """1 for each window of the search [S, 1], 0 for those held out."""
-    index = np.arange(len(problem.windows.first))
-    return np.where(index % _HELD_OUT == _HELD_OUT - 1, 0.0, 1.0)[:, None]
+    return _is_seen(len(problem.windows.first))[:, None].astype(float)
 
 
 def _check_frame(windows: Windows, config: WorldConfig, source: str) -> None:
@@ -207,12 +320,24 @@ def _check_frame(windows: Windows, config: WorldConfig, source: str) -> None:
         )
 
 
-def _fit_ball(problem: Problem, fit: Fit) -> tuple[Fit, np.ndarray]:
-    """The ball's flights, then its bounces; and the weights of the pictures [S, B]."""
+def _fit_ball(problem: Problem, fit: Fit, lifted: Simulate) -> tuple[Problem, Fit, np.ndarray]:
+    """The ball's flights, then its bounces; and the weights of the pictures [S, B].
+
+    Args:
+      lifted: the simulation with a ball that its spin lifts, which counts where flights show it.
+    """
     windows, states, seen = problem.windows, ~problem.windows.arm_state, _training(problem)
     problem.progress("flight")
     flying = windows.picture_times < windows.bounces[:, None] - BEFORE_BOUNCE
-    fit = minimise(problem, fit, ["flight"], problem.weights(flying, seen), 4, states)
+    plain = minimise(problem, fit, ["flight"], problem.weights(flying, seen), 4, states)
+    if _flies(problem, plain, flying):
+        fit = plain
+    else:
+        spinning = problem._replace(simulate=lifted, has_lift=True)
+        turned = minimise(spinning, fit, ["flight"], problem.weights(flying, seen), 8, states)
+        if _flies(spinning, turned, flying):
+            problem, fit = spinning, turned
+            problem.progress("the flights show lift by spin")
     problem.progress("bounce")
     stages, few = ["flight", "bounce"], problem.weights(1.0, _sample(problem, windows.has_ball))
     # A ball that slips and one that sticks are two valleys, and each latency may be one.
@@ -226,25 +351,110 @@ def _fit_ball(problem: Problem, fit: Fit) -> tuple[Fit, np.ndarray]:
     fit = minimise(problem, tried[0], stages, problem.weights(1.0, seen), 5, states)
     fit = minimise(problem, fit, [], problem.weights(1.0, 1.0 - seen), 3, states)
     pictures = picture_weights(problem, problem.predict(fit.vector, fit.starts))
-    return minimise(problem, fit, stages, problem.weights(pictures, seen), 6, states), pictures
+    fit = minimise(problem, fit, stages, problem.weights(pictures, seen), 6, states)
+    return problem, fit, pictures
 
 
-def _guess_arm(problem: Problem) -> Fit:
-    """The best of candidates that differ in latency and lag, which the search could confuse."""
-    layout, own = problem.layout, problem.layout.world(problem.layout.mean)
-    vectors = np.stack(
-        [
-            layout.vector(own | {"action_latency": latency, "servo_lag": lag})
-            for latency, lag in itertools.product(_LATENCIES, _LAGS)
-        ]
+def _flies(problem: Problem, fit: Fit, flying: np.ndarray) -> bool:
+    """Whether most flights [S, B] before a bounce, of those in the search, are explained."""
+    counts = problem.windows.has_ball & (_training(problem)[:, 0] > 0.0)
+    pictures = problem.windows.picture_weights * flying
+    errors = flight_errors(problem, problem.predict(fit.vector, fit.starts), pictures)
+    return bool(np.mean(errors[counts] < NO_FLIGHT) > 0.5)
+
+
+def _search_arm(
+    problem: Problem, config: WorldConfig, log: Log, following: Following
+) -> tuple[Noise, Fit]:
+    """The best fit to a few windows of the arm, from candidates that differ in what a search could
+    confuse; and the noise that it leaves."""
+    layout, windows = problem.layout, problem.windows
+    rough = np.hypot(problem.sensors.angles, following.errors)
+    problem = problem._replace(noise=problem.noise._replace(angles=rough))
+    vectors = np.concatenate([_own_servos(layout), _late_servos(layout, config, log, following)])
+    few = problem.weights(0.0, _sample(problem, np.any(windows.angle_weights > 0.0, axis=1)))
+    used = np.any(few > 0.0, axis=1)
+    starts = np.repeat(windows.starts[None], len(vectors), axis=0)
+    predicted = problem.simulate(vectors, starts, np.tile(used, (len(vectors), 1)))
+    is_angle = few[:, : windows.angles[0].size].reshape(windows.angles.shape) > 0.0
+    costs = []
+    for vector, rows in zip(vectors, predicted, strict=True):
+        # An offset of each joint is a part of every candidate.
+        residuals = windows.angles - windows.split(rows)[0]
+        offsets = np.median(residuals[is_angle].reshape(-1, layout.num_joints), axis=0)
+        vector[layout.slices["servo_offset"]] = offsets
+        left = np.where(is_angle, residuals - offsets, 0.0) / rough
+        costs.append(np.sum(left**2) if np.all(np.isfinite(left)) else np.inf)
+    best = [Fit(vectors[i], windows.starts) for i in np.argsort(costs)[:_KEPT]]
+    fits = [minimise(problem, fit, ["arm"], few, 2, windows.arm_state) for fit in best]
+    fit = min(fits, key=lambda fit: fit.cost)
+    return _residual_noise(problem, fit), fit
+
+
+def _own_servos(layout: Layout) -> np.ndarray:
+    """Candidates [C, P] with the model's own servos."""
+    pairs = itertools.product(_LATENCIES, _LAGS)
+    return np.stack(
+        [layout.vector({"action_latency": late, "servo_lag": lag}) for late, lag in pairs]
     )
-    starts = np.repeat(problem.windows.starts[None], len(vectors), axis=0)
-    counts = np.any(problem.windows.angle_weights > 0.0, axis=1)
-    weights = problem.weights(0.0, _sample(problem, counts))
-    used = np.tile(np.any(weights > 0.0, axis=1), (len(vectors), 1))
-    white = problem.whiten(problem.simulate(vectors, starts, used), weights)
-    best = int(np.nanargmin(np.sum(white**2, axis=(1, 2))))
-    return Fit(vectors[best], starts[best])
+
+
+def _late_servos(layout: Layout, config: WorldConfig, log: Log, following: Following) -> np.ndarray:
+    """Candidates [C, P] whose joints follow their commands as late as measured."""
+    model = world_model(config, visual=False)
+    servos = list(find_addresses(model).actuators)
+    stiffness, damping = model.actuator_gainprm[servos, 0], -model.actuator_biasprm[servos, 2]
+    own_delay = np.maximum(damping / stiffness, 1e-6)
+    # A command is held until the next: half a step more.
+    held = 0.5 * float(np.median(np.diff(log.target_times)))
+    total = max(following.delay - held, 2e-3)
+    vectors = []
+    for gain, servo_share, lag_share in itertools.product(_GAINS, _SERVO_SHARES, _LAG_SHARES):
+        of_servo = servo_share * total
+        lag = lag_share * (total - of_servo)
+        world = {
+            "servo_gain": np.full(layout.num_joints, gain),
+            "servo_damping": gain * of_servo / own_delay,
+            "action_latency": total - of_servo - lag,
+            "servo_lag": lag,
+        }
+        vectors.append(layout.clip(layout.vector(world)))
+    return np.stack(vectors)
+
+
+def _choose(
+    own: Problem, carried: Problem, fits: Sequence[tuple[Noise, Fit]]
+) -> tuple[Problem, Fit]:
+    """Whether the controller carries the arm's weight: the log decides, by the costs of both fits
+    in units of the smaller errors."""
+    noise = own.noise._replace(angles=np.min([noise.angles for noise, _ in fits], axis=0))
+    choices = [problem._replace(noise=noise) for problem in (own, carried)]
+    tried = [
+        minimise(problem, fit, ["arm"], fit.weights, 4, problem.windows.arm_state)
+        for problem, (_, fit) in zip(choices, fits, strict=True)
+    ]
+    chosen = int(tried[0].cost - tried[1].cost > _CARRIED)
+    if chosen:
+        own.progress("the controller carries the arm's weight")
+    return choices[chosen], tried[chosen]
+
+
+def _fit_arm(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
+    """The arm in all windows that the search sees, with robust weights: first in units of the
+    errors in a few windows, then in units of what the model leaves in all."""
+    states, seen = problem.windows.arm_state, _training(problem)
+    fit = minimise(problem, fit, ["arm"], problem.weights(0.0, seen), 8, states)
+    for _ in range(2):
+        problem = problem._replace(noise=_residual_noise(problem, fit))
+        angles = angle_weights(problem, problem.predict(fit.vector, fit.starts))
+        fit = minimise(problem, fit, ["arm"], problem.weights(0.0, seen, angles), 4, states)
+    return problem, fit
+
+
+def _residual_noise(problem: Problem, fit: Fit) -> Noise:
+    """The sensors' noise, or the model's errors of the angles where they are larger."""
+    errors = _joint_errors(problem.windows, fit)
+    return problem.noise._replace(angles=np.maximum(problem.sensors.angles, errors))
 
 
 def _shift_flights(problem: Problem, fit: Fit, latency: float, friction: float) -> Fit:

@@ -29,6 +29,9 @@ class Unknown(NamedTuple):
     own: bool = False
     """Whether each joint's entry moves, nearly, that joint alone: one simulation then serves the
     angles of all."""
+    is_factor: bool = False
+    """Whether it multiplies the model's number. The vector then has its logarithm, of which the
+    deviation and the steps are: 10 is as far from 1 as a tenth."""
 
 
 _JOINTS = None
@@ -36,12 +39,17 @@ ARM = {
     # Of action_latency and servo_lag together, s and s^2: see Layout.
     "delay": Unknown(0.035, 0.03, 5e-4, "s", "arm", limits=(0.0, 0.4), ball_step=3e-3),
     "delay_variance": Unknown(2e-4, 4e-4, 1e-5, "s", "arm", limits=(0.0, 0.04), ball_step=6e-5),
-    "servo_gain": Unknown(1.0, 0.2, 0.02, "", "arm", _JOINTS, (0.1, 10.0), 0.15, True),
-    "servo_damping": Unknown(1.0, 0.3, 0.02, "", "arm", _JOINTS, (0.05, 20.0), 0.15, True),
+    "servo_gain": Unknown(
+        1.0, 0.2, 0.02, "", "arm", _JOINTS, (0.1, 100.0), 0.15, own=True, is_factor=True
+    ),
+    "servo_damping": Unknown(
+        1.0, 0.3, 0.02, "", "arm", _JOINTS, (0.05, 20.0), 0.15, own=True, is_factor=True
+    ),
+    "servo_offset": Unknown(0.0, 0.002, 1e-3, "rad", "arm", _JOINTS, ball_step=0.0, own=True),
     "joint_frictionloss": Unknown(
         1.0, 5.0, 0.5, "N m", "arm", _JOINTS, (0.0, np.inf), 0.0, own=True
     ),
-    "link_mass": Unknown(1.0, 0.15, 0.05, "", "arm", _JOINTS, (0.1, 10.0), 0.0),
+    "link_mass": Unknown(1.0, 0.15, 0.05, "", "arm", _JOINTS, (0.1, 10.0), 0.0, is_factor=True),
     "encoder_bias": Unknown(0.0, 0.01, 8e-3, "rad", "bounce", _JOINTS),
     "gravity_tilt": Unknown(0.0, 0.03, 4e-3, "rad", "flight", 2),
 }
@@ -99,11 +107,20 @@ class Layout:
         def column(field: str) -> np.ndarray:
             return np.repeat([getattr(unknown, field) for unknown in each], sizes, axis=0)
 
-        self.mean, self.deviation = column("mean"), column("deviation")
+        self._factors = column("is_factor")
+        self.mean, self.deviation = self.encode(column("mean")), column("deviation")
         """Prior means and standard deviations [P]."""
-        self.limits, self.units = column("limits").T, column("unit").tolist()
+        self.limits, self.units = self.encode(column("limits").T), column("unit").tolist()
         """Lower and upper limits [2, P], and the unit of each term's entry."""
         self._stages = column("stage")
+
+    def encode(self, values: np.ndarray) -> np.ndarray:
+        """The vector [..., P] of values [..., P], of which factors have their logarithms."""
+        return np.where(self._factors, np.log(np.where(self._factors, values, 1.0)), values)
+
+    def decode(self, vector: np.ndarray) -> np.ndarray:
+        """The values [..., P] of a vector [..., P]."""
+        return np.where(self._factors, np.exp(np.where(self._factors, vector, 0.0)), vector)
 
     def free(self, stages: Sequence[str]) -> np.ndarray:
         """Which entries [P] the stages vary."""
@@ -112,6 +129,13 @@ class Layout:
     def clip(self, vector: np.ndarray) -> np.ndarray:
         """The vector [..., P] within the limits of each unknown."""
         return np.clip(vector, *self.limits)
+
+    def bounds(self, vector: np.ndarray) -> np.ndarray:
+        """Lower and upper bounds [2, P] of a step from a vector [P]: the limits, and a delay that
+        leaves a latency of at least 0 at the vector's lag."""
+        bounds, places = self.limits.copy(), self.slices
+        bounds[0, places["delay"]] = self._lag_mean(vector[places["delay_variance"]])
+        return bounds
 
     def interior(self, vector: np.ndarray, steps: float) -> np.ndarray:
         """The vector [P] with a delay from which the differences of derivatives, `steps` times
@@ -129,8 +153,9 @@ class Layout:
 
     def world(self, vector: np.ndarray) -> dict[str, np.ndarray]:
         """Each term's value [..., size], or [...] of a number."""
+        values = self.decode(vector)
         world = {
-            name: vector[..., place.start] if self.unknowns[name].size == 0 else vector[..., place]
+            name: values[..., place.start] if self.unknowns[name].size == 0 else values[..., place]
             for name, place in self.slices.items()
         }
         delay, variance = world.pop("delay"), world.pop("delay_variance")
@@ -140,14 +165,14 @@ class Layout:
 
     def vector(self, world: Mapping[str, np.ndarray]) -> np.ndarray:
         """The vector [P] of values by name; a missing one has its prior mean."""
-        vector, places = self.mean.copy(), self.slices
+        values, places = self.decode(self.mean), self.slices
         for name in set(places) & set(world):
-            vector[places[name]] = world[name]
+            values[places[name]] = world[name]
         if {"action_latency", "servo_lag"} <= set(world):
             mean = self.physics_dt / np.expm1(self.physics_dt / max(world["servo_lag"], 2e-5))
-            vector[places["delay"]] = world["action_latency"] + mean
-            vector[places["delay_variance"]] = mean * (mean + self.physics_dt)
-        return vector
+            values[places["delay"]] = world["action_latency"] + mean
+            values[places["delay_variance"]] = mean * (mean + self.physics_dt)
+        return self.encode(values)
 
     def labels(self, joint_names: Sequence[str]) -> list[str]:
         """Name of each entry, for a reader."""

@@ -11,7 +11,8 @@ from numpy.polynomial.polynomial import polyfit
 from scipy.ndimage import minimum_filter1d
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.identify.log import Log
+from bounce_mjx.identify.following import SETTLING, find_settled
+from bounce_mjx.identify.log import JOINT_GAP, Log
 
 MAX_DELAY = 0.08
 """Time before the first picture of a window at which its simulation starts, s; a picture may be
@@ -23,13 +24,9 @@ _BEFORE, _AFTER = 0.55, 0.2
 _AFTER_SHARE = 0.3
 _SECONDS = MAX_DELAY + _BEFORE + _AFTER + 0.03
 _SHORTEST = 0.16
-_FEWEST, _MOST = 5, 240
+_FEWEST, _MOST, _MOST_BALLS = 5, 240, 180
 _PADDING = 8
 _PICTURE_GAP = 0.06
-_JOINT_GAP = 0.1
-# Time after the start of a log, or a gap, until the arm has forgotten the unknown targets before
-# it, s: the longest latency and a few of the longest lags.
-_SETTLING = 0.3
 # Speed that the ball must have before and after a bounce, m/s.
 _BOUNCING = 0.5
 # Time about a bounce at which pictures do not count, s: a flight's kink has no derivative.
@@ -63,8 +60,16 @@ class Windows(NamedTuple):
     bounces: np.ndarray
     """Time [S] of the bounce since the window's start, s; NaN for the arm alone."""
     starts: np.ndarray
-    """First guess of the state at the start [S, 2 n + 9]: angles, velocities; the ball's position,
-    velocity and spin."""
+    """First guess of the state at the start [S, 2 n + 10]: angles, velocities; the ball's position,
+    velocity and spin; the relative deviation of its drag."""
+
+    dt: float
+    """A physics step, s."""
+
+    @property
+    def zero(self) -> np.ndarray:
+        """Time [S] at which each starts, s."""
+        return self.origin + self.first * self.dt
 
     @property
     def has_ball(self) -> np.ndarray:
@@ -86,12 +91,13 @@ class Windows(NamedTuple):
 
     @property
     def arm_state(self) -> np.ndarray:
-        """Which entries [2 n + 9] of a start are the arm's."""
+        """Which entries [2 n + 10] of a start are the arm's."""
         return np.arange(self.starts.shape[1]) < 2 * self.angles.shape[2]
 
 
 def cut(log: Log, physics_dt: float) -> Windows:
-    """Cuts a log into windows, `_MOST` at most: of more, every k-th is used.
+    """Cuts a log into windows, `_MOST` at most, first those with a bounce: of more, every k-th is
+    used.
 
     Raises:
       UserError: there are fewer than five.
@@ -103,16 +109,18 @@ def cut(log: Log, physics_dt: float) -> Windows:
             f"{log.source} has {len(spans)} stretches of unbroken joint angles and servo targets; "
             "record at least 5 s"
         )
-    spans.sort()
     if len(spans) > _MOST:
-        keep = np.linspace(0, len(spans) - 1, _MOST).round().astype(int)
-        spans = [spans[i] for i in keep]
+        with_ball = [span for span in spans if np.isfinite(span[2])]
+        others = [span for span in spans if not np.isfinite(span[2])]
+        with_ball = _thin(with_ball, max(_MOST_BALLS, _MOST - len(others)))
+        spans = with_ball + _thin(sorted(others), _MOST - len(with_ball))
+    spans.sort()
     origin = float(min(log.times[0], log.target_times[0]))
     begins = [max(start - MAX_DELAY, origin) for start, _, _ in spans]
     first = np.array([int((begin - origin) / physics_dt) for begin in begins], int)
     zero = origin + first * physics_dt
     angle_rows, picture_rows, starts, used = [], [], [], -np.inf
-    settled, bounces = _find_settled(log), np.array(spans)[:, 2] - zero
+    settled, bounces = find_settled(log), np.array(spans)[:, 2] - zero
     for (start, end, _), begin, bounce in zip(spans, zero, bounces, strict=True):
         inside = (log.times >= max(begin, used)) & (log.times < end) & settled
         seen = (log.picture_times >= start) & (log.picture_times <= end) & np.isfinite(bounce)
@@ -121,17 +129,32 @@ def cut(log: Log, physics_dt: float) -> Windows:
         ball = _ball_start(log, picture_rows[-1], bounce, begin)
         starts.append(np.concatenate([_joint_start(log, begin), ball]))
         used = end
-    windows = Windows(
-        first,
-        round(_SECONDS / physics_dt),
-        origin,
-        *_pad(angle_rows, log.times, zero, log.joint_angles),
-        *_pad(picture_rows, log.picture_times, zero, log.ball_positions),
-        bounces,
-        np.stack(starts),
+    angle_times, angles, angle_weights = _pad(angle_rows, log.times, zero, log.joint_angles)
+    picture_times, balls, picture_weights = _pad(
+        picture_rows, log.picture_times, zero, log.ball_positions
     )
-    near = np.abs(windows.picture_times - bounces[:, None]) < _AT_BOUNCE
-    return windows._replace(picture_weights=np.where(near, 0.0, windows.picture_weights))
+    near = np.abs(picture_times - bounces[:, None]) < _AT_BOUNCE
+    return Windows(
+        first=first,
+        steps=round(_SECONDS / physics_dt),
+        origin=origin,
+        angle_times=angle_times,
+        angles=angles,
+        angle_weights=angle_weights,
+        picture_times=picture_times,
+        balls=balls,
+        picture_weights=np.where(near, 0.0, picture_weights),
+        bounces=bounces,
+        starts=np.stack(starts),
+        dt=physics_dt,
+    )
+
+
+def _thin(spans: list, most: int) -> list:
+    """At most some of the spans, evenly over the log."""
+    if len(spans) <= most:
+        return spans
+    return [spans[i] for i in np.linspace(0, len(spans) - 1, most).round().astype(int)]
 
 
 def _find_bounces(log: Log) -> list[tuple[float, float, float]]:
@@ -173,9 +196,9 @@ def _slopes(times: np.ndarray, values: np.ndarray, reach: int) -> np.ndarray:
 def _find_rests(log: Log, spans: list[tuple[float, float, float]]) -> list[tuple[float, float]]:
     """Times between the windows with a ball, in pieces; none of them spans a gap of the log."""
     taken = sorted((start, end) for start, end, _ in spans)
-    gaps = np.flatnonzero(np.diff(log.times) > _JOINT_GAP)
-    taken += [(log.times[i], log.times[i + 1] + _SETTLING) for i in gaps]
-    first = max(log.times[0], log.target_times[0]) + _SETTLING
+    gaps = np.flatnonzero(np.diff(log.times) > JOINT_GAP)
+    taken += [(log.times[i], log.times[i + 1] + SETTLING) for i in gaps]
+    first = max(log.times[0], log.target_times[0]) + SETTLING
     pieces, begin = [], first
     for start, end in [*sorted(taken), (log.times[-1], np.inf)]:
         length = start - begin
@@ -185,14 +208,6 @@ def _find_rests(log: Log, spans: list[tuple[float, float, float]]) -> list[tuple
             pieces += list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
         begin = max(begin, end)
     return pieces
-
-
-def _find_settled(log: Log) -> np.ndarray:
-    """Which joint angles [T] no longer depend on the targets before the log or in a gap."""
-    begins = log.times[np.flatnonzero(np.diff(log.times) > _JOINT_GAP) + 1]
-    begins = np.concatenate([[max(log.times[0], log.target_times[0])], begins])
-    last = np.maximum(np.searchsorted(begins, log.times, side="right") - 1, 0)
-    return log.times - begins[last] >= _SETTLING
 
 
 def _pad(
@@ -218,12 +233,12 @@ def _joint_start(log: Log, time: float) -> np.ndarray:
 
 
 def _ball_start(log: Log, pictures: np.ndarray, bounce: float, zero: float) -> np.ndarray:
-    """Position, velocity and spin [9] of the ball at a time, by a free fall through the pictures
-    before the bounce."""
+    """Position, velocity, spin and deviation of the drag [10] of the ball at a time, by a free fall
+    through the pictures before the bounce."""
     if not len(pictures):
-        return np.concatenate([_NO_BALL, np.zeros(6)])
+        return np.concatenate([_NO_BALL, np.zeros(7)])
     t = log.picture_times[pictures] - zero
     before = t < bounce - 0.012
     t, balls = t[before], log.ball_positions[pictures][before]
     line = polyfit(t, balls - 0.5 * t[:, None] ** 2 * GRAVITY, 1)
-    return np.append(line.ravel(), np.zeros(3))
+    return np.append(line.ravel(), np.zeros(4))

@@ -3,12 +3,14 @@
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import mujoco
 import numpy as np
 import yaml
 
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.stages import Identified
 from bounce_mjx.identify.unknowns import BALL, CAMERA_ROTATION
+from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.world.named import NamedWorld
 from bounce_mjx.world.randomization import TERMS
 
@@ -23,7 +25,12 @@ _UNSEEN = 0.7
 # Information in units of the prior's below which a combination of unknowns is not shown.
 _WEAK = 1.5
 _SHARE = 0.35
-_GOOD_FIT = 1.2
+# An error in windows that the search had not seen is explained up to this multiple of the sensor's
+# noise, or up to these: a share of a joint's motion and an angle, rad; a distance of the ball, m.
+_GOOD_FIT = 2.0
+_GOOD_SHARE, _GOOD_ANGLE, _GOOD_DISTANCE = 0.02, 1e-3, 3e-3
+# Share of the windows with a ball from which its bounces count.
+_MOST_FLY = 0.5
 
 # What shows unknowns that a log does not show or separate.
 _MOTIONS = {
@@ -43,6 +50,10 @@ _MISTAKES = (
     "Look at the frame of the ball's position (the robot's base, in metres, z up), the unit and "
     "clock of ball_time and of the servo targets, swapped columns, a joint's zero, --robot, and "
     "how the paddle is mounted, which the log cannot tell from these: paddle_offset has its prior."
+)
+_ARM_MISTAKES = (
+    "The servos of --robot may be made up, or it is another robot; look at the unit and clock of "
+    "the servo targets too."
 )
 
 
@@ -64,11 +75,17 @@ class Estimate(NamedTuple):
 def estimates(found: Identified, joint_names: Sequence[str]) -> list[Estimate]:
     """All unknowns with their intervals; a sensor whose residuals exceed its noise widens them.
     `ball_latency` is the time from the exposure to the arrival."""
-    layout, width = found.layout, _HALF_WIDTH * found.deviation * misfit(found)
-    world = layout.world(found.fit.vector)
+    layout, vector = found.layout, found.fit.vector
+    world = layout.world(vector)
     values = np.concatenate([np.ravel(world[name]) for name in layout.terms])
-    low, high = (layout.clip(end) for end in (values - width, values + width))
-    alone = _HALF_WIDTH * misfit(found) / np.sqrt(np.diag(np.linalg.inv(found.covariance)))
+    # What a log does not show is as well known as before it.
+    deviation = np.minimum(found.deviation * misfit(found), layout.deviation)
+    low, high = (
+        layout.decode(layout.clip(vector + side * _HALF_WIDTH * deviation)) for side in (-1.0, 1.0)
+    )
+    given_others = misfit(found) / np.sqrt(np.diag(np.linalg.inv(found.covariance)))
+    ends = layout.decode(vector + _HALF_WIDTH * np.minimum(given_others, layout.deviation))
+    alone = ends - layout.decode(vector)
     for name, ends in _estimate_delays(found).items():
         place = layout.terms[name]
         low[place], high[place] = ends
@@ -110,45 +127,105 @@ def _estimate_delays(found: Identified) -> dict[str, tuple[float, float]]:
 
 
 def misfit(found: Identified) -> float:
-    """Factor by which the residuals exceed the sensors' noise, at least 1."""
-    return max(1.0, *found.after.values())
+    """Factor by which the errors in windows that the search had not seen exceed those in all, at
+    least 1."""
+    ratios = [found.held_out[name] / found.after[name] for name in found.held_out]
+    return max(1.0, *ratios)
 
 
 def sentences(found: Identified, joint_names: Sequence[str]) -> list[str]:
     """Sentences about the fit and about what the log cannot show."""
-    said = []
-    for sensor, error in found.held_out.items():
-        if error > _GOOD_FIT:
-            said.append(
-                f"The model does not explain {sensor}: its error in windows that the search had "
-                f"not seen is {error:.2f} times the sensor's noise. The robot does something that "
-                "the model lacks, or it is another robot, and the intervals are too narrow."
-            )
-    if found.dropped:
+    said = describe_doubts(found, joint_names)
+    if found.gravity_compensation:
+        said.append("The log shows that the controller carries the arm's weight.")
+    if found.dropped and found.dropped <= _MOST_FLY * np.sum(found.windows.has_ball):
         said.append(
             f"In {found.dropped} of {int(np.sum(found.windows.has_ball))} windows, the ball was "
             "not in free flight; their pictures do not count."
         )
     if not np.any(found.windows.has_ball):
         said.append(
-            "The log shows no bounce, so only the arm was identified. If the ball bounced, look at "
-            "the axes and the unit of its position, z up in metres, and at the unit of ball_time."
+            "The log shows no bounce, so only the arm was identified, without a zero that an "
+            "encoder and its servo share (encoder_bias)."
+        )
+    lag = found.layout.slices["delay_variance"]
+    if np.all(found.deviation[lag] >= _UNSEEN * found.layout.deviation[lag]):
+        said.append(
+            "The log does not tell action_latency and servo_lag apart; their sum is what it shows."
         )
     return [*_describe_mistakes(found, joint_names), *said, *_describe_unseen(found, joint_names)]
+
+
+def describe_doubts(found: Identified, joint_names: Sequence[str]) -> list[str]:
+    """Why the identified world does not explain the log, a sentence each; none if it does.
+
+    The errors are those in windows that the search had not seen. A model that is off by less than
+    its sensor's noise, or by a small share of the motion, is as good as a policy needs it.
+    """
+    windows, doubts = found.windows, []
+    angles = windows.angles[windows.angle_weights > 0.0]
+    for j, (name, error) in enumerate(zip(joint_names, found.joint_errors, strict=False)):
+        noise, motion = found.noise.angles[j], float(np.std(angles[:, j]))
+        if error > max(_GOOD_FIT * noise, _GOOD_SHARE * motion, _GOOD_ANGLE):
+            doubts.append(
+                f"The model does not explain the angles of {name}: its error in windows that the "
+                f"search had not seen is {1e3 * error:.2g} mrad, and {1e3 * noise:.2g} mrad is the "
+                "encoder's noise. The robot does something that the model lacks, or it is another "
+                "robot."
+            )
+    bounces = int(np.sum(windows.has_ball))
+    if bounces and found.dropped > _MOST_FLY * bounces:
+        doubts.append(
+            f"In {found.dropped} of {bounces} windows, the ball was not in free flight as the "
+            "model knows it; the other windows are too few to believe."
+        )
+    ratio = found.held_out.get("ball_position", 0.0)
+    error = ratio * float(np.mean(found.noise.balls)) if bounces else 0.0
+    if ratio > _GOOD_FIT and error > _GOOD_DISTANCE:
+        doubts.append(
+            f"The model does not explain the ball: its error in windows that the search had not "
+            f"seen is {1e3 * error:.2g} mm, {ratio:.2g} times the camera's noise."
+        )
+    return doubts
+
+
+def total_delay(found: Identified, model: mujoco.MjModel) -> str:
+    """The delay from a command to the angle, which a log shows however it is shared.
+
+    It is the action's latency, the lag, and the delay of the servos themselves: damping divided by
+    stiffness, which is the mean of a servo's answer to a step.
+    """
+    layout, servos = found.layout, list(find_addresses(model).actuators)
+    own = -model.actuator_biasprm[servos, 2] / model.actuator_gainprm[servos, 0]
+
+    def total(vector: np.ndarray) -> float:
+        world = layout.world(vector)
+        of_servos = np.mean(own * world["servo_damping"] / world["servo_gain"])
+        return float(world["action_latency"] + world["servo_lag"] + of_servos)
+
+    vector, steps = found.fit.vector, 1e-3 * layout.deviation
+    moved = [total(vector + step) for step in np.diag(steps)]
+    slope = (np.array(moved) - total(vector)) / steps
+    covariance = np.linalg.inv(found.information + np.diag(layout.deviation**-2.0))
+    width = _HALF_WIDTH * misfit(found) * float(np.sqrt(slope @ covariance @ slope))
+    late = 1e3 * total(vector)
+    return f"total delay: {late:.1f} +- {1e3 * width:.1f} ms, of latency, lag and servos"
 
 
 def _describe_mistakes(found: Identified, joint_names: Sequence[str]) -> list[str]:
     """Warnings of estimates that are several deviations of the prior away."""
     layout, vector = found.layout, found.fit.vector
+    means = layout.decode(layout.mean)
     off = np.abs(vector - layout.mean) / layout.deviation
     at_limit = np.any((layout.limits == vector) & (layout.limits != 0.0), axis=0)
     said = [
         f"warning: {entry.label} is {entry.value:.4g} {entry.unit}".rstrip()
-        + f", {off[i]:.1f} deviations of the prior from {layout.mean[i]:g}."
+        + f", {off[i]:.1f} deviations of the prior from {means[i]:g}."
         for i, entry in enumerate(estimates(found, joint_names))
         if off[i] > _SURPRISING or at_limit[i]
     ]
-    return [*said, _MISTAKES] if said else []
+    advice = _MISTAKES if np.any(found.windows.has_ball) else _ARM_MISTAKES
+    return [*said, advice] if said else []
 
 
 def _describe_unseen(found: Identified, joint_names: Sequence[str]) -> list[str]:
@@ -173,7 +250,13 @@ def _describe_unseen(found: Identified, joint_names: Sequence[str]) -> list[str]
     return list(said.values())
 
 
-def to_yaml(found: Identified, log: Log, joint_names: Sequence[str], robot: str | None) -> str:
+def to_yaml(
+    found: Identified,
+    log: Log,
+    joint_names: Sequence[str],
+    robot: str | None,
+    doubts: Sequence[str] = (),
+) -> str:
     """YAML text of the identified world: ranges for training, with their sources.
 
     The range of each entry of a term covers what the log allows while all other unknowns have their
@@ -183,6 +266,7 @@ def to_yaml(found: Identified, log: Log, joint_names: Sequence[str], robot: str 
 
     Args:
       robot: name or file of the robot's config.
+      doubts: why the world does not explain the log, for its first lines.
     """
     ranges: dict[str, list[Any]] = {}
     sources: dict[str, str] = {}
@@ -209,14 +293,21 @@ def to_yaml(found: Identified, log: Log, joint_names: Sequence[str], robot: str 
         sources[name] = f"{words} in {log.source}."
     head = {} if robot is None else {"robot": robot}
     head["env"] = {"randomization": ranges}
+    if found.gravity_compensation:
+        head["env"] = {"robot": {"gravity_compensation": found.gravity_compensation}} | head["env"]
     tail = {"sources": {f"randomization.{name}": text for name, text in sources.items()}}
+    if found.gravity_compensation:
+        words = f"{log.source} fits better with a controller that carries the arm's weight."
+        tail["sources"]["robot.gravity_compensation"] = words
     tail["assumed"] = [f"randomization.{name}" for name in assumed]
     # The numbers of an end on one line, and sources below one another.
     texts = [
         yaml.safe_dump(part, sort_keys=False, default_flow_style=style, width=100)
         for part, style in ((head, None), (tail, False))
     ]
-    return f"# Identified from {log.source}: bounce-mjx train --world FILE\n{''.join(texts)}"
+    lines = [f"Identified from {log.source}: bounce-mjx train --world FILE", *doubts]
+    comment = "".join(f"# {line}\n" for line in lines)
+    return comment + "".join(texts)
 
 
 def compare(world: NamedWorld, found: Identified, joint_names: Sequence[str]) -> list[str]:

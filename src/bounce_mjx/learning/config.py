@@ -28,9 +28,9 @@ class PPOConfig(settings.StrictModel):
     num_minibatches: settings.Count = 8
     """Minibatches in one epoch; must divide num_envs * rollout_length."""
     learning_rate: settings.Positive = 3e-4
-    """Learning rate at the start."""
+    """Learning rate at the start, within its limits."""
     min_learning_rate: settings.Positive = 1e-5
-    """Lower limit of the learning rate."""
+    """Lower limit of the learning rate that adapts."""
     max_learning_rate: settings.Positive = 3e-3
     """Upper limit of the learning rate at the start of training."""
     final_max_learning_rate: settings.Positive = 1e-4
@@ -39,7 +39,7 @@ class PPOConfig(settings.StrictModel):
     """Environment steps over which the upper limit decays exponentially."""
     target_kl: settings.NonNegative = 0.01
     """Target KL divergence of one update, to which the learning rate adapts; 0 keeps the rate
-    constant."""
+    constant, whatever its limits."""
     discount: settings.UnitInterval = 0.98
     """Discount factor of a control step."""
     gae_lambda: settings.UnitInterval = 0.95
@@ -67,7 +67,7 @@ class PPOConfig(settings.StrictModel):
     on top of a shared part."""
     shared_critic: bool = False
     """The value network starts from the last hidden layer of the policy, which both train."""
-    activation: Literal["silu", "relu", "tanh"] = "silu"
+    activation: Literal["silu", "relu", "tanh", "elu"] = "silu"
     """Activation of the hidden layers."""
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
     """Type of the hidden layers during training; bfloat16 is faster on a GPU. The rest is
@@ -83,6 +83,13 @@ class PPOConfig(settings.StrictModel):
             raise ValueError(
                 f"min_learning_rate {self.min_learning_rate} is above the upper limits "
                 f"max_learning_rate {limits[1]} and final_max_learning_rate {limits[0]}; lower it"
+            )
+        adapts = self.target_kl > 0.0
+        if adapts and not self.min_learning_rate <= self.learning_rate <= self.max_learning_rate:
+            raise ValueError(
+                f"learning_rate {self.learning_rate} is not within min_learning_rate "
+                f"{self.min_learning_rate} and max_learning_rate {self.max_learning_rate}, which "
+                "limit it after the first minibatch; change one of them, or set target_kl to 0"
             )
         batch = self.num_envs * self.rollout_length
         if batch % self.num_minibatches:

@@ -199,8 +199,10 @@ class PPO:
         state, minibatches = self.update(state, samples, update_key)
         fault = first_fault(metrics["reward"], new_statistics, minibatches, state.params)
         metrics |= {name: jnp.mean(values) for name, values in minibatches.items()}
+        if "policy/kl" in minibatches:
+            # How far the whole update has moved the policy.
+            metrics["policy/kl"] = jnp.mean(minibatches["policy/kl"][-1])
         metrics |= {
-            "policy/kl": jnp.mean(minibatches["policy/kl"][-1]),
             "policy/learning_rate": state.learning_rate,
             "loss/explained_variance": 1.0 - jnp.var(advantage) / jnp.var(value_target),
             "fault": fault,
@@ -259,7 +261,7 @@ class PPO:
         env_state = unpack(packed)
         last_inputs = self.network_inputs(vector.observe(env_state), env_state.env.metrics)
         ends = jnp.stack([last_inputs, timeout_inputs])
-        return env_state, rollout, ends, rollout_metrics(unpack(metrics), self.env.task.curves)
+        return env_state, rollout, ends, rollout_metrics(unpack(metrics))
 
     def network_inputs(self, observation: jax.Array, metrics: Metrics) -> jax.Array:
         """Inputs of the networks before normalisation [B, N + K]."""
@@ -310,7 +312,6 @@ class PPO:
         config, groups = self.config, num_groups(self.config)
         samples = jax.tree.map(lambda x: group(x, groups), samples)
         size = samples.log_prob.shape[1]
-        limit = max_learning_rate(config, state.iteration)
         flat, unravel = ravel_pytree(state.params)
 
         def step(learner, minibatch):
@@ -319,7 +320,7 @@ class PPO:
             # With the groups as an axis of their own, XLA transposes the layers' outputs on a CPU.
             batch = jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), batch)
             batch_loss = lambda flat: self.loss(unravel(flat), batch)  # noqa: E731
-            learner, metrics = self.minibatch_step(batch_loss, learner, limit)
+            learner, metrics = self.minibatch_step(batch_loss, learner, state.iteration)
             return learner, pack(metrics)
 
         def epoch(learner, key):
@@ -341,13 +342,13 @@ class PPO:
         ), unpack(metrics)
 
     def minibatch_step(
-        self, batch_loss: Callable, learner: LearnerState, limit: jax.Array
+        self, batch_loss: Callable, learner: LearnerState, iteration: jax.Array
     ) -> tuple[LearnerState, Metrics]:
         """One step of the optimizer.
 
         Args:
           batch_loss: parameters in one array -> the loss of the minibatch [], and its parts.
-          limit: upper limit of the learning rate [].
+          iteration: iterations done before this one [], int.
         """
         gradient, metrics = jax.grad(batch_loss, has_aux=True)(learner.params)
         direction, optimizer = self.optimizer.update(gradient, learner.optimizer)
@@ -356,8 +357,32 @@ class PPO:
         return LearnerState(
             params=learner.params - rate * direction,
             optimizer=optimizer,
-            learning_rate=adapt_learning_rate(self.config, rate, metrics["policy/kl"], limit),
+            learning_rate=self.next_learning_rate(rate, metrics, iteration),
         ), metrics
+
+    def next_learning_rate(
+        self, learning_rate: jax.Array, metrics: Metrics, iteration: jax.Array
+    ) -> jax.Array:
+        """The learning rate [] of the next minibatch step: `adapt_learning_rate`. A subclass with a
+        schedule of its own overrides this, and nothing else changes the rate.
+
+        Args:
+          learning_rate: of this minibatch step [].
+          metrics: of this minibatch step, each [].
+          iteration: iterations done before this one [], int.
+
+        Raises:
+          UserError: `loss` does not return the KL divergence.
+        """
+        if self.config.target_kl == 0.0:
+            return learning_rate
+        if "policy/kl" not in metrics:
+            raise UserError(
+                f"the loss of {type(self).__name__} returns no metric policy/kl, to which the "
+                "learning rate adapts; return it, or set target_kl to 0"
+            )
+        limit = max_learning_rate(self.config, iteration)
+        return adapt_learning_rate(self.config, learning_rate, metrics["policy/kl"], limit)
 
     def loss(self, params: Params, samples: Samples) -> tuple[jax.Array, Metrics]:
         """The loss of a minibatch [], and its parts."""
@@ -509,12 +534,21 @@ def max_learning_rate(config: PPOConfig, iteration: jax.Array) -> jax.Array:
 def adapt_learning_rate(
     config: PPOConfig, learning_rate: jax.Array, kl: jax.Array, limit: jax.Array
 ) -> jax.Array:
-    """The learning rate [] after an update, adapted so that the KL divergence approaches target_kl
-    (the adaptive rule of Schulman et al. 2017, section 4, applied to the learning rate)."""
-    if config.target_kl > 0.0:
-        is_large, is_small = kl > 2.0 * config.target_kl, kl < 0.5 * config.target_kl
-        factor = jnp.where(is_small, _LEARNING_RATE_FACTOR, 1.0)
-        learning_rate *= jnp.where(is_large, 1.0 / _LEARNING_RATE_FACTOR, factor)
+    """The learning rate [] after a minibatch step, adapted so that the KL divergence approaches
+    target_kl (the adaptive rule of Schulman et al. 2017, section 4, applied to the learning rate);
+    the same one if target_kl is 0.
+
+    Args:
+      learning_rate: of the minibatch step [].
+      kl: the policy's KL divergence from that of the rollout, in the minibatch step [].
+      limit: upper limit of the rate [], such as `max_learning_rate`.
+    """
+    if config.target_kl == 0.0:
+        return learning_rate
+    is_large = kl > 2.0 * config.target_kl
+    is_small = kl < 0.5 * config.target_kl
+    factor = jnp.where(is_small, _LEARNING_RATE_FACTOR, 1.0)
+    learning_rate *= jnp.where(is_large, 1.0 / _LEARNING_RATE_FACTOR, factor)
     return jnp.clip(learning_rate, config.min_learning_rate, limit)
 
 
@@ -527,14 +561,16 @@ def first_fault(
     Args:
       reward: mean reward of the rollout [].
       statistics: the statistics that include the rollout.
-      minibatch_metrics: each [epochs, minibatches].
+      minibatch_metrics: each [epochs, minibatches]; the gradient's norm is one of them.
       params: the parameters after the update.
     """
-    names = ("loss/value", "loss/policy", "loss/gradient_norm")
-    minibatches = jnp.stack([minibatch_metrics[name].ravel() for name in names], axis=-1)
+    places = {"loss/value": 3, "loss/policy": 4, "loss/gradient_norm": 5}
+    # The loss of a subclass may have other parts.
+    places = {name: place for name, place in places.items() if name in minibatch_metrics}
+    minibatches = jnp.stack([minibatch_metrics[name].ravel() for name in places], axis=-1)
     before = jnp.stack([jnp.isfinite(reward), all_finite(statistics)])
     finite = jnp.hstack([before, jnp.isfinite(minibatches).ravel(), all_finite(params)])
-    numbers = [1, 2] + [3, 4, 5] * len(minibatches) + [6]
+    numbers = [1, 2, *[*places.values()] * len(minibatches), 6]
     return jnp.where(finite.all(), 0, jnp.array(numbers)[jnp.argmin(finite)])
 
 

@@ -11,21 +11,21 @@ Scalar = float | jax.Array
 
 
 class Moving(NamedTuple):
-    """Servo targets that move within an arm's limits (`robot.setpoints`); times are in physics
-    steps."""
+    """Servo targets that move within an arm's limits (`robot.setpoints`). The unit of time is the
+    physics step in all fields: velocities are in rad per step, accelerations in rad per step^2."""
 
     velocity: Any
     """Velocities [nu] at the start of the control step."""
     acceleration: Any
     """Accelerations [nu] in the control step."""
-    before: Any
-    """Accelerations [nu] in the one before."""
+    last_acceleration: Any
+    """Accelerations [nu] in the control step before."""
     smoothing: Any = None
     """Time [nu] of the mean that limits the jerk."""
-    earlier: Any = None
+    older_acceleration: Any = None
     """Accelerations [nu] two control steps before, for targets that are late and smoothed."""
-    duration: Any = None
-    """Physics steps [] in a control step, with `earlier`."""
+    control_steps: Any = None
+    """Physics steps [] in a control step, with `older_acceleration`."""
 
 
 class Control(NamedTuple):
@@ -33,11 +33,11 @@ class Control(NamedTuple):
 
     All engines apply it the same way: `servo_targets` gives the `ctrl` of each physics step, the
     push changes the ball's velocity before the first step, and every step has the drag of its
-    velocity.
+    velocity. The unit of time is the physics step in all fields but the last two.
     """
 
     ctrl: Any
-    """Servo targets [nu]; those at the start of the control step if they are moving."""
+    """Servo targets [nu], rad; those at the start of the control step if they are moving."""
     moving: Moving | None = None
     """How the targets move."""
     previous: Any = None
@@ -57,44 +57,64 @@ class Control(NamedTuple):
 def servo_target(control: Control, step: Scalar) -> Scalar:
     """Target of a servo during one physics step.
 
-    The lag is the exact solution of a first-order filter whose input is constant during a step.
-
     Args:
       control: `ctrl`, `previous` and `filtered` of one servo or of several.
       step: index of the physics step, from 0.
     """
     if control.moving is not None:
         return _moving_target(control, control.moving, step)
-    late = control.previous is not None
-    before = control.switch if late else 0.0
-    if control.lag is None:
-        return jnp.where(step < before, control.previous, control.ctrl) if late else control.ctrl
+    if control.lag is not None:
+        return _lagging_target(control, step)
+    if control.previous is not None:
+        return jnp.where(step < control.switch, control.previous, control.ctrl)
+    return control.ctrl
+
+
+def _lagging_target(control: Control, step: Scalar) -> Scalar:
+    """`servo_target` behind a lag: the exact solution of a first-order filter whose input is
+    constant until the switch and after it."""
     # A filter with a time constant of 0 has no memory.
     rate = -1.0 / jnp.maximum(control.lag, 1e-3)
-    held = jnp.minimum(step + 1.0, before) if late else 0.0
-    at_switch = control.filtered
-    if late:
-        at_switch = control.previous + (at_switch - control.previous) * jnp.exp(rate * held)
-    since = jnp.maximum(step + 1.0 - before, 0.0)
-    settled = control.ctrl + (at_switch - control.ctrl) * jnp.exp(rate * since)
-    return jnp.where(step < before, at_switch, settled) if late else settled
+    # A target of a physics step is the filter's output at the end of the step.
+    time = step + 1.0
+    if control.previous is None:
+        return control.ctrl + (control.filtered - control.ctrl) * jnp.exp(rate * time)
+    time_before_switch = jnp.minimum(time, control.switch)
+    lead = control.filtered - control.previous
+    until_switch = control.previous + lead * jnp.exp(rate * time_before_switch)
+    time_after_switch = jnp.maximum(time - control.switch, 0.0)
+    lead = until_switch - control.ctrl
+    after_switch = control.ctrl + lead * jnp.exp(rate * time_after_switch)
+    return jnp.where(step < control.switch, until_switch, after_switch)
 
 
 def _moving_target(control: Control, moving: Moving, step: Scalar) -> Scalar:
     """`servo_target` of a target that moves: its position at the end of the physics step."""
-    start = Setpoint(control.ctrl, moving.velocity, moving.before)
-    earlier = None if moving.earlier is None else (moving.duration, moving.earlier)
-    since = step + 1.0
-    time = since if control.switch is None else since - control.switch
+    start = Setpoint(control.ctrl, moving.velocity, moving.last_acceleration)
+    older_step = None
+    if moving.older_acceleration is not None:
+        older_step = (moving.control_steps, moving.older_acceleration)
+    # The setpoint of a late target belongs to an earlier time.
+    time = step + 1.0
+    setpoint_time = time if control.switch is None else time - control.switch
 
-    def target(time: Scalar, lag: Scalar | None = None) -> Scalar:
-        return command(start, moving.acceleration, time, jnp, moving.smoothing, lag, earlier)
+    def position(setpoint_time: Scalar, lag: Scalar | None = None) -> Scalar:
+        return command(
+            start,
+            moving.acceleration,
+            setpoint_time,
+            jnp,
+            smoothing=moving.smoothing,
+            lag=lag,
+            earlier=older_step,
+        )
 
     if control.lag is None:
-        return target(time)
+        return position(setpoint_time)
+    # The lag's steady output, and its transient from the output before the first step.
     lag = jnp.maximum(control.lag, 1e-3)
-    behind = control.filtered - target(time - since, lag)
-    return target(time, lag) + behind * jnp.exp(-since / lag)
+    transient = control.filtered - position(setpoint_time - time, lag)
+    return position(setpoint_time, lag) + transient * jnp.exp(-time / lag)
 
 
 def servo_targets(control: Control, num_steps: int) -> jax.Array:

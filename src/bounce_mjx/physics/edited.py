@@ -7,7 +7,8 @@ a constant that folds.
 """
 
 import copy
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -17,13 +18,14 @@ import numpy as np
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics.parameters import Array, PhysicsParameters
-from bounce_mjx.physics.scalars import Scalar, Vec, add, mul
+from bounce_mjx.physics.scalars import Scalar, Vec, add, maximum, minimum, mul
 from bounce_mjx.robot.arm import raise_solver_limits
-from bounce_mjx.robot.model import find_addresses, to_direct_solref
+from bounce_mjx.robot.model import BallAddresses, find_addresses, to_direct_solref
+from bounce_mjx.robot.torques import force_ranges, torque_ranges
 
 # MuJoCo's mjMINMU: its C engine computes with no smaller coefficient of friction.
 MIN_FRICTION = 1e-5
-_NO_PAIR = (
+NO_PAIR = (
     "the MJCF has no contact pair of the ball and the paddle, which contact_stiffness, "
     "contact_damping and contact_friction change; add <pair> to <contact>"
 )
@@ -42,17 +44,23 @@ class Edit(NamedTuple):
     """Value of the entries, or of each, per value of the parameter."""
     number: Any = None
     """Which of the parameter's numbers each entry has; by default, each has its own."""
+    least: Any = None
+    """Least value of each entry, for a parameter that limits the model's own values."""
+    greatest: Any = None
+    """Greatest value of each entry, for a parameter that limits the model's own values."""
 
 
 class EditedModel:
     """A compiled model with new numbers in some entries.
 
     `model["dof_damping", 2]` is a number, `model["geom_pos", 3]` a tuple of numbers: Python floats,
-    or scalars where they were edited. Reading is recorded.
+    or scalars where they were edited. The brackets mark the entries as used by an engine, and
+    `unread` names the edited entries that no brackets have read; `peek` reads without a mark.
     """
 
     def __init__(self, mj_model: mujoco.MjModel):
-        self.model, self.addresses = mj_model, find_addresses(mj_model)
+        self.model = mj_model
+        self.addresses = find_addresses(mj_model)
         self._edited: dict[tuple[str, int], Scalar] = {}
         self._derived: dict[tuple[str, int], Scalar] = {}
         self._read: set[tuple[str, int]] = set()
@@ -68,10 +76,14 @@ class EditedModel:
         return self.peek(*key)
 
     def peek(self, field: str, *index: Any) -> Any:
-        """A number, or a tuple of numbers, without a record."""
-        own, values = _field(self.model, field), self._derived | self._edited
-        numbers = [values.get(x, own.flat[x[1]].item()) for x in self._keys(field, index)]
-        return Vec(numbers) if np.ndim(own[index]) else numbers[0]
+        """A number, or a tuple of numbers, without a mark."""
+        model_values = _field(self.model, field)
+        new_values = self._derived | self._edited
+        numbers = []
+        for key in self._keys(field, index):
+            _, place = key
+            numbers.append(new_values.get(key, model_values.flat[place].item()))
+        return Vec(numbers) if np.ndim(model_values[index]) else numbers[0]
 
     def put(self, field: str, index: Any, values: Iterable[Scalar]) -> None:
         """Edits entries."""
@@ -83,8 +95,8 @@ class EditedModel:
 
     def _keys(self, field: str, index: Any) -> list[tuple[str, int]]:
         """Keys of entries: the field, and the place in it."""
-        own = _field(self.model, field)
-        places = np.arange(own.size).reshape(own.shape)[index]
+        shape = _field(self.model, field).shape
+        places = np.arange(math.prod(shape)).reshape(shape)[index]
         return [(field, place) for place in np.ravel(places).tolist()]
 
     def rows(self, field: str) -> list[int]:
@@ -113,22 +125,28 @@ class EditedModel:
     def contact_pairs(self) -> list[int]:
         """Indices of the contact pairs of balls and the paddle, the first ball's with the paddle
         first; none if that one is missing."""
-        m, at = self.model, self.addresses
-        geoms = {at.paddle_geom, *(ball.geom for ball in at.balls)}
-        both = zip(m.pair_geom1.tolist(), m.pair_geom2.tolist(), strict=True)
-        pairs = {i: set(pair) for i, pair in enumerate(both) if geoms.issuperset(pair)}
-        first = {at.paddle_geom, at.balls[0].geom}
-        own = sorted(pairs, key=lambda i: pairs[i] != first)
-        return own if own and pairs[own[0]] == first else []
+        paddle = self.addresses.paddle_geom
+        balls = [ball.geom for ball in self.addresses.balls]
+        geoms1 = self.model.pair_geom1.tolist()
+        geoms2 = self.model.pair_geom2.tolist()
+        first = None
+        others = []
+        for i, pair in enumerate(zip(geoms1, geoms2, strict=True)):
+            if set(pair) == {paddle, balls[0]} and first is None:
+                first = i
+            elif {paddle, *balls}.issuperset(pair):
+                others.append(i)
+        return [] if first is None else [first, *others]
 
     def array(self, field: str) -> Array:
         """The field's array; a NumPy array without traced entries."""
-        own = _field(self.model, field)
+        model_values = _field(self.model, field)
         values = self.peek(field, ...)
         if not any(isinstance(value, jax.Array) for value in values):
-            return np.reshape(np.array(values, own.dtype), own.shape)
+            return np.reshape(np.array(values, model_values.dtype), model_values.shape)
         dtype = jnp.result_type(float)
-        return jnp.stack([jnp.asarray(x, dtype) for x in values]).reshape(own.shape)
+        scalars = [jnp.asarray(value, dtype) for value in values]
+        return jnp.stack(scalars).reshape(model_values.shape)
 
 
 def _field(mj_model: mujoco.MjModel, name: str) -> np.ndarray:
@@ -139,31 +157,40 @@ def _field(mj_model: mujoco.MjModel, name: str) -> np.ndarray:
 
 def edits(m: EditedModel) -> tuple[Edit, ...]:
     """The table of the parameters' entries."""
-    at, masses = m.addresses, m.model.body_mass
-    dofs, servos = list(at.arm_qvel), list(at.actuators)
-    bodies, geoms = [ball.body for ball in at.balls], [ball.geom for ball in at.balls]
+    paddle = m.addresses.paddle_geom
+    ball_bodies = [ball.body for ball in m.addresses.balls]
+    ball_geoms = [ball.geom for ball in m.addresses.balls]
     pairs = m.contact_pairs()
-    links = enumerate(m.link_bodies())
-    joint = {body: i for i, link in links for body in link.tolist() if masses[body] > 0.0}
-    heavy, joints = list(joint), list(joint.values())
-    share = masses[heavy] / m.link_masses()[joints]
+    dofs = list(m.addresses.arm_qvel)
+    servos = list(m.addresses.actuators)
+    per_torque = 1.0 / np.abs(m.model.actuator_gear[servos, 0])
+    least, greatest = force_ranges(m.model, servos)
+    # The bodies with a mass, and the link to which each belongs.
+    bodies = []
+    links = []
+    for link, link_bodies in enumerate(m.link_bodies()):
+        for body in link_bodies.tolist():
+            if m.model.body_mass[body] > 0.0:
+                bodies.append(body)
+                links.append(link)
+    share = m.model.body_mass[bodies] / m.link_masses()[links]
     return (
-        Edit("ball_mass", "body_mass", bodies),
-        Edit("ball_radius", "geom_size", (geoms, 0)),
+        Edit("ball_mass", "body_mass", ball_bodies),
+        Edit("ball_radius", "geom_size", (ball_geoms, 0)),
         Edit("contact_stiffness", "pair_solref", (pairs, 0), -1.0),
         Edit("contact_damping", "pair_solref", (pairs, 1), -1.0),
         Edit("contact_friction", "pair_friction", (pairs, slice(0, 2))),
         Edit("servo_gain", "actuator_gainprm", (servos, 0)),
         Edit("servo_gain", "actuator_biasprm", (servos, 1), -1.0),
         Edit("servo_damping", "actuator_biasprm", (servos, 2), -1.0),
-        Edit("force_limit", "actuator_forcerange", (servos, 1)),
-        Edit("force_limit", "actuator_forcerange", (servos, 0), -1.0),
+        Edit("force_limit", "actuator_forcerange", (servos, 0), -per_torque, least=least),
+        Edit("force_limit", "actuator_forcerange", (servos, 1), per_torque, greatest=greatest),
         Edit("armature", "dof_armature", dofs),
         Edit("damping", "dof_damping", dofs),
         Edit("frictionloss", "dof_frictionloss", dofs),
-        Edit("link_mass", "body_mass", heavy, share, joints),
-        Edit("paddle_position", "geom_pos", at.paddle_geom),
-        Edit("paddle_rotation", "geom_quat", at.paddle_geom),
+        Edit("link_mass", "body_mass", bodies, share, links),
+        Edit("paddle_position", "geom_pos", paddle),
+        Edit("paddle_rotation", "geom_quat", paddle),
         Edit("gravity", "opt.gravity", slice(None)),
     )
 
@@ -177,33 +204,51 @@ def edited(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> EditedMod
     Raises:
       UserError: an entry is not one of the model's, or the model lacks a contact pair.
     """
-    m, p = EditedModel(mj_model), parameters
-    if p.contact_stiffness is not None or p.contact_damping is not None:
+    m = EditedModel(mj_model)
+    if parameters.contact_stiffness is not None or parameters.contact_damping is not None:
+        # Both numbers of a solref have one format.
         for pair in m.contact_pairs():
             direct = to_direct_solref(mj_model.pair_solref[pair], mj_model.opt.timestep)
-            m.put("pair_solref", pair, [-float(x) for x in direct])
+            m.put("pair_solref", pair, [-float(number) for number in direct])
     for edit in edits(m):
-        value = getattr(p, edit.parameter)
-        if value is None:
-            continue
-        count = _field(mj_model, edit.field)[edit.index].size
-        if not count:
-            raise UserError(_NO_PAIR)
-        numbers = value if isinstance(value, tuple | list) else (value,) * count
-        each = numbers if edit.number is None else [numbers[i] for i in edit.number]
-        m.put(edit.field, edit.index, map(mul, each, np.broadcast_to(edit.scale, count).tolist()))
-    for name, value in (p.entries or {}).items():
-        field, _, inner = name.removesuffix("]").partition("[")
-        try:
-            m.put(field, tuple(int(number) for number in inner.split(",") if number), [value])
-        except (AttributeError, ValueError, IndexError):
-            raise UserError(
-                f"{name} is no entry of an MjModel; give a field with the index of one number, "
-                "such as dof_damping[2]"
-            ) from None
+        value = getattr(parameters, edit.parameter)
+        if value is not None:
+            m.put(edit.field, edit.index, _entries(m, edit, value))
+    for name, value in (parameters.entries or {}).items():
+        _put_entry(m, name, value)
     _set_flags(m)
     _derive(m)
     return m
+
+
+def _entries(m: EditedModel, edit: Edit, value: Scalar | Sequence[Scalar]) -> list[Scalar]:
+    """The numbers of an edit's entries for a value of its parameter."""
+    count = _field(m.model, edit.field)[edit.index].size
+    if not count:
+        raise UserError(NO_PAIR)
+    numbers = value if isinstance(value, tuple | list) else (value,) * count
+    if edit.number is not None:
+        numbers = [numbers[i] for i in edit.number]
+    scales = np.broadcast_to(edit.scale, count).tolist()
+    entries = list(map(mul, numbers, scales))
+    if edit.least is not None:
+        entries = list(map(maximum, entries, edit.least.tolist()))
+    if edit.greatest is not None:
+        entries = list(map(minimum, entries, edit.greatest.tolist()))
+    return entries
+
+
+def _put_entry(m: EditedModel, name: str, value: Scalar) -> None:
+    """Edits the entry with a name such as `dof_damping[2]`."""
+    field, _, index = name.removesuffix("]").partition("[")
+    try:
+        place = tuple(int(number) for number in index.split(",") if number)
+        m.put(field, place, [value])
+    except (AttributeError, ValueError, IndexError):
+        raise UserError(
+            f"{name} is no entry of an MjModel; give a field with the index of one number, "
+            "such as dof_damping[2]"
+        ) from None
 
 
 def _set_flags(m: EditedModel) -> None:
@@ -220,33 +265,56 @@ def _set_flags(m: EditedModel) -> None:
 def _derive(m: EditedModel) -> None:
     """Sets the entries that MuJoCo's compiler derives from edited ones. An inertia follows the
     mass, and a ball's also the square of the radius."""
-    c, balls, sizes = m.model, {x.body: x for x in m.addresses.balls}, m.rows("geom_size")
-    heavy = m.rows("body_mass")
-    for body in {*heavy, *(x.body for x in balls.values() if x.geom in sizes)}:
-        ball, mass, own = balls.get(body), m.peek("body_mass", body), c.body_mass[body].item()
-        factor = mul(mass, 1.0 / own) if own else 1.0
-        if ball and ball.geom in sizes:
-            radius = m.peek("geom_size", ball.geom, 0)
-            growth = mul(radius, 1.0 / c.geom_size[ball.geom, 0].item())
-            factor = mul(factor, mul(growth, growth))
-            m.follow("geom_rbound", ball.geom, [radius])
-            m.follow("geom_aabb", (ball.geom, slice(3, 6)), [radius] * 3)
-        m.follow("body_inertia", body, Vec(c.body_inertia[body].tolist()) * factor)
-        if ball:
-            inertia = m.peek("body_inertia", body)
-            # Inverses of the mass and of the inertia.
-            moving, turning = c.body_invweight0[body].tolist()
-            moving, turning = moving * own, turning * c.body_inertia[body, 0].item()
-            m.follow("body_invweight0", body, [moving / mass, turning / inertia[0]])
-            # MuJoCo stores the constant inertia matrix of a free body in the model.
-            m.follow("dof_M0", np.array(ball.qvel), (mass,) * 3 + inertia)
-    if heavy:
-        # MuJoCo numbers parents before children.
-        total = list(m.peek("body_mass", ...))
-        for body in range(c.nbody - 1, 0, -1):
-            parent = c.body_parentid[body]
-            total[parent] = add(total[parent], total[body])
-        m.follow("body_subtreemass", ..., total)
+    balls = {ball.body: ball for ball in m.addresses.balls}
+    edited_sizes = m.rows("geom_size")
+    edited_masses = m.rows("body_mass")
+    resized = [body for body, ball in balls.items() if ball.geom in edited_sizes]
+    for body in {*edited_masses, *resized}:
+        _derive_inertia(m, body, balls.get(body), body in resized)
+    if edited_masses:
+        _derive_subtree_masses(m)
+
+
+def _derive_inertia(
+    m: EditedModel, body: int, ball: BallAddresses | None, is_resized: bool
+) -> None:
+    """Sets what follows from the mass of a body and from the radius of a ball.
+
+    Args:
+      m: the model with its edits.
+      body: index of the body.
+      ball: the ball that it is; None for another body.
+      is_resized: whether it is a ball with an edited radius.
+    """
+    c = m.model
+    mass = m.peek("body_mass", body)
+    model_mass = c.body_mass[body].item()
+    factor = mul(mass, 1.0 / model_mass) if model_mass else 1.0
+    if is_resized:
+        radius = m.peek("geom_size", ball.geom, 0)
+        growth = mul(radius, 1.0 / c.geom_size[ball.geom, 0].item())
+        factor = mul(factor, mul(growth, growth))
+        m.follow("geom_rbound", ball.geom, [radius])
+        m.follow("geom_aabb", (ball.geom, slice(3, 6)), [radius] * 3)
+    m.follow("body_inertia", body, Vec(c.body_inertia[body].tolist()) * factor)
+    if ball is not None:
+        inertia = m.peek("body_inertia", body)
+        # Inverses of the mass and of the inertia.
+        inverse_mass, inverse_inertia = c.body_invweight0[body].tolist()
+        moving = inverse_mass * model_mass / mass
+        turning = inverse_inertia * c.body_inertia[body, 0].item() / inertia[0]
+        m.follow("body_invweight0", body, [moving, turning])
+        # MuJoCo stores the constant inertia matrix of a free body in the model.
+        m.follow("dof_M0", np.array(ball.qvel), (mass,) * 3 + inertia)
+
+
+def _derive_subtree_masses(m: EditedModel) -> None:
+    # MuJoCo numbers parents before children.
+    masses = list(m.peek("body_mass", ...))
+    for body in range(m.model.nbody - 1, 0, -1):
+        parent = m.model.body_parentid[body]
+        masses[parent] = add(masses[parent], masses[body])
+    m.follow("body_subtreemass", ..., masses)
 
 
 def edited_model(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> mujoco.MjModel:
@@ -266,18 +334,37 @@ def edited_model(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> muj
 
 
 def own_parameters(mj_model: mujoco.MjModel) -> PhysicsParameters:
-    """The model's own numbers, as NumPy arrays, except for the contact's. A servo without a limit
-    has an infinite one."""
-    m, own = EditedModel(mj_model), {}
+    """The model's own numbers, as NumPy arrays. A servo without a limit has an infinite one, and a
+    model without a contact pair of ball and paddle has None for the parameters of the contact."""
+    m = EditedModel(mj_model)
+    numbers = {}
     for edit in edits(m):
-        own.setdefault(edit.parameter, _field(mj_model, edit.field)[edit.index] / edit.scale)
-    servos = list(m.addresses.actuators)
-    least = np.min(np.abs(mj_model.actuator_forcerange[servos]), axis=1)
-    own["force_limit"] = np.where(mj_model.actuator_forcelimited[servos], least, np.inf)
-    own["link_mass"] = m.link_masses()
-    own |= {name: own[name][0] for name in ("ball_mass", "ball_radius")}
-    own |= dict.fromkeys(("contact_stiffness", "contact_damping", "contact_friction"))
-    return PhysicsParameters(**own)
+        # Where a parameter has several entries, the first one's number.
+        entries = _field(mj_model, edit.field)[edit.index] / edit.scale
+        numbers.setdefault(edit.parameter, entries)
+    numbers["ball_mass"] = numbers["ball_mass"][0]
+    numbers["ball_radius"] = numbers["ball_radius"][0]
+    torques = torque_ranges(mj_model, m.addresses.arm_joints, m.addresses.actuators)
+    numbers["force_limit"] = np.max(np.abs(torques), axis=0)
+    numbers["link_mass"] = m.link_masses()
+    numbers |= _contact_numbers(m)
+    return PhysicsParameters(**numbers)
+
+
+def _contact_numbers(m: EditedModel) -> dict[str, np.float64 | None]:
+    """The model's own parameters of the contact of ball and paddle; None without a pair."""
+    pairs = m.contact_pairs()
+    if not pairs:
+        return {"contact_stiffness": None, "contact_damping": None, "contact_friction": None}
+    stiffness, damping = direct_solref(m.model)
+    # MuJoCo keeps a coefficient for a frictionless pair too.
+    is_frictional = m.model.pair_dim[pairs[0]] > 1
+    friction = m.model.pair_friction[pairs[0], 0] if is_frictional else 0.0
+    return {
+        "contact_stiffness": np.float64(stiffness),
+        "contact_damping": np.float64(damping),
+        "contact_friction": np.float64(friction),
+    }
 
 
 def check_shapes(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> None:
@@ -286,14 +373,16 @@ def check_shapes(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> Non
     Raises:
       UserError: an array does not have the shape of the model's own.
     """
-    own, entries = own_parameters(mj_model)._asdict(), dict(parameters.entries or {})
-    given = parameters._asdict() | entries | {"entries": None}
-    for name, value in given.items():
-        if value is not None and jnp.shape(value) != np.shape(own.get(name)):
+    shapes = {name: np.shape(value) for name, value in own_parameters(mj_model)._asdict().items()}
+    values = parameters._asdict()
+    # Each other entry of the model is a number.
+    entries = values.pop("entries") or {}
+    for name, value in (values | dict(entries)).items():
+        shape = shapes.get(name, ())
+        if value is not None and jnp.shape(value) != shape:
             raise UserError(
                 f"the physics parameter {name} has the shape {jnp.shape(value)}; give an array of "
-                f"the shape {np.shape(own.get(name))} for one environment, and batch environments "
-                "with jax.vmap"
+                f"the shape {shape} for one environment, and batch environments with jax.vmap"
             )
 
 
@@ -305,6 +394,6 @@ def direct_solref(mj_model: mujoco.MjModel) -> tuple[float, float]:
     """
     pairs = EditedModel(mj_model).contact_pairs()
     if not pairs:
-        raise UserError(_NO_PAIR)
+        raise UserError(NO_PAIR)
     stiffness, damping = to_direct_solref(mj_model.pair_solref[pairs[0]], mj_model.opt.timestep)
     return float(stiffness), float(damping)

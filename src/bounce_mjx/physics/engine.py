@@ -14,6 +14,7 @@ from bounce_mjx.physics.edited import check_shapes
 from bounce_mjx.physics.fused import dynamics
 from bounce_mjx.physics.parameters import PhysicsParameters, PhysicsState
 from bounce_mjx.physics.support import unsupported_feature
+from bounce_mjx.robot.model import check_servos, find_addresses
 
 
 class Engine(NamedTuple):
@@ -41,17 +42,19 @@ def make_engine(mj_model: mujoco.MjModel, choice: str) -> Engine:
     """Builds the engine `choice` ("auto", "fused" or "mjx") for a compiled model.
 
     Raises:
-      UserError: the engine does not support the model.
+      UserError: an acting joint has no position servo, or the engine does not support the model.
     """
+    check_servos(mj_model, find_addresses(mj_model))
     # Its programs are traced later, when somebody may have edited the model.
     mj_model = copy.copy(mj_model)
-    name, other = ("fused", "mjx") if is_fused(mj_model, choice) else ("mjx", "fused")
-    lacking = {
-        engine: f"the {engine} physics does not support {feature}"
-        for engine in (name, "fused")
-        if (feature := unsupported_feature(mj_model, engine)) is not None
-    }
+    name = "fused" if is_fused(mj_model, choice) else "mjx"
+    lacking = {}
+    for engine in (name, "fused"):
+        feature = unsupported_feature(mj_model, engine)
+        if feature is not None:
+            lacking[engine] = f"the {engine} physics does not support {feature}"
     if name in lacking:
+        other = "mjx" if name == "fused" else "fused"
         remedy = "change the MJCF" if len(lacking) == 2 else f"use --physics {other}"
         raise UserError(f"{', and '.join(lacking.values())}; {remedy}")
     reason = f"chosen by --physics {choice}"

@@ -39,17 +39,30 @@ def step(
     control: Control,
     num_substeps: int = 1,
 ) -> PhysicsState:
-    """Advances one environment by `num_substeps` physics steps."""
+    """Advances one environment by `num_substeps` physics steps.
+
+    Args:
+      constants: from `read_model`.
+      parameters: of the environment.
+      state: before the steps.
+      control: over the steps.
+      num_substeps: number of physics steps.
+    """
     balls = constants.addresses.balls
 
     def substep(i: jax.Array, data: mjx.Data) -> mjx.Data:
         data = data.replace(ctrl=servo_target(control, i.astype(data.qpos.dtype)))
-        for ball in () if control.air_drag is None else balls:
+        if control.air_drag is not None:
+            data = with_drag(data)
+        return _step(model, data)
+
+    def with_drag(data: mjx.Data) -> mjx.Data:
+        for ball in balls:
             velocity = data.qvel[np.array(ball.qvel[:3])]
             force = model.body_mass[ball.body] * jnp.stack(drag(control.air_drag, velocity))
             applied = data.xfrc_applied.at[ball.body, :3].set(force)
             data = data.replace(xfrc_applied=applied)
-        return _step(model, data)
+        return data
 
     with _full_precision():
         model = world_model(constants, parameters)
@@ -67,9 +80,11 @@ def _step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     if int(model.opt.integrator) != int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST):
         return mjx.step(model, data)
     data = mjx.forward(model, data)
-    limits, force = jnp.asarray(model.actuator_forcerange), data.actuator_force
-    free = (limits[:, 0] < force) & (force < limits[:, 1]) | ~model.actuator_forcelimited
-    damping = jnp.asarray(model.actuator_biasprm).at[:, 2].multiply(free)
+    limits = jnp.asarray(model.actuator_forcerange)
+    force = data.actuator_force
+    is_within = (limits[:, 0] < force) & (force < limits[:, 1])
+    is_free = is_within | ~model.actuator_forcelimited
+    damping = jnp.asarray(model.actuator_biasprm).at[:, 2].multiply(is_free)
     return mjx.implicit(model.tree_replace({"actuator_biasprm": damping}), data)
 
 
@@ -98,7 +113,8 @@ def world_model(constants: MjxModel, parameters: PhysicsParameters) -> mjx.Model
             "(frictionloss); use --physics fused"
         )
     # MJX transforms every geom, even one flagged as sharing its body's frame.
-    fields = {x: m.array(x) for x in m.fields if x not in ("geom_sameframe", "pair_dim")}
+    names = m.fields - {"geom_sameframe", "pair_dim"}
+    fields = {name: m.array(name) for name in names}
     if "pair_friction" in fields:
         fields["pair_friction"] = jnp.maximum(fields["pair_friction"], MIN_FRICTION)
     model = constants.model

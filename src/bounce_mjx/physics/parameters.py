@@ -43,7 +43,8 @@ class PhysicsParameters(NamedTuple):
     servo_damping: Array | None = None
     """Damping [n] of the position servos, N m s/rad: `kv`."""
     force_limit: Array | None = None
-    """Force limits [n] of the position servos, N m: a symmetric `forcerange`."""
+    """Largest torques [n] of the position servos at their joints, N m: `forcerange` times `gear`. A
+    servo that is weaker keeps its own range."""
     armature: Array | None = None
     """Rotor inertia [n] at the joints, kg m^2."""
     damping: Array | None = None

@@ -3,6 +3,10 @@
 A scalar is a Python float (known while tracing) or a JAX array (known when running). Products with
 the entries 0 and 1 of a robot's fixed rotations vanish here, before XLA sees them. A physics step
 has thousands of operations: `jax.lax` traces them in a fraction of the time of `jax.numpy`.
+
+The rule for its users: where an operand may be a constant, write `add`, `sub`, `mul` and `neg`, or
+`Vec` and `Mat`, which use them; the operators `+`, `-`, `*` and `/` stand where an operand is
+surely an array. A constant is a float, never an int: 0.0, not 0.
 """
 
 import functools
@@ -70,6 +74,11 @@ def mul(a: Scalar, b: Scalar) -> Scalar:
 def maximum(a: Scalar, b: Scalar) -> Scalar:
     """The larger one."""
     return max(a, b) if is_constant(a) and is_constant(b) else jnp.maximum(a, b)
+
+
+def minimum(a: Scalar, b: Scalar) -> Scalar:
+    """The smaller one."""
+    return min(a, b) if is_constant(a) and is_constant(b) else jnp.minimum(a, b)
 
 
 def dot(a: Sequence[Scalar], b: Sequence[Scalar]) -> Scalar:

@@ -24,7 +24,8 @@ _HARMLESS = frozenset(
 # Fields that must be 0: features that both engines lack, and that one of them lacks.
 _BOTH_ZERO = (
     "opt.disableactuator opt.noslip_iterations nplugin jnt_stiffnesspoly dof_dampingpoly "
-    "actuator_delay actuator_damping actuator_dampingpoly actuator_armature pair_adhesion"
+    "actuator_dyntype actuator_delay actuator_damping actuator_dampingpoly actuator_armature "
+    "pair_adhesion"
 )
 _ZERO = {
     "fused": "opt.density opt.viscosity opt.wind nflex nmocap neq ntendon jnt_limited "

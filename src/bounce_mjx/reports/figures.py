@@ -61,7 +61,7 @@ def curves_figure(groups: Sequence[Group], columns: int = 3) -> Figure:
         shown += [curve for curve in group.task_curves if curve.title and curve not in shown]
     figure = _draw_curves(groups, shown, columns, height=2.4)
     for axes in figure.axes:
-        axes.set_ylim(bottom=0.0)
+        _begin_at_zero(axes)
         axes.set_xlabel("environment steps")
     return figure
 
@@ -91,7 +91,7 @@ def evaluation_figure(env: Env, recording: Recording, width: float = 10.0) -> Fi
     for i, plot in enumerate(plots):
         axes = figure.add_subplot(grid[1 + i // 2, i % 2])
         if isinstance(plot, Hits):
-            _draw_hits(axes, env, plot, paddle_points(env, recording, plot.steps))
+            draw_hits(axes, env, plot, paddle_points(env, recording, plot.steps))
         else:
             _draw_histogram(axes, plot)
     return figure
@@ -158,6 +158,13 @@ def _draw_curve(axes: Axes, groups: Sequence[Group], shown: Curve) -> None:
     axes.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
 
 
+def _begin_at_zero(axes: Axes) -> None:
+    """Begins the vertical axis at 0, unless a line goes below it, as a return may."""
+    lowest = min((np.min(line.get_ydata(), initial=0.0) for line in axes.lines), default=0.0)
+    if lowest >= 0.0:
+        axes.set_ylim(bottom=0.0)
+
+
 def add_legend(figure: Figure) -> None:
     """A legend of what any panel shows."""
     handles: dict[str, Artist] = {}
@@ -186,8 +193,7 @@ def _draw_heights(axes: Axes, env: Env, recording: Recording) -> None:
     axes.plot(time, recording.ball[:steps, ..., 2, 0], color="C0", label="ball")
     axes.plot(time, recording.paddle[:steps, 2, 0], color="C1", label="paddle")
     axes.set_xlim(0.0, env.config.episode_seconds)
-    if axes.dataLim.y0 >= 0.0:
-        axes.set_ylim(bottom=0.0)
+    _begin_at_zero(axes)
     axes.set_title("height over the first recorded episode, m", loc="left")
     axes.set_xlabel("time, s")
     axes.legend(loc="upper center", ncols=2 + len(levels[0]), bbox_to_anchor=(0.5, -0.2))
@@ -204,8 +210,8 @@ def _draw_histogram(axes: Axes, plot: Histogram) -> None:
     axes.axvline(0.0, color=_GREY, linewidth=0.8)
 
 
-def _draw_hits(axes: Axes, env: Env, plot: Hits, points: np.ndarray) -> None:
-    """The paddle's outline with a dot for each hit."""
+def draw_hits(axes: Axes, env: Env, plot: Hits, points: np.ndarray) -> None:
+    """The paddle's outline with a dot for each hit, also of those beside the paddle's face."""
     outline = env.mj_model.geom_size[env.addresses.paddle_geom, :2]
     half_x, half_y = 100.0 * outline
     corner, size = (-half_y, -half_x), (2.0 * half_y, 2.0 * half_x)
@@ -215,4 +221,6 @@ def _draw_hits(axes: Axes, env: Env, plot: Hits, points: np.ndarray) -> None:
     axes.plot(y, x, ".", markersize=3, alpha=0.4, color="C0", markeredgewidth=0)
     axes.set_title(f"{plot.title} ({len(points):,})")
     axes.set(xlabel="paddle's y", ylabel="paddle's x", aspect="equal")
-    axes.set(xlim=(-1.3 * half_y, 1.3 * half_y), ylim=(-1.3 * half_x, 1.3 * half_x))
+    width = max(1.3 * half_y, 1.05 * float(np.abs(y).max(initial=0.0)))
+    height = max(1.3 * half_x, 1.05 * float(np.abs(x).max(initial=0.0)))
+    axes.set(xlim=(-width, width), ylim=(-height, height))

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from bounce_mjx.identify.doctor import Checkup
+from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.stages import Identified
 from bounce_mjx.identify.world import estimates, misfit, sentences
 from bounce_mjx.reports.figures import add_legend, make_panels, style
@@ -14,16 +16,64 @@ from bounce_mjx.reports.html_page import figures_html, page, table
 
 # Windows of the arm alone, and of a bounce.
 _NUM_WINDOWS = 2
+# Most points of a joint in a figure of a whole log.
+_DRAWN = 600
+
+
+def inspection_page(logs: Sequence[Log], checkups: Sequence[Checkup]) -> str:
+    """The page about logs alone, self-contained: their faults, and how the joints follow."""
+    source = html.escape(", ".join(log.source for log in logs))
+    faults = sum(len(checkup.faults) for checkup in checkups)
+    advice = "mend them before a fit." if faults else "identify the robot from these logs."
+    body = f"""<h1>{source}</h1>
+<p><b>Found:</b> {faults} faults.</p>
+<p><b>What to do:</b> {advice}</p>
+{_describe_logs(logs, checkups)}"""
+    return page(f"logs {source}", body)
+
+
+def _describe_logs(logs: Sequence[Log], checkups: Sequence[Checkup]) -> str:
+    """Findings, table and figure of each log, as HTML."""
+    parts = []
+    for log, checkup in zip(logs, checkups, strict=True):
+        said = [str(finding) for finding in checkup.findings] or ["no faults"]
+        rows = [
+            [
+                joint.name,
+                f"{joint.measured:.2f}",
+                f"{joint.slope:.3f}",
+                f"{1e3 * joint.offset:.2f}",
+                f"{1e3 * joint.delay:.0f}",
+                f"{1e3 * joint.remainder:.2f}",
+            ]
+            for joint in checkup.joints
+        ]
+        header = ["joint", "moves, rad", "slope", "offset, mrad", "delay, ms", "remainder, mrad"]
+        title = "Commanded, later by the delay (lines), and measured (dots)"
+        parts.append(
+            f"<h2>{html.escape(log.source)}: angles against their commands</h2>\n<ul>"
+            + "".join(f"<li>{html.escape(text)}</li>\n" for text in said)
+            + f"</ul>\n{table(header, rows)}\n"
+            + figures_html({title: following_figure(log, checkup)})
+        )
+    return "\n".join(parts)
 
 
 def identification_page(
-    found: Identified, source: str, joint_names: Sequence[str], world: Path
+    found: Identified,
+    logs: Sequence[Log],
+    checkups: Sequence[Checkup],
+    joint_names: Sequence[str],
+    world: Path,
+    doubts: Sequence[str],
 ) -> str:
     """The page, self-contained.
 
     Args:
       world: the file of the identified world.
+      doubts: why it does not explain the logs.
     """
+    source = ", ".join(log.source for log in logs)
     listed = estimates(found, joint_names)
     marks = {True: "", False: "not shown by the log: the prior"}
     rows = [
@@ -37,23 +87,41 @@ def identification_page(
     ]
     seen = sum(e.seen for e in listed)
     caveats = sentences(found, joint_names)
-    doubts = [text for text in caveats if text.startswith(("warning:", "The model does not"))]
     said = "".join(f"<li>{html.escape(text)}</li>\n" for text in caveats or ["Nothing."])
     figures = {"Measured (dots) and simulated (lines)": traces_figure(found, joint_names)}
     body = f"""<h1>Identified from {html.escape(source)}</h1>
 <p><b>Found:</b> the log shows {seen} of {len(listed)} quantities of the robot's world, each
 below with the interval that contains it with 95% probability.</p>
 <p><b>How sure:</b> {_describe_fit(found)}</p>
-<p><b>What to do:</b> {_advise(bool(doubts), world)}</p>
+<p><b>What to do:</b> {_advise(doubts, world)}</p>
 <h2>Estimates</h2>
 {table(["quantity", "estimate", "95% interval", ""], rows)}
 <h2>Errors in units of the sensors' noise</h2>
 {table(["sensor", "model's own world", "identified", "windows held out"], fits)}
+{_describe_joints(found, joint_names)}
 {figures_html(figures)}
 <h2>What the log leaves open</h2>
 <ul>
-{said}</ul>"""
+{said}</ul>
+{_describe_logs(logs, checkups)}"""
     return page(f"identified from {source}", body)
+
+
+def _describe_joints(found: Identified, joint_names: Sequence[str]) -> str:
+    """What each joint's intervals rest on, as HTML."""
+    columns = found.noise.angles, found.counted.angles, found.following_errors, found.joint_errors
+    rows = [
+        [name, *(f"{1e3 * column[j]:.2f}" for column in columns)]
+        for j, name in enumerate(joint_names)
+    ]
+    header = [
+        "joint",
+        "encoder's noise",
+        "counted as noise",
+        "held out: delay and offset alone",
+        "held out: identified",
+    ]
+    return f"<h2>Errors of each joint, mrad</h2>\n{table(header, rows)}"
 
 
 def _describe_fit(found: Identified) -> str:
@@ -66,16 +134,31 @@ def _describe_fit(found: Identified) -> str:
     return html.escape(fit + wider)
 
 
-def _advise(has_doubts: bool, world: Path) -> str:
+def _advise(doubts: Sequence[str], world: Path) -> str:
     """What to do with the world, as HTML."""
     name = html.escape(str(world))
     train = "bounce-mjx train --warm-start robust_small --config finetune --world"
-    if has_doubts:
-        return "do not train with this world yet: heed the warnings below, and identify again."
+    if doubts:
+        return f"do not train with this world: {html.escape(doubts[0])}"
     return (
         f"adapt a policy with <code>{train} {name}</code>, and check the robot later with "
         f"<code>bounce-mjx identify LOG --check {name}</code>."
     )
+
+
+@style()
+def following_figure(log: Log, checkup: Checkup) -> Figure:
+    """Each joint's command, later by the joint's delay (lines), and its measured angle (dots)."""
+    figure, panels = make_panels(len(checkup.joints), 3, height=1.6)
+    rows = slice(None, None, max(len(log.times) // _DRAWN, 1))
+    times = log.times[rows]
+    for j, (axes, joint) in enumerate(zip(panels, checkup.joints, strict=False)):
+        late = np.interp(times - joint.delay, log.target_times, log.servo_targets[:, j])
+        axes.plot(times, log.joint_angles[rows, j], ".", ms=2, color="C0")
+        axes.plot(times, late, lw=1, color="C1")
+        axes.set_title(f"{joint.name}, rad")
+        axes.set_xlabel("time, s")
+    return figure
 
 
 @style()

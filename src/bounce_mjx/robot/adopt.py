@@ -62,7 +62,16 @@ def adopt(mjcf: Path, config: RobotConfig, control_dt: float, is_mount_given: bo
         model = arms.compile_spec(arm.spec, path)
         check_as_alone(arm, model)
         choices = [config.paddle] if is_mount_given else mounts(config.paddle)
-        pose = find_pose(model, [servo.force_limit for servo in arm.servos], choices)
+        force_limits = [servo.force_limit for servo in arm.servos]
+        try:
+            pose = find_pose(model, force_limits, choices)
+        except UserError as error:
+            if not arm.narrowed:
+                raise
+            narrowed = ", ".join(arm.narrowed)
+            raise UserError(
+                f"{error}; or widen the ctrlrange of the servos, which narrows {narrowed}"
+            ) from error
         servos, scale = _servos(model, arm, pose, control_dt)
         update = {"paddle": pose.mount}
         if servos is not arm.servos:

@@ -6,7 +6,7 @@ Every change to the user's model is collected as one sentence.
 import contextlib
 import importlib.util
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +16,7 @@ import numpy as np
 from bounce_mjx.errors import UserError, install_command, needed, reason_of, shorten
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.config import PaddleConfig, RobotConfig
+from bounce_mjx.robot.numbers import check_numbers
 
 BALL_BODY_NAME = "ball_link"
 PADDLE_GEOM_NAME = "blocker"
@@ -23,6 +24,8 @@ PADDLE_GEOM_NAME = "blocker"
 MIN_JOINTS = 3
 
 PADDLE_BODY_NAME = "paddle"
+# Ends of the names of a scene's balls.
+_BALL_NUMBERS = ("", "2", "3")
 BODY_FIELDS = ("body_pos", "body_quat", "body_ipos", "body_iquat", "body_mass", "body_inertia")
 JOINT_FIELDS = ("jnt_pos", "jnt_axis")
 # Viewers show the groups 0 to 2.
@@ -57,6 +60,8 @@ class Arm(NamedTuple):
     """The MJCF's own actuator of each acting joint."""
     changes: tuple[str, ...]
     """Changes to the user's model, one sentence each."""
+    narrowed: tuple[str, ...]
+    """The ranges that the servos' own are narrower than, in words."""
     alone: dict[str, np.ndarray]
     """`BODY_FIELDS` and `JOINT_FIELDS` of the model that is the user's file compiled alone: of the
     bodies that the scene has too, and of the acting joints."""
@@ -119,6 +124,7 @@ def build_arm(path: Path, config: RobotConfig) -> Arm:
     """
     arm = read_spec(path)
     model = compile_spec(arm, path)
+    check_numbers(model)
     with _compiling(path):
         return _Builder(arm, model, config).build()
 
@@ -130,7 +136,10 @@ def read_spec(path: Path) -> mujoco.MjSpec:
       UserError: the file is no MJCF.
     """
     with _compiling(path):
-        return mujoco.MjSpec.from_file(str(path))
+        spec = mujoco.MjSpec.from_file(str(path))
+    # MuJoCo chooses the memory: with too little of it, a step ends the process.
+    spec.memory = -1
+    return spec
 
 
 def compile_spec(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
@@ -199,6 +208,7 @@ class _Builder:
     def __init__(self, arm: mujoco.MjSpec, model: mujoco.MjModel, config: RobotConfig):
         self._arm, self._model, self._config = arm, model, config
         self._changes: list[str] = []
+        self._narrowed: list[str] = []
 
     def build(self) -> Arm:
         model = self._model
@@ -208,20 +218,27 @@ class _Builder:
             chain.insert(0, parent)
         joints = self._acting_joints(chain)
         actuators = self._actuators(joints)
-        servos = tuple(_servo(model, j, actuators[j]) for j in joints)
-        names = tuple(joint_name(model, j) for j in joints)
-        holder = self._arm.bodies[end]
-        holder.name = holder.name or "end_effector"
+        servos = tuple(_servo(model, joint, actuators[joint]) for joint in joints)
         loose = self._loose_bodies(chain, joints, actuators)
-        self._freeze(joints, actuators)
+        scene = read_spec(resource_path("mjcf/scene.xml"))
+        holder, joint_names = self._rename(scene, end, joints, actuators)
+        self._freeze_bodies()
+        self._freeze_joints(joints, actuators)
         self._strip(joints, loose)
         self._disable_contacts_and_limits(joints)
-        scene = self._attach(holder.name, position, quaternion)
-        self._replace_servos(scene, names)
-        kept = [b for b in range(1, model.nbody) if not is_below(model, b, loose)]
+        self._attach(scene, holder, position, quaternion)
+        self._replace_servos(scene, joint_names)
+        kept = [body for body in range(1, model.nbody) if not is_below(model, body, loose)]
         alone = {name: getattr(model, name)[kept] for name in BODY_FIELDS}
         alone |= {name: getattr(model, name)[joints] for name in JOINT_FIELDS}
-        return Arm(scene, names, servos, tuple(self._changes), alone)
+        return Arm(
+            spec=scene,
+            joint_names=joint_names,
+            servos=servos,
+            changes=tuple(self._changes),
+            narrowed=tuple(self._narrowed),
+            alone=alone,
+        )
 
     def _acting_joints(self, chain: list[int]) -> list[int]:
         model, given = self._model, self._config.joints
@@ -254,20 +271,19 @@ class _Builder:
 
     def _actuators(self, joints: list[int]) -> dict[int, int]:
         """The actuator of each joint that has one, and so of each acting joint."""
-        model, actuators = self._model, {}
-        for a in range(model.nactuator):
-            joint = int(model.actuator_trnid[a, 0])
-            if int(model.actuator_trntype[a]) in _JOINT_TRANSMISSIONS:
-                if joint in joints and joint in actuators:
-                    raise UserError(f"several actuators on {joint_name(model, joint)}; give it one")
-                actuators[joint] = a
-        idle = [joint_name(model, joint) for joint in joints if joint not in actuators]
+        model = self._model
+        drives = joint_actuators(model)
+        for joint in joints:
+            name = joint_name(model, joint)
+            if len(drives.get(joint, ())) > 1:
+                raise UserError(f"several actuators on {name}; give it one")
+        idle = [joint_name(model, joint) for joint in joints if joint not in drives]
         if idle:
             raise UserError(
                 f"no actuator on {_list(idle)}; add a <position> or <motor> with a force limit, or "
                 "name the acting joints with --joints"
             )
-        return actuators
+        return {joint: actuators[-1] for joint, actuators in drives.items()}
 
     def _loose_bodies(
         self, chain: list[int], joints: list[int], actuators: dict[int, int]
@@ -302,16 +318,46 @@ class _Builder:
             )
         return loose
 
-    def _freeze(self, joints: list[int], actuators: dict[int, int]) -> None:
-        """Gives the spec the numbers of the compiled model.
+    def _rename(
+        self, scene: mujoco.MjSpec, end: int, joints: list[int], actuators: dict[int, int]
+    ) -> tuple[str, tuple[str, ...]]:
+        """Gives the arm's parts names that the task's scene does not use.
+
+        Returns:
+          The names of the body that holds the paddle, and of the acting joints.
+        """
+        arm = self._arm
+        # Each access to a list of a spec walks through the whole spec.
+        bodies, parts, drives = list(arm.bodies), list(arm.joints), list(arm.actuators)
+        bodies[end].name = bodies[end].name or _free_name("end_effector", bodies)
+        renamed = []
+        for elements, others, added in (
+            (bodies[1:], scene.bodies, {PADDLE_BODY_NAME}),
+            (parts, scene.joints, set()),
+            (list(arm.geoms), scene.geoms, {PADDLE_GEOM_NAME}),
+        ):
+            names = [other.name for other in others if other.name]
+            reserved = added | {name + number for name in names for number in _BALL_NUMBERS}
+            for element in elements:
+                if element.name in reserved:
+                    free_name = _free_name(element.name, elements, reserved)
+                    renamed.append(f"{element.name} to {free_name}")
+                    element.name = free_name
+        if renamed:
+            self._changes.append(f"renamed what the scene has too: {_list(renamed, most=20)}")
+        for joint in joints:
+            # An actuator finds its joint by the name.
+            drives[actuators[joint]].target = parts[joint].name
+        return bodies[end].name, tuple(parts[joint].name for joint in joints)
+
+    def _freeze_bodies(self) -> None:
+        """Gives the bodies of the spec the numbers of the compiled model.
 
         MuJoCo's compiler computes them from the whole file, with its units and settings. Compiled
         again in another scene, without its limits and with fewer parts, they would be others.
         """
         arm, model = self._arm, self._model
-        # Each access to a list of a spec walks through the whole spec.
-        bodies, parts, drives = list(arm.bodies), list(arm.joints), list(arm.actuators)
-        for i, body in enumerate(bodies[1:], start=1):
+        for i, body in enumerate(list(arm.bodies)[1:], start=1):
             body.explicitinertial = True
             for field in BODY_FIELDS:
                 setattr(body, field.removeprefix("body_"), getattr(model, field)[i])
@@ -322,33 +368,59 @@ class _Builder:
                 body.set_frame(body.parent.add_frame())
         arm.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
         arm.compiler.boundmass = arm.compiler.boundinertia = 0.0
-        narrowed: list[str] = []
+
+    def _freeze_joints(self, joints: list[int], actuators: dict[int, int]) -> None:
+        """Gives the acting joints and their actuators the numbers of the compiled model, as
+        `_freeze_bodies`, and the joints the ranges that their servos reach."""
+        model = self._model
+        parts, drives = list(self._arm.joints), list(self._arm.actuators)
         for i in joints:
-            a, joint, dof = actuators[i], parts[i], model.jnt_dofadr[i]
-            own = model.jnt_range[i] if model.jnt_limited[i] else (-np.inf, np.inf)
-            least, greatest = _servo_range(model, a)
-            low, high = max(own[0], least), min(own[1], greatest)
-            if not low < high:
-                raise UserError(
-                    f"the range {own[0]:g} to {own[1]:g} of {joint_name(model, i)}, but a servo "
-                    f"that reaches {least:g} to {greatest:g}; correct its ctrlrange"
-                )
-            if low - own[0] > _NARROWER or own[1] - high > _NARROWER:
-                narrowed.append(joint_name(model, i))
+            actuator = actuators[i]
+            dof = model.jnt_dofadr[i]
+            gear = model.actuator_gear[actuator, 0]
+            joint, drive = parts[i], drives[actuator]
+            if np.any(joint.range) and not model.jnt_limited[i]:
+                name = joint_name(model, i)
+                self._changes.append(f"ignored the range of {name}, which is not limited")
             joint.limited = mujoco.mjtLimited.mjLIMITED_FALSE
-            joint.range = (low, high) if high < np.inf else np.zeros(2)
+            joint.range = self._reached_range(i, actuator)
             joint.springdamper = np.zeros(2)
-            # The rotor moves with the joint, also where another servo replaces the actuator.
-            gear, drive = model.actuator_gear[a, 0], drives[a]
             joint.stiffness[0] = model.jnt_stiffness[i]
-            joint.damping[0] = model.dof_damping[dof] + gear**2 * model.actuator_damping[a]
-            joint.armature = model.dof_armature[dof] + gear**2 * model.actuator_armature[a]
-            drive.armature, drive.damping[0] = 0.0, 0.0
-            drive.gainprm, drive.biasprm = model.actuator_gainprm[a], model.actuator_biasprm[a]
+            # The rotor moves with the joint, also where another servo replaces the actuator.
+            joint.damping[0] = model.dof_damping[dof] + gear**2 * model.actuator_damping[actuator]
+            joint.armature = model.dof_armature[dof] + gear**2 * model.actuator_armature[actuator]
+            drive.damping[0] = 0.0
+            drive.armature = 0.0
+            drive.gainprm = model.actuator_gainprm[actuator]
+            drive.biasprm = model.actuator_biasprm[actuator]
             drive.inheritrange = 0.0
-            drive.ctrlrange = model.actuator_ctrlrange[model.actuator_ctrladr[a]]
-        if narrowed:
-            self._changes.append(f"narrowed the ranges to what the servos reach: {_list(narrowed)}")
+            drive.ctrlrange = model.actuator_ctrlrange[model.actuator_ctrladr[actuator]]
+        if self._narrowed:
+            words = ", ".join(self._narrowed)
+            self._changes.append(f"narrowed the ranges to what the servos reach: {words}")
+
+    def _reached_range(self, joint: int, actuator: int) -> tuple[float, float]:
+        """The joint's range, as far as its servo reaches; 0 and 0 without a range.
+
+        Raises:
+          UserError: the servo reaches nothing of it.
+        """
+        model, name = self._model, joint_name(self._model, joint)
+        low, high = model.jnt_range[joint] if model.jnt_limited[joint] else (-np.inf, np.inf)
+        least, greatest = _servo_range(model, actuator)
+        reached_low, reached_high = max(low, least), min(high, greatest)
+        if not reached_low < reached_high:
+            raise UserError(
+                f"the range {low:g} to {high:g} of {name}, but a servo that reaches {least:g} to "
+                f"{greatest:g}; correct its ctrlrange"
+            )
+        if reached_low - low > _NARROWER or high - reached_high > _NARROWER:
+            self._narrowed.append(
+                f"{name} from {low:.4g} to {high:.4g} to {reached_low:.4g} to {reached_high:.4g}"
+            )
+        if np.isinf(reached_high):
+            return 0.0, 0.0
+        return reached_low, reached_high
 
     def _strip(self, joints: list[int], loose: list[int]) -> None:
         """Removes all but the arm, and fixes its base.
@@ -358,22 +430,29 @@ class _Builder:
         """
         arm, model = self._arm, self._model
         bodies, parts = list(arm.bodies), list(arm.joints)
-        names = [parts[j].name for j in joints]
+        acting = [parts[joint].name for joint in joints]
         still = (j for j in range(model.njnt) if not is_below(model, model.jnt_bodyid[j], loose))
         fixed = [parts[j] for j in still if j not in joints]
+        tendons = [_tendon_words(model, i) for i in range(model.ntendon)]
         # With what acts on them, such as a gripper's tendons.
         self._remove("removed the grippers and loose objects", [bodies[b] for b in loose])
         self._remove("fixed the joints that do not act", fixed)
-        for noun, found in (("equality constraint", arm.equalities), ("tendon", arm.tendons)):
-            if found:
-                raise UserError(
-                    f"the {noun} {found[0].name} on the arm, so it is not a serial chain; remove "
-                    "it, or give a serial arm"
-                )
+        couplings = [
+            _constraint_words(equality)
+            for equality in arm.equalities
+            if _moves_with(model, equality.id, joints)
+        ]
+        couplings += [tendons[tendon.id] for tendon in arm.tendons]
+        if couplings:
+            raise UserError(
+                f"the {couplings[0]} on the arm, so it is not a serial chain; remove it, or give a "
+                "serial arm"
+            )
         floors = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
         elements = (
             *(*arm.keys, *arm.sensors, *arm.pairs, *arm.excludes, *arm.lights, *arm.cameras),
-            *(actuator for actuator in arm.actuators if actuator.target not in names),
+            *arm.equalities,
+            *(actuator for actuator in arm.actuators if actuator.target not in acting),
             *(geom for geom in arm.geoms if geom.type in floors),
         )
         self._remove("removed what is not the arm", elements)
@@ -391,21 +470,25 @@ class _Builder:
         model = self._model
         if np.any((model.geom_contype != 0) & (model.geom_conaffinity != 0)):
             self._changes.append("turned off the arm's own contacts: only ball and paddle touch")
-        for body in self._arm.bodies[1:]:
+        for i, body in enumerate(self._arm.bodies):
             touching = [bool(geom.contype or geom.conaffinity) for geom in body.geoms]
             for geom, touches in zip(body.geoms, touching, strict=True):
-                # Where a link has both kinds of shapes, the others are its picture.
-                if touches and not all(touching):
+                # Where a link has both kinds of shapes, the others are its picture. What stands in
+                # the world, such as a table, is shown as it is.
+                if touches and i > 0 and not all(touching):
                     geom.group = HIDDEN_GROUP
                 geom.contype = geom.conaffinity = 0
         if np.any(model.jnt_limited[joints]):
             self._changes.append("made the joint limits act by clipping the servo targets")
 
-    def _attach(self, holder: str, position: np.ndarray, quaternion: np.ndarray) -> mujoco.MjSpec:
-        """The scene with the arm, and the paddle on the body `holder`."""
+    def _attach(
+        self, scene: mujoco.MjSpec, holder: str, position: np.ndarray, quaternion: np.ndarray
+    ) -> None:
+        """Puts the arm into the scene, and the paddle on the body `holder`."""
         config, arm = self._config, self._arm
-        scene = read_spec(resource_path("mjcf/scene.xml"))
-        self._changes.append("replaced the physics options with the task's")
+        differing = _differing_options(self._model.opt, scene.option)
+        if differing:
+            self._changes.append(f"replaced the physics options with the task's: {differing}")
         if np.any(self._model.dof_frictionloss):
             raise_solver_limits(scene.option)
         arm.option = scene.option
@@ -419,12 +502,11 @@ class _Builder:
             f"added a paddle of {size} cm and {config.paddle.mass:g} kg at {config.site}, and a "
             "ball"
         )
-        return scene
 
     def _replace_servos(self, scene: mujoco.MjSpec, names: tuple[str, ...]) -> None:
         """Replaces the actuators if the config has servos."""
         config = self._config
-        settings = config.servo_stiffness, config.servo_damping, config.servo_force_limit
+        settings = (config.servo_stiffness, config.servo_damping, config.servo_force_limit)
         if not any(settings):
             return
         counts = [len(numbers or ()) for numbers in settings]
@@ -550,6 +632,76 @@ def _force_limit(model: mujoco.MjModel, joint: int, actuator: int) -> float | No
         if limited:
             limit = min(limit, float(min(-low, high) * abs(factor)))
     return limit if np.isfinite(limit) else None
+
+
+def joint_actuators(model: mujoco.MjModel) -> dict[int, list[int]]:
+    """The actuators of each joint that has some, the joints in the model's order."""
+    drives: dict[int, list[int]] = {}
+    for actuator in range(model.nactuator):
+        # For a hinge or a slide, both kinds of transmission are the same.
+        if int(model.actuator_trntype[actuator]) in _JOINT_TRANSMISSIONS:
+            joint = int(model.actuator_trnid[actuator, 0])
+            drives.setdefault(joint, []).append(actuator)
+    return dict(sorted(drives.items()))
+
+
+def _free_name(name: str, elements: Iterable, reserved: Container[str] = ()) -> str:
+    """A name of an arm's part that no other element has, and that is not reserved."""
+    taken = {element.name for element in elements}
+    while name in taken or name in reserved:
+        name += "_of_arm"
+    return name
+
+
+def _constraint_words(equality: mujoco.MjsEquality) -> str:
+    """An equality constraint in words: its name; without one, its kind and what it connects."""
+    if equality.name:
+        return f"equality constraint {equality.name}"
+    kind = mujoco.mjtEq(equality.type).name.removeprefix("mjEQ_").lower()
+    connected = _list((equality.name1, equality.name2))
+    return f"unnamed equality constraint ({kind}: {connected})"
+
+
+def _moves_with(model: mujoco.MjModel, constraint: int, joints: list[int]) -> bool:
+    """Whether an equality constraint is one of the acting joints, or of a body that they move."""
+    kinds = mujoco.mjtEq
+    ends = [int(model.eq_obj1id[constraint]), int(model.eq_obj2id[constraint])]
+    kind = kinds(model.eq_type[constraint])
+    if kind == kinds.mjEQ_JOINT:
+        return not set(joints).isdisjoint(ends)
+    if kind not in (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD):
+        return True
+    if model.eq_objtype[constraint] == mujoco.mjtObj.mjOBJ_SITE:
+        ends = [int(model.site_bodyid[site]) for site in ends]
+    moved = [int(model.jnt_bodyid[joint]) for joint in joints]
+    return any(is_below(model, body, moved) for body in ends)
+
+
+def _tendon_words(model: mujoco.MjModel, tendon: int) -> str:
+    """A tendon in words: its name; without one, the joints that it couples."""
+    name = model.tendon(tendon).name
+    if name:
+        return f"tendon {name}"
+    wraps = range(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
+    joints = [
+        joint_name(model, model.wrap_objid[i])
+        for i in wraps
+        if model.wrap_type[i] == mujoco.mjtWrap.mjWRAP_JOINT
+    ]
+    return f"unnamed tendon ({_list(joints) if joints else 'spatial'})"
+
+
+def _differing_options(option: mujoco.MjOption, task: mujoco.MjOption) -> str:
+    """The options of a file that change where an arm moves and that differ from the task's."""
+    differing = []
+    if option.integrator != task.integrator:
+        integrator = mujoco.mjtIntegrator(option.integrator).name.removeprefix("mjINT_")
+        differing.append(f"the integrator {integrator.lower()}")
+    for name in ("gravity", "wind", "density", "viscosity"):
+        value = np.asarray(getattr(option, name))
+        if not np.allclose(value, getattr(task, name), atol=1e-2 if name == "gravity" else 0.0):
+            differing.append(f"{name} {np.round(value, 6).tolist()}")
+    return ", ".join(differing)
 
 
 def is_below(model: mujoco.MjModel, body: int, ancestors: list[int]) -> bool:

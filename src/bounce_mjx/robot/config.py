@@ -58,7 +58,7 @@ class LimitsConfig(settings.StrictModel):
     """Largest acceleration of a joint's command, rad/s^2; needed with velocity."""
     jerk: tuple[Annotated[settings.Positive, Field(le=1e6)], ...] | None = None
     """Largest jerk of a joint's command, rad/s^3; null for none."""
-    torque: tuple[Annotated[settings.Positive, Field(le=1e5)], ...] | None = None
+    torque: tuple[Annotated[settings.Positive, Field(ge=0.01, le=1e4)], ...] | None = None
     """Largest torque of each servo, N m; null for those of the servos."""
 
     @pydantic.model_validator(mode="after")
@@ -91,8 +91,12 @@ class RobotConfig(settings.StrictModel):
     limits: LimitsConfig = LimitsConfig()
     """The arm's own limits, as its manufacturer states them."""
 
+    gravity_compensation: settings.UnitInterval = 0.0
+    """Share of each link's weight that the arm's controller carries, so that the servos do not sag
+    under it; 0 leaves the MJCF's `gravcomp`."""
 
-OF_SITE = RobotConfig.model_fields.keys() - {"site", "limits"}
+
+OF_SITE = RobotConfig.model_fields.keys() - {"site", "limits", "gravity_compensation"}
 """Settings that change nothing without a site."""
 
 

@@ -16,10 +16,9 @@ from bounce_mjx.resources import resource_path
 from bounce_mjx.robot import arm
 from bounce_mjx.robot.balls import MAX_BALLS, add_balls, ball_name
 from bounce_mjx.robot.config import RobotConfig
+from bounce_mjx.robot.numbers import check_numbers, physical_fields
+from bounce_mjx.robot.torques import limit_torques
 
-# Starts of the names of a model's fields with physics in them, and those of colours among them.
-_PHYSICAL = ("body_", "jnt_", "dof_", "geom_", "pair_", "actuator_", "eq_", "tendon_", "qpos")
-_PICTURED = ("geom_rgba", "geom_matid", "geom_group")
 # With fewer physics steps in half a period of a contact, the ball can gain energy in a rebound.
 _STEPS_OF_A_CONTACT = 4
 
@@ -87,25 +86,38 @@ def load_model(
 
     Raises:
       UserError: the file is missing, is no MJCF, lacks a name that the task needs, has a joint
-        without a position servo, or more balls than `num_balls`; or half a period of a contact has
-        fewer than four physics steps.
+        without a position servo, more balls than `num_balls`, or a number that cannot be simulated;
+        or half a period of a contact has fewer than four physics steps.
     """
     spec, path = scene_spec(mjcf, robot or RobotConfig())
     add_balls(spec, num_balls)
+    if robot is not None and robot.gravity_compensation > 0.0:
+        _compensate_gravity(spec, robot.gravity_compensation)
     # MuJoCo does not drop geoms that make the bodies' inertia.
     from_geoms = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     if not visual and spec.compiler.inertiafromgeom != from_geoms:
         spec.compiler.discardvisual = True
     mj_model = arm.compile_spec(spec, path)
     with arm.naming(path):
+        check_numbers(mj_model)
         addresses = find_addresses(mj_model)
-        _check_servos(mj_model, addresses)
+        check_servos(mj_model, addresses)
         if (present := len(addresses.balls)) != num_balls:
             raise UserError(f"{present} balls, but num_balls is {num_balls}; set it to {present}")
-        _limit_torques(mj_model, addresses, robot or RobotConfig())
+        if robot is not None and robot.limits.torque is not None:
+            # `Env` refuses a config with another number of joints than the model.
+            torques = robot.limits.torque[: len(addresses.actuators)]
+            limit_torques(mj_model, addresses.actuators[: len(torques)], torques)
     mj_model.opt.timestep = physics_dt
     _check_step(mj_model)
     return mj_model
+
+
+def _compensate_gravity(spec: mujoco.MjSpec, share: float) -> None:
+    """Lets a controller carry a share of the weight of each body but the balls."""
+    for body in spec.bodies:
+        if not any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in body.joints):
+            body.gravcomp = share
 
 
 def paddle_home(
@@ -148,20 +160,6 @@ def scatter(rest: np.ndarray, places: Sequence[int], values: jax.Array) -> jax.A
     return jnp.stack([jnp.asarray(entry, values.dtype) for entry in entries])
 
 
-def _limit_torques(mj_model: mujoco.MjModel, addresses: Addresses, robot: RobotConfig) -> None:
-    """Applies `robot.limits.torque` to the servos, where theirs are not lower."""
-    torques = robot.limits.torque
-    if torques is None:
-        return
-    # `Env` refuses a config with another number of joints than the model.
-    for servo, torque in zip(addresses.actuators, torques, strict=False):
-        force = torque / abs(mj_model.actuator_gear[servo, 0])
-        limits = mj_model.actuator_forcerange[servo]
-        limited = mj_model.actuator_forcelimited[servo]
-        limits[:] = np.clip(limits, -force, force) if limited else (-force, force)
-        mj_model.actuator_forcelimited[servo] = True
-
-
 def _check_step(mj_model: mujoco.MjModel) -> None:
     """Refuses a physics step that is too long for a contact: its ball would gain energy."""
     step = mj_model.opt.timestep
@@ -202,11 +200,14 @@ def to_direct_solref(solref: Any, timestep: float) -> tuple[Any, Any]:
     return stiffness, jnp.where(is_standard, 2.0 / time_constant, -second)
 
 
-def _check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
-    """Refuses actuators whose control is not a target position of their joint.
+def check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
+    """Compares the acting joints' actuators with a position servo, whose control is the target
+    position of its joint.
 
-    With a <pid>, which has several controls, an actuator's index would not be its control's.
+    Raises:
+      UserError: one is another actuator; the text starts with it.
     """
+    # With a <pid>, which has several controls, an actuator's index would not be its control's.
     if np.any(mj_model.actuator_ctrlnum != 1):
         raise UserError("an actuator with several controls; drive each joint by a <position>")
     for joint, actuator in zip(addresses.arm_joints, addresses.actuators, strict=True):
@@ -273,28 +274,26 @@ def _servos(mj_model: mujoco.MjModel) -> dict[int, int]:
     """The actuator of each hinge and slide that has one, in the order of the joints."""
     acting = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
     servos: dict[int, int] = {}
-    for actuator in range(mj_model.nactuator):
-        joint = int(mj_model.actuator_trnid[actuator, 0])
-        if mj_model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_JOINT:
-            continue
+    for joint, actuators in arm.joint_actuators(mj_model).items():
         if int(mj_model.jnt_type[joint]) not in acting:
             continue
-        if joint in servos:
+        if len(actuators) > 1:
             name = arm.joint_name(mj_model, joint)
             raise UserError(f"several actuators on {name}; give it exactly one position servo")
-        servos[joint] = actuator
+        servos[joint] = actuators[0]
     if not servos:
         raise UserError("no actuator on a hinge or slide; give each joint of the arm a <position>")
-    return dict(sorted(servos.items()))
+    return servos
 
 
 def fingerprint(mj_model: mujoco.MjModel) -> bytes:
     """A hash of the numbers on which a simulation depends; it ignores colours and markers."""
     digest = hashlib.blake2b()
-    for owner, kinds in ((mj_model, _PHYSICAL), (mj_model.opt, "")):
-        for name in dir(owner):
-            if name.startswith(kinds) and not name.startswith(("_", *_PICTURED)):
-                digest.update(np.asarray(getattr(owner, name)).tobytes())
+    for name in physical_fields(mj_model):
+        digest.update(np.asarray(getattr(mj_model, name)).tobytes())
+    for name in dir(mj_model.opt):
+        if not name.startswith("_"):
+            digest.update(np.asarray(getattr(mj_model.opt, name)).tobytes())
     return digest.digest()
 
 

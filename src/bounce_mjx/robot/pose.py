@@ -1,7 +1,9 @@
 """Search of the start pose: a level paddle at a well-conditioned point in front of the robot.
 
-Inverse kinematics by least squares within the joint limits, from many seeds; the best pose
-has the largest score of conditioning, distance to the joint limits and strength.
+Inverse kinematics by damped least squares (Wampler 1986; Buss 2004) from many seeds. The best pose
+has the largest score of conditioning, distance to the joint limits and strength. Each step of the
+search is a continuous function of the model's numbers, and equal scores are told apart by the
+posture, so that the same arm written in degrees and in radians has the same start pose.
 """
 
 import itertools
@@ -11,7 +13,6 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
-import scipy.optimize
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.robot.arm import joint_name
@@ -24,12 +25,30 @@ _LENGTH = 0.25
 _LEAST_ACCELERATION, _AMPLE_ACCELERATION = 3.0, 20.0
 # Smallest singular value of a usable pose; 1 would be an arm that moves as a sphere.
 _LEAST_MANIPULABILITY = 0.02
+# Scores within this share of the best one count as equal.
+_EQUAL_SCORES = 0.01
+# Of two mirrored postures, the one on the positive side of its joints is taken: distances count
+# from this far beside the middle of the ranges, rad.
+_SIDE = 0.1
+
+# Seeds of each goal.
+_TRIES = 8
+# Steps toward the goal with a level paddle, then steps that only level it: not every arm can do
+# both.
+_STEPS_TO_GOAL, _STEPS_TO_LEVEL = 30, 30
+# Largest change of a joint in a step, rad or m.
+_LARGEST_STEP = 0.4
+# Damping of the least squares, m^2; levelling needs none.
+_DAMPING, _NO_DAMPING = 1e-3, 1e-9
 _LEVEL_TOLERANCE = 1e-9
-_TRIES, _EVALUATIONS = 8, 30
-_UP = np.array([0.0, 0.0, 1.0])
+# Number of random postures from which the reach is measured.
+_REACH_SAMPLES = 500
+
 # Distance of a pose from the joint limits, rad or m: the noise of a reset's joint positions. Of a
 # short range it is a tenth.
 _LEAST_MARGIN = 0.1
+# Distance from the joint limits that is plenty, rad.
+_AMPLE_MARGIN = 0.5
 _CLEARANCE = 0.09
 # Least height of the lines between the joints, half the thickness of a link, m; within a radius
 # around the first joint, at the base, they may be lower, but not below the floor.
@@ -37,8 +56,9 @@ _FLOOR_CLEARANCE = 0.07
 _BASE_RADIUS = 0.2
 # Lowest height of the paddle in the search, m: the links below it stay above the floor.
 _LOWEST = 0.1
-# Heights above the paddle that must be free of the arm, m: the ball flies there.
-_HEADROOM = 1.0
+# Heights that must be free of the arm around the paddle, m: the ball flies above, and a paddle that
+# lies flat on its site is 0.03 m above it.
+_BELOW, _HEADROOM = 0.02, 1.0
 
 
 class PaddlePose(NamedTuple):
@@ -89,57 +109,86 @@ def find_pose(
       UserError: the paddle cannot be level, tilted or lifted, or no servo is strong enough.
     """
     search = _Search(model, force_limits)
-    poses = [pose for choice in choices for pose in search.level_poses(choice)]
-    names = ", ".join(joint_name(model, j) for j in find_addresses(model).arm_joints)
-    for suits, problem in (
-        (
-            lambda pose: True,
+    names = ", ".join(joint_name(model, joint) for joint in find_addresses(model).arm_joints)
+    level = [pose for choice in choices for pose in search.level_poses(choice)]
+    if not level:
+        raise UserError(
             f"no reachable pose with a level paddle in front of the robot, {names} inside their "
             "ranges, and the links above the floor and out of the ball's way; check the site, the "
-            "paddle's position and quaternion, and the height of the base",
-        ),
-        (
-            lambda pose: pose.manipulability >= _LEAST_MANIPULABILITY,
+            "paddle's position and quaternion, and the height of the base"
+        )
+    able = [pose for pose in level if pose.manipulability >= _LEAST_MANIPULABILITY]
+    if not able:
+        raise UserError(
             f"no pose in which the joints {names} can lift the paddle and tilt it about two "
-            "axes; give an arm with joints about more axes, or with wider ranges",
-        ),
-        (
-            lambda pose: pose.acceleration >= _LEAST_ACCELERATION,
-            "no servo strong enough to hold the arm and to accelerate the paddle upward by "
-            f"{_LEAST_ACCELERATION:g} m/s^2; raise the force limits of {names}",
-        ),
-    ):
-        poses = list(filter(suits, poses))
-        if not poses:
-            raise UserError(problem)
-    return max(poses, key=lambda pose: pose.score)
+            "axes; give an arm with joints about more axes, or with wider ranges"
+        )
+    strong = [pose for pose in able if pose.acceleration >= _LEAST_ACCELERATION]
+    if not strong:
+        most = max(0.0, *(pose.acceleration for pose in able))
+        raise UserError(
+            "no servo strong enough: in addition to holding the arm, the actuators accelerate the "
+            f"paddle upward by {most:.1f} m/s^2 at most, and the task needs "
+            f"{_LEAST_ACCELERATION:g}; raise the force limits of {names}"
+        )
+    return search.best(strong)
 
 
 class _Search:
     def __init__(self, model: mujoco.MjModel, force_limits: Sequence[float | None]):
-        self._model, self._rng = model, np.random.default_rng(0)
+        self._model = model
+        self._rng = np.random.default_rng(0)
         self._limits = np.array([np.inf if limit is None else limit for limit in force_limits])
         self._data = mujoco.MjData(model)
         self._at: Addresses = find_addresses(model)
-        self._qpos, self._dofs = np.array(self._at.arm_qpos), np.array(self._at.arm_qvel)
+        self._qpos = np.array(self._at.arm_qpos)
+        self._dofs = np.array(self._at.arm_qvel)
         self._joints = np.array(self._at.arm_joints)
+        self._is_hinge = model.jnt_type[self._joints] == mujoco.mjtJoint.mjJNT_HINGE
         # The last link, to which the paddle's own body is welded.
         self._body = int(model.body_weldid[model.geom_bodyid[self._at.paddle_geom]])
-        self._range = low, high = joint_ranges(model)
+        self._low, self._high = joint_ranges(model)
         # A servo whose joint is at its limit could move it one way only.
-        margin = np.minimum(_LEAST_MARGIN, 0.1 * (high - low))
-        self._inside = self._range[0] + margin, self._range[1] - margin
+        margin = np.minimum(_LEAST_MARGIN, 0.1 * (self._high - self._low))
+        self._least = self._low + margin
+        self._greatest = self._high - margin
+        self._centre = self._inside(model.qpos0[self._qpos])
         # The seeds of a hinge lie within half a turn.
-        self._hinge = model.jnt_type[self._joints] == mujoco.mjtJoint.mjJNT_HINGE
-        wide = np.where(self._hinge, np.pi, np.where(np.isinf(low), 0.5, np.inf))
-        self._centre = centre = np.clip(model.qpos0[self._qpos], *self._inside)
-        self._seeds = [np.clip(centre + side * wide, *self._inside) for side in (-1.0, 1.0)]
+        width = np.where(self._is_hinge, np.pi, np.where(np.isinf(self._low), 0.5, np.inf))
+        self._least_seed = self._inside(self._centre - width)
+        self._greatest_seed = self._inside(self._centre + width)
         # MuJoCo skips the transformation of a geom flagged as sharing its body's frame.
         model.geom_sameframe[self._at.paddle_geom] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
         mujoco.mj_kinematics(model, self._data)
         self._base = self._data.xanchor[self._joints[0]].copy()
-        paddles = [self._forward(self._rng.uniform(*self._seeds))[0] for _ in range(500)]
-        self._reach = float(max(np.hypot(*(paddle - self._base)[:2]) for paddle in paddles))
+        self._reach = self._largest_distance()
+
+    def _inside(self, angles: np.ndarray) -> np.ndarray:
+        """The angles [n], clipped to the ranges without their margins."""
+        return np.clip(angles, self._least, self._greatest)
+
+    def _seed(self) -> np.ndarray:
+        """A random posture [n]."""
+        return self._rng.uniform(self._least_seed, self._greatest_seed)
+
+    def _largest_distance(self) -> float:
+        """Largest horizontal distance of the paddle from the first joint, m."""
+        distances = []
+        for _ in range(_REACH_SAMPLES):
+            paddle, _ = self._forward(self._seed())
+            distances.append(np.hypot(*(paddle - self._base)[:2]))
+        return float(max(distances))
+
+    def best(self, poses: Sequence[PaddlePose]) -> PaddlePose:
+        """The pose with the largest score; of equal ones, that nearest to the middle of the ranges.
+
+        Without the second rule, rounding would choose: the last joint of an arm with a flat paddle
+        turns it in its plane, and a symmetric arm has each pose twice.
+        """
+        largest = max(pose.score for pose in poses)
+        equal = [pose for pose in poses if pose.score >= (1.0 - _EQUAL_SCORES) * largest]
+        middle = self._centre + _SIDE
+        return min(equal, key=lambda pose: np.sum((pose.angles - middle) ** 2))
 
     def _forward(self, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Position [3] and normal [3] of the paddle."""
@@ -150,10 +199,12 @@ class _Search:
         return self._data.geom_xpos[self._at.paddle_geom].copy(), rotation[:, 2].copy()
 
     def _jacobian(self, paddle: np.ndarray) -> np.ndarray:
-        """Jacobian [6, n] of the paddle's displacement and scaled rotation, m."""
-        linear, angular = np.zeros((3, self._model.nv)), np.zeros((3, self._model.nv))
+        """Jacobian [5, n] of the paddle's displacement, m, and of its scaled tilt about x and y, m;
+        a turn about the vertical does not matter."""
+        linear = np.zeros((3, self._model.nv))
+        angular = np.zeros((3, self._model.nv))
         mujoco.mj_jac(self._model, self._data, linear, angular, paddle, self._body)
-        return np.vstack([linear, _LENGTH * angular])[:, self._dofs]
+        return np.vstack([linear, _LENGTH * angular[:2]])[:, self._dofs]
 
     def level_poses(self, choice: PaddleConfig) -> Iterator[PaddlePose]:
         """Poses with a level paddle in front of the robot, at many distances and heights, in which
@@ -168,84 +219,93 @@ class _Search:
         for distance, height in itertools.product(distances, heights):
             goal = np.array([self._base[0] + distance, self._base[1], height])
             for _ in range(_TRIES):
-                angles = self._solve(self._rng.uniform(*self._seeds), goal)
-                if angles is not None and self._is_clear(self._forward(angles)[0]):
+                angles = self._solve(self._seed(), goal)
+                if angles is None:
+                    continue
+                paddle, _ = self._forward(angles)
+                in_front = paddle[0] - self._base[0] > 0.3 * np.hypot(*(goal - self._base)[:2])
+                if in_front and paddle[2] > 0.03 and self._is_clear(paddle):
                     yield self._rate(angles, choice)
 
     def _solve(self, angles: np.ndarray, goal: np.ndarray) -> np.ndarray | None:
-        """The pose near the goal with a level paddle; None if the search finds none."""
-
-        def error(angles: np.ndarray, rows: slice) -> np.ndarray:
+        """The pose near the goal with a level paddle; None if the search does not level it."""
+        for _ in range(_STEPS_TO_GOAL):
             paddle, normal = self._forward(angles)
-            return np.concatenate([paddle - goal, _LENGTH * (normal - _UP)])[rows]
-
-        def derivative(angles: np.ndarray, rows: slice) -> np.ndarray:
+            error = np.concatenate([goal - paddle, _LENGTH * _levelling_turn(normal)])
+            angles = self._step(angles, self._jacobian(paddle), error, _DAMPING)
+        for _ in range(_STEPS_TO_LEVEL):
             paddle, normal = self._forward(angles)
-            jacobian = self._jacobian(paddle)
-            return np.vstack([jacobian[:3], np.cross(jacobian[3:].T, normal).T])[rows]
+            if normal[2] > 0.0 and np.linalg.norm(normal[:2]) < _LEVEL_TOLERANCE:
+                return self._unwound(angles)
+            error = _LENGTH * _levelling_turn(normal)
+            angles = self._step(angles, self._jacobian(paddle)[3:], error, _NO_DAMPING)
+        return None
 
-        # Level and at the goal, then level alone: not every arm can be both.
-        for rows in (slice(0, 6), slice(3, 6)):
-            angles = scipy.optimize.least_squares(
-                error,
-                angles,
-                derivative,
-                self._inside,
-                method="dogbox",
-                ftol=None,
-                xtol=None,
-                gtol=1e-13,
-                max_nfev=_EVALUATIONS,
-                args=(rows,),
-            ).x
-        # The same pose within half a turn, where the range allows it.
-        turns = np.round((angles - self._centre) / (2.0 * np.pi))
-        turned = np.where(self._hinge, angles - 2.0 * np.pi * turns, angles)
-        angles = np.where(np.clip(turned, *self._inside) == turned, turned, angles)
-        paddle, normal = self._forward(angles)
-        if normal[2] < 0.0 or np.linalg.norm(normal[:2]) > _LEVEL_TOLERANCE:
-            return None
-        in_front = paddle[0] - self._base[0] > 0.3 * np.hypot(*(goal - self._base)[:2])
-        return angles if in_front and paddle[2] > 0.03 else None
+    def _step(
+        self, angles: np.ndarray, jacobian: np.ndarray, error: np.ndarray, damping: float
+    ) -> np.ndarray:
+        """A step of damped least squares inside the ranges, of limited length."""
+        gram = jacobian @ jacobian.T + damping * np.eye(len(error))
+        step = jacobian.T @ np.linalg.solve(gram, error)
+        step *= min(1.0, _LARGEST_STEP / max(np.max(np.abs(step)), 1e-12))
+        return self._inside(angles + step)
+
+    def _unwound(self, angles: np.ndarray) -> np.ndarray:
+        """The same pose with each hinge within half a turn of the middle, where its range allows
+        it."""
+        # Half a turn to either side is the same pose: the positive one counts as nearer.
+        turns = np.round((angles - self._centre) / (2.0 * np.pi) - 1e-3)
+        unwound = angles - 2.0 * np.pi * turns
+        allowed = self._is_hinge & (self._inside(unwound) == unwound)
+        return np.where(allowed, unwound, angles)
 
     def _rate(self, angles: np.ndarray, choice: PaddleConfig) -> PaddlePose:
         """The pose with its score."""
         paddle, _ = self._forward(angles)
-        # A turn about the vertical does not matter.
-        jacobian = self._jacobian(paddle)[:5]
-        lifting = jacobian[2:]
-        task = jacobian if len(angles) >= 5 else lifting
-        smallest = float(np.linalg.svd(task, compute_uv=False)[-1])
-        if np.linalg.matrix_rank(lifting, tol=1e-3) < 3:
-            smallest = 0.0
+        jacobian = self._jacobian(paddle)
+        lifting_and_tilting = jacobian[2:]
+        task = jacobian if len(angles) >= 5 else lifting_and_tilting
+        manipulability = float(np.linalg.svd(task, compute_uv=False)[-1])
+        if np.linalg.matrix_rank(lifting_and_tilting, tol=1e-3) < 3:
+            manipulability = 0.0
         mass, holding = self._dynamics()
         acceleration = -np.inf
-        if smallest >= _LEAST_MANIPULABILITY and np.all(np.abs(holding) <= self._limits):
-            acceleration = self._acceleration(mass @ np.linalg.pinv(task)[:, -3], holding)
-        low, high = self._range
-        # The distance to the nearest joint limit as a share of half a radian.
-        margin = float(np.clip(np.min(np.minimum(angles - low, high - angles)) / 0.5, 0.0, 1.0))
-        strong = min(1.0, max(acceleration, 0.0) / _AMPLE_ACCELERATION)
-        score, inertia = smallest * margin * strong, np.diag(mass)
+        can_hold = np.all(np.abs(holding) <= self._limits)
+        if manipulability >= _LEAST_MANIPULABILITY and can_hold:
+            lifting_force = mass @ np.linalg.pinv(task)[:, -3]
+            acceleration = self._acceleration(lifting_force, holding)
+        to_limit = np.min(np.minimum(angles - self._low, self._high - angles))
+        margin = float(np.clip(to_limit / _AMPLE_MARGIN, 0.0, 1.0))
+        strength = min(1.0, max(acceleration, 0.0) / _AMPLE_ACCELERATION)
         return PaddlePose(
-            angles, paddle, choice, smallest, acceleration, inertia, holding, self._reach, score
+            angles=angles,
+            paddle=paddle,
+            mount=choice,
+            manipulability=manipulability,
+            acceleration=acceleration,
+            inertia=np.diag(mass),
+            holding=holding,
+            reach=self._reach,
+            score=manipulability * margin * strength,
         )
 
     def _is_clear(self, paddle: np.ndarray) -> bool:
         """Whether the links, as straight lines between the joints, stay above the floor and out of
         the ball's way."""
         data = self._data
-        points = [data.xanchor[j] for j in self._joints] + [data.xpos[self._body]]
-        for i, (start, end) in enumerate(zip(points, points[1:], strict=False)):
+        points = [data.xanchor[joint] for joint in self._joints] + [data.xpos[self._body]]
+        for i, (start, end) in enumerate(itertools.pairwise(points)):
             samples = start + np.linspace(0.0, 1.0, 12)[:, None] * (end - start)
             beyond_base = np.linalg.norm(samples - self._base, axis=1) > _BASE_RADIUS
             # The first joint may be anywhere along its axis.
-            lowest = np.where(beyond_base, _FLOOR_CLEARANCE, -1e-6 if i else -np.inf)
+            lowest_at_base = -1e-6 if i > 0 else -np.inf
+            lowest = np.where(beyond_base, _FLOOR_CLEARANCE, lowest_at_base)
             if np.any(samples[:, 2] < lowest):
                 return False
             near = np.hypot(*(samples[:, :2] - paddle[:2]).T) < _CLEARANCE
-            beside = (samples[:, 2] > paddle[2] - 0.03) & (samples[:, 2] < paddle[2] + _HEADROOM)
-            if np.any(near & beside):
+            above_bottom = samples[:, 2] > paddle[2] - _BELOW
+            below_top = samples[:, 2] < paddle[2] + _HEADROOM
+            if np.any(near & above_bottom & below_top):
                 return False
         return True
 
@@ -265,3 +325,13 @@ class _Search:
         spare = np.where(force > 0.0, self._limits - hold, self._limits + hold)
         moved = needed > 1e-9
         return float(np.min(spare[moved] / needed[moved], initial=np.inf))
+
+
+def _levelling_turn(normal: np.ndarray) -> np.ndarray:
+    """The turn [2] about x and y, rad, that levels a paddle with the normal [3]: for small angles
+    exact, and a whole radian if the paddle is upside down."""
+    turn = np.array([normal[1], -normal[0]])
+    if normal[2] >= 0.0:
+        return turn
+    size = np.linalg.norm(turn)
+    return turn / size if size > 1e-6 else np.array([1.0, 0.0])

@@ -3,38 +3,42 @@
 Arrays are numbers in OCDBT and zarr, and the rest is JSON: nothing in a checkpoint is executable.
 Every function that reads raises a `UserError` if the checkpoint is damaged or its config differs
 from the run's.
+
+Orbax writes each checkpoint, and `save_checkpoint` chooses which ones stay. A `CheckpointManager`
+would choose by a file of its own, would not open a folder in which one such file is damaged, and
+would take a checkpoint for written whose save failed.
 """
 
+import errno
+import functools
 import logging
 import os
-import re
 import shutil
-import sys
-from collections.abc import Callable, Sequence
+import types
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-import pydantic
 
 from bounce_mjx.baselines.mirror import MirrorLaw
 from bounce_mjx.config.files import differing_keys
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, reason_of, shorten
+from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import Actor, Policy, make_networks, networks_of, untrained_policy
 from bounce_mjx.learning.ppo import Params, names_of_critic_metrics
 from bounce_mjx.learning.statistics import RunningStatistics, init_statistics
 from bounce_mjx.runs import folders
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config, runs_folder
-from bounce_mjx.runs.files import MANIFEST_FILE, check_integrity, seal, to_plain, writable
+from bounce_mjx.runs.files import plain_path, seal, to_plain
+from bounce_mjx.runs.records import RECORD, Checkpoint, DamagedCheckpoint, Record, verify
 from bounce_mjx.tasks.registry import is_file
 
-# Where orbax moves the checkpoints that are not kept any more.
-_REPLACED = "replaced"
-POLICY, TRAINING, NETWORKS, RECORD = "policy", "training", "networks", "record"
+POLICY, TRAINING, NETWORKS = "policy", "training", "networks"
 """Items of a checkpoint: what acts; what a training continues from; both networks, with which
-another training can start; steps, config and evaluations."""
+another training can start."""
 
 NETWORK_KEYS = ("hidden_layers", "critic_layers", "shared_critic", "activation")
 """Keys of `ppo` that shape the networks."""
@@ -45,20 +49,21 @@ RESUMABLE_KEYS = frozenset(
     "total_steps eval_every eval_episodes screening_episodes eval_seed stop_when_solved log_dir "
     "num_devices".split()
 )
-# Version 0.1 wrote a checkpoint's plain data into this file, and arrays of one chunk in OCDBT and
-# zarr without orbax's own metadata.
-_OLD_RECORD = "run.json"
+# Room for the metadata of a checkpoint.
+_MARGIN = 2**20
+# Folder of what is being written or removed; a killed process leaves it.
+_UNFINISHED = ".unfinished"
 
 
-class Record(pydantic.BaseModel):
-    """The plain data of a checkpoint."""
+class NotSavedError(UserError):
+    """A checkpoint could not be written."""
 
-    steps: int
-    config: dict[str, Any]
-    progress: dict[str, Any]
+    def __init__(self, run: Path, reason: str):
+        self.reason = reason
+        super().__init__(f"{run} cannot be written ({reason}); choose another folder")
 
 
-def read_policy(checkpoint: folders.Checkpoint, config: TrainConfig) -> Policy:
+def read_policy(checkpoint: Checkpoint, config: TrainConfig) -> Policy:
     """Restores the policy of a checkpoint."""
     read_record(checkpoint)
     policy = _read_arrays(checkpoint, POLICY, policy_shapes(config))
@@ -73,8 +78,8 @@ def read_policy(checkpoint: folders.Checkpoint, config: TrainConfig) -> Policy:
 
 
 def read_actor(
-    checkpoint: folders.Checkpoint, config: TrainConfig
-) -> tuple[folders.Checkpoint, Policy | None, Callable[[Env], Actor]]:
+    checkpoint: Checkpoint, config: TrainConfig
+) -> tuple[Checkpoint, Policy | None, Callable[[Env], Actor]]:
     """The policy of a checkpoint and what acts with it, or the mirror law, which has no policy; and
     the checkpoint that was read: the next one, if a training replaces it meanwhile."""
     if checkpoint is folders.MIRROR_LAW:
@@ -95,20 +100,20 @@ def policy_shapes(config: TrainConfig) -> Policy:
     return jax.eval_shape(lambda: untrained_policy(networks, size, jax.random.PRNGKey(0)))
 
 
-def read_training(checkpoint: folders.Checkpoint, template: Any) -> tuple[Any, Record]:
+def read_training(checkpoint: Checkpoint, template: Any) -> tuple[Any, Record]:
     """Restores the whole training state of a checkpoint as NumPy arrays, and its record.
 
     Args:
       template: shapes and dtypes of the state, as from `jax.eval_shape`.
     """
-    if not (checkpoint.folder / TRAINING).is_dir() or _is_old(checkpoint.folder):
+    if not (checkpoint.folder / TRAINING).is_dir() or checkpoint.is_old:
         raise UserError(f"{checkpoint.folder} has no state of this version; use --warm-start")
     record = read_record(checkpoint)
     return _read_arrays(checkpoint, TRAINING, template), record
 
 
 def read_networks(
-    checkpoint: folders.Checkpoint, config: TrainConfig
+    checkpoint: Checkpoint, config: TrainConfig
 ) -> tuple[Params, RunningStatistics, tuple[str, ...]]:
     """Restores both networks of a checkpoint, the statistics of their inputs, and the names of the
     critic metrics among these."""
@@ -168,56 +173,46 @@ def read_start(config: TrainConfig, env: Env) -> tuple[Params, RunningStatistics
     return params, seen
 
 
-def read_record(checkpoint: folders.Checkpoint) -> Record:
+def read_record(checkpoint: Checkpoint) -> Record:
     """Verifies every file of a checkpoint and reads its plain data."""
-    run_config, folder = load_run_config(checkpoint.run), checkpoint.folder
+    run_config, record = load_run_config(checkpoint.run), verify(checkpoint)
     try:
-        if (folder / MANIFEST_FILE).exists():
-            check_integrity(folder)
-        else:
-            # Its training was killed before it wrote the manifest.
-            print(f"warning: {folder} has no {MANIFEST_FILE} to find damage by", file=sys.stderr)
-        name = _OLD_RECORD if _is_old(folder) else f"{RECORD}/metadata"
-        record = Record.model_validate_json((folder / name).read_bytes())
         config = type(run_config).model_validate(record.config)
-    # One of pydantic's is a ValueError.
-    except (OSError, ValueError) as error:
-        raise _damaged(checkpoint, error) from error
+    # Pydantic's own is one.
+    except ValueError as error:
+        raise DamagedCheckpoint(checkpoint, error) from error
     # The checkpoint has the paths of the original files, and the run's config those of its copies.
     files = {key for key in ("task", "algorithm") if is_file(getattr(config, key))}
     if differing := differing_keys(run_config, config) - RESUMABLE_KEYS - files - {"env.mjcf"}:
         raise UserError(
-            f"{folder} has a different config from {checkpoint.run / CONFIG_FILE}, which differs "
-            f"in {', '.join(sorted(differing))}; restore that file"
+            f"{checkpoint.folder} has a different config from {checkpoint.run / CONFIG_FILE}, "
+            f"which differs in {', '.join(sorted(differing))}; restore that file"
         )
     return record
 
 
-def _read_arrays(checkpoint: folders.Checkpoint, item: str, template: Any) -> Any:
+def _read_arrays(checkpoint: Checkpoint, item: str, template: Any) -> Any:
     """Reads an item of a checkpoint with exactly the structure, shapes and dtypes of `template`."""
-    folder = (checkpoint.folder / item).absolute()
     try:
-        if _is_old(checkpoint.folder):
-            return _read_old(folder, template)
-        # Imported here, as the import takes half a second.
-        import orbax.checkpoint as ocp
-
-        handler = ocp.PyTreeCheckpointHandler()
-        expected, found = _forms(template), _forms(handler.metadata(folder).tree)
-        for name in sorted(expected.keys() | found.keys()):
-            given, wanted = (x.get(name, "missing") for x in (found, expected))
-            if given != wanted:
-                raise ValueError(f"{item}.{name} is {given}, and should be {wanted}")
-        as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), template)
-        arguments = ocp.args.PyTreeRestore(item=template, restore_args=as_numpy)
-        return handler.restore(folder, args=arguments)
+        with plain_path(checkpoint.folder) as folder:
+            read = _read_old if checkpoint.is_old else _read_item
+            return read(folder / item, template)
     # Damaged files raise exceptions of many types.
     except Exception as error:
-        raise _damaged(checkpoint, error) from error
+        raise DamagedCheckpoint(checkpoint, error) from error
 
 
-def _is_old(folder: Path) -> bool:
-    return (folder / _OLD_RECORD).is_file()
+def _read_item(folder: Path, template: Any) -> Any:
+    ocp = _orbax()
+    handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=_alone())
+    expected, stored = _forms(template), _forms(handler.metadata(folder).tree)
+    for name in sorted(expected.keys() | stored.keys()):
+        given, wanted = (forms.get(name, "missing") for forms in (stored, expected))
+        if given != wanted:
+            raise ValueError(f"{folder.name}.{name} is {given}, and should be {wanted}")
+    as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), template)
+    arguments = ocp.args.PyTreeRestore(item=template, restore_args=as_numpy)
+    return handler.restore(folder, args=arguments)
 
 
 def _read_old(folder: Path, template: Any) -> Any:
@@ -242,13 +237,6 @@ def _forms(tree: Any) -> dict[str, str]:
     }
 
 
-def _damaged(checkpoint: folders.Checkpoint, error: Exception) -> UserError:
-    return UserError(
-        f"the checkpoint {checkpoint.folder} is damaged or of another version "
-        f"({shorten(reason_of(error), 200)}); give another checkpoint"
-    )
-
-
 def write_run(config: TrainConfig, steps: int, policy: Policy) -> Path:
     """Writes a new run whose checkpoint holds only a policy; its folder.
 
@@ -259,8 +247,7 @@ def write_run(config: TrainConfig, steps: int, policy: Policy) -> Path:
       UserError: the folder cannot be written.
     """
     run = folders.create_run(config)
-    with writable(run, "choose another folder"):
-        save_checkpoint(run, config, steps, {POLICY: policy})
+    save_checkpoint(run, config, steps, {POLICY: policy})
     return run
 
 
@@ -270,12 +257,11 @@ def save_checkpoint(
     steps: int,
     items: dict[str, Any],
     progress: dict[str, Any] | None = None,
-    score: Sequence[float] = (),
-) -> None:
-    """Writes a checkpoint; of the others, orbax keeps the best one. A process that is killed at any
-    moment leaves the others as they were.
-
-    Its number is that of its steps, or the next one if it was saved before without an evaluation.
+    report: Report | None = None,
+    kept: int | None = None,
+) -> int:
+    """Writes a checkpoint, and then removes the others of the run. A process that is killed at any
+    moment leaves a complete one.
 
     Args:
       run: the run's folder.
@@ -283,56 +269,86 @@ def save_checkpoint(
       steps: environment steps trained.
       items: pytrees of arrays by their names above.
       progress: the evaluations so far, plain data.
-      score: quality of the policy (`Report.score`); empty if it was not evaluated.
+      report: the evaluation of the policy; None if it was not evaluated.
+      kept: number of another checkpoint that is kept.
+
+    Returns:
+      Its number: that of its steps, or the next one where there is one of as many steps.
 
     Raises:
-      OSError: the checkpoint could not be written.
+      NotSavedError: it could not be written; the others are as they were.
     """
-    import orbax.checkpoint as ocp
-    from orbax.checkpoint.checkpoint_managers import preservation_policy as keep
-
-    folder = (run / folders.CHECKPOINTS).absolute()
-    folder.mkdir(exist_ok=True)
-    alone = {jax.process_index()}
-    best = keep.BestN(get_metric_fn=_score_in, n=1, keep_checkpoints_without_metrics=False)
-    options = ocp.CheckpointManagerOptions(
-        # Without it, orbax writes no metrics.
-        best_fn=_score_in,
-        preservation_policy=keep.AnyPreservationPolicy([keep.LatestN(1), best]),
-        create=False,
-        cleanup_tmp_directories=True,
-        enable_async_checkpointing=False,
-        todelete_subdir=_REPLACED,
-        multiprocessing_options=ocp.options.MultiprocessingOptions(
-            primary_host=jax.process_index(), active_processes=alone, barrier_sync_key_prefix="run"
-        ),
-    )
-    items = jax.tree.map(np.asarray, items)
-    given = {name: tree for name, tree in items.items() if jax.tree.leaves(tree)}
-    arguments = {name: ocp.args.StandardSave(tree) for name, tree in given.items()}
-    record = {"steps": steps, "config": config.model_dump(mode="json"), "progress": progress or {}}
-    arguments[RECORD] = ocp.args.JsonSave(to_plain(record))
-    # After an error, orbax would log a traceback.
-    log = logging.getLogger("absl")
-    log.disabled = True
+    folder = run / folders.CHECKPOINTS
+    # What is being written or removed. A killed process leaves it.
+    unfinished = folder / _UNFINISHED
     try:
-        # A new manager each time: one that failed would take the checkpoint for written.
-        with ocp.CheckpointManager(folder, options=options) as manager:
-            latest = manager.latest_step()
-            number = steps if latest is None else max(steps, latest + 1)
-            metrics = {"score": list(score)}
-            manager.save(number, args=ocp.args.Composite(**arguments), metrics=metrics)
-        seal(folder / str(number))
+        if not (run / CONFIG_FILE).is_file():
+            raise FileNotFoundError("it was moved or removed")
+        shutil.rmtree(unfinished, ignore_errors=True)
+        folder.mkdir(exist_ok=True)
+        unfinished.mkdir()
+        _check_room(unfinished, items)
+        others = folders.stored_checkpoints(run)
+        number = max([steps, *(other.steps + 1 for other in others)])
+        plain = config.model_dump(mode="json")
+        record = Record(steps=steps, config=plain, progress=progress or {}, report=report)
+        _write(unfinished / str(number), items, record)
+        (unfinished / str(number)).rename(folder / str(number))
+        for other in others:
+            if other.steps != kept:
+                # First out of the way, so that no reader finds a part of it.
+                other.folder.rename(unfinished / other.folder.name)
+    # Orbax and tensorstore raise exceptions of many types, also where the disk is full.
     except Exception as error:
-        # tensorstore reports a full disk as a ValueError.
-        code = re.search(r"os_error_code='(\d+)'", str(error))
-        if code is None:
-            raise
-        raise OSError(int(code[1]), os.strerror(int(code[1]))) from error
+        reason = getattr(error, "strerror", None) or shorten(reason_of(error), 200)
+        raise NotSavedError(run, reason) from error
     finally:
-        log.disabled = False
-        shutil.rmtree(folder / _REPLACED, ignore_errors=True)
+        shutil.rmtree(unfinished, ignore_errors=True)
+    return number
 
 
-def _score_in(metrics: dict[str, Any]) -> tuple[float, ...]:
-    return tuple(metrics["score"])
+def _check_room(folder: Path, items: dict[str, Any]) -> None:
+    """Raises OSError if the file system has too little room for arrays. Tensorstore would find out
+    in many threads, each of which would print a traceback."""
+    size = sum(np.asarray(leaf).nbytes for leaf in jax.tree.leaves(items))
+    if shutil.disk_usage(folder).free < size + _MARGIN:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def _write(folder: Path, items: dict[str, Any], record: Record) -> None:
+    """Writes a checkpoint's folder, and checks that its arrays are read as they were given."""
+    ocp, alone = _orbax(), _alone()
+    composite = ocp.CompositeOptions(multiprocessing_options=alone)
+    handler = ocp.CompositeCheckpointHandler(composite_options=composite)
+    items = {
+        name: jax.tree.map(np.asarray, tree)
+        for name, tree in items.items()
+        if jax.tree.leaves(tree)
+    }
+    arguments = {name: ocp.args.StandardSave(tree) for name, tree in items.items()}
+    arguments[RECORD] = ocp.args.JsonSave(to_plain(record.model_dump()))
+    with plain_path(folder.parent) as place:
+        with ocp.Checkpointer(handler, multiprocessing_options=alone) as writer:
+            writer.save(place / folder.name, args=ocp.args.Composite(**arguments))
+        for name, tree in items.items():
+            stored = _read_item(place / folder.name / name, tree)
+            jax.tree.map(np.testing.assert_array_equal, stored, tree)
+    seal(folder)
+
+
+@functools.cache
+def _orbax() -> types.ModuleType:
+    """The package. Its import takes half a second, and its threads log a traceback of each error,
+    which is raised as well."""
+    import orbax.checkpoint
+
+    logging.getLogger("absl").addFilter(lambda record: "orbax" not in record.pathname)
+    return orbax.checkpoint
+
+
+def _alone() -> Any:
+    """Orbax's option for a process that does not wait for those of other hosts."""
+    number = jax.process_index()
+    return _orbax().options.MultiprocessingOptions(
+        primary_host=number, active_processes={number}, barrier_sync_key_prefix="run"
+    )

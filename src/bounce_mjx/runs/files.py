@@ -4,6 +4,7 @@ import contextlib
 import hashlib
 import json
 import os
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
@@ -77,6 +78,21 @@ def write_atomically(path: Path, content: str | bytes) -> None:
         file.write(content.encode() if isinstance(content, str) else content)
         file.flush()
         os.fsync(file.fileno())
+
+
+@contextlib.contextmanager
+def plain_path(folder: Path) -> Iterator[Path]:
+    """Yields a path of a folder for orbax, which takes a bracket in a path for a pattern and then
+    loses arrays, and for tensorstore, to which a backslash is a slash: a link where the path has
+    one."""
+    path = folder.absolute()
+    if not set("[]\\") & set(str(path)):
+        yield path
+        return
+    with tempfile.TemporaryDirectory() as place:
+        link = Path(place) / "link"
+        link.symlink_to(path, target_is_directory=True)
+        yield link
 
 
 def write_output(path: Path, content: str | bytes) -> None:

@@ -10,8 +10,7 @@
             policy/                     the policy's arrays
             training/                   the training state's arrays; optional
             networks/                   both networks, for another training; optional
-            record/                     the steps, the config, the evaluations so far
-            metrics/                    the score of the evaluation
+            record/                     the steps, the config, the evaluations so far and its own
             manifest.json               size and SHA-256 of every other file
 
 A run with several seeds has one folder per seed, such as seed_003/, with the layout of a run with
@@ -23,39 +22,28 @@ Functions that search raise a `UserError` if they find nothing.
 import contextlib
 import datetime
 import itertools
-import json
 import os
 import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import bounce_mjx
 from bounce_mjx.config.files import dump_config
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import UserError, suggest, warn_once
 from bounce_mjx.lazy import mujoco
 from bounce_mjx.resources import POLICIES, PRETRAINED, TASK_POLICIES, resource_path
-from bounce_mjx.runs.config import BASE, CONFIG_FILE, ROBOT, TrainConfig, runs_folder
+from bounce_mjx.runs.config import CONFIG_FILE, ROBOT, TrainConfig, dump_sources, runs_folder
 from bounce_mjx.runs.files import seal, writable, write_atomically
+from bounce_mjx.runs.presets import BASE
 from bounce_mjx.runs.progress import load_results
+from bounce_mjx.runs.records import Checkpoint, DamagedCheckpoint, Record, verify
 from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file, read_source, source_file
 
 LATEST = "latest"
 """Name of the newest run on the command line."""
 CHECKPOINTS = "checkpoints"
-
-
-class Checkpoint(NamedTuple):
-    """Location of a checkpoint."""
-
-    run: Path
-    """The run's folder."""
-    folder: Path
-    """The checkpoint's own folder."""
-    steps: int
-    """Its number: the environment steps trained, or one more where a checkpoint without an
-    evaluation had that number."""
 
 
 MIRROR_LAW = Checkpoint(Path("mirror law"), Path("mirror law"), 0)
@@ -68,11 +56,6 @@ def create_run(config: TrainConfig) -> Path:
     Raises:
       UserError: the folder cannot be written, or the robot cannot be copied into it.
     """
-    if "[" in str(config.log_dir.absolute()):
-        # Its search takes brackets for a pattern.
-        raise UserError(
-            f"{config.log_dir.absolute()} has a square bracket, where orbax loses arrays; rename it"
-        )
     # Not the local time, which is another one on another machine, and in autumn goes back.
     stamp = datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d_%H-%M-%S")
     with writable(config.log_dir, "choose another folder with --log-dir"):
@@ -101,10 +84,12 @@ def save_config(run: Path, config: TrainConfig) -> None:
                 write_atomically(run / file, read_source(name))
             config = config.model_copy(update={key: f"{file}:{name.rpartition(':')[2]}"})
     if (mjcf := config.env.mjcf) is not None:
-        if not mjcf.is_relative_to((run / ROBOT).absolute()):
-            mjcf = copy_robot(mjcf, run).absolute()
+        # As a config's own path is absolute and without .. in it.
+        here = Path(os.path.abspath(run))
+        if not mjcf.is_relative_to(here / ROBOT):
+            mjcf = copy_robot(mjcf, here)
         # The run's folder may be moved.
-        env = config.env.model_copy(update={"mjcf": mjcf.relative_to(run.absolute())})
+        env = config.env.model_copy(update={"mjcf": mjcf.relative_to(here)})
         config = config.model_copy(update={"env": env})
     write_config(run, config)
 
@@ -149,7 +134,7 @@ def _files_of(mjcf: Path) -> list[Path]:
 def write_config(run: Path, config: TrainConfig) -> None:
     """Writes the run's config as it is, without copies."""
     head = f"# bounce_mjx {bounce_mjx.__version__}\n{BASE}: null\n"
-    write_atomically(run / CONFIG_FILE, head + dump_config(config))
+    write_atomically(run / CONFIG_FILE, head + dump_config(config) + dump_sources(config))
 
 
 def runs_of_seeds(run: Path) -> list[Path]:
@@ -192,10 +177,9 @@ def find_run(path: Path) -> Path:
     """Folder of the run that contains a path; the path may be the folder itself."""
     # Unlike os.path.isdir, Path.is_dir raises an error for a name that is too long.
     if not os.path.isdir(path):
-        raise UserError(
-            f"there is no checkpoint folder {path}; give a run's folder such as "
-            "runs/bounce_ball/<time stamp>"
-        )
+        near = suggest(str(path), [LATEST])
+        advice = near or "give a run's folder such as runs/bounce_ball/<time stamp>"
+        raise UserError(f"there is no checkpoint folder {path}; {advice}")
     for folder in (path, *Path(os.path.abspath(path)).parents):
         if (folder / CONFIG_FILE).is_file():
             return folder
@@ -227,31 +211,66 @@ def runs_in(folder: Path) -> list[Path]:
     return list(filter(stored_checkpoints, runs))
 
 
-def find_checkpoint(path: Path) -> Checkpoint:
+def find_checkpoint(path: str | Path) -> Checkpoint:
     """Finds a checkpoint.
 
     Args:
       path: a run's folder (finds its best checkpoint, or its latest if there is no best), a folder
         of checkpoints in it, or a checkpoint.
     """
+    path = Path(path)
     run = find_run(path)
     if os.path.samefile(path, run):
         path = run = _best_seed(run)
     return best_checkpoint(run, path)
 
 
-def latest_checkpoint(run: Path) -> Checkpoint:
-    """Newest checkpoint of a run, from which its training resumes."""
-    return max(_checkpoints_in(run, run), key=lambda x: x.steps)
+def latest_checkpoint(run: Path, place: Path | None = None) -> Checkpoint:
+    """Newest intact checkpoint of a run, from which its training resumes.
+
+    Args:
+      place: folder of the run in which it lies; that of a checkpoint finds this one.
+    """
+    return max(_intact_checkpoints(run, place), key=lambda checkpoint: checkpoint.steps)
 
 
 def best_checkpoint(run: Path, place: Path | None = None) -> Checkpoint:
-    """Checkpoint of a run with the best evaluation; among equals and without one, the newest.
+    """Intact checkpoint of a run with the best evaluation; among equals and without one, the
+    newest.
 
     Args:
-      place: folder of the run in which it lies.
+      place: see `latest_checkpoint`.
     """
-    return max(_checkpoints_in(run, place or run), key=lambda x: (_score(x.folder), x.steps))
+    records = _intact_checkpoints(run, place)
+
+    def quality(checkpoint: Checkpoint) -> tuple[Any, ...]:
+        record = records[checkpoint]
+        score = record.report.score if record and record.report else ()
+        # Version 0.1 wrote no evaluation, and had a folder for the best one.
+        return score, checkpoint.folder.parent.name == "best", checkpoint.steps
+
+    return max(records, key=quality)
+
+
+def _intact_checkpoints(run: Path, place: Path | None) -> dict[Checkpoint, Record | None]:
+    """The intact checkpoints in a folder of a run, at least one, with their records. A warning
+    names the damaged ones; a single checkpoint is not read, as its reader refuses it."""
+    stored = _checkpoints_in(run, place or run)
+    if len(stored) == 1:
+        return {stored[0]: None}
+    intact, damaged = {}, []
+    for checkpoint in stored:
+        try:
+            intact[checkpoint] = verify(checkpoint)
+        except DamagedCheckpoint as error:
+            # A training may have replaced it meanwhile.
+            if checkpoint.folder.exists():
+                damaged.append(error)
+    if damaged and not intact:
+        raise damaged[-1]
+    for error in damaged:
+        warn_once(f"{error.damage}; another one is used")
+    return intact or _intact_checkpoints(run, place)
 
 
 def pretrained_checkpoint(name: str = PRETRAINED) -> Checkpoint:
@@ -278,6 +297,8 @@ def choose_checkpoint(path: Path | None, log_dir: Path) -> Checkpoint:
             raise
         print(f"no run in {log_dir}: using the policy that comes with the package")
         return pretrained_checkpoint(folders[log_dir])
+    if not os.path.isdir(run) and (near := suggest(str(path), POLICIES)):
+        raise UserError(f"there is no checkpoint folder and no policy {path}; {near}")
     if run != path:
         results = load_results(_best_seed(run))
         known = results.best.summary if results else "not evaluated"
@@ -303,18 +324,9 @@ def _checkpoints_in(run: Path, place: Path) -> list[Checkpoint]:
     inside = [x for x in stored_checkpoints(run) if x.folder.is_relative_to(place)]
     if not inside:
         raise UserError(
-            f"{place} has no checkpoint, because the first follows an evaluation; train longer"
+            f"{place} has no checkpoint, as its training ended before the first one; start again"
         )
     return inside
-
-
-def _score(folder: Path) -> tuple[float, ...]:
-    """Quality of a checkpoint, greater than () if it was evaluated."""
-    if folder.parent.name == "best":
-        return (0.0,)
-    with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
-        return tuple(json.loads((folder / "metrics/metrics").read_bytes())["score"])
-    return ()
 
 
 def _best_seed(run: Path) -> Path:

@@ -1,4 +1,16 @@
-"""What a task is made of: `Task`, its settings, reward terms, results and pictures."""
+"""What a task is made of. The tasks themselves, one file each, are in `bounce_mjx.tasks`.
+
+    task.py      `Task`, and what an environment gives it and gets: `Start`, `Step`, `TaskStep`
+    rewards.py   the terms of a reward, as settings with a formula
+    flight.py    the free flight of the ball, for rewards and observations
+    results.py   what judges a policy
+    shown.py     what viewers and reports draw
+
+A task's file reads `from bounce_mjx import task`, and has each of these names as `task.NAME`; the
+settings and the observation of the world, which it extends, are among them. It goes in this order:
+constants, reward terms, observation, `Config`, then the task with its start, its step (reward, end,
+metrics), its quantities of the observation, its results, and what is shown.
+"""
 
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.task.flight import GRAVITY, Flight, closest, flight

@@ -67,9 +67,15 @@ class Result:
 
 def share_of_episodes(name: str, measured: str, met: np.ndarray, least: float) -> Result:
     """The result for the share of the episodes [E] that meet a condition, at least `least`."""
-    share, bound = float(met.mean()), f">= {100 * least:g}"
-    margin = _clearness(share - least, MARGIN_FAILURES * (1.0 - least))
-    return Result(name, f"{measured}, %", 100.0 * share, bound, share >= least, margin)
+    share = float(met.mean())
+    return Result(
+        name=name,
+        measured=f"{measured}, %",
+        value=100.0 * share,
+        bound=f">= {100 * least:g}",
+        passed=share >= least,
+        margin=_clearness(share - least, MARGIN_FAILURES * (1.0 - least)),
+    )
 
 
 def share_of_events(
@@ -82,9 +88,9 @@ def share_of_events(
       met: number that meet the condition in each episode [E].
       events: number of all in each episode [E].
     """
-    found = mean_of_events(name, f"{measured}, %", met, events, (least, math.inf))
-    share = None if found.value is None else 100.0 * found.value
-    return dataclasses.replace(found, value=share, bound=f">= {100 * least:g}")
+    share = mean_of_events(name, f"{measured}, %", met, events, (least, math.inf))
+    percentage = None if share.value is None else 100.0 * share.value
+    return dataclasses.replace(share, value=percentage, bound=f">= {100 * least:g}")
 
 
 def mean_of_events(
@@ -104,9 +110,12 @@ def mean_of_events(
     """
     mean, margin = mean_and_margin(totals, events)
     low, high = bounds
-    bound = f"{low} to {high}"
-    if not (math.isfinite(low) and math.isfinite(high)):
-        bound = f"<= {high:g}" if math.isfinite(high) else f">= {low:g}"
+    if math.isinf(low):
+        bound = f"<= {high:g}"
+    elif math.isinf(high):
+        bound = f">= {low:g}"
+    else:
+        bound = f"{low} to {high}"
     if condition:
         return Result(name, measured, mean, f"{bound} ({condition})", None)
     distance = -1.0 if mean is None else min(mean - low, high - mean)
@@ -123,9 +132,9 @@ def root_mean_square(
       squares: sum of the squared quantity in each episode [E].
       events: number of steps or events in each episode [E].
     """
-    found = mean_of_events(name, measured, squares, events, (-math.inf, most**2))
-    root = None if found.value is None else math.sqrt(found.value)
-    return dataclasses.replace(found, value=root, bound=f"<= {most:g}")
+    mean_square = mean_of_events(name, measured, squares, events, (-math.inf, most**2))
+    root = None if mean_square.value is None else math.sqrt(mean_square.value)
+    return dataclasses.replace(mean_square, value=root, bound=f"<= {most:g}")
 
 
 def mean_and_margin(totals: np.ndarray, events: np.ndarray) -> tuple[float | None, float]:

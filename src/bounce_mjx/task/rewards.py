@@ -1,13 +1,15 @@
 """Reward terms: settings with a weight, and a formula.
 
-A task's reward is a group of settings, in which each field of a subclass of `RewardTerm` is a term.
-The config, the flags, the metrics `reward/<field>`, the log and the report follow the fields. A
-term is added by a subclass of the group with one more field.
+`Task.step` returns the weighted terms by name, however it computes them; the metrics
+`reward/<name>`, the log and the report follow. The tasks of the package make them from settings: a
+group, the config's `reward`, in which each field of a subclass of `RewardTerm` is a term
+(`weighted_terms`). Then the config and the flags follow as well, and a subclass of the group with
+one more field adds a term.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection
 from typing import Any
 
 from bounce_mjx.config.settings import Finite, Positive, StrictModel
@@ -79,27 +81,41 @@ def weighted_terms(reward: StrictModel, inputs: Any = None, **own: Any) -> dict[
     Raises:
       UserError: `own` has a name that is no term, or lacks one although there are no inputs.
     """
-    terms = {name: getattr(reward, name) for name in term_names(type(reward))}
-    missing = terms.keys() - own.keys() if own and inputs is None else set()
-    check_names("weighted_terms", "term of the reward", own.keys() | terms.keys() - missing, terms)
-    return {name: t.weight * t.value(own.get(name, inputs)) for name, t in terms.items()}
+    names = term_names(type(reward))
+    # Without `own`, the formulas may take no inputs at all.
+    share_inputs = inputs is not None or not own
+    provided = own.keys() | names if share_inputs else own.keys()
+    check_names("weighted_terms", "term of the reward", provided, names)
+    weighted = {}
+    for name in names:
+        term = getattr(reward, name)
+        weighted[name] = term.weight * term.value(own.get(name, inputs))
+    return weighted
 
 
-def check_names(what: str, kind: str, given: Iterable[str], known: Iterable[str]) -> None:
+def check_names(what: str, kind: str, given: Collection[str], known: Collection[str]) -> None:
     """Compares the names that a task's code gives with those that it has.
+
+    Args:
+      what: the code, for the error.
+      kind: what the names stand for, for the error.
 
     Raises:
       UserError: a name is unknown or missing.
     """
-    given, known = set(given), set(known)
-    for name in sorted(given ^ known, key=lambda name: (name in known, name)):
-        wrong = f"lacks the {kind}" if name in known else f"names a {kind} that there is not,"
-        names = ", ".join(sorted(known)) or "none"
-        raise UserError(f"{what} {wrong} {shorten(name)}; there are: {names}")
+    unknown = sorted(set(given) - set(known))
+    missing = sorted(set(known) - set(given))
+    names = ", ".join(sorted(set(known))) or "none"
+    if unknown:
+        raise UserError(
+            f"{what} names a {kind} that there is not, {shorten(unknown[0])}; there are: {names}"
+        )
+    if missing:
+        raise UserError(f"{what} lacks the {kind} {shorten(missing[0])}; there are: {names}")
 
 
 def gaussian(error: jax.Array, scale: jax.Array | float) -> jax.Array:
-    """exp(-error^2 / (2 scale^2))."""
+    """exp(-error^2 / (2 scale^2)), for an error and a width in the same unit."""
     return jnp.exp(-jnp.square(error) / (2.0 * jnp.square(scale)))
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.lazy import jax, jnp
@@ -11,6 +12,9 @@ from bounce_mjx.task.results import Episodes, Figure, Result
 from bounce_mjx.task.shown import Curve, Histogram, Hits, Marker, Recording
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.observation import Kinematics
+
+if TYPE_CHECKING:
+    from bounce_mjx.robot.geometry import Geometry
 
 State = Any
 """A pytree that a task keeps of an episode."""
@@ -36,11 +40,13 @@ class Step(NamedTuple):
     truth: Kinematics
     """Positions and velocities after the step."""
     command: Values
-    """Value [] of each command during the step."""
+    """Value [] of each command during the step, which the policy saw as it chose the action."""
     action: jax.Array
     """Clipped action [n]."""
     last_action: jax.Array
     """Clipped action of the previous step [n]."""
+    ball_radius: jax.Array | float | None = None
+    """Radius [] of the balls in this episode, m; None for that of the task's `geometry`."""
 
 
 class TaskStep(NamedTuple):
@@ -62,7 +68,7 @@ class Moment(NamedTuple):
     truth: Kinematics
     """Positions and velocities after the step."""
     command: Values
-    """Value [] of each command."""
+    """Value [] of each command after the step."""
     state: State
     """The task's state after the step."""
     metrics: Values
@@ -94,7 +100,8 @@ class Task:
     folder: ClassVar[str] = ""
     """Name of the folder of its runs in runs/; by default, the class's name in lower case."""
     curves: ClassVar[tuple[Curve, ...]] = ()
-    """What a training logs and a report draws of the metrics; the first is the progress line's."""
+    """What a training logs and a report draws of the metrics; the first is the progress line's. A
+    metric without one is logged as its mean over the steps."""
     num_balls: ClassVar[tuple[int, ...]] = (1,)
     """Numbers of balls (`WorldConfig.num_balls`) that it takes."""
     num_draws: ClassVar[int] = 0
@@ -110,10 +117,31 @@ class Task:
                 f"the task {cls.__name__} has no Config of its own, and settings belong to one "
                 f"task; write a class that extends that of {cls.__base__.__name__}"
             )
+        owner = vars(cls.Config).get("task")
+        # The cell of a notebook may run again.
+        if owner and (owner.__module__, owner.__qualname__) != (cls.__module__, cls.__qualname__):
+            raise UserError(
+                f"the task {cls.__name__} has the Config of {owner.__name__}, and settings belong "
+                f"to one task; write a class that extends {cls.Config.__qualname__}"
+            )
         cls.Config.task = cls
 
     def __init__(self, config: WorldConfig):
         self.config = config
+
+    @functools.cached_property
+    def geometry(self) -> Geometry:
+        """Sizes and places of ball and paddle in the model. An environment sets those of its own;
+        a task without one compiles the config's model for them."""
+        # The settings alone need no JAX.
+        from bounce_mjx.robot.geometry import read_geometry
+        from bounce_mjx.robot.model import load_model
+
+        config = self.config
+        model = load_model(
+            config.mjcf, config.physics_dt, False, config.robot, num_balls=config.num_balls
+        )
+        return read_geometry(model, config.default_joint_angles)
 
     def throw(self, draws: jax.Array, command: Values) -> tuple[jax.Array, jax.Array] | None:
         """Position [3] (m) and velocity [3] (m/s) of the ball at a reset, before the noise and the
@@ -138,8 +166,18 @@ class Task:
         """
         raise NotImplementedError
 
+    def first_command(self, command: Values) -> Values:
+        """The commands where they are sampled, at a reset and within an episode, for a task in
+        which a sample is not what the policy has to follow, such as the middle of a path.
+
+        Args:
+          command: value [] of each command, as it is sampled.
+        """
+        return command
+
     def next_command(self, state: State, command: Values) -> Values:
-        """The commands from now on, for a task whose commands move within an episode.
+        """The commands from now on, for a task whose commands move within an episode; it follows
+        `first_command` too.
 
         Args:
           state: the task's state after the step or the reset.

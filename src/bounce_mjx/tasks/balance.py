@@ -14,15 +14,21 @@ MAX_SPEED = 0.05
 """Greatest speed of the point, m/s."""
 MIN_RADIUS = 0.01
 """Radius of the point's circle below which the point is slower than `point_speed`, m."""
-START_HEIGHT = 0.0255
-"""Height of the ball over the paddle's centre at a reset, m: 3 mm above its rest, because the noise
-of the joint angles lifts the paddle by up to 2.5 mm."""
-LOST_DISTANCE, LOST_DEPTH = 0.1, 0.02
-"""The episode ends when the ball is farther from the paddle's centre, or lower, m."""
+LIFT = 0.003
+"""Height of the ball over its rest on the paddle at a reset, m, because the noise of the joint
+angles lifts the paddle by up to 2.5 mm."""
+START_HEIGHT = 0.0225 + LIFT
+"""The same over the paddle's centre, for the project's own ball and paddle, m."""
+LOST_DISTANCE = 0.1
+"""The episode ends when the ball is farther from the paddle's centre, m."""
+LOST_DEPTH = 0.02
+"""The episode ends when the ball is farther below the paddle's centre, m."""
 SETTLING_SECONDS = 1.0
 """Time at the start of an episode in which the error does not count, s."""
-MAX_ERROR = (0.01, 0.015)
-"""Greatest RMS error without and with pushes, m."""
+MAX_ERROR = 0.01
+"""Greatest RMS error without pushes, m."""
+MAX_PUSHED_ERROR = 0.015
+"""Greatest RMS error with pushes, m."""
 MIN_STABLE = 0.99
 """Least share of episodes that last."""
 
@@ -54,7 +60,7 @@ class Config(task.WorldConfig):
         *task.PADDLE_HOME[:2],
         task.PADDLE_HOME[2] + START_HEIGHT,
     )
-    """Mean ball position at a reset, m."""
+    """Mean ball position at a reset, m; higher where a larger ball would be within the paddle."""
     reset: task.ResetConfig = task.ResetConfig(joint_angles=0.002, ball_position=0.0)
     """The noise of a reset."""
     friction: Friction | None = 0.3
@@ -75,9 +81,18 @@ class Config(task.WorldConfig):
 
     @property
     def commands(self) -> dict[str, task.Command]:
-        reach = task.Command(-REACH, REACH, "m", least=-REACH, greatest=REACH, step=0.005)
-        speed = task.Command(-MAX_SPEED, MAX_SPEED, "m/s", -MAX_SPEED, MAX_SPEED, step=0.01)
-        return {"point_x": reach, "point_y": reach, "point_speed": speed}
+        """The point from the paddle's centre along the world's x and y, and its speed."""
+        coordinate = task.Command(-REACH, REACH, "m", least=-REACH, greatest=REACH, step=0.005)
+        speed = task.Command(
+            -MAX_SPEED,
+            MAX_SPEED,
+            "m/s",
+            least=-MAX_SPEED,
+            greatest=MAX_SPEED,
+            step=0.01,
+            hidden=True,
+        )
+        return {"point_x": coordinate, "point_y": coordinate, "point_speed": speed}
 
 
 class Balance(task.Task):
@@ -85,74 +100,112 @@ class Balance(task.Task):
     on a circle with `point_speed`, anticlockwise if it is positive; 0 keeps it where it is."""
 
     Config = Config
+    config: Config
     curves = (task.Curve("task/error", "error", title="ball to point, cm", scale=100.0),)
     num_draws = 4
 
+    # The start.
+
     def throw(self, draws: jax.Array, command: task.Values) -> tuple[jax.Array, jax.Array]:
+        """The ball lies still within half the reach of `ball_init_pos`, higher where a larger ball
+        would be within the paddle."""
         x, y, z = self.config.ball_init_pos
-        east, north = REACH * (draws[:2] - 0.5)
-        return jnp.stack([x + east, y + north, jnp.full_like(x, z)]), jnp.zeros(3)
+        rest = self.geometry.paddle_home[2] + self.geometry.rest_height
+        if z < rest:
+            z = rest + LIFT
+        offset_x, offset_y = REACH * (draws[:2] - 0.5)
+        position = jnp.stack([x + offset_x, y + offset_y, jnp.full_like(x, z)])
+        return position, jnp.zeros(3)
 
     def reset(self, start: task.Start) -> jax.Array:
+        """The centre [2] of the point's circle, from the paddle's centre, m."""
         return 0.7 * REACH * (2.0 * start.draws[2:] - 1.0)
 
-    def step(self, centre: jax.Array, step: task.Step) -> task.TaskStep:
-        truth = step.truth
-        offset = truth.ball_position - truth.paddle_position
-        values = {
-            "point": task.length(offset[:2] - _point(step.command)),
-            "home": task.length(truth.paddle_position - jnp.array(self.focus())),
-            "action_rate": jnp.mean(jnp.square(step.action - step.last_action)),
-        }
-        return task.TaskStep(
-            state=centre,
-            reward=task.weighted_terms(self.config.reward, **values),
-            ended=(offset[2] < -LOST_DEPTH) | (task.length(offset) > LOST_DISTANCE),
-            metrics={"error": values["point"]},
-        )
+    # The point.
 
     def next_command(self, centre: jax.Array, command: task.Values) -> task.Values:
         """The point turns about its sampled centre, from where it is or a user has set it, and
         stays within reach."""
         arm = _point(command) - centre
-        turn = command["point_speed"] * self.config.control_dt
-        turn = turn / jnp.maximum(task.length(arm), MIN_RADIUS)
+        way = command["point_speed"] * self.config.control_dt
+        angle = way / jnp.maximum(task.length(arm), MIN_RADIUS)
         sideways = jnp.stack([-arm[1], arm[0]])
-        point = centre + jnp.cos(turn) * arm + jnp.sin(turn) * sideways
+        point = centre + jnp.cos(angle) * arm + jnp.sin(angle) * sideways
         x, y = point * REACH / jnp.maximum(task.length(point), REACH)
         return command | {"point_x": x, "point_y": y}
 
+    # A control step: reward, end, metrics.
+
+    def step(self, centre: jax.Array, step: task.Step) -> task.TaskStep:
+        truth = step.truth
+        offset = truth.ball_position - truth.paddle_position
+        point_error = task.length(offset[:2] - _point(step.command))
+        home = jnp.array(self.geometry.paddle_home)
+        is_low = offset[2] < -LOST_DEPTH
+        is_far = task.length(offset) > LOST_DISTANCE
+        return task.TaskStep(
+            state=centre,
+            reward=task.weighted_terms(
+                self.config.reward,
+                point=point_error,
+                home=task.length(truth.paddle_position - home),
+                action_rate=jnp.mean(jnp.square(step.action - step.last_action)),
+            ),
+            ended=is_low | is_far,
+            metrics={"error": point_error},
+        )
+
+    # The results.
+
     def tally(self, moment: task.Moment) -> task.Tally:
-        judged = moment.seconds > SETTLING_SECONDS + 0.5 * self.config.control_dt
-        return task.Tally({"steps": judged, "squares": judged * moment.metrics["error"] ** 2})
+        is_judged = moment.seconds > SETTLING_SECONDS + 0.5 * self.config.control_dt
+        return task.Tally(
+            sums={
+                "steps": is_judged,
+                "squares": is_judged * moment.metrics["error"] ** 2,
+            }
+        )
 
     def results(self, episodes: task.Episodes) -> tuple[task.Result, ...]:
         """Stable episodes, and the error; whether the pushes are on decides on its bound."""
-        pushes = (self.config.randomization.push_speed or (0.0, 0.0))[1] > 0.0
-        squares, steps = episodes.sums["squares"], episodes.sums["steps"]
-        measured = "RMS distance of ball and point, cm"
+        _, greatest_push = self.config.randomization.push_speed or (0.0, 0.0)
+        max_error = MAX_PUSHED_ERROR if greatest_push > 0.0 else MAX_ERROR
         return (
             task.share_of_episodes("stable", "episodes that last", episodes.lasted, MIN_STABLE),
             task.root_mean_square(
-                "error", measured, 1e4 * squares, steps, 100.0 * MAX_ERROR[pushes]
+                "error",
+                "RMS distance of ball and point, cm",
+                1e4 * episodes.sums["squares"],
+                episodes.sums["steps"],
+                100.0 * max_error,
             ),
         )
+
+    # What is shown.
 
     def markers(self, command: Any, metrics: Any) -> tuple[task.Marker, ...]:
         """A frame around the ball at the point."""
         x, y, z = self.focus()
-        place = (x + command["point_x"], y + command["point_y"], z + 0.004)
-        size, green = (0.021, 0.021, 0.001), (0.15, 0.9, 0.3, 0.9)
-        return (task.Marker("point", place, size, green, "frame"),)
+        radius = self.geometry.ball_radius
+        face = z + self.geometry.rest_height - radius
+        return (
+            task.Marker(
+                "point",
+                position=(x + command["point_x"], y + command["point_y"], face + 0.0005),
+                size=(radius + 0.002, radius + 0.002, 0.001),
+                rgba=(0.15, 0.9, 0.3, 0.9),
+                shape="frame",
+            ),
+        )
 
     def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
         return {"from the point": f"{1000.0 * metrics['error']:.0f} mm"}
 
     def focus(self) -> tuple[float, float, float]:
         """Where the paddle is held at a reset."""
-        x, y, z = self.config.ball_init_pos
-        return x, y, z - START_HEIGHT
+        return self.geometry.paddle_home
 
 
 def _point(command: task.Values) -> jax.Array:
+    """The point from the paddle's centre [2], m."""
     return jnp.stack([command["point_x"], command["point_y"]])

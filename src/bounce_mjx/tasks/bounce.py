@@ -27,6 +27,7 @@ MAX_APEX_ERROR = 0.1
 """Largest distance of an accurate apex from the target height, m."""
 
 MIN_CONSECUTIVE_BOUNCES = 3
+"""Least number of bounces in a row, once in an episode."""
 
 MIN_EPISODE_SHARE = 0.99
 """Minimum share of episodes with enough consecutive bounces, and of stable episodes."""
@@ -92,15 +93,13 @@ class BounceConfig(task.WorldConfig):
     @pydantic.model_validator(mode="after")
     def _check_start(self):
         x, y, z = self.ball_init_pos
-        limits = (
-            ("min_ball_height", z > self.min_ball_height),
-            ("max_horizontal_distance", max(abs(x), abs(y)) < self.max_horizontal_distance),
-            (
-                "max_height_above_target",
-                z < self.target_height_range[0] + self.max_height_above_target,
-            ),
-        )
-        for name, holds in limits:
+        lowest_target = self.target_height_range[0]
+        is_within = {
+            "min_ball_height": z > self.min_ball_height,
+            "max_horizontal_distance": max(abs(x), abs(y)) < self.max_horizontal_distance,
+            "max_height_above_target": z < lowest_target + self.max_height_above_target,
+        }
+        for name, holds in is_within.items():
             if not holds:
                 raise ValueError(
                     f"{name} is {getattr(self, name):g} m, so an episode ends where it starts, at "
@@ -113,11 +112,16 @@ class BounceConfig(task.WorldConfig):
         """The heights follow the paddle; the reach stays what it is beyond the paddle's home."""
         default = cls()
         x, y, z = paddle
-        reward, lift = default.reward, z - default.reward.paddle_home_height
+        reward = default.reward
+        lift = z - reward.paddle_home_height
+        lowest_target, highest_target = default.target_height_range
         beyond = default.max_horizontal_distance - reward.target_x
         base_height = reward.height_progress.base_height + lift
         return super().settings_at(paddle) | {
-            "target_height_range": [round(h + lift, 4) for h in default.target_height_range],
+            "target_height_range": [
+                round(lowest_target + lift, 4),
+                round(highest_target + lift, 4),
+            ],
             "min_ball_height": round(default.min_ball_height + lift, 4),
             "max_horizontal_distance": round(max(abs(x), abs(y)) + beyond, 4),
             "reward": {
@@ -137,16 +141,15 @@ class BounceConfig(task.WorldConfig):
         """Where an episode ends, and twice the speed of a fall from its greatest height."""
         top = self.target_height_range[1] + self.max_height_above_target
         aside = self.max_horizontal_distance
-        return math.hypot(aside, aside, top), 2.0 * math.sqrt(2.0 * 9.81 * top)
+        farthest = math.hypot(aside, aside, top)
+        fall_speed = math.sqrt(2.0 * task.GRAVITY * top)
+        return farthest, 2.0 * fall_speed
 
     @property
     def commands(self) -> dict[str, task.Command]:
         """The target height."""
-        return {
-            "target_height": task.Command(
-                *self.target_height_range, "m", least=1e-3, span=(0.3, 0.8)
-            )
-        }
+        lowest, highest = self.target_height_range
+        return {"target_height": task.Command(lowest, highest, "m", least=1e-3, span=(0.3, 0.8))}
 
 
 class BounceState(NamedTuple):
@@ -187,17 +190,25 @@ class Bounce(task.Task):
     )
     critic_metrics = ("n_bounces",)
 
+    # The start, and a control step: bounce, reward, ends, metrics.
+
     def reset(self, start: task.Start) -> BounceState:
         """No bounce yet; the first apex is the height at which the ball starts."""
         height = start.truth.ball_position[2]
-        return BounceState(jnp.zeros((), bool), jnp.zeros_like(height), apex=height)
+        return BounceState(
+            rising=jnp.zeros((), bool),
+            n_bounces=jnp.zeros_like(height),
+            apex=height,
+        )
 
     def step(self, state: BounceState, step: task.Step) -> task.TaskStep:
         """A bounce or none, the specification's reward, and whether the ball fell, flew too high or
         too far."""
-        target, truth, config = step.command["target_height"], step.truth, self.config
+        config = self.config
+        truth = step.truth
+        ball = truth.ball_position
+        target = step.command["target_height"]
         after, bounced = self.detect(state, step)
-        ball, apex_offset = truth.ball_position, state.apex - target
         inputs = RewardInputs(
             ball_position=ball,
             ball_velocity=truth.ball_velocity,
@@ -210,6 +221,7 @@ class Bounce(task.Task):
             joint_velocity=truth.joint_velocities,
             home=config.reward,
         )
+        apex_offset = state.apex - target
         fell = ball[2] < config.min_ball_height
         too_high = ball[2] > target + config.max_height_above_target
         too_far = jnp.any(jnp.abs(ball[:2]) > config.max_horizontal_distance)
@@ -236,7 +248,9 @@ class Bounce(task.Task):
         Returns:
           The new state, and whether this step is a bounce [] (bool).
         """
-        config, truth, height = self.config, step.truth, step.truth.ball_position[2]
+        config = self.config
+        truth = step.truth
+        height = truth.ball_position[2]
         rising = truth.ball_velocity[2] > config.bounce_min_velocity
         near = jnp.abs(height - truth.paddle_position[2]) < config.bounce_max_distance
         bounced = rising & ~state.rising & near
@@ -249,15 +263,21 @@ class Bounce(task.Task):
         )
         return after, bounced
 
+    # The observation: the last bounces, from the measurements.
+
     def first_quantities(self, measured: task.Values) -> tuple[MeasuredFlight, task.Values]:
         """Before the first bounce, its quantities are those of the start."""
         ball = measured["ball_position"]
-        zero = jnp.zeros_like(ball[2])
-        flight = MeasuredFlight(ball[2], jnp.zeros((), bool), lowest=ball[2], time=zero)
-        return flight, _at_bounce(measured, ball) | {
-            "apex_error": zero[None],
-            "bounce_interval": zero[None],
-        }
+        height = ball[2]
+        zero = jnp.zeros_like(height)
+        flight = MeasuredFlight(
+            apex=height,
+            is_low=jnp.zeros((), bool),
+            lowest=height,
+            time=zero,
+        )
+        of_no_flight = {"apex_error": zero[None], "bounce_interval": zero[None]}
+        return flight, _at_bounce(measured, ball) | of_no_flight
 
     def next_quantities(
         self, memory: MeasuredFlight, histories: task.Values, measured: task.Values
@@ -275,21 +295,30 @@ class Bounce(task.Task):
             lowest=jnp.where(at_lowest, height, memory.lowest),
             time=jnp.where(starts, 0.0, time),
         )
-        at_start = {
+        of_last_flight = {
             "apex_error": memory.apex - measured["target_height"],
             "bounce_interval": time[None],
         }
-        new = at_start | _at_bounce(measured, measured["ball_picture"])
-        return flight, {
-            name: task.latest(x, new[name], starts, starts if name in at_start else at_lowest)
-            for name, x in histories.items()
-        }
+        of_bounce = _at_bounce(measured, measured["ball_picture"])
+        new_histories = {}
+        for name, history in histories.items():
+            if name in of_last_flight:
+                newest = of_last_flight[name]
+                changes = starts
+            else:
+                newest = of_bounce[name]
+                changes = at_lowest
+            new_histories[name] = task.latest(history, newest, is_new=starts, changes=changes)
+        return flight, new_histories
+
+    # The results.
 
     def tally(self, moment: task.Moment) -> task.Tally:
         """Bounces, centred steps, apexes and the speed of the rising ball."""
         metrics = moment.metrics
         bounced = metrics["bounced"] > 0
-        x, vz = moment.truth.ball_position[0], moment.truth.ball_velocity[2]
+        x = moment.truth.ball_position[0]
+        vz = moment.truth.ball_velocity[2]
         settling = SETTLING_SECONDS + 0.5 * self.config.control_dt
         settled = moment.seconds > settling
         judged = bounced & (moment.command_seconds > settling)
@@ -313,31 +342,55 @@ class Bounce(task.Task):
 
     def results(self, episodes: task.Episodes) -> tuple[task.Result, ...]:
         """The five results of the specification."""
-        sums, heights = episodes.sums, episodes.commands["target_height"]
-        # Rounded, as a config has the heights of another arm with four digits.
-        rise = self.config.reward.paddle_home_height - HOME_HEIGHT
-        lowest, highest = (round(height + rise, 4) for height in UPWARD_SPEED_TARGETS)
-        is_judged = lowest <= heights[0] and heights[1] <= highest
-        condition = "" if is_judged else f"targets {lowest} to {highest} only"
+        sums = episodes.sums
         in_row = episodes.maxima["n_bounces"] >= MIN_CONSECUTIVE_BOUNCES
-        texts = {
-            "consecutive bounces": f"episodes with at least {MIN_CONSECUTIVE_BOUNCES} in a row",
-            "horizontal position": f"steps with |x error| <= {MAX_X_ERROR} m",
-            "height": f"bounces with |apex error| <= {MAX_APEX_ERROR} m",
-            "upward speed": "mean velocity of the rising ball, m/s",
-            "stable": f"episodes that last the full {self.config.episode_seconds:g} s",
-        }
-        row, place, height, speed, stable = texts.items()
-        centred, settled = sums["centred_steps"], sums["settled_steps"]
-        accurate, bounces = sums["accurate_bounces"], sums["settled_bounces"]
-        rising = sums["rising_speed"], sums["rising_steps"]
         return (
-            task.share_of_episodes(*row, in_row, MIN_EPISODE_SHARE),
-            task.share_of_events(*place, centred, settled, MIN_STEP_SHARE),
-            task.share_of_events(*height, accurate, bounces, MIN_STEP_SHARE),
-            task.mean_of_events(*speed, *rising, UPWARD_SPEED_RANGE, condition),
-            task.share_of_episodes(*stable, episodes.lasted, MIN_EPISODE_SHARE),
+            task.share_of_episodes(
+                "consecutive bounces",
+                f"episodes with at least {MIN_CONSECUTIVE_BOUNCES} in a row",
+                in_row,
+                MIN_EPISODE_SHARE,
+            ),
+            task.share_of_events(
+                "horizontal position",
+                f"steps with |x error| <= {MAX_X_ERROR} m",
+                sums["centred_steps"],
+                sums["settled_steps"],
+                MIN_STEP_SHARE,
+            ),
+            task.share_of_events(
+                "height",
+                f"bounces with |apex error| <= {MAX_APEX_ERROR} m",
+                sums["accurate_bounces"],
+                sums["settled_bounces"],
+                MIN_STEP_SHARE,
+            ),
+            task.mean_of_events(
+                "upward speed",
+                "mean velocity of the rising ball, m/s",
+                sums["rising_speed"],
+                sums["rising_steps"],
+                UPWARD_SPEED_RANGE,
+                self._upward_speed_condition(episodes),
+            ),
+            task.share_of_episodes(
+                "stable",
+                f"episodes that last the full {self.config.episode_seconds:g} s",
+                episodes.lasted,
+                MIN_EPISODE_SHARE,
+            ),
         )
+
+    def _upward_speed_condition(self, episodes: task.Episodes) -> str:
+        """The condition of the upward speed's bounds, in words, if the episodes do not meet it."""
+        # Rounded, as a config has the heights of another arm with four digits.
+        lift = self.config.reward.paddle_home_height - HOME_HEIGHT
+        lowest = round(UPWARD_SPEED_TARGETS[0] + lift, 4)
+        highest = round(UPWARD_SPEED_TARGETS[1] + lift, 4)
+        lowest_target, highest_target = episodes.commands["target_height"]
+        if lowest <= lowest_target and highest_target <= highest:
+            return ""
+        return f"targets {lowest} to {highest} only"
 
     def details(self, episodes: task.Episodes) -> dict[str, task.Figure]:
         """The mean bounce count and apex error."""
@@ -348,24 +401,39 @@ class Bounce(task.Task):
             "mean_apex_error_m": error,
         }
 
+    # What is shown.
+
     def plots(self, recording: task.Recording) -> tuple[task.Histogram | task.Hits, ...]:
         """Apex errors, and where the ball hits the paddle."""
         bounces = (recording.metrics["bounced"] > 0) & recording.running
         bounces[: round(SETTLING_SECONDS / self.config.control_dt)] = False
         errors = 100.0 * recording.metrics["apex_offset"][bounces]
-        title = "apex minus target height, cm"
         return (
-            task.Histogram(title, "bounces", errors, 100.0 * MAX_APEX_ERROR),
+            task.Histogram(
+                "apex minus target height, cm", "bounces", errors, bound=100.0 * MAX_APEX_ERROR
+            ),
             task.Hits("hits on the paddle, cm", bounces),
         )
 
     def markers(self, command: dict[str, float], metrics: Any) -> tuple[task.Marker, ...]:
         """A disc at the target height, and the outline of the paddle's home."""
-        target = (*self.focus()[:2], command["target_height"])
-        green, blue = (0.15, 0.9, 0.3, 0.4), (0.15, 0.45, 1.0, 0.9)
+        home = self.focus()
+        x, y, _ = home
         return (
-            task.Marker("target_height", target, (0.05, 0.001, 0.0), green, "cylinder"),
-            task.Marker("paddle_home", self.focus(), (0.05, 0.065, 0.001), blue, "frame"),
+            task.Marker(
+                "target_height",
+                position=(x, y, command["target_height"]),
+                size=(0.05, 0.001, 0.0),
+                rgba=(0.15, 0.9, 0.3, 0.4),
+                shape="cylinder",
+            ),
+            task.Marker(
+                "paddle_home",
+                position=home,
+                size=(0.05, 0.065, 0.001),
+                rgba=(0.15, 0.45, 1.0, 0.9),
+                shape="frame",
+            ),
         )
 
     def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:

@@ -1,5 +1,10 @@
 """The reward terms of bouncing, as in the original specification, in the same order and with the
-same symbols."""
+same symbols.
+
+Each term is a class: its weight, its constants, and the formula `value`. In the formulas,
+G(x, s) = exp(-x^2 / (2 s^2)), S is the logistic sigmoid, g is gravity, and the other symbols are
+properties of `RewardInputs`: err_xy, d_vert, delta_h and err_home in m, vz in m/s.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +12,7 @@ import dataclasses
 import functools
 from typing import Annotated
 
+import pydantic
 from pydantic import Field
 
 from bounce_mjx.config import settings
@@ -79,6 +85,7 @@ class PositionReward(RewardTerm):
     """Factor by which the Gaussian is wider at the paddle."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
+        """G(err_xy, base_scale (1 + proximity_gain exp(-d_vert / vertical_scale)))."""
         w_vert = jnp.exp(-inputs.d_vert / self.vertical_scale)
         return gaussian(inputs.err_xy, self.base_scale * (1.0 + self.proximity_gain * w_vert))
 
@@ -94,6 +101,7 @@ class OutOfPositionReward(RewardTerm):
     """Width of the sigmoid, m."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
+        """-magnitude S((err_xy - threshold) / scale)."""
         return -self.magnitude * jax.nn.sigmoid((inputs.err_xy - self.threshold) / self.scale)
 
 
@@ -116,8 +124,18 @@ class VelocityMatchingReward(RewardTerm):
     """Width of the Gaussian of the velocity error, m/s."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
-        """The velocity of a case is 0 where the condition of that case does not hold."""
-        vz, delta_h = inputs.vz, inputs.delta_h
+        """G(v_target - desired_velocity, error_scale) for the velocity at the target height, m/s:
+
+        v_target = v_up S_up S_below + v_down (1 - S_up) (1 - S_below)
+                   + v_near G(delta_h, near_scale)
+
+        with S_up = S(vz / rising_scale) and S_below = S(delta_h / below_scale). By the conservation
+        of energy v_up = sqrt(vz^2 - 2 g delta_h) rising below the target, and
+        v_down = -sqrt(vz^2 + 2 g |delta_h|) falling above it; v_near = vz near it. Each is 0 where
+        its condition does not hold.
+        """
+        vz = inputs.vz
+        delta_h = inputs.delta_h
         rising_below = (vz > 0.0) & (delta_h > 0.0)
         squared_up = jnp.square(vz) - 2.0 * inputs.home.gravity * delta_h
         v_up = jnp.where(rising_below, safe_sqrt(squared_up), 0.0)
@@ -129,10 +147,8 @@ class VelocityMatchingReward(RewardTerm):
         s_up = jax.nn.sigmoid(vz / self.rising_scale)
         s_below = jax.nn.sigmoid(delta_h / self.below_scale)
         w_near = gaussian(delta_h, self.near_scale)
-        v_at_target = (
-            v_up * s_up * s_below + v_down * (1.0 - s_up) * (1.0 - s_below) + v_near * w_near
-        )
-        return gaussian(v_at_target - self.desired_velocity, self.error_scale)
+        v_target = v_up * s_up * s_below + v_down * (1.0 - s_up) * (1.0 - s_below) + v_near * w_near
+        return gaussian(v_target - self.desired_velocity, self.error_scale)
 
 
 class HeightReward(RewardTerm):
@@ -144,6 +160,7 @@ class HeightReward(RewardTerm):
     """Width of the Gaussian of the height error, m."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
+        """G(delta_h, scale)."""
         return gaussian(inputs.delta_h, self.scale)
 
 
@@ -156,6 +173,7 @@ class HeightProgressReward(RewardTerm):
     """Reward for each metre above the base height, 1/m."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
+        """gain max(0, z - base_height) for the ball's height z."""
         return jnp.maximum(0.0, inputs.ball_position[2] - self.base_height) * self.gain
 
 
@@ -177,7 +195,18 @@ class ControlledUpwardReward(RewardTerm):
     velocity_limit: settings.Speed = 1.5
     """Upward velocity above which the term no longer grows, m/s."""
 
+    @pydantic.model_validator(mode="after")
+    def _check_order(self):
+        if self.min_ideal_velocity > self.max_ideal_velocity:
+            raise ValueError(
+                f"max_ideal_velocity {self.max_ideal_velocity:g} is below min_ideal_velocity "
+                f"{self.min_ideal_velocity:g}; give the greater one as max_ideal_velocity"
+            )
+        return self
+
     def value(self, inputs: RewardInputs) -> jax.Array:
+        """G(err_xy, position_scale) G(vz - v_ideal, velocity_scale) S(vz / rising_scale)
+        clip(vz, 0, velocity_limit), with v_ideal = sqrt(2 g max(0, delta_h)) within its limits."""
         v_ideal = safe_sqrt(2.0 * inputs.home.gravity * inputs.delta_h)
         v_ideal = jnp.clip(v_ideal, self.min_ideal_velocity, self.max_ideal_velocity)
         q_pos = gaussian(inputs.err_xy, self.position_scale)
@@ -197,7 +226,8 @@ class ConsecutiveBouncesReward(RewardTerm):
     """Width of the Gaussian of the horizontal error, m."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
-        """The specification's indicator n > 0 is implied, as the logarithm is 0 at n = 0."""
+        """gain log(1 + n) G(err_xy, position_scale) for the bounce count n. The specification's
+        indicator n > 0 is implied, as the logarithm is 0 at n = 0."""
         return (
             self.gain * jnp.log1p(inputs.n_bounces) * gaussian(inputs.err_xy, self.position_scale)
         )
@@ -218,6 +248,7 @@ class HighBounceCountReward(RewardTerm):
     """Width of the sigmoid, bounces."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
+        """gain n G(err_xy, position_scale) S((n - threshold) / scale) for the bounce count n."""
         s_high = jax.nn.sigmoid((inputs.n_bounces - self.threshold) / self.scale)
         return inputs.n_bounces * self.gain * gaussian(inputs.err_xy, self.position_scale) * s_high
 
@@ -239,6 +270,9 @@ class AlignmentReward(RewardTerm):
     """Overall factor."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
+        """gain b G(err_align, scale) (1 + proximity_gain exp(-d_vert / vertical_scale)) for the
+        horizontal distance err_align of ball and paddle (m); b is bounce_boost on the step of a
+        bounce, else 1."""
         err_align = horizontal_distance(inputs.ball_position, inputs.paddle_position)
         w_prox = jnp.exp(-inputs.d_vert / self.vertical_scale)
         q_align = gaussian(err_align, self.scale) * (1.0 + self.proximity_gain * w_prox)
@@ -260,6 +294,8 @@ class PaddleHomeReward(RewardTerm):
     """Width of the sigmoid, m."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
+        """G(err_home, scale) (1 + distance_gain S((d_vert - distance_threshold) / distance_scale)),
+        in m."""
         far = jax.nn.sigmoid((inputs.d_vert - self.distance_threshold) / self.distance_scale)
         return gaussian(inputs.err_home, self.scale) * (1.0 + self.distance_gain * far)
 
@@ -275,6 +311,7 @@ class ExcessiveUpwardReward(RewardTerm):
     """Width of the sigmoid, m/s."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
+        """-magnitude S((vz - threshold) / scale)."""
         return -self.magnitude * jax.nn.sigmoid((inputs.vz - self.threshold) / self.scale)
 
 
@@ -294,6 +331,7 @@ class DownwardVelocityReward(RewardTerm):
     """Width of the sigmoid, m/s."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
+        """-vz clip(-gain vz, 0, limit) S(-(vz + threshold) / scale)."""
         magnitude = -inputs.vz * jnp.clip(-inputs.vz * self.gain, 0.0, self.limit)
         return magnitude * jax.nn.sigmoid(-(inputs.vz + self.threshold) / self.scale)
 
@@ -307,6 +345,7 @@ class PaddleHeightViolationReward(RewardTerm):
     """Height error of the paddle that costs nothing, m."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
+        """-gain max(0, err_home - tolerance)."""
         return -self.gain * jnp.maximum(0.0, inputs.err_home - self.tolerance)
 
 
@@ -317,6 +356,7 @@ class ActionRateReward(RewardTerm):
     """Weight of the term."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
+        """-sum((action - last action)^2)."""
         return -jnp.sum(jnp.square(inputs.action - inputs.last_action))
 
 
@@ -327,6 +367,7 @@ class JointVelocityReward(RewardTerm):
     """Weight of the term."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
+        """-sum(joint velocity^2), (rad/s)^2."""
         return -jnp.sum(jnp.square(inputs.joint_velocity))
 
 

@@ -11,8 +11,10 @@ from bounce_mjx import task
 from bounce_mjx.config.settings import Coordinate, Duration, Friction
 from bounce_mjx.lazy import jax, jnp
 
-SPEEDS, FLIGHTS = (1.0, 2.0), (0.6, 0.7)
-"""Ranges of a throw's horizontal speed, m/s, and of the time until the ball is at its aim, s."""
+SPEEDS = (1.0, 2.0)
+"""Range of a throw's horizontal speed, m/s."""
+FLIGHT_SECONDS = (0.6, 0.7)
+"""Range of the time until a thrown ball is at its aim, s."""
 MAX_DISTANCE = 2.0
 """Greatest horizontal distance of a start from the arm's base, m; it limits the fastest throws."""
 MAX_DIRECTION = math.radians(30.0)
@@ -20,13 +22,19 @@ MAX_DIRECTION = math.radians(30.0)
 AIM_RADIUS = 0.05
 """Greatest distance of the aim from the ball's rest on the paddle, m."""
 REST_HEIGHT = 0.0225
-"""Height of a resting ball over the paddle's centre, m."""
-REST_SPEED, REST_SECONDS = 0.05, 0.5
-"""A ball is at rest that touched the paddle and was slower relative to it (m/s) for a time (s)."""
-CATCH_SECONDS, MIN_CAUGHT = 2.0, 0.95
-"""A caught ball is at rest within this time of the first contact, s; least share of caught ones."""
-LOST_DEPTH, FLOOR = 0.05, 0.02
-"""The episode ends when the ball is farther below the paddle, or the paddle nearer the floor, m."""
+"""Height of a resting ball over the paddle's centre, for the project's own ball and paddle, m."""
+REST_SPEED = 0.05
+"""A ball that touches the paddle rests on it if it is slower relative to it, m/s."""
+REST_SECONDS = 0.5
+"""Time for which a ball has to rest to be at rest, s."""
+CATCH_SECONDS = 2.0
+"""A caught ball is at rest within this time of the first contact, s."""
+MIN_CAUGHT = 0.95
+"""Least share of caught balls."""
+LOST_DEPTH = 0.05
+"""The episode ends when the ball is farther below the paddle's centre, m."""
+FLOOR = 0.02
+"""The episode ends when the paddle's centre is nearer the floor, m."""
 
 
 class Rewards(task.StrictModel):
@@ -52,7 +60,8 @@ class Config(task.WorldConfig):
         *task.PADDLE_HOME[:2],
         task.PADDLE_HOME[2] + REST_HEIGHT,
     )
-    """Where the ball would rest on the paddle at a reset, m; throws aim near it."""
+    """Where the ball would rest on the paddle at a reset, m; throws aim near it, or higher where a
+    larger ball rests higher."""
     reset: task.ResetConfig = task.ResetConfig(joint_angles=0.02, ball_position=0.0)
     """The noise of a reset."""
     friction: Friction | None = 0.3
@@ -83,46 +92,73 @@ class Config(task.WorldConfig):
 
 
 class CatchState(NamedTuple):
-    """What the task keeps of an episode: the ball's vertical velocity [] (m/s) and its position
-    from the paddle's centre [3] (m) after the last step, the time since the first contact and the
-    time at rest [], both s, and whether the ball was at rest in time [], bool."""
+    """What the task keeps of an episode."""
 
     fall: jax.Array
+    """Vertical velocity of the ball after the last step [], m/s."""
     offset: jax.Array
+    """From the paddle's centre to the ball after the last step [3], m."""
     contact: jax.Array
+    """Time since the first contact [], s; 0 before it."""
     rest: jax.Array
+    """Time for which the ball has rested on the paddle [], s."""
     caught: jax.Array
+    """Whether the ball was at rest in time [], bool."""
 
 
 class Catch(task.Task):
     """A ball is thrown at the arm, which brings it to rest on the paddle."""
 
     Config = Config
+    config: Config
     curves = (task.Curve("episode/caught", "caught", "episodes", "share of caught balls"),)
     num_draws = 5
 
+    # The start.
+
     def throw(self, draws: jax.Array, command: task.Values) -> tuple[jax.Array, jax.Array]:
         """The throw starts at the height of its aim, so that the ball falls at 2.9 to 3.4 m/s."""
-        home = jnp.array(self.config.ball_init_pos)
-        offset = AIM_RADIUS * jnp.sqrt(draws[0]) * _direction(2.0 * math.pi * draws[1])
-        seconds = FLIGHTS[0] + (FLIGHTS[1] - FLIGHTS[0]) * draws[2]
-        fastest = (MAX_DISTANCE - task.length(home[:2] + offset[:2])) / seconds
-        speed = SPEEDS[0] + (jnp.minimum(SPEEDS[1], fastest) - SPEEDS[0]) * draws[3]
-        outward = jnp.arctan2(home[1], home[0]) + MAX_DIRECTION * (2.0 * draws[4] - 1.0)
-        velocity = -speed * _direction(outward)
-        rising = jnp.array([0.0, 0.0, 0.5 * task.GRAVITY]) * seconds
-        return home + offset - seconds * velocity, velocity + rising
+        x, y, z = self.config.ball_init_pos
+        rest = self.geometry.paddle_home[2] + self.geometry.rest_height
+        home = jnp.array([x, y, max(z, rest)])
+        # The root makes the aims uniform over the disc.
+        aim_offset = AIM_RADIUS * jnp.sqrt(draws[0]) * _direction(2.0 * math.pi * draws[1])
+
+        shortest, longest = FLIGHT_SECONDS
+        seconds = shortest + (longest - shortest) * draws[2]
+
+        slowest, fastest = SPEEDS
+        speed_from_limit = (MAX_DISTANCE - task.length(home[:2] + aim_offset[:2])) / seconds
+        speed = slowest + (jnp.minimum(fastest, speed_from_limit) - slowest) * draws[3]
+
+        away_from_base = jnp.arctan2(home[1], home[0])
+        outward = away_from_base + MAX_DIRECTION * (2.0 * draws[4] - 1.0)
+        horizontal_velocity = -speed * _direction(outward)
+        # Half the flight rises.
+        upward_velocity = jnp.array([0.0, 0.0, 0.5 * task.GRAVITY]) * seconds
+        position = home + aim_offset - seconds * horizontal_velocity
+        return position, horizontal_velocity + upward_velocity
 
     def reset(self, start: task.Start) -> CatchState:
-        zero, truth = jnp.zeros(()), start.truth
-        offset = truth.ball_position - truth.paddle_position
-        return CatchState(truth.ball_velocity[2], offset, zero, zero, zero > 0.0)
+        truth = start.truth
+        zero = jnp.zeros(())
+        return CatchState(
+            fall=truth.ball_velocity[2],
+            offset=truth.ball_position - truth.paddle_position,
+            contact=zero,
+            rest=zero,
+            caught=zero > 0.0,
+        )
+
+    # A control step: contact, rest, reward, end.
 
     def step(self, state: CatchState, step: task.Step) -> task.TaskStep:
-        truth, dt = step.truth, self.config.control_dt
+        truth = step.truth
+        dt = self.config.control_dt
         offset = truth.ball_position - truth.paddle_position
         # The mean of the step, in which the servos' speed rises and falls.
         velocity = (offset - state.offset) / dt
+
         # A ball that touches nothing falls freely.
         touches = truth.ball_velocity[2] - state.fall > -0.5 * task.GRAVITY * dt
         resting = touches & (task.length(velocity) < REST_SPEED)
@@ -130,39 +166,70 @@ class Catch(task.Task):
         rest = jnp.where(resting, state.rest + dt, 0.0)
         in_time = contact < CATCH_SECONDS + 0.5 * dt
         caught = state.caught | (in_time & (rest > REST_SECONDS - 0.5 * dt))
-        drop = 2.0 * task.GRAVITY * jnp.maximum(offset[2] - REST_HEIGHT, 0.0)
-        values = {
-            "centre": task.length(offset[:2]),
-            "fall": task.safe_sqrt(jnp.sum(jnp.square(velocity)) + drop),
-            "rest": resting,
-            "action_rate": jnp.mean(jnp.square(step.action - step.last_action)),
-        }
+
+        is_low = offset[2] < -LOST_DEPTH
+        hits_floor = truth.paddle_position[2] < FLOOR
         return task.TaskStep(
-            state=CatchState(truth.ball_velocity[2], offset, contact, rest, caught),
-            reward=task.weighted_terms(self.config.reward, **values),
-            ended=(offset[2] < -LOST_DEPTH) | (truth.paddle_position[2] < FLOOR),
+            state=CatchState(
+                fall=truth.ball_velocity[2],
+                offset=offset,
+                contact=contact,
+                rest=rest,
+                caught=caught,
+            ),
+            reward=task.weighted_terms(
+                self.config.reward,
+                centre=task.length(offset[:2]),
+                fall=self._impact_speed(offset, velocity),
+                rest=resting,
+                action_rate=jnp.mean(jnp.square(step.action - step.last_action)),
+            ),
+            ended=is_low | hits_floor,
             metrics={"caught": caught},
         )
 
+    def _impact_speed(self, offset: jax.Array, velocity: jax.Array) -> jax.Array:
+        """Speed [] relative to the paddle at which the ball meets it, m/s, by its energy:
+        sqrt(v^2 + 2 g h) for a ball at the height h over its rest on the paddle.
+
+        Args:
+          offset: from the paddle's centre to the ball [3], m.
+          velocity: of the ball relative to the paddle [3], m/s.
+        """
+        height = jnp.maximum(offset[2] - self.geometry.rest_height, 0.0)
+        from_fall = 2.0 * task.GRAVITY * height
+        return task.safe_sqrt(jnp.sum(jnp.square(velocity)) + from_fall)
+
+    # The results.
+
     def tally(self, moment: task.Moment) -> task.Tally:
-        return task.Tally({}, {"caught": moment.metrics["caught"]})
+        return task.Tally(sums={}, maxima={"caught": moment.metrics["caught"]})
 
     def results(self, episodes: task.Episodes) -> tuple[task.Result, ...]:
         measured = f"balls at rest within {CATCH_SECONDS:g} s of the first contact"
         caught = (episodes.maxima["caught"] > 0.0) & (episodes.lasted > 0.0)
         return (task.share_of_episodes("caught", measured, caught, MIN_CAUGHT),)
 
+    # What is shown.
+
     def markers(self, command: Any, metrics: Any) -> tuple[task.Marker, ...]:
         """A disc around the points at which throws aim."""
-        size, green = (AIM_RADIUS, 0.0005, 0.0), (0.15, 0.9, 0.3, 0.4)
-        return (task.Marker("aim", self.focus(), size, green, "cylinder"),)
+        return (
+            task.Marker(
+                "aim",
+                position=self.focus(),
+                size=(AIM_RADIUS, 0.0005, 0.0),
+                rgba=(0.15, 0.9, 0.3, 0.4),
+                shape="cylinder",
+            ),
+        )
 
     def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
         return {"caught": "yes" if metrics["caught"] else "no"}
 
     def focus(self) -> tuple[float, float, float]:
-        x, y, z = self.config.ball_init_pos
-        return x, y, z - REST_HEIGHT
+        """Where the paddle is held at a reset."""
+        return self.geometry.paddle_home
 
 
 def _direction(angle: jax.Array) -> jax.Array:

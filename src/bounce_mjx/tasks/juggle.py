@@ -9,15 +9,27 @@ from pydantic import Field
 from bounce_mjx import task
 from bounce_mjx.config.settings import Ascending, Coordinate, Finite, Length, Positive
 from bounce_mjx.lazy import jax, jnp
+from bounce_mjx.task.rewards import check_names
 
-REST, FLOWN = 0.0225, 0.125
-"""Height of a ball's centre over the paddle's while they touch, m; and the share of its flight that
-the last ball has flown at a reset."""
-SETTLING, MAX_HEIGHT_ERROR = 2.0, 0.1
-"""Time since the height was commanded after which apexes count, s; and how near they are, m."""
-LEAST_HEIGHT = 0.1
-"""Least height of the apexes over home, m: a lower flight has no time."""
-Height = Annotated[Finite, Field(ge=LEAST_HEIGHT, le=10.0)]
+FLOWN = 0.125
+"""Share of its flight that the last ball has flown at a reset."""
+SETTLING_SECONDS = 2.0
+"""Time since the height was commanded after which apexes count, s."""
+MAX_HEIGHT_ERROR = 0.1
+"""Largest distance of an accurate apex from the target height, m."""
+MIN_APEX_HEIGHT = 0.1
+"""Height over home above which a ball that turns has an apex, m; a lower one rolls or dribbles."""
+MIN_TARGET_HEIGHT = 0.1
+"""Least target height over home, m: a lower flight has no time."""
+APEX_FACTORS = (1.0, 1.0, 0.3)
+"""Factors of an apex's error along x, y and z: 0.1 m of height count as 0.03 m."""
+MIN_EPISODE_SHARE = 0.99
+"""Least share of episodes that keep all balls, and of those in which none touch."""
+MIN_TURN_SHARE = 0.99
+"""Least share of hits that alternate."""
+MIN_HEIGHT_SHARE = 0.95
+"""Least share of accurate apexes."""
+Height = Annotated[Finite, Field(ge=MIN_TARGET_HEIGHT, le=10.0)]
 
 
 class Rewards(task.StrictModel):
@@ -57,7 +69,8 @@ class Config(task.WorldConfig):
     height_range: Annotated[tuple[Height, Height], Ascending] = (0.35, 0.55)
     """Range of the target height over home, m."""
     max_distance: Length = 0.7
-    """The episode ends when a ball is this far from the top of its column, m; or when two touch."""
+    """The episode ends when a ball is this far from the top of its column, m; or when it is lower
+    than home, or two touch."""
     action: task.ActionConfig = task.ActionConfig(base="target")
     """What an action adds to."""
     observation: Observation = Observation(ball_quaternion=0, ball_angular_velocity=0)
@@ -76,132 +89,272 @@ class Config(task.WorldConfig):
     @property
     def commands(self) -> dict[str, task.Command]:
         """The height of the apexes."""
-        low, high = (self.home[2] + height for height in self.height_range)
-        return {"target_height": task.Command(low, high, "m", least=self.home[2] + LEAST_HEIGHT)}
+        home_height = self.home[2]
+        lowest, highest = self.height_range
+        return {
+            "target_height": task.Command(
+                home_height + lowest,
+                home_height + highest,
+                "m",
+                least=home_height + MIN_TARGET_HEIGHT,
+            )
+        }
 
     def columns(self, height: Any) -> list[tuple[Any, Any, Any]]:
-        """The commanded apex of each ball, m."""
-        (x, y, _), middle = self.home, 0.5 * (self.num_balls - 1)
-        return [(x, y + self.spacing * (i - middle), height) for i in range(self.num_balls)]
+        """The top of each ball's column: its commanded apex (x, y, z), m.
+
+        Args:
+          height: the commanded height [], m.
+        """
+        x, y, _ = self.home
+        middle = 0.5 * (self.num_balls - 1)
+        return [(x, y + self.spacing * (ball - middle), height) for ball in range(self.num_balls)]
 
 
 class Juggle(task.Task):
     """Balls bounce alternately at the commanded height on one paddle, each in a column."""
 
     Config = Config
+    config: Config
     num_balls = (2, 3)
     curves = (
         task.Curve("task/turns", "in_turn", "hits", "alternating hits, %", 100.0),
         task.Curve("task/height_error", "height_error", "apexes", "|apex − height|, cm", 100.0),
     )
 
-    def _columns(self, height: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The commanded apexes [B, 3] (m) and the time of a whole flight to them [] (s)."""
-        fall = task.safe_sqrt(2.0 * (height - self.config.home[2] - REST) / task.GRAVITY)
-        columns = [jnp.stack([*map(jnp.asarray, top)]) for top in self.config.columns(height)]
-        return jnp.stack(columns), 2.0 * fall
+    # Places and times.
+
+    def _ground(self) -> float:
+        """Height of a ball that touches the paddle at home, m."""
+        return self.config.home[2] + self.geometry.rest_height
+
+    def _columns(self, height: jax.Array) -> jax.Array:
+        """The tops of the columns [B, 3] at the commanded height [], m."""
+        tops = []
+        for x, y, z in self.config.columns(height):
+            tops.append(jnp.stack([jnp.asarray(x), jnp.asarray(y), jnp.asarray(z)]))
+        return jnp.stack(tops)
+
+    def _period(self, height: jax.Array) -> jax.Array:
+        """Time from one hit of a ball to its next one [], s, with an apex at the height [], m:
+        2 sqrt(2 h / g) for an apex h over the ground."""
+        return 2.0 * task.safe_sqrt(2.0 * (height - self._ground()) / task.GRAVITY)
+
+    # The start.
 
     def throw(self, draws: jax.Array, command: task.Values) -> tuple[jax.Array, jax.Array]:
         """The balls are in their columns and land alternately, the first one first."""
-        columns, period = self._columns(command["target_height"])
-        turns = jnp.arange(self.config.num_balls)[::-1, None] / self.config.num_balls
-        rise = (0.5 - FLOWN - turns) * period * jnp.array([0.0, 0.0, 1.0])
-        return columns - 0.5 * task.GRAVITY * jnp.square(rise), task.GRAVITY * rise
+        height = command["target_height"]
+        period = self._period(height)
+        count = self.config.num_balls
+        turns_later = jnp.arange(count)[::-1, None] / count
+        # Time until each ball's apex along z; negative after it.
+        rise = (0.5 - FLOWN - turns_later) * period * jnp.array([0.0, 0.0, 1.0])
+        positions = self._columns(height) - 0.5 * task.GRAVITY * jnp.square(rise)
+        velocities = task.GRAVITY * rise
+        return positions, velocities
 
-    def reset(self, start: task.Start) -> Any:
-        # Whether each ball rises, and the number of the ball that was hit last.
-        return start.truth.ball_velocity[:, 2] > 0.0, jnp.full((), self.config.num_balls - 1.0)
+    def reset(self, start: task.Start) -> tuple[jax.Array, jax.Array]:
+        """Whether each ball rises [B], bool, and the number of the ball that was hit last []: the
+        last one, so that the first one is next."""
+        rising = start.truth.ball_velocity[:, 2] > 0.0
+        last_hit = jnp.full((), self.config.num_balls - 1.0)
+        return rising, last_hit
 
-    def step(self, state: Any, step: task.Step) -> task.TaskStep:
-        (rose, last), reward = state, self.config.reward
-        terms = {name: getattr(reward, name) for name in task.term_names(type(reward))}
-        truth, height, count = step.truth, step.command["target_height"], self.config.num_balls
-        balls, velocities, home = truth.ball_position, truth.ball_velocity, self.config.home
-        flights = task.flight(balls, velocities, home[2] + REST)
-        columns, period = self._columns(height)
-        early = jnp.roll(flights.fall, -1) - flights.fall - period / count
-        errors = {
-            "apex": (flights.top - columns) * jnp.array([1.0, 1.0, 0.3]),
-            "landing": (flights.end - columns)[:, :2],
-            "turn": (jnp.mod(early + 0.5 * period, period) - 0.5 * period)[:, None],
-            "home": (truth.paddle_position - jnp.array(home))[None],
-            "calm": jnp.concatenate([truth.joint_velocities, step.action - step.last_action])[None],
-        }
-        rising, numbers = velocities[:, 2] > 0.0, jnp.arange(count)
-        hits, apexes = rising & ~rose, rose & ~rising & (balls[:, 2] > home[2] + MAX_HEIGHT_ERROR)
+    # A control step: events, reward, end, metrics.
+
+    def step(self, state: tuple[jax.Array, jax.Array], step: task.Step) -> task.TaskStep:
+        rose, last_hit = state
+        truth = step.truth
+        balls = truth.ball_position
+        height = step.command["target_height"]
+        columns = self._columns(height)
+        flights = task.flight(balls, truth.ball_velocity, self._ground())
+
+        rising = truth.ball_velocity[:, 2] > 0.0
+        hits = rising & ~rose
+        is_high = balls[:, 2] > self.config.home[2] + MIN_APEX_HEIGHT
+        apexes = rose & ~rising & is_high
+
+        is_far = jnp.sum(jnp.square(balls - columns), axis=1) > self.config.max_distance**2
+        is_low = balls[:, 2] < self.config.home[2]
+        touched = self._touched(step)
+
+        ball_numbers = jnp.arange(self.config.num_balls)
+        next_in_turn = jnp.mod(last_hit + 1.0, self.config.num_balls)
         height_errors = jnp.abs(balls[:, 2] - height)
-        far = jnp.sum(jnp.square(balls - columns), axis=1) > self.config.max_distance**2
-        closest = task.closest(balls, velocities, self.config.control_dt)
-        touched = closest < 2.0 * self.config.robot.ball.radius
-        landing = _next(flights.end, flights.fall)
+        next_landing = _next(flights.end, flights.fall)
         return task.TaskStep(
-            state=(rising, jnp.where(jnp.any(hits), jnp.max(numbers * hits), last)),
-            reward={n: t.weight * jnp.mean(jax.vmap(t.value)(errors[n])) for n, t in terms.items()},
-            ended=jnp.any(far | (balls[:, 2] < home[2])) | touched,
+            state=(
+                rising,
+                jnp.where(jnp.any(hits), jnp.max(ball_numbers * hits), last_hit),
+            ),
+            reward=self._weighted_terms(
+                {
+                    "apex": self._apex_errors(flights, columns),
+                    "landing": self._landing_errors(flights, columns),
+                    "turn": self._turn_errors(flights, self._period(height)),
+                    "home": self._home_error(step),
+                    "calm": self._calm_error(step),
+                }
+            ),
+            ended=jnp.any(is_far | is_low) | touched,
             metrics={
                 "hits": jnp.sum(hits),
-                "in_turn": jnp.sum(hits & (numbers == jnp.mod(last + 1.0, count))),
+                "in_turn": jnp.sum(hits & (ball_numbers == next_in_turn)),
                 "apexes": jnp.sum(apexes),
                 "high": jnp.sum(apexes & (height_errors <= MAX_HEIGHT_ERROR)),
                 "height_error": jnp.sum(apexes * height_errors),
                 "touched": touched,
-                "landing_x": landing[0],
-                "landing_y": landing[1],
+                "landing_x": next_landing[0],
+                "landing_y": next_landing[1],
             },
         )
 
-    def first_quantities(self, measured: task.Values) -> tuple[Any, task.Values]:
-        height, velocities = measured["target_height"][0], measured["ball_velocity"]
-        ground, (columns, _) = self.config.home[2] + REST, self._columns(height)
-        top, end, _, fall = task.flight(measured["ball_position"], velocities, ground)
-        parts = (
-            (end - measured["paddle_position"])[:, :2],
-            (end - columns)[:, :2],
-            velocities[:, :2],
-            jnp.stack([top[:, 2] - height, fall, jnp.mean(fall) - fall], axis=1),
+    def _touched(self, step: task.Step) -> jax.Array:
+        """Whether two balls touched during the step [], bool."""
+        radius = self.geometry.ball_radius if step.ball_radius is None else step.ball_radius
+        distance = task.closest(
+            step.truth.ball_position, step.truth.ball_velocity, self.config.control_dt
         )
-        return (), {"next_ball": _next(jnp.concatenate(parts, axis=1), fall)}
+        return distance < 2.0 * radius
+
+    # The reward: the error of each term, a row for each ball or one for all.
+
+    def _apex_errors(self, flights: task.Flight, columns: jax.Array) -> jax.Array:
+        """From the tops of the columns to the flights' apexes [B, 3], m; 0.1 m of height count as
+        0.03 m."""
+        return (flights.top - columns) * jnp.array(APEX_FACTORS)
+
+    def _landing_errors(self, flights: task.Flight, columns: jax.Array) -> jax.Array:
+        """From the columns to the flights' ends [B, 2], m."""
+        return (flights.end - columns)[:, :2]
+
+    def _turn_errors(self, flights: task.Flight, period: jax.Array) -> jax.Array:
+        """From a turn, `period` / B, to the time between the landings of two balls [B, 1], s; whole
+        periods do not count."""
+        between = jnp.roll(flights.fall, -1) - flights.fall
+        late = between - period / self.config.num_balls
+        nearest = jnp.mod(late + 0.5 * period, period) - 0.5 * period
+        return nearest[:, None]
+
+    def _home_error(self, step: task.Step) -> jax.Array:
+        """From home to the paddle [1, 3], m."""
+        error = step.truth.paddle_position - jnp.array(self.config.home)
+        return error[None]
+
+    def _calm_error(self, step: task.Step) -> jax.Array:
+        """The joint velocities, and the change of the action, as one vector [1, 2 n]."""
+        action_change = step.action - step.last_action
+        return jnp.concatenate([step.truth.joint_velocities, action_change])[None]
+
+    def _weighted_terms(self, errors: task.Values) -> task.Values:
+        """Each term [] times its weight: the mean over the rows [B or 1, ...] of its errors.
+
+        Raises:
+          UserError: the config's reward has other terms.
+        """
+        reward = self.config.reward
+        names = task.term_names(type(reward))
+        check_names("the step of juggle", "term of the reward", errors, names)
+        weighted = {}
+        for name in names:
+            term = getattr(reward, name)
+            weighted[name] = term.weight * jnp.mean(jax.vmap(term.value)(errors[name]))
+        return weighted
+
+    # The observation: the next ball, from the measurements.
+
+    def first_quantities(self, measured: task.Values) -> tuple[Any, task.Values]:
+        height = measured["target_height"][0]
+        velocities = measured["ball_velocity"]
+        flights = task.flight(measured["ball_position"], velocities, self._ground())
+        quantities = [
+            (flights.end - measured["paddle_position"])[:, :2],
+            (flights.end - self._columns(height))[:, :2],
+            velocities[:, :2],
+            (flights.top[:, 2] - height)[:, None],
+            flights.fall[:, None],
+            (jnp.mean(flights.fall) - flights.fall)[:, None],
+        ]
+        next_ball = _next(jnp.concatenate(quantities, axis=1), flights.fall)
+        return (), {"next_ball": next_ball}
 
     def next_quantities(
-        self, memory: Any, histories: Any, measured: Any
+        self, memory: Any, histories: task.Values, measured: task.Values
     ) -> tuple[Any, task.Values]:
-        newest = self.first_quantities(measured)[1]
-        return (), {name: task.latest(h, newest[name]) for name, h in histories.items()}
+        _, newest = self.first_quantities(measured)
+        return (), {name: task.latest(old, newest[name]) for name, old in histories.items()}
+
+    # The results.
 
     def tally(self, moment: task.Moment) -> task.Tally:
-        metrics, settled = moment.metrics, moment.command_seconds > SETTLING
-        counts = {"hits": 1.0, "in_turn": 1.0, "apexes": settled, "high": settled}
-        sums = {name: counted * metrics[name] for name, counted in counts.items()}
-        return task.Tally(sums, {"touched": metrics["touched"]})
+        metrics = moment.metrics
+        settled = moment.command_seconds > SETTLING_SECONDS
+        return task.Tally(
+            sums={
+                "hits": 1.0 * metrics["hits"],
+                "in_turn": 1.0 * metrics["in_turn"],
+                "apexes": settled * metrics["apexes"],
+                "high": settled * metrics["high"],
+            },
+            maxima={"touched": metrics["touched"]},
+        )
 
     def results(self, episodes: task.Episodes) -> tuple[task.Result, ...]:
-        sums, apart = episodes.sums, episodes.maxima["touched"] == 0.0
+        sums = episodes.sums
+        apart = episodes.maxima["touched"] == 0.0
         return (
-            task.share_of_episodes("kept", "episodes that keep all balls", episodes.lasted, 0.99),
-            task.share_of_events("turns", "alternating hits", sums["in_turn"], sums["hits"], 0.99),
-            task.share_of_episodes("apart", "episodes without touching balls", apart, 0.99),
+            task.share_of_episodes(
+                "kept", "episodes that keep all balls", episodes.lasted, MIN_EPISODE_SHARE
+            ),
             task.share_of_events(
-                "height", "apexes within 0.1 m", sums["high"], sums["apexes"], 0.95
+                "turns", "alternating hits", sums["in_turn"], sums["hits"], MIN_TURN_SHARE
+            ),
+            task.share_of_episodes(
+                "apart", "episodes without touching balls", apart, MIN_EPISODE_SHARE
+            ),
+            task.share_of_events(
+                "height", "apexes within 0.1 m", sums["high"], sums["apexes"], MIN_HEIGHT_SHARE
             ),
         )
 
+    # What is shown.
+
     def markers(self, command: Any, metrics: Any) -> tuple[task.Marker, ...]:
         """A disc on top of each column, and a frame where the next ball lands."""
-        look = ((0.02, 0.001, 0.0), (0.15, 0.9, 0.3, 0.6), "cylinder")
-        tops = enumerate(self.config.columns(command["target_height"]), start=1)
-        place = (metrics["landing_x"], metrics["landing_y"], self.config.home[2] + REST)
-        return (
-            *(task.Marker(f"target height {i}", top, *look) for i, top in tops),
-            task.Marker("next ball", place, (0.021, 0.021, 0.001), (1.0, 0.8, 0.1, 0.9), "frame"),
+        markers = []
+        for number, top in enumerate(self.config.columns(command["target_height"]), start=1):
+            markers.append(
+                task.Marker(
+                    f"target height {number}",
+                    position=top,
+                    size=(0.02, 0.001, 0.0),
+                    rgba=(0.15, 0.9, 0.3, 0.6),
+                    shape="cylinder",
+                )
+            )
+        markers.append(
+            task.Marker(
+                "next ball",
+                position=(metrics["landing_x"], metrics["landing_y"], self._ground()),
+                size=(0.021, 0.021, 0.001),
+                rgba=(1.0, 0.8, 0.1, 0.9),
+                shape="frame",
+            )
         )
+        return tuple(markers)
 
     def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
         return {"target": f"{command['target_height']:.2f} m"}
 
 
 def _next(values: jax.Array, falls: jax.Array) -> jax.Array:
-    """The row of values [B, n] of the ball that lands next."""
-    chosen, soonest = values[0], jnp.min(falls)
-    for value, fall in zip(values[1:], falls[1:], strict=True):
-        chosen = jnp.where(fall <= soonest, value, chosen)
+    """The row of values [B, n] of the ball that lands next, after the shortest of the falls [B]
+    (s)."""
+    # Not values[argmin]: the exported graph takes fixed indices alone.
+    chosen = values[0]
+    soonest = jnp.min(falls)
+    for ball_values, fall in zip(values[1:], falls[1:], strict=True):
+        chosen = jnp.where(fall <= soonest, ball_values, chosen)
     return chosen

@@ -13,18 +13,25 @@ from bounce_mjx import task
 from bounce_mjx.lazy import jax, jnp, np
 
 NAMES = ("circle", "line", "figure of eight", "steps", "wandering")
+"""Names of the paths, by their numbers."""
 STEPS = 3
 """Number of the path of steps: the corners of a hexagon."""
-CORNERS, SIDE, STEP_SECONDS = 6, 0.1, 4.0
-"""Corners of the hexagon, its side (m), and the time at a corner (s)."""
+CORNERS = 6
+"""Corners of the hexagon."""
+SIDE = 0.1
+"""Side of the hexagon, and the distance of its corners from the middle, m."""
+STEP_SECONDS = 4.0
+"""Time at a corner, s."""
 FASTEST = (1.0, 1.0, math.sqrt(2.0), math.inf, math.sqrt(32.0) / 3.0)
 """Greatest speed on each path of the size 1, per radian of its phase."""
 SWAY = 0.05
 """Amplitude of the height, m."""
 COMMANDS = {
-    "path": task.Command(0.0, len(NAMES), "", 0.0, len(NAMES), step=1.0, names=NAMES),
-    "course": task.Command(0.0, 1.0, "turns", 0.0, 1.0),
-    "phase": task.Command(0.0, 1.0, "turns", 0.0, 1.0),
+    "path": task.Command(
+        0.0, len(NAMES), least=0.0, greatest=len(NAMES), step=1.0, names=NAMES, hidden=True
+    ),
+    "course": task.Command(0.0, 1.0, "turns", least=0.0, greatest=1.0, hidden=True),
+    "phase": task.Command(0.0, 1.0, "turns", least=0.0, greatest=1.0, hidden=True),
 }
 """Number of the path; its direction, and the form of the wandering; the place on it."""
 
@@ -36,34 +43,53 @@ def point(command: Values, xp: Any = None) -> Any:
     return (xp or jnp).stack([command[f"target_{axis}"] for axis in ("x", "y", "height")])
 
 
+def at_point(command: Values, point: Any) -> Values:
+    """The commands with another point now [3], m."""
+    x, y, height = point
+    return command | {"target_x": x, "target_y": y, "target_height": height}
+
+
 def offset(command: Values, size: float, phase: Any, xp: Any = None) -> Any:
     """The point from the middle of its path [3, ...], m, at places on it [...], turns.
 
     Args:
       size: radius of the circle, half the length of the line and of the figure of eight, m.
     """
-    xp, course = xp or jnp, command["course"]
+    xp = xp or jnp
+    course = command["course"]
 
-    def wave(number: float, shift: Any = 0.0, turns: Any = phase) -> Any:
-        return xp.sin(2.0 * math.pi * (number * turns + shift))
+    def sine(turns: Any) -> Any:
+        return xp.sin(2.0 * math.pi * turns)
 
-    corner, side = xp.floor(CORNERS * phase) / CORNERS, SIDE / size
-    wander_x = (wave(1, 3.0 * course) + wave(2, 5.0 * course) / 2.0) / 1.5
-    wander_y = (wave(1, 7.0 * course) + wave(3, 11.0 * course) / 3.0) / 1.5
-    xs = (wave(1, 0.25), wave(1), wave(1), side * wave(1, 0.25, corner), wander_x)
-    ys = (wave(1), 0.0 * phase, wave(2) / 2.0, side * wave(1, 0.0, corner), wander_y)
-    x, y = (size * _choose(values, command, xp) for values in (xs, ys))
-    cosine, sine = wave(1, 0.25, course), wave(1, 0.0, course)
-    return xp.stack([cosine * x - sine * y, sine * x + cosine * y, SWAY * wave(1, course)])
+    def cosine(turns: Any) -> Any:
+        return xp.sin(2.0 * math.pi * (turns + 0.25))
+
+    # The steps' own size does not depend on that of the others.
+    corner = xp.floor(CORNERS * phase) / CORNERS
+    side = SIDE / size
+    wandering_x = (sine(phase + 3.0 * course) + sine(2.0 * phase + 5.0 * course) / 2.0) / 1.5
+    wandering_y = (sine(phase + 7.0 * course) + sine(3.0 * phase + 11.0 * course) / 3.0) / 1.5
+    # In the order of the names, each of the size 1.
+    xs = (cosine(phase), sine(phase), sine(phase), side * cosine(corner), wandering_x)
+    ys = (sine(phase), 0.0 * phase, sine(2.0 * phase) / 2.0, side * sine(corner), wandering_y)
+    x = size * _choose(xs, command, xp)
+    y = size * _choose(ys, command, xp)
+
+    # The course turns the path.
+    cos_course = cosine(course)
+    sin_course = sine(course)
+    turned_x = cos_course * x - sin_course * y
+    turned_y = sin_course * x + cos_course * y
+    return xp.stack([turned_x, turned_y, SWAY * sine(phase + course)])
 
 
 def phase_in(seconds: Any, command: Values, size: float) -> jax.Array:
     """Place on the path in some seconds [], turns. Steps have their own time, unless the speed
     is 0."""
     speed = command["point_speed"]
-    rates = [speed / (2.0 * math.pi * size * fastest) for fastest in FASTEST]
-    rates[STEPS] = (speed > 0.0) / (CORNERS * STEP_SECONDS)
-    return command["phase"] + seconds * _choose(rates, command, jnp)
+    turns_a_second = [speed / (2.0 * math.pi * size * fastest) for fastest in FASTEST]
+    turns_a_second[STEPS] = (speed > 0.0) / (CORNERS * STEP_SECONDS)
+    return command["phase"] + seconds * _choose(turns_a_second, command, jnp)
 
 
 def seconds_at_corner(command: Values) -> jax.Array:
@@ -74,12 +100,29 @@ def seconds_at_corner(command: Values) -> jax.Array:
 
 def markers(command: dict[str, float], size: float) -> tuple[task.Marker, ...]:
     """A disc at the point, and dots on its path."""
-    here, places = point(command, np), np.linspace(0.0, 1.0, 24, endpoint=False)
-    dots = here + offset(command, size, places, np).T - offset(command, size, command["phase"], np)
-    green, blue, cube = (0.15, 0.9, 0.3, 0.6), (0.15, 0.45, 1.0, 0.7), (0.004, 0.004, 0.004)
-    disc = task.Marker("target point", tuple(here.tolist()), (0.03, 0.001, 0.0), green, "cylinder")
-    path = (task.Marker(f"path {i}", tuple(p), cube, blue) for i, p in enumerate(dots.tolist()))
-    return disc, *path
+    here = point(command, np)
+    here_from_middle = offset(command, size, command["phase"], np)
+    phases = np.linspace(0.0, 1.0, 24, endpoint=False)
+    dots = here + offset(command, size, phases, np).T - here_from_middle
+    markers = [
+        task.Marker(
+            "target point",
+            position=tuple(here.tolist()),
+            size=(0.03, 0.001, 0.0),
+            rgba=(0.15, 0.9, 0.3, 0.6),
+            shape="cylinder",
+        )
+    ]
+    for i, dot in enumerate(dots.tolist()):
+        markers.append(
+            task.Marker(
+                f"path {i}",
+                position=tuple(dot),
+                size=(0.004, 0.004, 0.004),
+                rgba=(0.15, 0.45, 1.0, 0.7),
+            )
+        )
+    return tuple(markers)
 
 
 def name(command: dict[str, float]) -> str:

@@ -7,6 +7,7 @@ a run's copy of a file that the user has named is the same task.
 import importlib
 import importlib.metadata
 import inspect
+import os
 import sys
 import traceback
 import types
@@ -73,8 +74,8 @@ def is_file(name: str) -> bool:
 
 
 def source_file(name: str) -> Path:
-    """Absolute path of the file in FILE.py:CLASS."""
-    return Path(name.rpartition(":")[0]).expanduser().absolute()
+    """Absolute path of the file in FILE.py:CLASS, without .. in it."""
+    return Path(os.path.abspath(Path(name.rpartition(":")[0]).expanduser()))
 
 
 def read_source(name: str) -> bytes:
@@ -96,8 +97,8 @@ def is_same_code(name: str, other: str) -> bool:
     """Whether two names stand for the same task, which a copy of its file is too."""
     if not (is_file(name) and is_file(other)):
         return name == other
-    classes = {each.rpartition(":")[2] for each in (name, other)}
-    return len(classes) == 1 and read_source(name) == read_source(other)
+    is_same_class = name.rpartition(":")[2] == other.rpartition(":")[2]
+    return is_same_class and read_source(name) == read_source(other)
 
 
 def known_task(name: str) -> type[Task] | None:
@@ -117,7 +118,8 @@ def admit(name: str, task: type[Task]) -> None:
 def registered_tasks() -> dict[str, str]:
     """MODULE:CLASS of the tasks of the package and of installed packages, by name."""
     entries = importlib.metadata.entry_points(group=GROUP)
-    return dict(sorted(({entry.name: entry.value for entry in entries} | _OWN).items()))
+    installed = {entry.name: entry.value for entry in entries}
+    return dict(sorted((installed | _OWN).items()))
 
 
 def class_in_file(name: str, base: type[Kind]) -> type[Kind]:
@@ -126,7 +128,8 @@ def class_in_file(name: str, base: type[Kind]) -> type[Kind]:
     Raises:
       UserError: the file cannot be imported, or has no such class.
     """
-    path, source = source_file(name), read_source(name)
+    path = source_file(name)
+    source = read_source(name)
     if source not in _files:
         module = types.ModuleType(f"bounce_mjx_{path.stem}_{len(_files)}")
         module.__file__ = str(path)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 from pydantic import Field
 
@@ -12,15 +12,41 @@ from bounce_mjx.config.settings import Ascending, Coordinate, Finite, Length, Po
 from bounce_mjx.lazy import jax, jnp
 from bounce_mjx.tasks import paths
 
-REST = 0.0225
-"""Height of the ball's centre over the paddle's while they touch, m."""
-SETTLING, STEP_SETTLING = 2.0, 1.0
-"""Time since a reset, and since a step of the point, after which apexes count, s."""
-BANDS = {"slow error": (0.0, 0.1, 1.5), "fast error": (0.25, 0.3, 3.0)}
-"""Speeds of a point without steps that a result judges (m/s), and the largest RMS error (cm)."""
-MAX_STEP_ERROR, MAX_HEIGHT_ERROR = 0.03, 0.1
-JUMP_SPEED, JUMP_ACCELERATION = 1.0, 3.0
-"""A point that is faster (m/s) or accelerates more (m/s^2) has jumped."""
+SETTLING_SECONDS = 2.0
+"""Time since a reset or a sample of the commands after which apexes count, s."""
+STEP_SETTLING_SECONDS = 1.0
+"""Time since a step of the point after which apexes count for the result after steps, s."""
+
+
+class Band(NamedTuple):
+    """Speeds of a point without steps that a result judges."""
+
+    slowest: float
+    """m/s."""
+    fastest: float
+    """m/s."""
+    max_error: float
+    """Largest RMS error, cm."""
+
+
+BANDS = {"slow error": Band(0.0, 0.1, 1.5), "fast error": Band(0.25, 0.3, 3.0)}
+"""The judged speeds, by the result's name."""
+MAX_STEP_ERROR = 0.03
+"""Largest distance of apex and point after a step, m."""
+MAX_HEIGHT_ERROR = 0.1
+"""Largest distance of an accurate apex from the point's height, m."""
+MIN_APEX_HEIGHT = 0.1
+"""Height over home above which a ball that turns has an apex, m; a lower one rolls or dribbles."""
+MIN_EPISODE_SHARE = 0.99
+"""Least share of episodes that last."""
+MIN_APEX_SHARE = 0.95
+"""Least share of apexes within 0.1 m of their height, and of those near the point after a step."""
+JUMP_SPEED = 1.0
+"""A point that is faster has jumped, m/s."""
+JUMP_ACCELERATION = 3.0
+"""A point that accelerates more has jumped, m/s^2."""
+APEX_FACTORS = (1.0, 1.0, 0.3)
+"""Factors of an apex's error along x, y and z: 0.1 m of height count as 0.03 m."""
 Height = Annotated[Finite, Field(ge=0.1, le=10.0)]
 """Over home, m; the point sways around it, and stays above a resting ball."""
 PointSpeed = Annotated[Finite, Field(ge=0.0, le=JUMP_SPEED)]
@@ -83,122 +109,215 @@ class Config(task.WorldConfig):
     @property
     def commands(self) -> dict[str, task.Command]:
         """The point, sampled as the middle of its path, its speed, and its path."""
-        (x, y, z), (low, high) = self.home, self.height_range
-        return {
+        x, y, z = self.home
+        lowest, highest = self.height_range
+        slowest, fastest = self.speed_range
+        commands = {
             "target_x": task.Command(x - 0.02, x + 0.02, "m", span=(x - 0.15, x + 0.15), step=0.01),
             "target_y": task.Command(y - 0.02, y + 0.02, "m", span=(y - 0.15, y + 0.15), step=0.01),
-            "target_height": task.Command(z + low, z + high, "m", span=(z + 0.3, z + 0.7)),
-            "point_speed": task.Command(*self.speed_range, "m/s", 0.0, span=(0.0, 0.3)),
-        } | paths.COMMANDS
+            "target_height": task.Command(z + lowest, z + highest, "m", span=(z + 0.3, z + 0.7)),
+            "point_speed": task.Command(
+                slowest, fastest, "m/s", least=0.0, span=(0.0, 0.3), hidden=True
+            ),
+        }
+        return commands | paths.COMMANDS
 
 
 class Track(task.Task):
     """The ball bounces over a point that moves along a path, at its height."""
 
     Config = Config
+    config: Config
     curves = (
         task.Curve("task/error", "error", "apexes", "distance of apex and point, cm", 100.0),
         task.Curve("task/height_error", "height_error", "apexes", "|apex − height|, cm", 100.0),
     )
 
-    def reset(self, start: task.Start) -> tuple[jax.Array, jax.Array]:
-        # Whether the ball rises, and the point's offset, 0 as it is sampled in the middle.
-        return jnp.array(False), jnp.zeros_like(start.truth.ball_position)
+    def _ground(self) -> float:
+        """Height of a ball that touches the paddle at home, m."""
+        return self.config.home[2] + self.geometry.rest_height
 
-    def next_command(self, state: Any, command: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    # The point.
+
+    def first_command(self, command: task.Values) -> task.Values:
+        """The point on its path, whose middle is sampled."""
+        offset = paths.offset(command, self.config.path_size, command["phase"])
+        return paths.at_point(command, paths.point(command) + offset)
+
+    def next_command(self, state: Any, command: task.Values) -> task.Values:
         """The path moves the point on from where it is, which a user may have set."""
-        phase = paths.phase_in(self.config.control_dt, command, self.config.path_size)
-        offset = paths.offset(command, self.config.path_size, phase)
-        x, y, z = paths.point(command) + offset - state[1]
-        command = command | {"target_x": x, "target_y": y, "target_height": z}
-        return command | {"path": jnp.floor(command["path"]), "phase": phase - jnp.floor(phase)}
-
-    def step(self, state: Any, step: task.Step) -> task.TaskStep:
-        truth, command, home = step.truth, step.command, self.config.home[2]
-        ball, velocity, paddle = truth.ball_position, truth.ball_velocity, truth.paddle_position
-        flight, size = task.flight(ball, velocity, home + REST), self.config.path_size
+        size = self.config.path_size
+        next_phase = paths.phase_in(self.config.control_dt, command, size)
         offset = paths.offset(command, size, command["phase"])
-
-        def point(seconds: jax.Array) -> jax.Array:
-            phase = paths.phase_in(seconds, command, size)
-            return paths.point(command) + paths.offset(command, size, phase) - offset
-
-        errors = {
-            "apex": (flight.top - point(flight.rise)) * jnp.array([1.0, 1.0, 0.3]),
-            "landing": (flight.end - point(flight.fall))[:2],
-            "paddle": (flight.end - paddle)[:2],
-            "home": paddle[2] - home,
-            "calm": jnp.concatenate([truth.joint_velocities, step.action - step.last_action]),
+        next_offset = paths.offset(command, size, next_phase)
+        point = paths.point(command) + next_offset - offset
+        return paths.at_point(command, point) | {
+            "path": jnp.floor(command["path"]),
+            "phase": next_phase - jnp.floor(next_phase),
         }
-        is_apex = state[0] & (velocity[2] <= 0.0) & (ball[2] > home + MAX_HEIGHT_ERROR)
-        x, y, z = jnp.square(ball - paths.point(command))
+
+    def _point_in(self, seconds: jax.Array, command: task.Values) -> jax.Array:
+        """The point [3] in some seconds [], m, if the path moves it on."""
+        size = self.config.path_size
+        offset = paths.offset(command, size, command["phase"])
+        later = paths.phase_in(seconds, command, size)
+        return paths.point(command) + paths.offset(command, size, later) - offset
+
+    # The start, and a control step: reward, end, metrics.
+
+    def reset(self, start: task.Start) -> jax.Array:
+        """Whether the ball rises [], bool."""
+        return jnp.array(False)
+
+    def step(self, rose: jax.Array, step: task.Step) -> task.TaskStep:
+        truth = step.truth
+        ball = truth.ball_position
+        vertical_velocity = truth.ball_velocity[2]
+        home_height = self.config.home[2]
+        flight = task.flight(ball, truth.ball_velocity, self._ground())
+
+        is_high = ball[2] > home_height + MIN_APEX_HEIGHT
+        is_apex = rose & (vertical_velocity <= 0.0) & is_high
+        x_square, y_square, z_square = jnp.square(ball - paths.point(step.command))
+        is_far = x_square + y_square + z_square > self.config.max_distance**2
+        is_low = ball[2] < home_height
         return task.TaskStep(
-            state=(velocity[2] > 0.0, offset),
-            reward=task.weighted_terms(self.config.reward, **errors),
-            ended=(ball[2] < home) | (x + y + z > self.config.max_distance**2),
+            state=vertical_velocity > 0.0,
+            reward=task.weighted_terms(
+                self.config.reward,
+                apex=self._apex_error(flight, step.command),
+                landing=self._landing_error(flight, step.command),
+                paddle=(flight.end - truth.paddle_position)[:2],
+                home=truth.paddle_position[2] - home_height,
+                calm=self._calm_error(step),
+            ),
+            ended=is_low | is_far,
             metrics={
                 "apexes": is_apex,
-                "error": jnp.where(is_apex, task.safe_sqrt(x + y), 0.0),
-                "height_error": jnp.where(is_apex, task.safe_sqrt(z), 0.0),
+                "error": jnp.where(is_apex, task.safe_sqrt(x_square + y_square), 0.0),
+                "height_error": jnp.where(is_apex, task.safe_sqrt(z_square), 0.0),
             },
         )
 
-    def first_quantities(self, measured: dict[str, jax.Array]) -> Any:
-        memory = paths.point(measured)[:2, 0], jnp.zeros_like(measured["ball_position"][:2])
-        memory, histories = self.next_quantities(memory, {"aim": memory[1][None]}, measured)
+    def _apex_error(self, flight: task.Flight, command: task.Values) -> jax.Array:
+        """From the point at the time of the flight's apex to the apex [3], m; 0.1 m of height count
+        as 0.03 m."""
+        point = self._point_in(flight.rise, command)
+        return (flight.top - point) * jnp.array(APEX_FACTORS)
+
+    def _landing_error(self, flight: task.Flight, command: task.Values) -> jax.Array:
+        """From the point at the time of the flight's end to that end [2], m."""
+        point = self._point_in(flight.fall, command)
+        return (flight.end - point)[:2]
+
+    def _calm_error(self, step: task.Step) -> jax.Array:
+        """The joint velocities, and the change of the action, as one vector [2 n]."""
+        action_change = step.action - step.last_action
+        return jnp.concatenate([step.truth.joint_velocities, action_change])
+
+    # The observation: where to aim, from the measurements.
+
+    def first_quantities(self, measured: task.Values) -> tuple[Any, task.Values]:
+        point = paths.point(measured)[:2, 0]
+        velocity = jnp.zeros_like(measured["ball_position"][:2])
+        unknown_aim = jnp.zeros_like(velocity)[None]
+        memory, histories = self.next_quantities((point, velocity), {"aim": unknown_aim}, measured)
         return memory, {"aim": histories["aim"][0]}
 
-    def next_quantities(self, memory: Any, histories: Any, measured: dict[str, jax.Array]) -> Any:
-        """It remembers the point [2] and its velocity [2]."""
+    def next_quantities(
+        self, memory: Any, histories: task.Values, measured: task.Values
+    ) -> tuple[Any, task.Values]:
+        """It remembers the point [2] (m) and its velocity [2] (m/s)."""
+        last_point, last_velocity = memory
+        point = paths.point(measured)[:, 0]
+        velocity = self._rate(point[:2] - last_point, JUMP_SPEED)
+        acceleration = self._rate(velocity - last_velocity, JUMP_ACCELERATION)
 
-        def rate(change: jax.Array, limit: float) -> jax.Array:
-            change = change / self.config.control_dt
-            return jnp.where(jnp.abs(change) <= limit, change, 0.0)
-
-        ground, target = self.config.home[2] + REST, paths.point(measured)[:, 0]
+        ground = self._ground()
         flight = task.flight(measured["ball_position"], measured["ball_velocity"], ground)
-        time = flight.fall + task.safe_sqrt(2.0 * (target[2] - ground) / task.GRAVITY)
-        velocity = rate(target[:2] - memory[0], JUMP_SPEED)
-        acceleration = rate(velocity - memory[1], JUMP_ACCELERATION)
-        then = target[:2] + time * velocity + 0.5 * jnp.square(time) * acceleration
-        aim = then - flight.end[:2]
-        return (target[:2], velocity), {n: task.latest(h, aim) for n, h in histories.items()}
+        next_rise = task.safe_sqrt(2.0 * (point[2] - ground) / task.GRAVITY)
+        seconds = flight.fall + next_rise
+        moved = seconds * velocity
+        point_then = point[:2] + moved + 0.5 * jnp.square(seconds) * acceleration
+        aim = point_then - flight.end[:2]
+        next_memory = (point[:2], velocity)
+        return next_memory, {name: task.latest(old, aim) for name, old in histories.items()}
+
+    def _rate(self, change: jax.Array, limit: float) -> jax.Array:
+        """A change [2] of a control step, for each second; 0 beyond a limit, for a jump."""
+        rate = change / self.config.control_dt
+        return jnp.where(jnp.abs(rate) <= limit, rate, 0.0)
+
+    # The results.
 
     def tally(self, moment: task.Moment) -> task.Tally:
-        error, command = moment.metrics["error"], moment.command
-        apex = (moment.metrics["apexes"] > 0) & (moment.command_seconds > SETTLING)
-        steps, speed = command["path"] == paths.STEPS, command["point_speed"]
-        late = apex & steps & (paths.seconds_at_corner(command) > STEP_SETTLING)
-        high = apex & (moment.metrics["height_error"] <= MAX_HEIGHT_ERROR)
+        command = moment.command
+        error = moment.metrics["error"]
+        has_steps = command["path"] == paths.STEPS
+        has_settled = moment.command_seconds > SETTLING_SECONDS
+        has_reached = paths.seconds_at_corner(command) > STEP_SETTLING_SECONDS
+
+        apex = (moment.metrics["apexes"] > 0) & has_settled
+        after_step = apex & has_steps & has_reached
         sums = {
             "apexes": apex,
-            "high": high,
-            "late": late,
-            "near": late & (error <= MAX_STEP_ERROR),
+            "high": apex & (moment.metrics["height_error"] <= MAX_HEIGHT_ERROR),
+            "late": after_step,
+            "near": after_step & (error <= MAX_STEP_ERROR),
         }
-        kinds = {"after steps": steps}
-        for name, (low, top, _) in BANDS.items():
-            kinds[name] = ~steps & (speed > low - 1e-6) & (speed < top + 1e-6)
-            sums[name] = apex & kinds[name]
+        # Whether the episode has what a result judges.
+        is_judged = {"after steps": has_steps}
+        for name, band in BANDS.items():
+            is_in_band = _is_in_band(command["point_speed"], band) & ~has_steps
+            is_judged[name] = is_in_band
+            sums[name] = apex & is_in_band
             sums[f"{name}^2"] = sums[name] * jnp.square(100.0 * error)
-        return task.Tally(sums, maxima=kinds)
+        return task.Tally(sums, maxima=is_judged)
 
     def results(self, episodes: task.Episodes) -> tuple[task.Result, ...]:
-        sums, had, words = episodes.sums, episodes.maxima, "apexes within 3 cm, 1 s after a step"
-        found = [task.share_of_events("after steps", words, sums["near"], sums["late"], 0.95)]
-        for name, (low, top, most) in BANDS.items():
-            words = f"RMS distance of apex and point at {low:g} to {top} m/s, cm"
-            found += [task.root_mean_square(name, words, sums[f"{name}^2"], sums[name], most)]
-        words, length = "apexes within 0.1 m of their height", f"{self.config.episode_seconds:g} s"
+        sums = episodes.sums
+        of_point = [
+            task.share_of_events(
+                "after steps",
+                "apexes within 3 cm, 1 s after a step",
+                sums["near"],
+                sums["late"],
+                MIN_APEX_SHARE,
+            )
+        ]
+        for name, band in BANDS.items():
+            speeds = f"{band.slowest:g} to {band.fastest} m/s"
+            measured = f"RMS distance of apex and point at {speeds}, cm"
+            of_point.append(
+                task.root_mean_square(name, measured, sums[f"{name}^2"], sums[name], band.max_error)
+            )
+        # Episodes of other paths or speeds do not judge.
+        for i, result in enumerate(of_point):
+            if not episodes.maxima[result.name].any():
+                of_point[i] = replace(result, passed=None, margin=None)
+
+        lasting = f"episodes that last {self.config.episode_seconds:g} s"
         return (
-            # Episodes of other paths or speeds do not judge.
-            *(r if had[r.name].any() else replace(r, passed=None, margin=None) for r in found),
-            task.share_of_events("height", words, sums["high"], sums["apexes"], 0.95),
-            task.share_of_episodes("stable", f"episodes that last {length}", episodes.lasted, 0.99),
+            *of_point,
+            task.share_of_events(
+                "height",
+                "apexes within 0.1 m of their height",
+                sums["high"],
+                sums["apexes"],
+                MIN_APEX_SHARE,
+            ),
+            task.share_of_episodes("stable", lasting, episodes.lasted, MIN_EPISODE_SHARE),
         )
+
+    # What is shown.
 
     def markers(self, command: Any, metrics: Any) -> tuple[task.Marker, ...]:
         return paths.markers(command, self.config.path_size)
 
     def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
         return {"path": f"{paths.name(command)}, {command['point_speed']:.2f} m/s"}
+
+
+def _is_in_band(speed: jax.Array, band: Band) -> jax.Array:
+    """Whether a speed [] (m/s) is in a band [], bool; its ends are, despite float32."""
+    return (speed > band.slowest - 1e-6) & (speed < band.fastest + 1e-6)

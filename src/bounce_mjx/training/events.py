@@ -70,14 +70,18 @@ def say(console: Console, line: str) -> None:
 
 
 def block_line(
-    config: TrainConfig, steps: int, seconds: float, left: float, points: list[dict[str, float]]
+    config: TrainConfig,
+    steps: int,
+    seconds: float,
+    left: float | None,
+    points: list[dict[str, float]],
 ) -> str:
     """A block of iterations.
 
     Args:
       steps: environment steps of each seed so far.
       seconds: duration of the block.
-      left: estimated time to the last step, s; the training may end earlier.
+      left: estimated time to the last step, s; the training may end earlier. None without one.
       points: those of the curves of each seed.
     """
     rate = count_text(points[0]["speed/steps_per_second"])

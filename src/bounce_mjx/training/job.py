@@ -1,19 +1,18 @@
-"""The training job: trains until it is finished or stopped, and evaluates and saves in between.
+"""The training job: `train` is its loop, and `Job` has what the loop does.
 
-It is the same for every algorithm that has the interface of `PPOTrainer`.
+It is the same for every algorithm whose trainer is a `Trainer`.
 """
 
 import concurrent.futures
 import contextlib
 import dataclasses
-import functools
 import importlib
 import shlex
 import shutil
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -21,48 +20,31 @@ from rich.console import Console
 
 import bounce_mjx
 from bounce_mjx.env.env import Env
-from bounce_mjx.errors import UserError, reason_of, shorten
+from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.interrupt import Interrupted, StopRequest
 from bounce_mjx.learning.policy import Policy
+from bounce_mjx.physics.convergence import solver_warning
 from bounce_mjx.runs import checkpoints, folders
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.files import to_json, writable, write_atomically
-from bounce_mjx.runs.progress import RESULTS_FILE, Progress
+from bounce_mjx.runs.files import writable
+from bounce_mjx.runs.progress import Progress
 from bounce_mjx.tasks.registry import is_file
-from bounce_mjx.training import events, hosts, ppo_trainer
+from bounce_mjx.training import events, faults, hosts
+from bounce_mjx.training.clock import Clock
 from bounce_mjx.training.evaluators import Evaluators
-from bounce_mjx.training.first_block import fault_of
 from bounce_mjx.training.log import TensorBoardLog
+from bounce_mjx.training.ppo_trainer import PPOTrainer, iterations_per_block
+from bounce_mjx.training.saving import Saver
+from bounce_mjx.training.seeds import SeedRun
+from bounce_mjx.training.trainer import Metrics, Snapshot, Trainer
 
-# Imported by name during the compilation, because these imports take half a second each.
+Result = TypeVar("Result")
+MakeTrainer = Callable[[TrainConfig, Env], Trainer]
+MakeEvaluators = Callable[..., Evaluators]
+
+# Imported during the compilation, because these imports take half a second each.
 _SLOW_MODULES = "orbax.checkpoint", "bounce_mjx.reports.page"
-
-
-@dataclasses.dataclass
-class SeedRun:
-    """One seed of a training run."""
-
-    run: Path
-    """Folder of the seed's best checkpoint and log; with one seed, the run's folder itself."""
-    config: TrainConfig
-    """The config of this seed, as for a training of one seed."""
-    seconds: dict[str, float]
-    """Seconds by phase, for all seeds together."""
-    progress: Progress = dataclasses.field(default_factory=Progress)
-    best_policy: Policy | None = None
-    """The policy of the best checkpoint."""
-
-    def recall_best(self) -> None:
-        """Takes for the best what the best checkpoint on the disk says: a policy that could not be
-        saved is not the best one, and a process may have been killed before it wrote its state."""
-        self.best_policy, self.progress.best, self.progress.best_steps = None, None, 0
-        with contextlib.suppress(UserError):
-            best = folders.best_checkpoint(self.run)
-            stored = Progress.model_validate(checkpoints.read_record(best).progress)
-            if stored.best is not None:
-                self.best_policy = checkpoints.read_policy(best, self.config)
-                self.progress.best, self.progress.best_steps = stored.best, stored.best_steps
 
 
 class TrainingStopped(Interrupted):
@@ -75,13 +57,13 @@ def train(
     *,
     resume: Path | None = None,
     callbacks: Sequence[events.Callback] = (),
-    make_trainer: Callable[[TrainConfig, Env], ppo_trainer.PPOTrainer] = ppo_trainer.PPOTrainer,
-    make_evaluators: Callable[..., Evaluators] = Evaluators,
+    make_trainer: MakeTrainer = PPOTrainer,
+    make_evaluators: MakeEvaluators = Evaluators,
 ) -> list[SeedRun]:
     """Trains with a config, and returns its seeds.
 
     Args:
-      resume: folder of the run to continue, whose config is `config`.
+      resume: the run to continue, whose config is `config`: its folder, or a checkpoint in it.
       callbacks: see `Callback`.
       make_trainer: builds the trainer; raises UserError where the config does not fit it.
       make_evaluators: builds what evaluates the policies, with the arguments of `Evaluators`.
@@ -95,15 +77,84 @@ def train(
     """
     hosts.agree(config, resume)
     with contextlib.ExitStack() as stack:
-        job = Job(config, console, resume, callbacks, stack, make_trainer)
-        job.open()
+        job = open_job(config, console, stack, resume, callbacks, make_trainer)
         try:
             job.compile(make_evaluators)
-            job.train()
+            while True:
+                if job.evaluation_is_due():
+                    job.evaluate()
+                if job.save_is_due():
+                    job.save()
+                if job.is_stopping() or job.is_finished():
+                    break
+                metrics, seconds = job.train_block()
+                job.log_block(metrics, seconds)
             job.finish()
         except jax.errors.JaxRuntimeError as error:
-            raise UserError(job.failure(error)) from error
-        return job.members
+            raise UserError(job.describe_failure(error)) from error
+        return job.seeds
+
+
+def open_job(
+    config: TrainConfig,
+    console: Console,
+    stack: contextlib.ExitStack,
+    resume: Path | None = None,
+    callbacks: Sequence[events.Callback] = (),
+    make_trainer: MakeTrainer = PPOTrainer,
+) -> "Job":
+    """Builds what may refuse the config, then makes the folder of a new run, or reads the resumed
+    one, and says what is trained.
+
+    Args:
+      stack: closes what the job has opened.
+    """
+    pool = concurrent.futures.ThreadPoolExecutor()
+    stack.callback(pool.shutdown, wait=False, cancel_futures=True)
+    clock = Clock()
+    config = in_whole_blocks(config)
+    env = Env(config.env)
+    trainer = make_trainer(config, env)
+    is_warm = config.warm_start is not None and resume is None
+    networks = checkpoints.read_start(config, env) if is_warm else None
+    # Before, a signal ends the process by its default action.
+    stop = stack.enter_context(StopRequest())
+    run = _make_run(config) if resume is None else folders.find_run(resume)
+    job = Job(
+        config=config,
+        env=env,
+        trainer=trainer,
+        run=run,
+        is_new=resume is None,
+        networks=networks,
+        console=console,
+        callbacks=list(callbacks) if hosts.is_leader() else [],
+        pool=pool,
+        stack=stack,
+        stop=stop,
+        clock=clock,
+    )
+    stack.push(job.remove_unstarted)
+    if hosts.is_leader():
+        stack.enter_context(folders.lock_run(run))
+    stack.callback(job.saver.wait)
+    if resume is not None:
+        job.read_state(resume)
+    job.write_configs()
+    job.introduce()
+    return job
+
+
+def in_whole_blocks(config: TrainConfig) -> TrainConfig:
+    """The config with the number of steps at the whole block nearest to it, at least one."""
+    block_steps = steps_per_block(config)
+    blocks = max(1, round(config.total_steps / block_steps))
+    return config.model_copy(update={"total_steps": blocks * block_steps})
+
+
+def steps_per_block(config: TrainConfig) -> int:
+    """Environment steps of a block."""
+    return iterations_per_block(config) * config.ppo.batch_steps
 
 
 def named_task(config: TrainConfig) -> list[str]:
@@ -111,6 +162,7 @@ def named_task(config: TrainConfig) -> list[str]:
     return ["--task", config.task] if is_file(config.task) else []
 
 
+@dataclasses.dataclass
 class Job:
     """A training run in progress.
 
@@ -119,384 +171,426 @@ class Job:
     does the same work, but only the leader writes.
     """
 
-    def __init__(
-        self,
-        config: TrainConfig,
-        console: Console,
-        resume: Path | None,
-        callbacks: Sequence[events.Callback],
-        stack: contextlib.ExitStack,
-        make_trainer: Callable[[TrainConfig, Env], ppo_trainer.PPOTrainer],
-    ):
-        """Builds what may refuse the config, before a folder is made."""
-        self.console, self.resume, self.stack = console, resume, stack
-        self.say = functools.partial(events.say, console)
-        self.callbacks = callbacks if hosts.is_leader() else ()
-        self.pool = concurrent.futures.ThreadPoolExecutor()
-        stack.callback(self.pool.shutdown, wait=False, cancel_futures=True)
-        self.seconds, self.lap_started = {}, time.perf_counter()
-        self.block_steps = ppo_trainer.iterations_per_block(config) * config.ppo.batch_steps
-        blocks = max(1, round(config.total_steps / self.block_steps))
-        self.config = config.model_copy(update={"total_steps": blocks * self.block_steps})
-        self.eval_steps = self.block_steps * max(1, round(config.eval_every / self.block_steps))
-        self.env = Env(config.env)
-        self.trainer = make_trainer(config, self.env)
-        warm = config.warm_start is not None and resume is None
-        self.first = checkpoints.read_start(config, self.env) if warm else None
-        self.state: Any = None
-        self.steps = 0
-        self.ended = False
-        self.opening = self.saving = self.pool.submit(lambda: None)
+    config: TrainConfig
+    env: Env
+    trainer: Trainer
+    run: Path
+    """The run's folder."""
+    is_new: bool
+    """Whether the run is not resumed."""
+    networks: Any
+    """Those of a warm start, which the trainer starts with; None without one."""
+    console: Console
+    callbacks: list[Any]
+    pool: concurrent.futures.Executor
+    stack: contextlib.ExitStack
+    stop: StopRequest
+    clock: Clock
 
-    def open(self) -> None:
-        """Makes the folder of a new run, or reads the resumed one, and says what is trained."""
-        # Before, a signal ends the process by its default action.
-        self.stop = self.stack.enter_context(StopRequest())
+    steps: int = 0
+    """Environment steps of each seed so far."""
+    is_saved: bool = True
+    """Whether the current state needs no save any more."""
+    is_ended: bool = False
+    """Whether a callback has ended the training."""
+    state: Any = None
+    """State from which the resumed run starts."""
+    snapshot: Snapshot | None = None
+    """The current state, once it was asked for."""
+    seeds: list[SeedRun] = dataclasses.field(init=False)
+    saver: Saver = dataclasses.field(init=False)
+    evaluators: Evaluators = dataclasses.field(init=False)
+    """Set by `compile`."""
+
+    def __post_init__(self) -> None:
         config = self.config
-        self.run = self.resume
-        if self.run is None:
-            made = str(folders.create_run(config)) if hosts.is_leader() else None
-            self.run = Path(hosts.exchange(made)[0])
-        self.stack.push(self._remove_unstarted)
-        if hosts.is_leader():
-            self.stack.enter_context(folders.lock_run(self.run))
-        self.stack.callback(lambda: concurrent.futures.wait([self.saving]))
-        self.members = []
+        self.block_steps = steps_per_block(config)
+        self.eval_steps = self.block_steps * max(1, round(config.eval_every / self.block_steps))
+        self.seeds = []
         for seed in range(config.seed, config.seed + config.num_seeds):
             folder = self.run / f"seed_{seed:03d}" if config.num_seeds > 1 else self.run
             alone = config.model_copy(update={"seed": seed, "num_seeds": 1})
-            self.members.append(SeedRun(folder, alone, self.seconds))
-        if self.resume is not None:
-            latest = folders.latest_checkpoint(self.run)
-            self.state, record = checkpoints.read_training(latest, self.trainer.state_template)
-            self.steps = record.steps
-            evaluated = record.progress.get("seeds", [record.progress])
-            for member, plain in zip(self.members, evaluated, strict=True):
-                member.progress = Progress.model_validate(plain)
-                member.recall_best()
-            if self._is_done() or self._is_solved():
-                met = "has met all results" if self._is_solved() else "has been trained to its end"
-                self.say(f"{self.run} {met}, {self.steps:,} steps; add --total-steps N to train on")
-        configs = {self.run: config} | {member.run: member.config for member in self.members}
-        for folder, own in configs.items() if hosts.is_leader() else ():
+            self.seeds.append(SeedRun(folder, alone, self.clock.seconds))
+        self.saver = Saver(self.run, config, self.seeds, self.pool, self.say)
+
+    # Opening
+
+    def read_state(self, resume: Path) -> None:
+        """Reads the checkpoint from which the resumed run continues.
+
+        Args:
+          resume: the run's folder, or a checkpoint in it.
+        """
+        checkpoint = folders.latest_checkpoint(self.run, resume)
+        self.state, record = checkpoints.read_training(checkpoint, self.trainer.state_template)
+        self.steps = record.steps
+        # What was trained after a checkpoint that the user named does not count any more.
+        newest = max(stored.steps for stored in folders.stored_checkpoints(self.run))
+        place = None if checkpoint.steps == newest else checkpoint.folder
+        evaluated = record.progress.get("seeds", [record.progress])
+        for seed, plain in zip(self.seeds, evaluated, strict=True):
+            seed.progress = Progress.model_validate(plain)
+            seed.recall_best(place if seed.run == self.run else None)
+        if self.is_finished():
+            met = "has met all results" if self.is_solved() else "has been trained to its end"
+            self.say(f"{self.run} {met}, {self.steps:,} steps; add --total-steps N to train on")
+
+    def write_configs(self) -> None:
+        """Writes the config of the run and of each seed."""
+        configs = {self.run: self.config} | {seed.run: seed.config for seed in self.seeds}
+        for folder, config in configs.items() if hosts.is_leader() else ():
             with writable(folder, "make room there or make it writable"):
                 folder.mkdir(exist_ok=True)
-                folders.save_config(folder, own)
-        mesh = self.trainer.mesh
-        count = f"{mesh.size} x " if mesh.size > 1 else ""
-        self.device = f"{count}{mesh.devices.flat[0].device_kind}"
+                folders.save_config(folder, config)
+
+    def introduce(self) -> None:
+        """Says what is trained, where, and for how long."""
         self.say(f"physics: {self.env.engine.name} ({self.env.engine.reason})")
-        for term in config.env.unseen_noise:
+        if self.env.engine.name == "fused":
+            warning = solver_warning(self.env.mj_model)
+            if warning is not None:
+                self.say(f"warning: {warning}")
+        for term in self.config.env.unseen_noise:
             self.say(f"warning: the policy does not see what {term} changes")
         self.say(f"device: {self.device}  run: {self.run}")
-        bound = "at most " if config.stop_when_solved else ""
-        self.say(f"steps: {bound}{config.total_steps:,}, in blocks of {self.block_steps:,}")
-        self._lap("setup")
+        bound = "at most " if self.config.stop_when_solved else ""
+        steps = f"{self.config.total_steps:,}, in blocks of {self.block_steps:,}"
+        self.say(f"steps: {bound}{steps}")
+        self.clock.lap("setup")
 
-    def _lap(self, name: str) -> None:
-        """Adds the time since the last lap to that of a phase."""
-        now = time.perf_counter()
-        self.seconds[name] = self.seconds.get(name, 0.0) + now - self.lap_started
-        self.lap_started = now
+    def compile(self, make_evaluators: MakeEvaluators) -> None:
+        """Compiles the programs that training needs to start. Evaluations are compiled, and the
+        libraries that save and draw are imported, in the background, also while the training
+        already runs."""
 
-    @property
-    def _go_on(self) -> str:
-        name = self.config.algorithm
-        own = ["--algorithm", name] if is_file(name) else []
-        flags = [*named_task(self.config), *own, "--resume", str(self.run)]
-        return f"continue with: bounce-mjx train {shlex.join(flags)}"
-
-    def failure(self, error: jax.errors.JaxRuntimeError) -> str:
-        """What a device's failure means to the user."""
-        reason = shorten(reason_of(error), 200)
-        if reason.startswith("RESOURCE_EXHAUSTED"):
-            envs = f"{self.config.ppo.num_envs:,} environments"
-            return f"{self.device} has too little memory for {envs} ({reason}); lower num_envs"
-        fewer = ", with --num-devices 1 if one is left" if self.trainer.mesh.size > 1 else ""
-        return f"{self.device} failed after {self.steps:,} steps ({reason}); {self._advice}{fewer}"
-
-    @property
-    def _advice(self) -> str:
-        """What to do after the death of a device or a save."""
-        if latest := self._latest():
-            return f"{self._go_on} (the last checkpoint is {latest})"
-        return "start again, as no checkpoint had been saved yet"
-
-    def _latest(self) -> Path | None:
-        """The newest checkpoint, once the last save has ended."""
-        concurrent.futures.wait([self.saving])
-        with contextlib.suppress(UserError):
-            return folders.latest_checkpoint(self.run).folder
-
-    def _remove_unstarted(self, error: type[BaseException] | None, *_) -> None:
-        """Removes the folder of a new run without a checkpoint or a block."""
-        is_new = self.resume is None and self.steps == 0
-        if error is not None and is_new and hosts.is_leader() and self._latest() is None:
-            # A log that is opened later would make the folder again.
-            concurrent.futures.wait([self.opening])
-            shutil.rmtree(self.run, ignore_errors=True)
-
-    def compile(self, make_evaluators: Callable[..., Evaluators]) -> None:
-        """Compiles the programs that training needs to start. Evaluations are compiled, logs are
-        opened, and the libraries that save and draw are imported in the background, also while the
-        training already runs."""
-
-        def compile() -> None:
+        def trace() -> tuple[Evaluators, concurrent.futures.Future]:
             # The longest program is traced first: Python traces one program at a time while XLA
             # compiles others.
             compiling = self.trainer.compile(self.pool)
-            self.evaluators = make_evaluators(self.config, self.env, self.trainer.mesh, self.pool)
-            self.opening = self.pool.submit(self._open_logs)
-            self.opening.add_done_callback(lambda _: [*map(importlib.import_module, _SLOW_MODULES)])
-            compiling.result()
+            evaluators = make_evaluators(self.config, self.env, self.trainer.mesh, self.pool)
+            return evaluators, compiling
 
         with self.console.status("compiling"):
-            compiling = self.pool.submit(compile)
-            if not self.stop.wait_for(compiling):
-                raise Interrupted
-        compiling.result()
-        # A callback may refuse the run.
-        self.opening.result()
-        self.stack.callback(events.call_all, self.callbacks, "close")
+            self.evaluators, compiling = self.wait_for(self.pool.submit(trace))
+            self.open_logs()
+            self.pool.submit(_import_slow_modules)
+            self.wait_for(compiling)
         if jax.process_count() > 1:
             # A process that finds its programs in the cache waits here for a process that compiles
             # them; otherwise the exchange between devices would time out after 30 s.
             self.evaluators.wait()
             hosts.any_of(False)
-        self.trainer.start(self.state, self.first)
+        self.trainer.start(self.state, self.networks)
         self.state = None
-        self._lap("compile")
-        self.started, self.first_step = time.monotonic(), self.steps
+        self.clock.lap("compile")
 
-    def _open_logs(self) -> None:
-        """Opens the log, where it is written, and tells the callbacks of each seed."""
+    def open_logs(self) -> None:
+        """Opens the log, where it is written, and tells the callbacks of each seed, which may
+        refuse the run."""
         if hosts.is_leader():
-            resumed = None if self.resume is None else self.steps
-            self.callbacks = [TensorBoardLog(resumed), *self.callbacks]
-        for member in self.members:
-            events.call_all(self.callbacks, "start", member.run, member.config)
+            self.callbacks.insert(0, TensorBoardLog(None if self.is_new else self.steps))
+        self.stack.callback(events.call_all, self.callbacks, "close")
+        for seed in self.seeds:
+            events.call_all(self.callbacks, "start", seed.run, seed.config)
 
-    def _tell(self, member: SeedRun, metrics: dict[str, float], **evaluation: Any) -> None:
-        """Tells the callbacks an `Event` of a seed."""
-        event = events.Event(member.run, member.config, self.steps, metrics, **evaluation)
-        answers = [callback(event) for callback in self.callbacks]
-        self.ended |= any(answer is False for answer in answers)
+    # The loop
 
-    def train(self) -> None:
-        """Trains until the last step, or until a stop is requested."""
-        while not self._stopping():
-            if self._is_due() and not self._evaluate():
-                break
-            if self._is_done() or self._is_solved():
-                break
-            self._run_block()
-            self.ended = hosts.any_of(self.ended)
-
-    def finish(self) -> None:
-        """Waits until everything is saved, and evaluates the best policy on fresh resets.
-
-        Raises:
-          TrainingStopped: a stop was requested.
-        """
-        stopping = self._stopping()
-        if stopping and not self._is_evaluated():
-            if self.resume is None and self.steps == 0:
-                jax.distributed.shutdown()
-                raise Interrupted
-            self._end_save()
-            self._save(self.trainer.snapshot(), {})
-        self._end_save(is_last=True)
-        evaluated = not stopping and self._evaluate_best()
-        jax.distributed.shutdown()
-        if not evaluated:
-            where = "" if stopping else ", before the final evaluation"
-            raise TrainingStopped(f"stopped after {self.steps:,} steps{where}; {self._go_on}")
-
-    def _stopping(self) -> bool:
-        return hosts.any_of(self.stop.requested)
-
-    def _healthy(self) -> list[SeedRun]:
-        return [member for member in self.members if member.progress.fault is None]
-
-    def _is_solved(self) -> bool:
-        solved = all(member.progress.solved for member in self._healthy())
-        return self.config.stop_when_solved and solved
-
-    def _is_evaluated(self) -> bool:
-        return all(member.progress.has(self.steps) for member in self._healthy())
-
-    def _is_done(self) -> bool:
-        return self.ended or self.steps >= self.config.total_steps
-
-    def _is_due(self) -> bool:
-        done = self._is_done()
-        if done and any(member.progress.best is None for member in self._healthy()):
+    def evaluation_is_due(self) -> bool:
+        """Whether the current policies are to be evaluated."""
+        is_done = self.is_done()
+        if is_done and any(seed.best is None for seed in self.healthy()):
             return True
         # The policy of a warm start is the one to beat.
-        trained = self.steps > 0 or self.first is not None
-        at_evaluation = done or self.steps % self.eval_steps == 0
-        return trained and at_evaluation and not self._is_evaluated()
+        is_trained = self.steps > 0 or self.networks is not None
+        at_evaluation = is_done or self.steps % self.eval_steps == 0
+        return is_trained and at_evaluation and not self.is_evaluated()
 
-    def _evaluate(self) -> bool:
-        """Evaluates and saves; returns False if a stop was requested meanwhile."""
-        snapshot = self.trainer.snapshot()
-        reports = self._wait_for_reports(self.evaluators.select, snapshot.policies)
+    def evaluate(self) -> None:
+        """Evaluates the current policies, unless a stop is requested meanwhile."""
+        is_first = "evaluate" not in self.clock.seconds
+        policies = self.take_snapshot().policies
+        reports = self.wait_for_reports(self.evaluators.select, policies)
         if reports is None:
-            return False
-        each = zip(self.members, reports, snapshot.policies, strict=True)
-        evaluated = [one for one in each if one[0].progress.fault is None]
+            return
+        seconds = sum(self.clock.seconds.values())
+        # Then it is known whether the best policy before was saved.
+        self.saver.end()
+        self.clock.lap("save")
+        evaluated = [
+            (seed, report, policy)
+            for seed, report, policy in zip(self.seeds, reports, policies, strict=True)
+            if seed.progress.fault is None
+        ]
         judged = [report for _, report, _ in evaluated]
         self.say(events.evaluation_line(self.config.num_seeds, self.steps, judged))
-        seconds, scores = sum(self.seconds.values()), {}
-        self._end_save()
-        for member, report, policy in evaluated:
-            self._tell(member, events.points_of(report), report=report, policy=policy)
-            is_best = member.progress.improves(report, self.steps, seconds)
-            if is_best:
-                member.best_policy = policy
-            if is_best or len(self.members) == 1:
-                scores[member.run] = report.score
-        self._save(snapshot, scores)
-        return True
+        for seed, report, policy in evaluated:
+            self.tell(seed, events.points_of(report), report=report, policy=policy)
+            seed.add_report(report, policy, self.steps, seconds)
+        self.is_saved = False
+        if is_first:
+            self.clock.restart_estimate(self.steps)
 
-    def _evaluate_best(self) -> bool:
-        """Evaluates the best policies on fresh resets, and writes the results; returns False if a
-        stop was requested meanwhile."""
-        # A seed that diverged before its first evaluation has no best policy; another seed's policy
-        # takes its place in the batch.
-        best = [member.best_policy for member in self.members]
-        other = next(policy for policy in best if policy is not None)
-        reports = self._wait_for_reports(self.evaluators.final, [x or other for x in best])
-        if reports is None:
-            return False
-        for member, report in zip(self.members, reports, strict=True):
-            member.progress.best = report if member.best_policy else None
-        if hosts.is_leader():
-            self.saving = self.pool.submit(_write, [], self._results(fresh_resets=True))
-        self._end_save(is_last=True)
-        return True
+    def save_is_due(self) -> bool:
+        """Whether the current state is to be saved: after each evaluation."""
+        return not self.is_saved and self.is_evaluated()
 
-    def _wait_for_reports(
-        self, evaluate: Callable[[list[Policy]], list[Report]], policies: list[Policy]
-    ) -> list[Report] | None:
-        """Returns a report of each seed, or None if a stop was requested meanwhile."""
-        evaluating = self.pool.submit(evaluate, policies)
-        # On several hosts, a process that stopped on its own would keep the others waiting.
-        if not self.stop.wait_for(evaluating) and jax.process_count() == 1:
-            return None
-        reports = evaluating.result()
-        self._lap("evaluate")
-        return reports
+    def save(self) -> None:
+        """Starts to save the state, and with several seeds the policies that are the best of their
+        seed."""
+        self.saver.end()
+        self.saver.start(self.take_snapshot(), self.steps, self.about())
+        self.is_saved = True
+        self.clock.lap("save")
 
-    def _run_block(self) -> None:
+    def is_stopping(self) -> bool:
+        """Whether a signal has come to any process."""
+        return hosts.any_of(self.stop.requested)
+
+    def is_finished(self) -> bool:
+        """Whether the training ends here."""
+        return self.is_done() or self.is_solved()
+
+    def train_block(self) -> tuple[Metrics, float]:
+        """Trains for a block of I iterations; its metrics, each [S, I], and its duration, s.
+
+        Raises:
+          UserError: nothing can be learned from the first block.
+        """
+        self.snapshot = None
         started = time.perf_counter()
         block = self.pool.submit(self.trainer.run)
         if not self.stop.wait_for(block):
             self.say("stopping after this block; the same signal again ends it at once")
         metrics = block.result()
         seconds = time.perf_counter() - started
-        if self.steps == 0 and (wrong := fault_of(metrics, self.config)) is not None:
+        if self.steps == 0 and (wrong := faults.first_block_fault(metrics, self.config)):
             raise UserError(f"these settings cannot be trained: {wrong}")
-        faults = metrics.pop("fault")
         self.steps += self.block_steps
-        rate = len(faults) * self.block_steps / seconds
-        metrics["speed/steps_per_second"] = np.full((len(faults), 1), rate)
+        self.is_saved = False
+        for seed in self.seeds:
+            seed.report = None
+        return metrics, seconds
+
+    def log_block(self, metrics: Metrics, seconds: float) -> None:
+        """Says and logs a block.
+
+        Raises:
+          UserError: every seed has diverged.
+        """
+        block_faults = metrics.pop("fault")
+        rate = len(self.seeds) * self.block_steps / seconds
+        metrics["speed/steps_per_second"] = np.full((len(self.seeds), 1), rate)
         points = events.block_points(metrics)
-        # At the mean speed so far with its evaluations.
-        share = (self.config.total_steps - self.steps) / (self.steps - self.first_step)
-        left = share * (time.monotonic() - self.started)
+        left = self.time_left()
         self.say(events.block_line(self.config, self.steps, seconds, left, points))
         if total := int(sum(point["task/non_finite"] for point in points)):
             self.say(f"states that were not finite, whose environments were reset: {total:,}")
-        for member, own in zip(self.members, points, strict=True):
-            self._tell(member, own)
-        self._check_faults(faults)
-        self._lap("train")
+        for seed, seed_points in zip(self.seeds, points, strict=True):
+            self.tell(seed, seed_points)
+        self.end_diverged(block_faults)
+        self.is_ended = hosts.any_of(self.is_ended)
+        self.clock.lap("train")
 
-    def _check_faults(self, faults: np.ndarray) -> None:
-        """Ends a run that diverged, because its state is useless; with several seeds, the
-        other seeds continue.
-
-        Args:
-          faults: the metric "fault" of a block [seeds, I].
-        """
-        before = self.steps // self.config.ppo.batch_steps - faults.shape[1]
-        for member, block_faults in zip(self.members, faults, strict=True):
-            if member.progress.fault is not None or not block_faults.any():
-                continue
-            first = int(np.argmax(block_faults != 0))
-            quantity = self.trainer.checked[int(block_faults[first]) - 1]
-            where = f"iteration {before + first + 1}"
-            member.progress.fault = f"{quantity} became infinite or NaN at {where}"
-            if self.config.num_seeds > 1:
-                self.say(f"seed {member.config.seed} diverged: {member.progress.fault}")
-        if self._healthy():
-            return
-        raise UserError(
-            f"training diverged: {self.members[-1].progress.fault}; the last good checkpoint is "
-            f"{self._latest() or 'none'}; lower the learning rate, or change the rewards"
-        )
-
-    def _end_save(self, is_last: bool = False) -> None:
-        """Waits for the last save. What could not be saved is lost, as the next save has newer
-        data: such a policy is not the best one.
+    def finish(self) -> None:
+        """Waits until everything is saved, and evaluates the best policy on fresh resets.
 
         Raises:
-          UserError: it failed, and no other follows.
+          TrainingStopped: a stop was requested.
+          Interrupted: it was requested before there was anything to save.
+          UserError: the state could not be saved.
         """
-        problem = None
-        try:
-            self.saving.result()
-        except OSError as error:
-            problem = f"{self.run} cannot be written ({error.strerror})"
-            if is_last:
-                lost = "so the end of the training is lost; make room, and"
-                raise UserError(f"{problem}, {lost} {self._advice}") from error
-            meanwhile = "training continues, and saves at its next evaluation"
-            self.say(f"the state is not saved, as {problem}; make room: {meanwhile}")
-        if hosts.any_of(problem is not None):
-            for member in self.members:
-                member.recall_best()
-        self._lap("save")
+        stopping, where = self.is_stopping(), ""
+        if self.is_ended and self.steps < self.config.total_steps:
+            self.say(f"a callback ended the training after {self.steps:,} steps; {self.go_on}")
+        if stopping and self.is_new and self.steps == 0:
+            jax.distributed.shutdown()
+            raise Interrupted
+        if not self.is_saved:
+            self.save()
+        self.end_last_save()
+        if not stopping and not self.evaluate_best():
+            stopping, where = True, ", before the final evaluation"
+        jax.distributed.shutdown()
+        if stopping:
+            raise TrainingStopped(f"stopped after {self.steps:,} steps{where}; {self.go_on}")
 
-    def _save(self, snapshot: ppo_trainer.Snapshot, scores: dict[Path, tuple[float, ...]]) -> None:
-        """Starts to save the state, and with several seeds the policies of some of them.
+    def evaluate_best(self) -> bool:
+        """Evaluates the best policies on fresh resets, and writes the results; returns False if a
+        stop was requested meanwhile."""
+        # A seed that diverged before its first evaluation has no best policy; another seed's policy
+        # takes its place in the batch.
+        other = next(seed.best.policy for seed in self.seeds if seed.best)
+        policies = [seed.best.policy if seed.best else other for seed in self.seeds]
+        reports = self.wait_for_reports(self.evaluators.final, policies)
+        if reports is None:
+            return False
+        for seed, report in zip(self.seeds, reports, strict=True):
+            seed.progress.best = report if seed.best else None
+        self.saver.start(None, self.steps, self.about(fresh_resets=True))
+        self.end_last_save()
+        return True
 
-        Args:
-          scores: quality of the policies that were evaluated, by the seed's folder; with several
-            seeds, of those that are the best of their seed.
+    def end_last_save(self) -> None:
+        """Waits for a save that no other follows.
+
+        Raises:
+          UserError: it failed.
         """
-        if hosts.is_leader():
-            # A copy, because the training reuses its buffers meanwhile.
-            policies, state, networks = jax.tree.map(np.array, snapshot)
-            training, is_alone = {checkpoints.TRAINING: state}, len(self.members) == 1
-            saves, records = [], [member.progress.model_dump() for member in self.members]
-            for i, member in enumerate(self.members):
-                items = training.copy() if is_alone else {}
-                items[checkpoints.POLICY] = policies[i]
-                items[checkpoints.NETWORKS] = networks and networks[i]
-                score = scores.get(member.run, ())
-                if is_alone or score:
-                    saves.append((member.run, member.config, self.steps, items, records[i], score))
-            if not is_alone:
-                # Last, as it refers to the best policies of the seeds.
-                saves.append((self.run, self.config, self.steps, training, {"seeds": records}))
-            self.saving = self.pool.submit(_write, saves, self._results())
-        self._lap("save")
+        problem = self.saver.end(is_last=True)
+        self.clock.lap("save")
+        if problem:
+            raise UserError(
+                f"{self.run} cannot be written ({problem}), so the end of the training is lost; "
+                f"make room, and {self.advice}"
+            )
 
-    def _results(self, fresh_resets: bool = False) -> dict[Path, str]:
-        """The content of each seed's results.json; none before its first evaluation."""
-        about = {"trained_steps": self.steps, "seconds": self.seconds, "device": self.device}
-        about |= {"fresh_resets": fresh_resets, "version": bounce_mjx.__version__}
+    # What is known of the training
+
+    @property
+    def device(self) -> str:
+        """Name and number of the devices."""
+        mesh = self.trainer.mesh
+        count = f"{mesh.size} x " if mesh.size > 1 else ""
+        return f"{count}{mesh.devices.flat[0].device_kind}"
+
+    def healthy(self) -> list[SeedRun]:
+        """The seeds that have not diverged."""
+        return [seed for seed in self.seeds if seed.progress.fault is None]
+
+    def is_done(self) -> bool:
+        """Whether the last step is reached, or a callback has ended the training."""
+        return self.is_ended or self.steps >= self.config.total_steps
+
+    def is_solved(self) -> bool:
+        """Whether the results end the training."""
+        solved = all(seed.progress.solved for seed in self.healthy())
+        return self.config.stop_when_solved and solved
+
+    def is_evaluated(self) -> bool:
+        """Whether the current policies are evaluated."""
+        return all(seed.progress.has(self.steps) for seed in self.healthy())
+
+    def take_snapshot(self) -> Snapshot:
+        """The current state, in every process."""
+        if self.snapshot is None:
+            self.snapshot = self.trainer.snapshot()
+        return self.snapshot
+
+    def time_left(self) -> float | None:
+        """Estimated time to the last step, s. None after the first block, meanwhile other programs
+        are still compiled."""
+        if "train" in self.clock.seconds:
+            return self.clock.left(self.steps, self.config.total_steps)
+        self.clock.restart_estimate(self.steps)
+        return None
+
+    def about(self, fresh_resets: bool = False) -> dict[str, Any]:
+        """What the results say of the training, see `Results`."""
         return {
-            member.run / RESULTS_FILE: to_json(member.progress.results(**about))
-            for member in self.members
-            if member.progress.best is not None
+            "trained_steps": self.steps,
+            "seconds": self.clock.seconds,
+            "device": self.device,
+            "fresh_resets": fresh_resets,
+            "version": bounce_mjx.__version__,
         }
 
+    # Telling
 
-def _write(saves: list[tuple[Any, ...]], results: dict[Path, str]) -> None:
-    for arguments in saves:
-        checkpoints.save_checkpoint(*arguments)
-    for path, content in results.items():
-        write_atomically(path, content)
+    def say(self, line: str) -> None:
+        """Prints a line."""
+        events.say(self.console, line)
+
+    def tell(self, seed: SeedRun, metrics: dict[str, float], **evaluation: Any) -> None:
+        """Tells the callbacks an `Event` of a seed."""
+        event = events.Event(seed.run, seed.config, self.steps, metrics, **evaluation)
+        answers = [callback(event) for callback in self.callbacks]
+        self.is_ended |= any(answer is False for answer in answers)
+
+    @property
+    def go_on(self) -> str:
+        """How to continue the run."""
+        name = self.config.algorithm
+        algorithm = ["--algorithm", name] if is_file(name) else []
+        flags = [*named_task(self.config), *algorithm, "--resume", str(self.run)]
+        return f"continue with: bounce-mjx train {shlex.join(flags)}"
+
+    # Signals and faults
+
+    def wait_for(self, future: "concurrent.futures.Future[Result]") -> Result:
+        """The result of what is computed before the first block.
+
+        Raises:
+          Interrupted: a stop was requested meanwhile.
+        """
+        if not self.stop.wait_for(future):
+            raise Interrupted
+        return future.result()
+
+    def wait_for_reports(
+        self, evaluate: Callable[[list[Policy]], list[Report]], policies: list[Policy]
+    ) -> list[Report] | None:
+        """A report of each seed, or None if a stop was requested meanwhile."""
+        evaluating = self.pool.submit(evaluate, policies)
+        # On several hosts, a process that stopped on its own would keep the others waiting.
+        if not self.stop.wait_for(evaluating) and jax.process_count() == 1:
+            return None
+        reports = evaluating.result()
+        self.clock.lap("evaluate")
+        return reports
+
+    def end_diverged(self, block_faults: np.ndarray) -> None:
+        """Ends a run that diverged; with several seeds, the other seeds continue.
+
+        Args:
+          block_faults: the metric "fault" of the last block [S, I].
+
+        Raises:
+          UserError: every seed has diverged.
+        """
+        iterations = block_faults.shape[1]
+        first = self.steps // self.config.ppo.batch_steps - iterations + 1
+        for seed in faults.mark_diverged(self.seeds, block_faults, self.trainer.checked, first):
+            if len(self.seeds) > 1:
+                self.say(f"seed {seed.config.seed} diverged: {seed.progress.fault}")
+        if not self.healthy():
+            raise UserError(
+                f"training diverged: {self.seeds[-1].progress.fault}; the last good checkpoint is "
+                f"{self.latest() or 'none'}; lower the learning rate, or change the rewards"
+            )
+
+    def describe_failure(self, error: jax.errors.JaxRuntimeError) -> str:
+        """What the failure of a device means to the user."""
+        is_one = self.trainer.mesh.size == 1
+        fewer = "" if is_one else ", with --num-devices 1 if one is left"
+        advice = f"{self.advice}{fewer}"
+        return faults.describe_failure(error, self.device, self.config, self.steps, advice)
+
+    @property
+    def advice(self) -> str:
+        """What to do after the death of a device or a save."""
+        if latest := self.latest():
+            return f"{self.go_on} (the last checkpoint is {latest})"
+        return "start again, as no checkpoint had been saved yet"
+
+    def latest(self) -> Path | None:
+        """The newest checkpoint, once the last save has ended."""
+        self.saver.wait()
+        with contextlib.suppress(UserError):
+            return folders.latest_checkpoint(self.run).folder
+
+    def remove_unstarted(self, error: type[BaseException] | None, *_) -> None:
+        """Removes the folder of a new run without a checkpoint or a block."""
+        is_unstarted = self.is_new and self.steps == 0
+        if error is not None and is_unstarted and hosts.is_leader() and self.latest() is None:
+            shutil.rmtree(self.run, ignore_errors=True)
+
+
+def _make_run(config: TrainConfig) -> Path:
+    """The folder of a new run, which the leader makes."""
+    made = str(folders.create_run(config)) if hosts.is_leader() else None
+    return Path(hosts.exchange(made)[0])
+
+
+def _import_slow_modules() -> None:
+    for name in _SLOW_MODULES:
+        importlib.import_module(name)

@@ -1,5 +1,9 @@
 """A callback that logs for TensorBoard."""
 
+import contextlib
+import os
+import re
+import struct
 import sys
 import time
 from pathlib import Path
@@ -9,9 +13,14 @@ from bounce_mjx.config.files import flat
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training.events import Event
 
+# TensorBoard reads the files whose names have it.
+_NAME = "events.out.tfevents"
+_STAMP = re.compile(rf"{re.escape(_NAME)}\.(\d+)")
+
 
 class TensorBoardLog:
-    """A log in the folder of each run. What cannot be written, as on a full disk, is lost.
+    """A log in the folder of each run. What cannot be written, as on a full disk, is lost; the log
+    stays readable, and goes on once there is room.
 
     TensorboardX's `SummaryWriter` has a thread, which the first error ends, and then its queue
     blocks for ever.
@@ -26,20 +35,18 @@ class TensorBoardLog:
         # tensorboardX imports where it is installed and which takes four seconds.
         is_free = sys.modules.setdefault("torch", None) is None
         try:
-            from tensorboardX import event_file_writer, summary
+            from tensorboardX import record_writer, summary
             from tensorboardX.proto import event_pb2
         finally:
             if is_free:
                 del sys.modules["torch"]
-        self.summary, self._events = summary, event_pb2
-        self._new_writer = event_file_writer.EventsWriter
-        self._resumed, self._writers = resumed, {}
+        self.summary, self._event = summary, event_pb2.Event
+        self._session_log, self._checksum = event_pb2.SessionLog, record_writer.masked_crc32c
+        self._resumed = resumed
+        self._files: dict[Path, _LogFile] = {}
 
     def start(self, run: Path, config: TrainConfig) -> None:
         """Logs the config as hyperparameters."""
-        if self._resumed is not None:
-            start = self._events.SessionLog(status=self._events.SessionLog.START)
-            self.add(run, self._resumed + 1, session_log=start)
         plain = flat(config.model_dump(mode="json")).items()
         plain = {name: x if isinstance(x, int | float) else str(x) for name, x in plain}
         shown = dict.fromkeys(("results/mean_return", "episode/return"), 0.0)
@@ -52,16 +59,52 @@ class TensorBoardLog:
         self.add(event.run, event.steps, summary=self.summary.Summary(value=values))
 
     def add(self, folder: Path, steps: int, **content: Any) -> None:
-        """Writes an entry as tensorboardX makes it. A file with one that is only half written ends
-        there for its readers, so that a new one follows it."""
-        try:
-            if folder not in self._writers:
-                folder.mkdir(parents=True, exist_ok=True)
-                # Logs that are opened in the same second need different names.
-                writer = self._new_writer(f"{folder / 'events'}", f".{time.time_ns()}")
-                self._writers[folder] = writer
-            entry = self._events.Event(wall_time=time.time(), step=steps, **content)
-            self._writers[folder].write_event(entry)
-            self._writers[folder].flush()
-        except OSError:
-            self._writers.pop(folder, None)
+        """Writes an entry into the log of a folder, which exists."""
+        if folder not in self._files:
+            self._files[folder] = _LogFile(folder, self._head())
+        self._files[folder].write(self._record(step=steps, **content))
+
+    def _head(self) -> bytes:
+        """The first entries of a file."""
+        head = self._record(file_version="brain.Event:2")
+        if self._resumed is not None:
+            start = self._session_log(status=self._session_log.START)
+            head += self._record(step=self._resumed + 1, session_log=start)
+        return head
+
+    def _record(self, **content: Any) -> bytes:
+        """An entry in the format of TensorBoard's files."""
+        data = self._event(wall_time=time.time(), **content).SerializeToString()
+        length = struct.pack("<Q", len(data))
+        checksums = (struct.pack("<I", self._checksum(part)) for part in (length, data))
+        return b"".join((length, next(checksums), data, next(checksums)))
+
+
+class _LogFile:
+    """A file of entries, which has each of them whole or not at all."""
+
+    def __init__(self, folder: Path, head: bytes):
+        """
+        Args:
+          head: what the file begins with.
+        """
+        # TensorBoard reads files in the order of their names, and the clock may have been set back.
+        names = [path.name for path in folder.glob(f"{_NAME}.*")]
+        stamps = [int(found[1]) for name in names if (found := _STAMP.match(name))]
+        stamp = max([int(time.time()), *(earlier + 1 for earlier in stamps)])
+        self._path = folder / f"{_NAME}.{stamp:010d}.{os.getpid()}"
+        self._head, self._file = head, None
+
+    def write(self, entry: bytes) -> None:
+        """Writes an entry, unless there is no room for it."""
+        with contextlib.suppress(OSError):
+            if self._file is None:
+                self._file = self._path.open("xb", buffering=0)
+            size, written = self._file.tell(), 0
+            content = entry if size else self._head + entry
+            try:
+                written = self._file.write(content)
+            finally:
+                if written != len(content):
+                    self._file.truncate(size)
+                    self._file.seek(size)

@@ -7,7 +7,7 @@ statistics. With several seeds each device holds some of them.
 
 import concurrent.futures
 import functools
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -18,27 +18,13 @@ from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning import ppo
 from bounce_mjx.learning.config import PPOConfig, find_algorithm
-from bounce_mjx.learning.policy import Policy
 from bounce_mjx.learning.statistics import RunningStatistics
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training import hosts
 from bounce_mjx.training.setup import compiler_options
+from bounce_mjx.training.trainer import Metrics, Snapshot
 
 _AXIS = "devices"
-
-Metrics = dict[str, np.ndarray]
-
-
-class Snapshot(NamedTuple):
-    """The policies and the state of a training run at one moment, as pytrees of NumPy arrays."""
-
-    policies: list[Policy]
-    """The policy of each seed."""
-    state: Any
-    """Everything that is needed to continue the training; numbers of at most 32 bits."""
-    networks: list[dict[str, Any]] | None = None
-    """What another training can start with, for each seed: "params" and "statistics" of both
-    networks."""
 
 
 def iterations_per_block(config: TrainConfig) -> int:
@@ -54,11 +40,9 @@ def each_seed(tree: Any, num_seeds: int) -> list[Any]:
 
 
 class PPOTrainer:
-    """S independent runs of one algorithm, one for each seed. The training job runs any other class
-    with its public attributes and methods, too."""
+    """The `Trainer` that runs an algorithm's programs: PPO, or a subclass of it."""
 
     checked = ppo.CHECKED
-    """The quantities that must stay finite, in the order of their computation."""
 
     def __init__(self, config: TrainConfig, env: Env):
         """
@@ -183,7 +167,10 @@ def make_mesh(num_devices: int | None, config: PPOConfig, num_seeds: int = 1) ->
     if num_devices is None:
         num_devices = 1 if jax.process_count() == 1 else len(devices)
     if num_devices > len(devices):
-        raise UserError(f"num_devices is {num_devices}, but there are {len(devices)}; choose fewer")
+        raise UserError(
+            f"num_devices is {num_devices}, but the number of devices here is {len(devices)}; give "
+            f"--num-devices {len(devices)}"
+        )
     if jax.process_count() > 1 and num_devices < len(devices):
         raise UserError(f"num_devices is {num_devices}, but the hosts have {len(devices)}; omit it")
     if num_seeds > 1:

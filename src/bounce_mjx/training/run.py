@@ -23,8 +23,8 @@ from bounce_mjx.runs import folders
 from bounce_mjx.runs.checkpoints import read_actor
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.progress import load_results
+from bounce_mjx.runs.settings import PYTHON, Choice, Stack, stack
 from bounce_mjx.training import hosts, job
-from bounce_mjx.training.command import Start, changed
 from bounce_mjx.training.events import Callback, say
 from bounce_mjx.training.setup import set_up_jax
 
@@ -37,6 +37,9 @@ class Run:
     folder: Path
     task: str | None = None
     """The task as the user names it: a run of a task in a file, FILE.py:CLASS, needs it once."""
+
+    def __post_init__(self):
+        object.__setattr__(self, "folder", Path(self.folder))
 
     @property
     def config(self) -> TrainConfig:
@@ -70,8 +73,7 @@ class Run:
     def policy(self) -> Callable[[jax.Array], jax.Array]:
         """The best checkpoint's policy: the most likely actions [..., A] of observations [..., N].
         It can be compiled and differentiated."""
-        _, arrays, actor = read_actor(self.checkpoint, self.config)
-        return functools.partial(actor(Env(self.config.env)).act, arrays)
+        return _read_policy(self.checkpoint, self.task)
 
     def evaluate(self, **options: Any) -> Report:
         """Measures the results of the best checkpoint, as `bounce-mjx eval` does.
@@ -86,6 +88,16 @@ class Run:
         _, arrays, actor = read_actor(self.checkpoint, self.config)
         options = EvaluationOptions(**options)
         return evaluate_policy(arrays, self.config.env, actor, options).report
+
+
+# A program may ask for the policy in each of its steps.
+@functools.lru_cache(maxsize=16)
+def _read_policy(
+    checkpoint: folders.Checkpoint, task: str | None
+) -> Callable[[jax.Array], jax.Array]:
+    config = load_run_config(checkpoint.run, task)
+    _, arrays, actor = read_actor(checkpoint, config)
+    return functools.partial(actor(Env(config.env)).act, arrays)
 
 
 def train(
@@ -113,11 +125,13 @@ def train(
     Args:
       task: name of a task, or FILE.py:CLASS.
       config: name of a preset or a YAML file, or several, each of which lies on those before it; by
-        default, the preset for this machine. Or a whole config, on which nothing else lies.
+        default, the preset for this machine. Or a whole config, which stands alone.
       robot: name or file of a robot's config.
       world: name or file of a world.
-      warm_start: run with whose networks the training starts.
-      resume: run to continue in place; only its length and evaluations may change.
+      warm_start: run, or policy of the package, from whose networks and environment the training
+        starts.
+      resume: run, or a checkpoint in it, to continue in place; only its length and evaluations
+        may change.
       callbacks: functions that are called with an `Event` for each block and each evaluation; the
         training ends once one returns False.
       report: whether to write report.html into the run's folder.
@@ -129,17 +143,32 @@ def train(
       UserError: a setting is wrong; or as `job.train`.
       TrainingStopped: the user stopped the training.
     """
-    if not isinstance(config, TrainConfig):
-        files = [config] if isinstance(config, str | Path) else config
-        given = {"task": task, "config": tuple(files), "robot": robot, "world": world}
-        given |= {"warm_start": warm_start, "resume": resume}
-        given |= {name: settings.get(name) for name in ("log_dir", "total_steps")}
-        start = validate(Start, given, "train")
-        base = start.base()
-        config, resume = start.settle(changed(base, settings), base), start.run
+    whole = config if isinstance(config, TrainConfig) else None
+    files = () if whole else (config,) if isinstance(config, str | Path) else tuple(config)
+    said = settings | {"task": task, "warm_start": warm_start}
+    said = {key: value for key, value in said.items() if key in settings or value is not None}
+    deciding = {k: said[k] for k in ("task", "algorithm", "warm_start", "log_dir") if k in said}
+    given = {"config": files, "robot": robot, "world": world, "resume": resume}
+    layers = stack(validate(Choice, given | deciding, PYTHON), whole=whole)
+    config = layers.config(said)
     set_up_jax(config.env)
     console = stdout(quiet=quiet or not hosts.is_leader())
-    seeds = job.train(config, console, resume=resume, callbacks=callbacks)
+    return run_training(layers, config, console, callbacks, report)
+
+
+def run_training(
+    layers: Stack,
+    config: TrainConfig,
+    console: Console,
+    callbacks: Sequence[Callback],
+    report: bool,
+) -> Run:
+    """Trains with a config, which has its settings from layers, and returns the run."""
+    if layers.resume is None:
+        say(console, f"config: {layers.title}")
+    for note in layers.notes:
+        say(console, f"note: {note}")
+    seeds = job.train(config, console, resume=layers.resume, callbacks=callbacks)
     best = print_results(seeds, console)
     if report and hosts.is_leader():
         leave_report(best, console)

@@ -1,5 +1,6 @@
 """A callback that films the policy for TensorBoard."""
 
+import contextlib
 import io
 from pathlib import Path
 
@@ -60,4 +61,7 @@ class EvaluationVideo:
         image = kind.Image(**shape, encoded_image_string=gif.getvalue())
         summary = kind(value=[kind.Value(tag="policy", image=image)])
         # In its own folder, as TensorBoard stops reading a file once its folder has a newer one.
-        self._log.add(event.run / "video", event.steps, summary=summary)
+        folder = event.run / "video"
+        with contextlib.suppress(OSError):
+            folder.mkdir(exist_ok=True)
+        self._log.add(folder, event.steps, summary=summary)

@@ -32,6 +32,11 @@ _PLOT_RATE = 8.0
 _PLOT_SECONDS = 4.0
 AXIS = {"stroke": "#444", "grid": {"stroke": "#e3e6ea"}}
 """Style of the axes of a plot."""
+# uPlot's range: from the floor to 1.05 m, and further where a ball or a target is outside.
+_HEIGHT_AXIS = {
+    "min": {"soft": 0.0, "mode": 1, "pad": 0.05},
+    "max": {"soft": 1.05, "mode": 1, "pad": 0.05},
+}
 _LEVEL_COLOURS = ("#2b8a3e", "#9c36b5", "#0b7285")
 _REWARD = "reward/"
 
@@ -118,7 +123,7 @@ class _Plots:
             (np.zeros(1),) * len(lines),
             tuple(lines),
             axes=({**AXIS, "size": 30}, {**AXIS, "size": 40}),
-            scales={"x": {"time": False}, "y": {"range": (0.0, 1.05)}},
+            scales={"x": {"time": False}, "y": {"range": _HEIGHT_AXIS}},
             legend={"live": False},
             height=190,
         )

@@ -185,9 +185,9 @@ class Simulation:
         command = {name: np.float32(self.command.get(name, np.nan)) for name in config.commands}
         world = {}
         for name in config.randomization.terms:
-            shape, nominal = TERMS[name].shape(self.env.action_size), TERMS[name].nominal
-            if nominal is not None:
-                entries = (np.nan,) if self.world is None else self.world.get(name, (nominal,))
+            if name in self.env.nominals:
+                shape, nominal = TERMS[name].shape(self.env.action_size), self.env.nominals[name]
+                entries = np.nan if self.world is None else self.world.get(name, nominal)
                 world[name] = np.full(shape or 1, entries, np.float32).reshape(shape)
         return self.policy, self._key, self._states, self._steps, command, self._push, world
 

@@ -19,21 +19,18 @@ class WorldSlider(NamedTuple):
     step: float
     scale: float = 1.0
     """Factor from the slider's unit to the term's."""
+    nominal: float = 0.0
+    """Position without effect on the project's own model, in the slider's unit."""
 
     @property
     def span(self) -> tuple[float, float]:
         """The limits in the term's unit."""
         return self.limits[0] * self.scale, self.limits[1] * self.scale
 
-    @property
-    def nominal(self) -> float:
-        """The nominal value in the slider's unit."""
-        return TERMS[self.term].nominal / self.scale
-
     def world_value(self, position: float) -> tuple[float, ...]:
         """Entries of the term at a slider position; the slider moves the first entry."""
         others = math.prod(TERMS[self.term].size) - 1
-        return (position * self.scale, *(TERMS[self.term].nominal,) * others)
+        return (position * self.scale, *(self.nominal * self.scale,) * others)
 
 
 SLIDERS = (
@@ -41,7 +38,7 @@ SLIDERS = (
     WorldSlider("picture delay, ms", "ball_latency", (0.0, 50.0), 1.0, 1e-3),
     WorldSlider("ball noise, mm", "ball_position_noise", (0.0, 20.0), 0.5, 1e-3),
     WorldSlider("paddle tilt, degrees", "paddle_tilt", (-5.0, 5.0), 0.1, math.radians(1.0)),
-    WorldSlider("restitution", "restitution", (0.6, 0.98), 0.01),
+    WorldSlider("restitution", "restitution", (0.6, 0.98), 0.01, nominal=0.85),
 )
 
 
@@ -64,12 +61,14 @@ def with_sliders(config: WorldConfig) -> WorldConfig:
 
 def reset_ranges(config: WorldConfig) -> Ranges:
     """Ranges with which a reset of `with_sliders(config)` samples the worlds of `config`."""
-    nominal = {
-        name: jnp.full(TERMS[name].shape(config.num_joints), TERMS[name].nominal, jnp.float32)
-        for name in with_sliders(config).randomization.terms
-        if name not in config.randomization.terms
-    }
-    return config.randomization.ranges() | {name: (end, end) for name, end in nominal.items()}
+    active = with_sliders(config).randomization.terms
+    ranges = config.randomization.ranges()
+    for slider in SLIDERS:
+        if slider.term in active and slider.term not in config.randomization.terms:
+            shape = TERMS[slider.term].shape(config.num_joints)
+            end = jnp.full(shape, slider.nominal * slider.scale, jnp.float32)
+            ranges[slider.term] = end, end
+    return ranges
 
 
 def sliders_for(config: RandomizationConfig) -> tuple[WorldSlider, ...]:

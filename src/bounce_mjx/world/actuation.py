@@ -26,8 +26,8 @@ class Actuation(NamedTuple):
     """Memory of the actuation; a field is None if no setting needs it."""
 
     setpoint: Setpoint | None = None
-    """The joints' commands at the end of the last step, each entry [n], to which an action adds;
-    the position alone if the commands jump."""
+    """The joints' setpoints at the end of the last step, each entry [n], to which an action adds;
+    the position alone if the setpoints jump."""
     queue: Control | None = None
     """Controls of the last control steps, each entry [K, nu], the newest first."""
     filtered: jax.Array | None = None
@@ -35,23 +35,32 @@ class Actuation(NamedTuple):
 
 
 class Actuators:
-    """The actuators of a world."""
+    """The actuators of a world.
+
+    An action goes through `Actuators.next` from top to bottom: it asks for a target of each joint,
+    the arm's limits make a setpoint of it, which is the physics' `Control`; latency and lag delay
+    that, and `physics.control.servo_target` gives its value in each physics step.
+    """
 
     def __init__(self, config: WorldConfig, mj_model: mujoco.MjModel):
-        self._config, self._nu, self._addresses = config, mj_model.nu, find_addresses(mj_model)
+        self._config = config
+        self._nu = mj_model.nu
+        self._addresses = find_addresses(mj_model)
         self._range = joint_ranges(mj_model)
         self._limits = joint_limits(config.robot.limits, *self._range)
         self._gears = mj_model.actuator_gear[list(self._addresses.actuators), 0]
 
     def first(self, qpos: jax.Array) -> Actuation:
         """Memory at a reset, with the servos at rest at qpos [nq]."""
-        config, still = self._config, jnp.zeros(self._config.num_joints, qpos.dtype)
-        wanted, last = self._joint_targets(self._angles(qpos), still), None
-        if config.action.base == "target":
-            last = Setpoint(wanted, still, still)
-        control, setpoint = self._command(wanted, last)
-        memory = start_actuation(config.randomization, config.control_dt, control)
-        return memory._replace(setpoint=setpoint)
+        zeros = jnp.zeros(self._config.num_joints, qpos.dtype)
+        targets = self._joint_targets(self._joint_angles(qpos), zeros, None)
+        setpoint = None
+        if self._config.action.base == "target":
+            setpoint = Setpoint(targets, zeros, zeros)
+        after = self._next_setpoint(setpoint, targets)
+        control = self._control(targets, setpoint, after)
+        memory = start_actuation(self._config.randomization, self._config.control_dt, control)
+        return memory._replace(setpoint=after)
 
     def next(
         self,
@@ -64,131 +73,205 @@ class Actuators:
         """The inputs of the physics over a control step, and the memory after it.
 
         Args:
+          before: the memory before the step.
           qpos: true positions before the step [nq].
           action: clipped [n].
+          world: the values that the episode sampled.
           clock: before the step; None for a world that is not randomised.
         """
-        config, angles = self._config, self._angles(qpos)
+        angles = self._joint_angles(qpos)
         if "joint_angle_noise" in world:
             # The same noise as in the observation from which the policy chose the action.
-            numbers, _ = noise.joints(clock.counter, config.num_joints, action.dtype)
-            angles = angles + world["joint_angle_noise"] * numbers
-        wanted = self._joint_targets(angles, action, before.setpoint)
-        control, setpoint = self._command(wanted, before.setpoint)
-        control, memory = add_delay(world, before, control, config.control_dt, config.num_substeps)
+            angle_noise, _ = noise.joints(clock.counter, self._config.num_joints, action.dtype)
+            angles = angles + world["joint_angle_noise"] * angle_noise
+        targets = self._joint_targets(angles, action, before.setpoint)
+        setpoint = self._next_setpoint(before.setpoint, targets)
+        control = self._control(targets, before.setpoint, setpoint)
+        if "servo_offset" in world:
+            control = control._replace(ctrl=control.ctrl + self._ctrl(world["servo_offset"]))
+        control, memory = add_delay(
+            world, before, control, self._config.control_dt, self._config.num_substeps
+        )
         control = control._replace(air_drag=world.get("air_drag"))
         if "push_speed" in world:
-            control = control._replace(ball_push=self._push(world, clock))
+            control = control._replace(ball_push=self._ball_push(world, clock))
         return control, memory._replace(setpoint=setpoint)
 
-    def _angles(self, qpos: jax.Array) -> jax.Array:
+    def _joint_angles(self, qpos: jax.Array) -> jax.Array:
+        """Positions of the acting joints [n], rad."""
         return jnp.stack([qpos[i] for i in self._addresses.arm_qpos])
 
     def _joint_targets(
-        self, angles: jax.Array, action: jax.Array, last: Setpoint | None = None
+        self, angles: jax.Array, action: jax.Array, setpoint: Setpoint | None
     ) -> jax.Array:
         """The target of each joint [n], rad: an angle plus the scaled action, clipped to the range.
 
         Args:
           angles: measured [n], rad, without the offset of the encoders' zeros, which the servo
             shares.
-          last: the last commands, to which the action adds, within `max_lead` of the measured
+          action: clipped [n].
+          setpoint: the last setpoint, to which the action adds, within `max_lead` of the measured
             angles; None if it adds to these.
         """
-        if last is not None:
-            lead = self._config.action.max_lead
-            angles = jnp.clip(last.position, angles - lead, angles + lead)
-        targets = angles + self._config.action_scale * action
+        base = angles
+        if setpoint is not None:
+            max_lead = self._config.action.max_lead
+            base = jnp.clip(setpoint.position, angles - max_lead, angles + max_lead)
+        targets = base + self._config.action_scale * action
         return jnp.clip(targets, *jnp.asarray(self._range, targets.dtype))
 
-    def _command(self, wanted: jax.Array, last: Setpoint | None) -> tuple[Control, Setpoint | None]:
-        """The control that takes the joints to their targets [n], as far as the limits allow, and
-        the command at the end of the step."""
+    def _next_setpoint(self, setpoint: Setpoint | None, targets: jax.Array) -> Setpoint | None:
+        """The setpoint at the end of a control step: as near to the targets [n] as the limits
+        allow. None if the actions add to the measured angles, as nothing has to be remembered."""
+        if setpoint is None:
+            return None
         if self._limits is None:
-            after = None if last is None else Setpoint(wanted, None, None)
-            return Control(self._ctrl(wanted)), after
-        substep, smoothing = self._config.physics_dt, self._limits.smoothing
-        after = next_setpoint(self._limits, last, wanted, self._config.control_dt, jnp)
-        if smoothing is not None:
-            # An actuator of no joint has a target of zero, whatever the time.
-            times = jnp.asarray(smoothing / substep, wanted.dtype)
-            smoothing = scatter(np.ones(self._nu), self._addresses.actuators, times)
+            return Setpoint(targets, None, None)
+        return next_setpoint(self._limits, setpoint, targets, self._config.control_dt, jnp)
+
+    def _control(
+        self, targets: jax.Array, before: Setpoint | None, after: Setpoint | None
+    ) -> Control:
+        """The control that takes the joints to the end of a control step, without delays.
+
+        Args:
+          targets: of the joints [n], rad.
+          before: the setpoint at the start of the step, in an arm with limits.
+          after: the setpoint at the end of the step, in an arm with limits.
+        """
+        if self._limits is None:
+            return Control(self._ctrl(targets))
+        # Times in seconds end here: the physics counts physics steps.
+        physics_dt = self._config.physics_dt
         moving = Moving(
-            velocity=self._ctrl(last.velocity * substep),
-            acceleration=self._ctrl(after.acceleration * substep**2),
-            before=self._ctrl(last.acceleration * substep**2),
-            smoothing=smoothing,
+            velocity=self._ctrl(before.velocity * physics_dt),
+            acceleration=self._ctrl(after.acceleration * physics_dt**2),
+            last_acceleration=self._ctrl(before.acceleration * physics_dt**2),
+            smoothing=self._smoothing_steps(targets.dtype),
         )
-        return Control(self._ctrl(last.position), moving), after
+        return Control(self._ctrl(before.position), moving)
+
+    def _smoothing_steps(self, dtype: jnp.dtype) -> jax.Array | None:
+        """Time [nu] of the mean that limits the jerk, in physics steps; None without such a
+        limit."""
+        if self._limits.smoothing is None:
+            return None
+        steps = jnp.asarray(self._limits.smoothing / self._config.physics_dt, dtype)
+        # An actuator of no joint has a target of zero, whatever the time.
+        return scatter(np.ones(self._nu), self._addresses.actuators, steps)
 
     def _ctrl(self, values: jax.Array) -> jax.Array:
         """Inputs of the actuators [nu] from a value of each joint's angle [n]."""
         gears = jnp.asarray(self._gears, values.dtype)
         return scatter(np.zeros(self._nu), self._addresses.actuators, gears * values)
 
-    def _push(self, world: World, clock: Clock) -> jax.Array:
+    def _ball_push(self, world: World, clock: Clock) -> jax.Array:
         """Velocity [3] that a push adds to the ball at the start of a control step, m/s; 0 at most
         steps. Several balls are pushed at one time, each in its direction [B, 3]."""
-        config, phase = self._config, clock.phases[1]
+        phase = clock.push_phase
         interval = world.get("push_interval", jnp.full_like(phase, DEFAULT_PUSH_INTERVAL))
-        now = recurs(interval, phase, clock.step, config.control_dt)
-        each = () if config.num_balls == 1 else (config.num_balls,)
+        is_due = noise.is_due(interval, phase, clock.step, self._config.control_dt)
+        num_balls = self._config.num_balls
+        shape = () if num_balls == 1 else (num_balls,)
         counter = noise.next_counter(clock.counter)
-        angle = 2.0 * math.pi * noise.uniform(counter, noise.PUSH, each, phase.dtype)
-        speed = jnp.where(now, world["push_speed"], 0.0)
-        x, y = speed * jnp.cos(angle), speed * jnp.sin(angle)
+        angle = 2.0 * math.pi * noise.uniform(counter, noise.PUSH, shape, phase.dtype)
+        speed = jnp.where(is_due, world["push_speed"], 0.0)
+        x = speed * jnp.cos(angle)
+        y = speed * jnp.sin(angle)
         return jnp.stack([x, y, jnp.zeros_like(x)], axis=-1)
 
 
-def start_actuation(config: RandomizationConfig, control_dt: float, rest: Control) -> Actuation:
-    """Memory of latency and lag at a reset, with the servos at rest under a control."""
+def start_actuation(config: RandomizationConfig, control_dt: float, control: Control) -> Actuation:
+    """Memory of latency and lag at a reset.
+
+    Args:
+      config: the terms of the world.
+      control_dt: time of one control step, s.
+      control: under which the servos rest.
+    """
     queue = None
     if config.action_latency is not None:
         length = math.floor(config.action_latency[1] / control_dt) + 2
-        queue = jax.tree.map(lambda x: jnp.broadcast_to(x, (length, *x.shape)), _varying(rest))
-    return Actuation(queue=queue, filtered=None if config.servo_lag is None else rest.ctrl)
+        queue = jax.tree.map(
+            lambda value: jnp.broadcast_to(value, (length, *value.shape)), _varying(control)
+        )
+    filtered = None
+    if config.servo_lag is not None:
+        filtered = control.ctrl
+    return Actuation(queue=queue, filtered=filtered)
 
 
 def _varying(control: Control) -> Control:
     """The control without what is the same in each step."""
-    moving = control.moving
-    return control._replace(moving=moving and moving._replace(smoothing=None))
+    if control.moving is None:
+        return control
+    return control._replace(moving=control.moving._replace(smoothing=None))
 
 
 def add_delay(
     world: World, memory: Actuation, control: Control, control_dt: float, num_substeps: int
 ) -> tuple[Control, Actuation]:
-    """Control of a control step from that of its action, which has targets alone.
+    """The control of a control step with latency and lag, and the memory after the step.
 
     The targets arrive late by any number of physics steps, and the servos' first-order lag filters
     them.
+
+    Args:
+      world: the values that the episode sampled.
+      memory: before the step.
+      control: of the step's action, which has targets alone.
+      control_dt: time of one control step, s.
+      num_substeps: physics steps in a control step.
     """
-    queue, filtered, moving = memory.queue, memory.filtered, control.moving
+    queue = memory.queue
     if queue is not None:
-        shift = lambda new, q: jnp.concatenate([new[None], q[:-1]])  # noqa: E731
-        queue = jax.tree.map(shift, _varying(control), queue)
+        queue = jax.tree.map(with_newest, queue, _varying(control))
         latency = world["action_latency"] / control_dt
-        # Without the 1e-4, rounding could turn a latency of one 10 ms step into zero whole steps
-        # and a switch at the end of the step.
-        whole = jnp.floor(latency + 1e-4)
-        control, older = (
-            jax.tree.map(lambda q, age=age: entry_at(q[age:], whole), queue) for age in (0, 1)
-        )
-        if moving is None:
-            control = control._replace(previous=older.ctrl)
-        elif moving.smoothing is not None:
-            late = control.moving._replace(
-                smoothing=moving.smoothing,
-                earlier=older.moving.before,
-                duration=jnp.asarray(num_substeps, control.ctrl.dtype),
-            )
-            control = control._replace(moving=late)
-        control = control._replace(switch=jnp.round((latency - whole) * num_substeps))
+        control = _late_control(queue, control, latency, num_substeps)
+    filtered = memory.filtered
     if filtered is not None:
-        steps = world["servo_lag"] / (control_dt / num_substeps)
-        control = control._replace(filtered=filtered, lag=steps)
-        filtered = servo_target(control, jnp.asarray(num_substeps - 1, filtered.dtype))
+        lag_steps = world["servo_lag"] / (control_dt / num_substeps)
+        control = control._replace(filtered=filtered, lag=lag_steps)
+        last_step = jnp.asarray(num_substeps - 1, filtered.dtype)
+        filtered = servo_target(control, last_step)
     return control, memory._replace(queue=queue, filtered=filtered)
+
+
+def _late_control(
+    queue: Control, control: Control, latency: jax.Array, num_substeps: int
+) -> Control:
+    """The control that acts in a control step: an older one until the physics step `switch`, and
+    the one after it from then on.
+
+    Args:
+      queue: controls of the last control steps, each entry [K, nu], that of this step's action
+        first.
+      control: of this step's action.
+      latency: in control steps [].
+      num_substeps: physics steps in a control step.
+    """
+    # Without the 1e-4, rounding could turn a latency of one 10 ms step into zero whole steps
+    # and a switch at the end of the step.
+    whole = jnp.floor(latency + 1e-4)
+    newer = jax.tree.map(lambda entries: entry_at(entries, whole), queue)
+    older = jax.tree.map(lambda entries: entry_at(entries[1:], whole), queue)
+    switch = jnp.round((latency - whole) * num_substeps)
+    if control.moving is None:
+        return newer._replace(previous=older.ctrl, switch=switch)
+    if control.moving.smoothing is None:
+        # The motion of the newer one reaches back into the older one's step.
+        return newer._replace(switch=switch)
+    moving = newer.moving._replace(
+        smoothing=control.moving.smoothing,
+        older_acceleration=older.moving.last_acceleration,
+        control_steps=jnp.asarray(num_substeps, control.ctrl.dtype),
+    )
+    return newer._replace(moving=moving, switch=switch)
+
+
+def with_newest(queue: jax.Array, newest: jax.Array) -> jax.Array:
+    """A queue [K, ...] with a new value [...] in front, without its oldest one."""
+    return jnp.concatenate([newest[None], queue[:-1]])
 
 
 def entry_at(queue: jax.Array, index: jax.Array) -> jax.Array:
@@ -198,10 +281,3 @@ def entry_at(queue: jax.Array, index: jax.Array) -> jax.Array:
     for i in range(1, len(queue)):
         entry = jnp.where(index >= i, queue[i], entry)
     return entry
-
-
-def recurs(interval: jax.Array, phase: jax.Array, step: jax.Array, control_dt: float) -> jax.Array:
-    """Whether an event that recurs every interval (s) falls into the control step [], bool."""
-    per_step = control_dt / interval
-    time = phase + step.astype(phase.dtype) * per_step
-    return jnp.floor(time + per_step) > jnp.floor(time)

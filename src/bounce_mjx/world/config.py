@@ -12,7 +12,7 @@ from bounce_mjx.config import settings
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.robot.config import OF_SITE, RobotConfig, Vector, is_packaged
 from bounce_mjx.world.observation import ObservationConfig, ObservationLayout
-from bounce_mjx.world.randomization import TERMS, RandomizationConfig
+from bounce_mjx.world.randomization import EACH_JOINT, TERMS, RandomizationConfig
 
 PADDLE_HOME = (0.59356, 0.0, 0.0498)
 """Centre of the paddle of the project's own arm at a reset, m."""
@@ -42,6 +42,8 @@ class Command(NamedTuple):
     """Change by a key of a viewer."""
     names: tuple[str, ...] = ()
     """Names of the values 0 to 1, 1 to 2, ..., if they are choices; a user may give a name."""
+    hidden: bool = False
+    """Whether the policy need not see it, because it acts through other commands."""
 
     def checked(self, value: Any, label: str) -> float:
         """A user's value as a number.
@@ -110,7 +112,7 @@ class RobotSettings(settings.StrictModel):
     the project's own robot."""
     action_scale: Annotated[settings.Positive, Field(le=0.5)] = 0.02
     """Change of the servo target for an action of 1, rad."""
-    max_joint_velocity: settings.Speed = 2.0 * math.pi
+    max_joint_velocity: Annotated[settings.Positive, Field(le=50.0)] = 2.0 * math.pi
     """The episode ends when a joint is faster than this, rad/s."""
     randomization: RandomizationConfig = RandomizationConfig()
     """The world that each episode samples."""
@@ -169,11 +171,20 @@ class WorldConfig(RobotSettings):
                 f"control_dt {self.control_dt} is not a whole number of physics steps of "
                 f"{self.physics_dt} s; choose a multiple of physics_dt"
             )
-        limits, terms = self.robot.limits, self.randomization
-        counts = {f"robot.limits.{name}": len(x) for name, x in limits if x is not None}
-        for name in terms.terms:
-            if TERMS[name].size is None and isinstance(getattr(terms, name)[0], tuple):
-                counts[f"randomization.{name}"] = len(getattr(terms, name)[0])
+        if self.action.base == "target" and self.action.max_lead < self.action_scale:
+            raise ValueError(
+                f"action.max_lead is {self.action.max_lead:g}, which is less than the action_scale "
+                f"{self.action_scale:g}, so that no action would have its full effect; give more"
+            )
+        limits = self.robot.limits
+        counts = {}
+        for name, numbers in limits:
+            if numbers is not None:
+                counts[f"robot.limits.{name}"] = len(numbers)
+        for name in self.randomization.terms:
+            low, _ = getattr(self.randomization, name)
+            if TERMS[name].size is EACH_JOINT and isinstance(low, tuple):
+                counts[f"randomization.{name}"] = len(low)
         for key, count in counts.items():
             if count != self.num_joints:
                 raise ValueError(
@@ -198,11 +209,15 @@ class WorldConfig(RobotSettings):
     @pydantic.model_validator(mode="after")
     def _check_effects(self):
         """A setting that has no effect is a mistake. A run's own config has all defaults."""
-        unused = {f"robot.{name}": "robot.site" for name in OF_SITE} if not self.robot.site else {}
+        unused = {}
+        if not self.robot.site:
+            unused |= {f"robot.{name}": "robot.site" for name in OF_SITE}
         if self.action.base == "measured":
-            unused["action.max_lead"] = unused["observation.servo_lead"] = "the action.base target"
+            unused["action.max_lead"] = "the action.base target"
+            unused["observation.servo_lead"] = "the action.base target"
         for key, needed in unused.items():
-            group, name = (getattr(self, key.split(".")[0]), key.split(".")[1])
+            group_name, name = key.split(".")
+            group = getattr(self, group_name)
             if getattr(group, name) != type(group).model_fields[name].default:
                 raise ValueError(
                     f"{key} has no effect without {needed}; set that too, or leave {key} out"
@@ -212,10 +227,10 @@ class WorldConfig(RobotSettings):
     @pydantic.field_validator("mjcf")
     @classmethod
     def _make_absolute(cls, path: Path | None) -> Path | None:
-        """A run's config is read from other folders too."""
+        """A run's config is read from other folders too, and by people: without .. in it."""
         if path is None or is_packaged(path):
             return path
-        return Path(os.path.expanduser(path)).absolute()
+        return Path(os.path.abspath(os.path.expanduser(path)))
 
     @classmethod
     def settings_at(cls, paddle: tuple[float, float, float]) -> dict[str, Any]:
@@ -228,9 +243,15 @@ class WorldConfig(RobotSettings):
         Args:
           paddle: centre of the level paddle at `default_joint_angles`, m.
         """
-        starts = (c.model_fields["ball_init_pos"].default for c in (cls, WorldConfig))
-        moved = zip(*starts, paddle, (0.0, 0.0, 0.4), strict=True)
-        return {"ball_init_pos": [round(b - w + p + h, 4) + 0.0 for b, w, p, h in moved]}
+        world_start = WorldConfig.model_fields["ball_init_pos"].default
+        task_start = cls.model_fields["ball_init_pos"].default
+        over_paddle = (0.0, 0.0, 0.4)
+        position = []
+        for i in range(3):
+            coordinate = task_start[i] - world_start[i] + paddle[i] + over_paddle[i]
+            # Without a negative zero.
+            position.append(round(coordinate, 4) + 0.0)
+        return {"ball_init_pos": position}
 
     @property
     def num_joints(self) -> int:
@@ -250,16 +271,18 @@ class WorldConfig(RobotSettings):
     @property
     def unseen_noise(self) -> tuple[str, ...]:
         """Terms of the randomisation that change measurements which the policy does not see."""
-        seen, terms = self.observation, self.randomization.terms
-        if seen.lengths("task"):
+        observation = self.observation
+        if observation.lengths("task"):
             return ()
-        velocity = seen.ball_velocity and seen.velocity == "measured"
-        unseen = {
-            "joint_velocity_": seen.joint_velocities,
-            "ball_velocity_": velocity,
-            "ball_position_": seen.ball_position or (seen.ball_velocity and not velocity),
+        has_sensor = observation.velocity == "measured"
+        is_seen = {
+            "joint_velocity_": observation.joint_velocities,
+            "ball_velocity_": observation.ball_velocity and has_sensor,
+            "ball_position_": observation.ball_position
+            or (observation.ball_velocity and not has_sensor),
         }
-        return tuple(t for t in terms if any(t.startswith(p) and not s for p, s in unseen.items()))
+        unseen = tuple(prefix for prefix, seen in is_seen.items() if not seen)
+        return tuple(name for name in self.randomization.terms if name.startswith(unseen))
 
     @property
     def heights(self) -> dict[str, float]:

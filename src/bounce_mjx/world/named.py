@@ -1,6 +1,7 @@
 """Named worlds: the numbers of a real robot and its camera in a YAML file, each with its source."""
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -66,16 +67,34 @@ class NamedWorld(StrictModel):
         """
         before = env.get("randomization", {}) if training else {}
         kept = {key: value for key, value in before.items() if key in CURRICULUM}
-        return merged(env | {"randomization": kept}, self.settings)
+        values = merged(env | {"randomization": kept}, self.settings)
+        return values | {"randomization": without_idle_curriculum(values["randomization"])}
 
-    def double_assumed(self) -> dict[str, dict[str, Any]]:
+    def double_assumed(self, nominals: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         """For each assumed key, the nested settings of `env` in which alone its number is doubled.
 
         A term of the randomisation goes twice as far from the model's value, within its limits; a
         rate, an interval, or a limit, of which less is harder, is halved.
+
+        Args:
+          nominals: the values of the terms without randomisation (`Env.nominals`).
         """
         given = flat(self.settings)
-        return {key: nested(key, _double(key, given[key])) for key in self.assumed}
+        return {key: nested(key, _double(key, given[key], nominals)) for key in self.assumed}
+
+
+def without_idle_curriculum(randomization: dict[str, Any]) -> dict[str, Any]:
+    """Settings of a randomisation without the parts of the curriculum that act on none of its
+    terms: `shares` of other terms, and `share` and `warmup_steps` without a term to share."""
+    terms = [name for name in TERMS if randomization.get(name) is not None]
+    acting = dict(randomization)
+    if not any(TERMS[name].has_nominal for name in terms):
+        acting.pop("share", None)
+        if acting.get("first_command_range", 1.0) == 1.0:
+            acting.pop("warmup_steps", None)
+    if acting.get("shares"):
+        acting["shares"] = {name: p for name, p in acting["shares"].items() if name in terms}
+    return acting
 
 
 def read_world(path: Path) -> NamedWorld:
@@ -88,13 +107,21 @@ def read_world(path: Path) -> NamedWorld:
     return validate(NamedWorld, values, str(path))
 
 
-def _double(key: str, value: Any) -> Any:
+def _double(key: str, value: Any, nominals: Mapping[str, Any]) -> Any:
+    """The value of an assumed setting in `double_assumed`."""
     group, _, name = key.rpartition(".")
-    factor, centre, (least, most) = 2.0, 0.0, (-math.inf, math.inf)
+    factor = 2.0
+    centre = 0.0
+    least = -math.inf
+    greatest = math.inf
     if group == "randomization":
-        nominal, (least, most) = TERMS[name].nominal, TERMS[name].bounds
-        factor, centre = (0.5, 0.0) if nominal is None else (2.0, nominal)
+        least, greatest = TERMS[name].bounds
+        if name in nominals:
+            centre = nominals[name]
+        else:
+            factor = 0.5
     elif group == "robot.limits":
         factor = 0.5
 
-    return np.clip(centre + factor * (np.array(value) - centre), least, most).tolist()
+    doubled = centre + factor * (np.array(value) - centre)
+    return np.clip(doubled, least, greatest).tolist()

@@ -24,7 +24,23 @@ class Clock(NamedTuple):
     step: jax.Array
     """Control steps since the reset [], int32."""
     phases: jax.Array
-    """Share of the current interval that had passed at the reset [3]: camera, pushes, commands."""
+    """Phases [3] of the camera, of the pushes and of the commands at the reset, as shares of their
+    intervals."""
+
+    @property
+    def camera_phase(self) -> jax.Array:
+        """Share of an interval [] from the reset until the first picture is taken."""
+        return self.phases[0]
+
+    @property
+    def push_phase(self) -> jax.Array:
+        """Share of an interval [] that had passed at the reset."""
+        return self.phases[1]
+
+    @property
+    def command_phase(self) -> jax.Array:
+        """Share of an interval [] that had passed at the reset."""
+        return self.phases[2]
 
 
 def first_clock(key: jax.Array, dtype: jnp.dtype) -> Clock:
@@ -45,9 +61,29 @@ def next_counter(counter: jax.Array) -> jax.Array:
     return counter * jnp.int32(747796405) + jnp.int32(-1403630843)
 
 
+def is_due(interval: jax.Array, phase: jax.Array, step: jax.Array, control_dt: float) -> jax.Array:
+    """Whether an event that recurs falls into a control step [], bool.
+
+    Args:
+      interval: time between two events [], s.
+      phase: share of an interval that had passed at the reset [].
+      step: control steps since the reset [], int.
+      control_dt: time of one control step, s.
+    """
+    intervals_per_step = control_dt / interval
+    passed = phase + step.astype(phase.dtype) * intervals_per_step
+    return jnp.floor(passed + intervals_per_step) > jnp.floor(passed)
+
+
 def uniform(counter: jax.Array, stream: int, shape: tuple[int, ...], dtype: jnp.dtype) -> jax.Array:
-    """Uniform numbers in (0, 1) of the given shape; each stream of a counter has its own
-    numbers."""
+    """Uniform numbers in (0, 1).
+
+    Args:
+      counter: of a `Clock` [], int32.
+      stream: one of the streams above; each has its own numbers.
+      shape: of the result.
+      dtype: of the result.
+    """
     size = math.prod(shape)
     index = jnp.arange(size, dtype=jnp.int32) + jnp.int32(stream * 1024)
     bits = _mix(counter + _mix(index))
@@ -56,7 +92,8 @@ def uniform(counter: jax.Array, stream: int, shape: tuple[int, ...], dtype: jnp.
 
 
 def normal(counter: jax.Array, stream: int, shape: tuple[int, ...], dtype: jnp.dtype) -> jax.Array:
-    """Normally distributed numbers with mean 0 and variance 1 (Box and Muller 1958)."""
+    """Normally distributed numbers with mean 0 and variance 1 (Box and Muller 1958); the arguments
+    are those of `uniform`."""
     size = math.prod(shape)
     pairs = (size + 1) // 2
     numbers = uniform(counter, stream, (2, pairs), dtype)
@@ -75,7 +112,10 @@ def joints(counter: jax.Array, num_joints: int, dtype: jnp.dtype) -> tuple[jax.A
 def _mix(x: jax.Array) -> jax.Array:
     """A bijection of int32 in which every output bit depends on every input bit (lowbias32 of
     Wellons, hash-prospector)."""
-    shift = lambda x, n: jax.lax.shift_right_logical(x, jnp.int32(n))  # noqa: E731
-    x = (x ^ shift(x, 16)) * jnp.int32(0x7FEB352D)
-    x = (x ^ shift(x, 15)) * jnp.int32(0x846CA68B - 2**32)
-    return x ^ shift(x, 16)
+
+    def shifted(number: jax.Array, bits: int) -> jax.Array:
+        return jax.lax.shift_right_logical(number, jnp.int32(bits))
+
+    x = (x ^ shifted(x, 16)) * jnp.int32(0x7FEB352D)
+    x = (x ^ shifted(x, 15)) * jnp.int32(0x846CA68B - 2**32)
+    return x ^ shifted(x, 16)

@@ -1,5 +1,10 @@
 """Domain randomisation: each episode samples its own world.
 
+`RandomizationConfig` is the table of the terms. A term's row says what it is (its comment, with the
+unit), its shape, its bounds and its nominal value; and, if it is physical, the field of
+`PhysicsParameters` that it changes, and the operation by which it does. `physics.edited.edits` is
+the table of that field's entries in the model.
+
 A term is a key of the config with a range (low, high), from which a reset samples every entry of
 the term uniformly. Each end of a term of several entries may be one number for all, or one for each
 entry. A term that is null is off and costs nothing.
@@ -8,8 +13,7 @@ entry. A term that is null is off and costs nothing.
 from __future__ import annotations
 
 import math
-import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -18,7 +22,7 @@ from pydantic import Field
 
 from bounce_mjx.config.settings import Finite, StrictModel, UnitInterval, whole_number
 from bounce_mjx.config.validation import unit_of
-from bounce_mjx.errors import shorten
+from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.lazy import jax, jnp, mujoco, np
 
 if TYPE_CHECKING:
@@ -49,18 +53,48 @@ Ranges = dict[str, tuple["jax.Array", "jax.Array"]]
 shape."""
 
 
-def tilt_frame(own: jax.Array, angles: jax.Array) -> jax.Array:
-    """The quaternion of a frame that turns about its own x axis, then about its new y axis."""
+class Operation(NamedTuple):
+    """How a sampled value and the model's own parameters make a physical parameter."""
+
+    apply: Callable[[PhysicsParameters, str, jax.Array], jax.Array]
+    """(the model's own parameters, the parameter's name, sampled value) -> the parameter."""
+    nominal: float | None = None
+    """The sampled value that changes nothing, if it is the same for all models."""
+    model_nominal: Callable[[PhysicsParameters, str], Any] | None = None
+    """(the model's own parameters, the parameter's name) -> the sampled value that changes nothing,
+    if it depends on the model; None for a model that lacks the parameter."""
+
+
+def scale(model: PhysicsParameters, parameter: str, factor: jax.Array) -> jax.Array:
+    """The model's own value times a factor."""
+    return jnp.asarray(getattr(model, parameter), factor.dtype) * factor
+
+
+def shift(model: PhysicsParameters, parameter: str, difference: jax.Array) -> jax.Array:
+    """The model's own value plus a difference."""
+    return jnp.asarray(getattr(model, parameter), difference.dtype) + difference
+
+
+def replace(model: PhysicsParameters, parameter: str, value: jax.Array) -> jax.Array:
+    """The sampled value itself."""
+    return value
+
+
+def tilt_frame(model: PhysicsParameters, parameter: str, angles: jax.Array) -> jax.Array:
+    """The quaternion [4] of a frame that turns by angles [2] about its own x axis, then about its
+    new y axis."""
     from bounce_mjx.physics.scalars import quaternion_product
 
-    return jnp.stack(quaternion_product(tuple(own), _rotation_xy(angles)))
+    quaternion = jnp.asarray(getattr(model, parameter), angles.dtype)
+    return jnp.stack(quaternion_product(tuple(quaternion), _rotation_xy(angles)))
 
 
-def tilt_vector(own: jax.Array, angles: jax.Array) -> jax.Array:
-    """A vector that turns about the x axis, then about the new y axis."""
+def tilt_vector(model: PhysicsParameters, parameter: str, angles: jax.Array) -> jax.Array:
+    """A vector [3] that turns by angles [2] about the x axis, then about the new y axis."""
     from bounce_mjx.physics.scalars import quaternion_matrix
 
-    return jnp.stack(quaternion_matrix(_rotation_xy(angles)) @ tuple(own))
+    vector = jnp.asarray(getattr(model, parameter), angles.dtype)
+    return jnp.stack(quaternion_matrix(_rotation_xy(angles)) @ tuple(vector))
 
 
 def _rotation_xy(angles: jax.Array) -> Quaternion:
@@ -69,39 +103,89 @@ def _rotation_xy(angles: jax.Array) -> Quaternion:
     return cos_a * cos_b, sin_a * cos_b, cos_a * sin_b, sin_a * sin_b
 
 
-# The operations of terms, on the model's own value and the sampled one.
-scale, shift = operator.mul, operator.add
+def restitution_to_damping(
+    model: PhysicsParameters, parameter: str, restitution: jax.Array
+) -> jax.Array:
+    """The damping [] of the contact, 1/s, with a restitution [] at the model's own stiffness.
+
+    Raises:
+      UserError: the model has no contact pair of ball and paddle.
+    """
+    from bounce_mjx.physics.edited import NO_PAIR
+
+    if model.contact_stiffness is None:
+        raise UserError(NO_PAIR)
+    return contact_damping(restitution, model.contact_stiffness)
 
 
-def limit(own: jax.Array, most: jax.Array) -> jax.Array:
-    return jnp.minimum(own, most)
+def _model_restitution(model: PhysicsParameters, parameter: str) -> Any:
+    if model.contact_damping is None:
+        return None
+    return contact_restitution(model.contact_damping, model.contact_stiffness)
 
 
-def replace(_: Any, value: jax.Array) -> jax.Array:
-    return value
+SCALE = Operation(scale, nominal=1.0)
+ADD = Operation(shift, nominal=0.0)
+TILT_FRAME = Operation(tilt_frame, nominal=0.0)
+TILT_VECTOR = Operation(tilt_vector, nominal=0.0)
+REPLACE = Operation(replace, model_nominal=getattr)
+RESTITUTION = Operation(restitution_to_damping, model_nominal=_model_restitution)
+LIMIT = Operation(replace)
+"""For a parameter that limits the model's own value, which may have no limit: no nominal value."""
+
+NUMBER = ()
+"""Size of a term with one number."""
+EACH_JOINT = None
+"""Size of a term with one number for each acting joint."""
 
 
 class Term(NamedTuple):
     """A quantity that may differ between episodes: the metadata of its range."""
 
     size: tuple[int, ...] | None
-    """Shape of one episode's sample; None for one entry for each acting joint."""
-    nominal: float | None
-    """Value without randomisation, from which the range grows during the warm-up; None for a range
-    that does not grow."""
+    """Shape of one episode's sample; None (`EACH_JOINT`) for one entry for each acting joint."""
     bounds: tuple[float, float]
     """Smallest and largest sensible value."""
+    nominal: float | None = None
+    """Value without randomisation, from which the range grows during the warm-up, if it is the same
+    for all models; otherwise the operation's `model_nominal`. A term with neither is sampled in
+    every episode, and its range does not grow."""
     parameter: str | None = None
     """The field of `PhysicsParameters` that it changes."""
-    operation: Callable[[Any, Any], Any] | None = None
-    """(the model's own value, sampled value) -> value of the parameter; None for a restitution."""
+    operation: Operation | None = None
+    """How it changes that parameter."""
+
+    @property
+    def has_nominal(self) -> bool:
+        """Whether it has a value without randomisation."""
+        if self.nominal is not None:
+            return True
+        return self.operation is not None and self.operation.model_nominal is not None
 
     def shape(self, num_joints: int) -> tuple[int, ...]:
         """Shape of one episode's sample for an arm with this number of acting joints."""
         return (num_joints,) if self.size is None else self.size
 
 
-_FACTOR = (1e-3, 1e3)
+def physical(
+    parameter: str,
+    operation: Operation,
+    size: tuple[int, ...] | None,
+    bounds: tuple[float, float],
+) -> Term:
+    """A term that changes a field of `PhysicsParameters`.
+
+    Args:
+      parameter: the field.
+      operation: how the sampled value changes it.
+      size: of one sample, as `Term.size`.
+      bounds: smallest and largest sensible value.
+    """
+    return Term(size, bounds, operation.nominal, parameter, operation)
+
+
+# Wide, but narrower than the factor between a unit and a thousandth of it.
+_FACTOR = (0.01, 200.0)
 
 
 class RandomizationConfig(StrictModel):
@@ -110,78 +194,98 @@ class RandomizationConfig(StrictModel):
 
     former = {"restitution_slope": None, "air_lift": None}
 
-    restitution: Annotated[Sampled, Term((), 0.85, (0.6, 0.98), "contact_damping")] = None
-    """Restitution of the ball on the paddle, 0.6 to 0.98; the model's is 0.85."""
-    ball_mass: Annotated[Sampled, Term((), 1.0, _FACTOR, "ball_mass", scale)] = None
+    restitution: Annotated[
+        Sampled, physical("contact_damping", RESTITUTION, NUMBER, bounds=(0.4, 0.98))
+    ] = None
+    """Restitution of the ball on the paddle, in place of the model's, which is 0.85 for the
+    project's own robot."""
+    ball_mass: Annotated[Sampled, physical("ball_mass", SCALE, NUMBER, bounds=(0.01, 1e3))] = None
     """Factor of the ball's mass."""
-    ball_radius: Annotated[Sampled, Term((), 1.0, (0.1, 10.0), "ball_radius", scale)] = None
+    ball_radius: Annotated[Sampled, physical("ball_radius", SCALE, NUMBER, bounds=(0.1, 10.0))] = (
+        None
+    )
     """Factor of the ball's radius."""
-    air_drag: Annotated[Sampled, Term((), 0.0, (0.0, 10.0))] = None
+    air_drag: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 10.0), nominal=0.0)] = None
     """Deceleration of the ball by the air divided by its squared speed, 1/m; about 0.11 for a
     table-tennis ball."""
     contact_friction: Annotated[
-        Sampled, Term((), 0.0, (0.0, 10.0), "contact_friction", replace)
+        Sampled, physical("contact_friction", REPLACE, NUMBER, bounds=(0.0, 10.0))
     ] = None
     """Coefficient of sliding friction between ball and paddle, in place of the model's."""
-    servo_gain: Annotated[Sampled, Term(None, 1.0, _FACTOR, "servo_gain", scale)] = None
+    servo_gain: Annotated[Sampled, physical("servo_gain", SCALE, EACH_JOINT, bounds=_FACTOR)] = None
     """Factor of each servo's stiffness."""
-    servo_damping: Annotated[Sampled, Term(None, 1.0, _FACTOR, "servo_damping", scale)] = None
+    servo_damping: Annotated[
+        Sampled, physical("servo_damping", SCALE, EACH_JOINT, bounds=_FACTOR)
+    ] = None
     """Factor of each servo's damping."""
-    servo_lag: Annotated[Sampled, Term((), 0.0, (0.0, 1.0))] = None
+    servo_lag: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 1.0), nominal=0.0)] = None
     """Time constant of a first-order lag of the servo targets, s."""
-    torque_limit: Annotated[Sampled, Term(None, None, (1e-3, 1e5), "force_limit", limit)] = None
-    """Largest torque of each servo, N m; a servo that is weaker keeps its own limit."""
-    joint_damping: Annotated[Sampled, Term(None, 0.0, (0.0, 1e4), "damping", shift)] = None
+    servo_offset: Annotated[Sampled, Term(EACH_JOINT, bounds=(-0.5, 0.5), nominal=0.0)] = None
+    """Constant error of each servo: where it holds its joint, less its target, rad."""
+    torque_limit: Annotated[
+        Sampled, physical("force_limit", LIMIT, EACH_JOINT, bounds=(0.01, 1e4))
+    ] = None
+    """Largest torque of each servo at its joint, N m; a servo that is weaker keeps its own
+    limit."""
+    joint_damping: Annotated[Sampled, physical("damping", ADD, EACH_JOINT, bounds=(0.0, 500.0))] = (
+        None
+    )
     """Viscous damping added to each joint, N m s/rad."""
-    joint_frictionloss: Annotated[Sampled, Term(None, 0.0, (0.0, 1e4), "frictionloss", replace)] = (
-        None
-    )
+    joint_frictionloss: Annotated[
+        Sampled, physical("frictionloss", REPLACE, EACH_JOINT, bounds=(0.0, 500.0))
+    ] = None
     """Dry friction of each joint, N m, in place of the model's."""
-    armature: Annotated[Sampled, Term(None, 1.0, _FACTOR, "armature", scale)] = None
+    armature: Annotated[Sampled, physical("armature", SCALE, EACH_JOINT, bounds=_FACTOR)] = None
     """Factor of each joint's rotor inertia."""
-    link_mass: Annotated[Sampled, Term(None, 1.0, _FACTOR, "link_mass", scale)] = None
+    link_mass: Annotated[Sampled, physical("link_mass", SCALE, EACH_JOINT, bounds=_FACTOR)] = None
     """Factor of each link's mass."""
-    paddle_offset: Annotated[Sampled, Term((3,), 0.0, (-0.5, 0.5), "paddle_position", shift)] = None
+    paddle_offset: Annotated[
+        Sampled, physical("paddle_position", ADD, (3,), bounds=(-0.5, 0.5))
+    ] = None
     """Displacement of the paddle along each axis of the last link, m."""
-    paddle_tilt: Annotated[Sampled, Term((2,), 0.0, (-1.0, 1.0), "paddle_rotation", tilt_frame)] = (
+    paddle_tilt: Annotated[
+        Sampled, physical("paddle_rotation", TILT_FRAME, (2,), bounds=(-0.5, 0.5))
+    ] = None
+    """Rotation of the paddle about its own x and y axis, rad."""
+    gravity_tilt: Annotated[Sampled, physical("gravity", TILT_VECTOR, (2,), bounds=(-0.5, 0.5))] = (
         None
     )
-    """Rotation of the paddle about its own x and y axis, rad."""
-    gravity_tilt: Annotated[Sampled, Term((2,), 0.0, (-1.0, 1.0), "gravity", tilt_vector)] = None
     """Rotation of gravity about the world's x and y axis, rad."""
-    action_latency: Annotated[Sampled, Term((), 0.0, (0.0, 1.0))] = None
+    action_latency: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 1.0), nominal=0.0)] = None
     """Time from an action to its servo targets, s."""
-    ball_latency: Annotated[Sampled, Term((), 0.0, (0.0, 1.0))] = None
+    ball_latency: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 1.0), nominal=0.0)] = None
     """Time from a camera picture of the ball to its use, s."""
-    camera_rate: Annotated[Sampled, Term((), None, (1.0, 1e4))] = None
+    camera_rate: Annotated[Sampled, Term(NUMBER, bounds=(1.0, 1e4))] = None
     """Camera pictures of the ball per second, Hz; null for one at every control step."""
-    frame_drop: Annotated[Sampled, Term((), 0.0, (0.0, 0.99))] = None
+    frame_drop: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 0.99), nominal=0.0)] = None
     """Probability that a camera picture is lost."""
-    ball_position_noise: Annotated[Sampled, Term((), 0.0, (0.0, 0.5))] = None
+    ball_position_noise: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 0.5), nominal=0.0)] = None
     """Standard deviation of the noise of each measured ball coordinate, m."""
-    ball_position_bias: Annotated[Sampled, Term((3,), 0.0, (-0.5, 0.5))] = None
+    ball_position_bias: Annotated[Sampled, Term((3,), bounds=(-0.5, 0.5), nominal=0.0)] = None
     """Error of each measured ball coordinate, constant in an episode, m."""
-    ball_velocity_noise: Annotated[Sampled, Term((), 0.0, (0.0, 10.0))] = None
+    ball_velocity_noise: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 10.0), nominal=0.0)] = None
     """Standard deviation of the noise of each component of the measured ball velocity, m/s."""
-    ball_velocity_bias: Annotated[Sampled, Term((3,), 0.0, (-10.0, 10.0))] = None
+    ball_velocity_bias: Annotated[Sampled, Term((3,), bounds=(-10.0, 10.0), nominal=0.0)] = None
     """Error of each component of the measured ball velocity, constant in an episode, m/s."""
-    joint_angle_noise: Annotated[Sampled, Term((), 0.0, (0.0, 0.5))] = None
+    joint_angle_noise: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 0.5), nominal=0.0)] = None
     """Standard deviation of the noise of each measured joint angle, rad."""
-    encoder_bias: Annotated[Sampled, Term(None, 0.0, (-0.5, 0.5))] = None
+    encoder_bias: Annotated[Sampled, Term(EACH_JOINT, bounds=(-0.5, 0.5), nominal=0.0)] = None
     """Error of each encoder's zero, which the servo shares, rad."""
-    joint_velocity_noise: Annotated[Sampled, Term((), 0.0, (0.0, 10.0))] = None
+    joint_velocity_noise: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 10.0), nominal=0.0)] = None
     """Standard deviation of the noise of each measured joint velocity, rad/s."""
-    joint_velocity_bias: Annotated[Sampled, Term(None, 0.0, (-10.0, 10.0))] = None
+    joint_velocity_bias: Annotated[Sampled, Term(EACH_JOINT, bounds=(-10.0, 10.0), nominal=0.0)] = (
+        None
+    )
     """Error of each measured joint velocity, constant in an episode, rad/s."""
-    push_speed: Annotated[Sampled, Term((), 0.0, (0.0, 10.0))] = None
+    push_speed: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 10.0), nominal=0.0)] = None
     """Horizontal speed that a push adds to the ball, in a random direction, m/s."""
-    push_interval: Annotated[Sampled, Term((), None, (0.01, 600.0))] = None
+    push_interval: Annotated[Sampled, Term(NUMBER, bounds=(0.05, 600.0))] = None
     """Time between two pushes, s; 2 s if only push_speed is given."""
-    command_interval: Annotated[Sampled, Term((), None, (0.01, 600.0))] = None
+    command_interval: Annotated[Sampled, Term(NUMBER, bounds=(0.05, 600.0))] = None
     """Time between two samples of the task's commands within an episode, s."""
-    ball_start: Annotated[Sampled, Term((3,), 0.0, (-1.0, 1.0))] = None
+    ball_start: Annotated[Sampled, Term((3,), bounds=(-1.0, 1.0), nominal=0.0)] = None
     """Displacement of each coordinate of the ball at a reset, in addition to `env.reset`, m."""
-    joint_start: Annotated[Sampled, Term(None, 0.0, (-3.0, 3.0))] = None
+    joint_start: Annotated[Sampled, Term(EACH_JOINT, bounds=(-3.0, 3.0), nominal=0.0)] = None
     """Displacement of each joint angle at a reset, in addition to `env.reset`, rad."""
     share: UnitInterval = 1.0
     """Probability that a term with a nominal value is sampled in an episode; otherwise it has that
@@ -199,50 +303,94 @@ class RandomizationConfig(StrictModel):
         return hash(self.model_dump_json())
 
     @pydantic.model_validator(mode="after")
-    def _check_ranges(self):
-        for name in (self.shares or {}).keys() - TERMS.keys():
+    def _check_effects(self):
+        for name in sorted(self.shares or {}):
+            self._check_share_of(name)
+        varies = any(TERMS[name].has_nominal for name in self.terms)
+        if self.warmup_steps and not varies and self.first_command_range == 1.0:
             raise ValueError(
-                f"shares has a probability for {shorten(name)}, which is not a term; remove it"
+                "warmup_steps is given without a term whose range grows; give both, or neither"
             )
+        if self.share < 1.0 and not varies:
+            raise ValueError("share is given without a term that it is of; give both, or neither")
         if self.push_interval and not self.push_speed:
             raise ValueError("push_interval is given without push_speed; give both")
         if self.first_command_range < 1.0 and not self.warmup_steps:
             raise ValueError("first_command_range is given without warmup_steps; give both")
-        for name in self.terms:
-            ends, (size, _, (least, greatest), *_) = getattr(self, name), TERMS[name]
-            unit = f" {unit_of(type(self).model_fields[name].description)}".rstrip()
-            counts = {len(end) if isinstance(end, tuple) else 0 for end in ends}
-            if len(counts) > 1 or (size is not None and not counts <= {0, *size}):
-                each = "joint" if size is None else f"of {sum(size)} axes"
-                lists = "" if size == () else f", or two lists with one for each {each}"
-                raise ValueError(
-                    f"{name} {shorten(str(ends))} is not a range; give two numbers{lists}"
-                )
-            for low, high in entries(ends):
-                if not least <= low <= high <= greatest:
-                    raise ValueError(
-                        f"{name} ({low}, {high}) is not a range within {least:g} to "
-                        f"{greatest:g}{unit}; give the lower end first"
-                    )
         return self
+
+    def _check_share_of(self, name: str) -> None:
+        """Refuses a probability of a term that does not use it."""
+        if name not in TERMS:
+            reason = "which is not a term"
+        elif getattr(self, name) is None:
+            reason = "a term that is off"
+        elif not TERMS[name].has_nominal:
+            reason = "a term that is sampled in every episode"
+        else:
+            return
+        raise ValueError(f"shares has a probability for {shorten(name)}, {reason}; remove it")
+
+    @pydantic.model_validator(mode="after")
+    def _check_ranges(self):
+        for name in self.terms:
+            self._check_shape(name)
+            self._check_bounds(name)
+        return self
+
+    def _check_shape(self, name: str) -> None:
+        """Refuses a range whose ends have another number of entries than the term, or than each
+        other."""
+        ends = getattr(self, name)
+        size = TERMS[name].size
+        counts = {len(end) if isinstance(end, tuple) else 0 for end in ends}
+        fits_term = size is EACH_JOINT or counts <= {0, *size}
+        if len(counts) == 1 and fits_term:
+            return
+        if size == NUMBER:
+            lists = ""
+        elif size is EACH_JOINT:
+            lists = ", or two lists with one for each joint"
+        else:
+            lists = f", or two lists with one for each of {sum(size)} axes"
+        raise ValueError(f"{name} {shorten(str(ends))} is not a range; give two numbers{lists}")
+
+    def _check_bounds(self, name: str) -> None:
+        """Refuses a range that is empty or not within the term's bounds."""
+        least, greatest = TERMS[name].bounds
+        unit = unit_of(type(self).model_fields[name].description)
+        for low, high in entries(getattr(self, name)):
+            if not least <= low <= high <= greatest:
+                within = f"{least:g} to {greatest:g} {unit}".rstrip()
+                raise ValueError(
+                    f"{name} ({low}, {high}) is not a range within {within}; give the lower end "
+                    "first"
+                )
 
     @property
     def terms(self) -> tuple[str, ...]:
         """Names of the active terms."""
         return tuple(name for name in TERMS if getattr(self, name) is not None)
 
-    def ranges(self, progress: jax.Array | float = 1.0) -> Ranges:
+    def ranges(
+        self,
+        progress: jax.Array | float = 1.0,
+        nominals: Mapping[str, Any] = MappingProxyType({}),
+    ) -> Ranges:
         """Ranges of the active terms.
 
         Args:
           progress: share of the warm-up that has passed [], from 0 to 1.
+          nominals: `nominal_values` of the terms, from which their ranges grow; a range without one
+            does not grow.
         """
-
         ranges = {}
         for name in self.terms:
-            ends, nominal = np.array(getattr(self, name)), TERMS[name].nominal
-            start = ends if nominal is None else nominal
-            ranges[name] = tuple(jnp.asarray(start + (ends - start) * progress, jnp.float32))
+            ends = tuple(np.array(end) for end in getattr(self, name))
+            if name in nominals:
+                start = nominals[name]
+                ends = tuple(start + (end - start) * progress for end in ends)
+            ranges[name] = tuple(jnp.asarray(end, jnp.float32) for end in ends)
         return ranges
 
 
@@ -260,19 +408,47 @@ TERMS: dict[str, Term] = {
 """All terms of `RandomizationConfig`."""
 
 
+def nominal_values(mj_model: mujoco.MjModel, terms: Iterable[str]) -> dict[str, np.ndarray]:
+    """Values without randomisation of the terms that have one, each of the term's shape.
+
+    Of a term that replaces a number of the model, it is that number; a model without a contact pair
+    has none of the contact.
+    """
+    # The engines are not needed to read a config.
+    from bounce_mjx.physics.edited import own_parameters
+
+    model = own_parameters(mj_model)
+    num_joints = len(model.armature)
+    nominals = {}
+    for name in terms:
+        term = TERMS[name]
+        value = term.nominal
+        if value is None and term.has_nominal:
+            value = term.operation.model_nominal(model, term.parameter)
+        if value is not None:
+            nominals[name] = np.broadcast_to(np.float64(value), term.shape(num_joints))
+    return nominals
+
+
 def sample_world(
     ranges: Ranges,
     key: jax.Array,
     dtype: jnp.dtype,
     num_joints: int,
+    nominals: Mapping[str, Any] = MappingProxyType({}),
     share: float | jax.Array = 1.0,
     shares: Mapping[str, float] = MappingProxyType({}),
 ) -> World:
     """Samples the world of one episode; consumes the key.
 
     Args:
+      ranges: of the active terms.
+      key: consumed.
+      dtype: of the values.
       num_joints: number of acting joints.
-      share: probability [] that each term with a nominal value is sampled.
+      nominals: `nominal_values`, which the terms have that are not sampled; a term without one is
+        sampled in every episode.
+      share: probability [] that each term is sampled.
       shares: probabilities of single terms, in place of `share`.
     """
     # The order of TERMS, because JAX sorts the keys of a traced dictionary.
@@ -280,14 +456,16 @@ def sample_world(
     sizes = {name: math.prod(shape) for name, shape in shapes.items()}
     # One sample for all numbers, because splitting the key costs more than sampling.
     uniform = jax.random.uniform(key, (sum(sizes.values()) + len(sizes),), dtype)
-    world, start = {}, len(sizes)
+    world = {}
+    # The first numbers decide which terms are sampled.
+    start = len(sizes)
     for i, (name, size) in enumerate(sizes.items()):
-        term, (low, high) = TERMS[name], ranges[name]
+        low, high = ranges[name]
         places = uniform[start : start + size].reshape(shapes[name])
         value = jnp.asarray(low, dtype) + jnp.asarray(high - low, dtype) * places
-        if term.nominal is not None:
+        if name in nominals:
             is_sampled = uniform[i] < shares.get(name, share)
-            value = jnp.where(is_sampled, value, jnp.asarray(term.nominal, dtype))
+            value = jnp.where(is_sampled, value, jnp.asarray(nominals[name], dtype))
         world[name] = value
         start += size
     return world
@@ -296,22 +474,17 @@ def sample_world(
 def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParameters:
     """Parameters of the physics for a sampled world."""
     # The engines are not needed to read a config.
-    from bounce_mjx.physics.edited import direct_solref, own_parameters
+    from bounce_mjx.physics.edited import own_parameters
     from bounce_mjx.physics.parameters import PhysicsParameters
 
     terms = {name: term for name, term in TERMS.items() if name in world and term.parameter}
     if not terms:
         return PhysicsParameters()
-    own, given = own_parameters(mj_model), {}
-    for name, (*_, parameter, operation) in terms.items():
-        value, own_value = world[name], getattr(own, parameter)
-        if operation is None:
-            given[parameter] = contact_damping(value, direct_solref(mj_model)[0])
-        else:
-            if own_value is not None:
-                own_value = jnp.asarray(own_value, value.dtype)
-            given[parameter] = operation(own_value, value)
-    return PhysicsParameters(**given)
+    model = own_parameters(mj_model)
+    parameters = {}
+    for name, term in terms.items():
+        parameters[term.parameter] = term.operation.apply(model, term.parameter, world[name])
+    return PhysicsParameters(**parameters)
 
 
 # Damping ratios of the contact, and the measured restitution: the mean of the drops on the held
@@ -326,6 +499,13 @@ _DROPS = (
 def contact_damping(restitution: jax.Array, stiffness: float) -> jax.Array:
     """Damping [] of the contact, 1/s, that gives a restitution [] at a contact stiffness (1/s^2):
     2 zeta sqrt(stiffness), with the damping ratio zeta interpolated between drop tests."""
-    ratio, e = np.array(_DROPS[::-1]).T
-    zeta = jnp.interp(restitution, e, ratio)
+    ratios, restitutions = np.array(_DROPS[::-1]).T
+    zeta = jnp.interp(restitution, restitutions, ratios)
     return (2.0 * np.sqrt(stiffness) * zeta).astype(jnp.asarray(restitution).dtype)
+
+
+def contact_restitution(damping: float, stiffness: float) -> np.ndarray:
+    """Restitution [] of a contact with a damping (1/s) at a stiffness (1/s^2): the inverse of
+    `contact_damping`."""
+    ratios, restitutions = np.array(_DROPS).T
+    return np.interp(damping / (2.0 * np.sqrt(stiffness)), ratios, restitutions)

@@ -2,7 +2,7 @@
 history."""
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +11,11 @@ import mujoco
 from bounce_mjx.physics import Engine
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
 from bounce_mjx.robot.model import find_addresses, scatter
+from bounce_mjx.robot.setpoints import Setpoint
 from bounce_mjx.world import noise
-from bounce_mjx.world.actuation import entry_at
+from bounce_mjx.world.actuation import entry_at, with_newest
 from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.noise import Clock
 from bounce_mjx.world.observation import Kinematics
 from bounce_mjx.world.randomization import World
 
@@ -54,95 +56,151 @@ class Sensing(NamedTuple):
     histories: dict[str, jax.Array]
     """Last values of each observed quantity [H, size], the newest first."""
     task: Any
-    """What the task remembers of the measurements."""
+    """What the task remembers of the measurements (`Task.next_quantities`)."""
+
+
+class Instant(NamedTuple):
+    """What the sensors depend on, at a reset or after a control step."""
+
+    truth: Kinematics
+    """True positions and velocities."""
+    command: dict[str, jax.Array]
+    """Value [] of each command."""
+    last_action: jax.Array
+    """Clipped action of the control step [n]."""
+    setpoint: Setpoint | None
+    """Memory of the servo targets (`Actuation.setpoint`)."""
+    world: World
+    """The values that the episode sampled."""
+    clock: Clock
+
+
+class Remembering(Protocol):
+    """The part of a `Task` that remembers measurements; its methods say what each argument is."""
+
+    def first_quantities(
+        self, measured: dict[str, jax.Array]
+    ) -> tuple[Any, dict[str, jax.Array]]: ...
+
+    def next_quantities(
+        self, memory: Any, histories: dict[str, jax.Array], measured: dict[str, jax.Array]
+    ) -> tuple[Any, dict[str, jax.Array]]: ...
 
 
 class Sensors:
-    """The sensors of a world; `now` is the state (`env.EnvState`) after a reset or a control step,
-    and `truth` its kinematics."""
+    """The sensors of a world."""
 
-    def __init__(self, config: WorldConfig, mj_model: mujoco.MjModel, engine: Engine, task: Any):
+    def __init__(
+        self, config: WorldConfig, mj_model: mujoco.MjModel, engine: Engine, task: Remembering
+    ):
         """Chooses what has to be simulated.
 
         Args:
-          task: `task.Task`, which has quantities of its own.
+          config: of the world, with its observation and its randomisation.
+          mj_model: its model.
+          engine: computes where the paddle seems to be.
+          task: has quantities of its own.
         """
-        self._config, self._engine, self._task = config, engine, task
-        self._qpos, self._arm = mj_model.qpos0, find_addresses(mj_model).arm_qpos
-        observation, terms = config.observation, set(config.randomization.terms)
-        self.are_needed = bool(_TERMS & terms) or not observation.is_momentary
+        self._config = config
+        self._engine = engine
+        self._task = task
+        self._qpos = mj_model.qpos0
+        self._arm_qpos = find_addresses(mj_model).arm_qpos
+        terms = set(config.randomization.terms)
+        self.are_needed = bool(_TERMS & terms) or not config.observation.is_momentary
         """Whether the observation differs from the true state of a single instant."""
-        sees_paddle = observation.paddle_position or observation.lengths("task")
+        sees_paddle = config.observation.paddle_position or config.observation.lengths("task")
         self._misjudges_paddle = bool(sees_paddle and _PADDLE_TERMS & terms)
 
-    def first(self, now: Any, truth: Kinematics) -> Sensing:
+    def first(self, now: Instant) -> Sensing:
         """Memory at a reset: the histories repeat the first measurements, and the ball has rested
         until then."""
-        config, ball = self._config, _position_and_velocity(truth)
-        latency = (config.randomization.ball_latency or (0.0, 0.0))[1]
-        rate = config.randomization.camera_rate
-        # The greatest age of the last picture if none is lost.
-        oldest = latency if rate is None else latency + 1.0 / rate[0]
-        length = math.ceil(oldest / config.control_dt - 1e-6) + 1
-        balls, zero = jnp.broadcast_to(ball, (length, *ball.shape)), jnp.zeros((), ball.dtype)
+        ball = _position_and_velocity(now.truth)
+        balls = jnp.broadcast_to(ball, (self._num_remembered(), *ball.shape))
+        zero = jnp.zeros((), ball.dtype)
         # Too long ago for a velocity from the difference to it.
-        before = Picture(
-            truth.ball_position, truth.ball_velocity, zero + _LONG_AGO, zero - _LONG_AGO
+        last_picture = Picture(
+            position=now.truth.ball_position,
+            velocity=now.truth.ball_velocity,
+            age=zero + _LONG_AGO,
+            number=zero - _LONG_AGO,
         )
-        picture, measured = self._measure(now, truth, balls, before)
-        task, own = self._task.first_quantities(measured)
-        values = measured | own
-        histories = {
-            name: jnp.broadcast_to(values[name], (count, *values[name].shape))
-            for name, count in config.observation.lengths().items()
-        }
+        picture = take_picture(self._config, now.world, now.clock, balls, last_picture)
+        measured = self._measure(now, picture)
+        task, quantities = self._task.first_quantities(measured)
+        values = measured | quantities
+        histories = {}
+        for name, count in self._config.observation.lengths().items():
+            histories[name] = jnp.broadcast_to(values[name], (count, *values[name].shape))
         return Sensing(balls, picture, histories, task)
 
-    def next(self, now: Any, truth: Kinematics) -> Sensing:
-        """Memory after a control step; that of the state is the one before it."""
-        before = now.sensing
-        balls = jnp.concatenate([_position_and_velocity(truth)[None], before.balls[:-1]])
-        picture, measured = self._measure(now, truth, balls, before.picture)
-        own, histories = {}, {}
+    def _num_remembered(self) -> int:
+        """Control steps of which the ball is remembered: as old as the last picture can be if none
+        is lost."""
+        randomization = self._config.randomization
+        oldest = 0.0
+        if randomization.ball_latency is not None:
+            oldest = randomization.ball_latency[1]
+        if randomization.camera_rate is not None:
+            oldest += 1.0 / randomization.camera_rate[0]
+        return math.ceil(oldest / self._config.control_dt - 1e-6) + 1
+
+    def next(self, before: Sensing, now: Instant) -> Sensing:
+        """Memory after a control step, from that before it."""
+        balls = with_newest(before.balls, _position_and_velocity(now.truth))
+        picture = take_picture(self._config, now.world, now.clock, balls, before.picture)
+        measured = self._measure(now, picture)
+        histories = {}
+        of_task = {}
         for name, past in before.histories.items():
             if name in measured:
-                histories[name] = jnp.concatenate([measured[name][None], past[:-1]])
+                histories[name] = with_newest(past, measured[name])
             else:
-                own[name] = past
-        task, own = self._task.next_quantities(before.task, own, measured)
-        return Sensing(balls, picture, histories | own, task)
+                of_task[name] = past
+        task, of_task = self._task.next_quantities(before.task, of_task, measured)
+        return Sensing(balls, picture, histories | of_task, task)
 
-    def _measure(
-        self, now: Any, truth: Kinematics, balls: jax.Array, last: Picture
-    ) -> tuple[Picture, dict[str, jax.Array]]:
-        """The last picture that has arrived, and the measured value [size] of each quantity of the
-        world and of each command."""
-        world, picture = now.world, take_picture(self._config, now, balls, last)
-        dtype, angles = truth.joint_angles.dtype, truth.joint_angles
-        angle_noise, velocity_noise = noise.joints(now.clock.counter, len(angles), dtype)
-        if "joint_angle_noise" in world:
-            angles = angles + world["joint_angle_noise"] * angle_noise
-        if "encoder_bias" in world:
-            angles = angles + world["encoder_bias"]
-        velocities = truth.joint_velocities
-        measured = truth._asdict() | {name: value[None] for name, value in now.command.items()}
+    def _measure(self, now: Instant, picture: Picture) -> dict[str, jax.Array]:
+        """The measured value [size] of each quantity of the world and of each command."""
+        world = now.world
+        angles, velocities = measured_joints(world, now.clock.counter, now.truth)
+        measured = now.truth._asdict()
+        measured |= {name: value[None] for name, value in now.command.items()}
         measured |= {
             "action": now.last_action,
             "joint_angles": angles,
-            "joint_velocities": _add_errors(world, "joint_velocity", velocities, velocity_noise),
+            "joint_velocities": velocities,
             "ball_position": picture.position,
             "ball_velocity": picture.velocity,
             "ball_age": picture.age[None],
             "ball_picture": picture.position,
         }
-        if now.actuation.setpoint is not None:
+        if now.setpoint is not None:
             # The servo shares the offset of the encoder's zero.
-            lead = now.actuation.setpoint.position - (angles - world.get("encoder_bias", 0.0))
-            measured["servo_lead"] = lead
+            servo_angles = angles - world.get("encoder_bias", 0.0)
+            measured["servo_lead"] = now.setpoint.position - servo_angles
         if self._misjudges_paddle:
-            qpos = scatter(self._qpos, self._arm, angles)
+            qpos = scatter(self._qpos, self._arm_qpos, angles)
             measured["paddle_position"] = self._engine.paddle_position(MODEL_PARAMETERS, qpos)
-        return picture, measured
+        return measured
+
+
+def measured_joints(
+    world: World, counter: jax.Array, truth: Kinematics
+) -> tuple[jax.Array, jax.Array]:
+    """The measured angles [n] (rad) and velocities [n] (rad/s) of the acting joints.
+
+    Args:
+      counter: of the clock [], int32.
+    """
+    angles = truth.joint_angles
+    angle_noise, velocity_noise = noise.joints(counter, len(angles), angles.dtype)
+    if "joint_angle_noise" in world:
+        angles = angles + world["joint_angle_noise"] * angle_noise
+    if "encoder_bias" in world:
+        angles = angles + world["encoder_bias"]
+    velocities = _add_errors(world, "joint_velocity", truth.joint_velocities, velocity_noise)
+    return angles, velocities
 
 
 def _position_and_velocity(truth: Kinematics) -> jax.Array:
@@ -150,72 +208,104 @@ def _position_and_velocity(truth: Kinematics) -> jax.Array:
     return jnp.concatenate([truth.ball_position, truth.ball_velocity], axis=-1)
 
 
-def take_picture(config: WorldConfig, now: Any, balls: jax.Array, last: Picture) -> Picture:
+def take_picture(
+    config: WorldConfig, world: World, clock: Clock, balls: jax.Array, last: Picture
+) -> Picture:
     """Last picture that has arrived at a control step.
 
-    A camera takes pictures at its own rate, independent of the control steps. Between two control
-    steps, the ball's path is the cubic with the true positions and velocities at both, which is
-    exact in free flight; the velocity is interpolated linearly. Each picture arrives after the
-    latency or is lost; the first one is not lost.
+    A camera takes pictures at its own rate, independent of the control steps. Each picture arrives
+    after the latency or is lost; the first one is not lost.
 
     Args:
+      config: of the world.
+      world: the values that the episode sampled.
+      clock: at the control step.
       balls: `Sensing.balls`, including the ball of this control step.
       last: the last picture at the control step before.
     """
-    world, clock, dtype, control_dt = now.world, now.clock, balls.dtype, config.control_dt
+    control_dt = config.control_dt
+    dtype = balls.dtype
+    # The age of the newest picture in control steps.
+    number, age = _newest_picture(world, clock, control_dt, dtype)
+    position, velocity = _ball_at(balls, age, control_dt)
+    noises = noise.normal(clock.counter, noise.BALL, balls.shape[1:], dtype)
+    position = _add_errors(world, "ball_position", position, noises[..., :3])
+    last_age = last.age + control_dt
+    if config.observation.velocity == "differences":
+        elapsed = jnp.maximum(last_age - age * control_dt, 1e-3)
+        velocity = (position - last.position) / elapsed
+    velocity = _add_errors(world, "ball_velocity", velocity, noises[..., 3:])
+
+    is_new = number > last.number
+    arrives = is_new
+    if "frame_drop" in world:
+        chance = noise.uniform(clock.counter, noise.FRAME_DROP, (), dtype)
+        arrives = is_new & ((chance >= world["frame_drop"]) | (clock.step == 0))
+    new = Picture(position, velocity, age * control_dt, number)
+    # A lost picture stays lost.
+    kept = last._replace(age=last_age, number=jnp.where(is_new, number, last.number))
+    return jax.tree.map(lambda new, kept: jnp.where(arrives, new, kept), new, kept)
+
+
+def _newest_picture(
+    world: World, clock: Clock, control_dt: float, dtype: jnp.dtype
+) -> tuple[jax.Array, jax.Array]:
+    """Number [] of the newest picture that can have arrived, and its age [] in control steps.
+
+    Args:
+      control_dt: time of one control step, s.
+      dtype: of the results.
+    """
     steps = clock.step.astype(dtype)
     latency = world.get("ball_latency", jnp.zeros((), dtype)) / control_dt
     if "camera_rate" in world:
-        interval, phase = 1.0 / (world["camera_rate"] * control_dt), clock.phases[0]
+        interval = 1.0 / (world["camera_rate"] * control_dt)
+        phase = clock.camera_phase
         # The 1e-4 lets a picture that is due at exactly this instant arrive despite rounding.
         number = jnp.floor((steps - latency) / interval - phase + 1e-4)
         age = steps - (number + phase) * interval
     else:
-        number, age = steps, latency
-    age = jnp.maximum(age, 0.0)
-    whole = jnp.floor(age)
-    newer, older = entry_at(balls, whole), entry_at(balls, whole + 1.0)
-    position, velocity = _between(newer, older, age - whole, control_dt)
-
-    noises = noise.normal(clock.counter, noise.BALL, balls.shape[1:], dtype)
-    position = _add_errors(world, "ball_position", position, noises[..., :3])
-    due = number > last.number
-    arrived = due
-    if "frame_drop" in world:
-        chance = noise.uniform(clock.counter, noise.FRAME_DROP, (), dtype)
-        arrived = due & ((chance >= world["frame_drop"]) | (clock.step == 0))
-    held_age = last.age + control_dt
-    if config.observation.velocity == "differences":
-        elapsed = jnp.maximum(held_age - age * control_dt, 1e-3)
-        velocity = (position - last.position) / elapsed
-    velocity = _add_errors(world, "ball_velocity", velocity, noises[..., 3:])
-    fresh = Picture(position, velocity, age * control_dt, number)
-    # A lost picture stays lost.
-    held = last._replace(age=held_age, number=jnp.where(due, number, last.number))
-    return jax.tree.map(lambda new, old: jnp.where(arrived, new, old), fresh, held)
+        number = steps
+        age = latency
+    return number, jnp.maximum(age, 0.0)
 
 
-def _between(
-    newer: jax.Array, older: jax.Array, share: jax.Array, control_dt: float
-) -> tuple[jax.Array, jax.Array]:
-    """Position [..., 3] and velocity [..., 3] between two control steps (cubic Hermite
-    interpolation).
+def _ball_at(balls: jax.Array, age: jax.Array, control_dt: float) -> tuple[jax.Array, jax.Array]:
+    """Position [..., 3] and velocity [..., 3] of the ball some time ago.
+
+    Between two control steps, the ball's path is the cubic with the true positions and velocities
+    at both (Hermite interpolation), which is exact in free flight; the velocity is interpolated
+    linearly.
 
     Args:
-      newer, older: position and velocity [..., 6] at each.
-      share: time before the newer one as a share of the control step [].
+      balls: `Sensing.balls` [K, ..., 6].
+      age: the time in control steps [].
+      control_dt: time of one control step, s.
     """
-    now, before, velocity, velocity_before = (
-        x[..., part] for part in (slice(3), slice(3, 6)) for x in (newer, older)
-    )
-    change = before - now
-    start, end = -control_dt * velocity, -control_dt * velocity_before
-    curve = (1.0 - share) * (start - change) - share * (end - change)
-    position = now + share * (change + (1.0 - share) * curve)
-    return position, velocity + share * (velocity_before - velocity)
+    whole = jnp.floor(age)
+    share = age - whole
+    newer = entry_at(balls, whole)
+    older = entry_at(balls, whole + 1.0)
+    new_position, new_velocity = newer[..., :3], newer[..., 3:]
+    old_position, old_velocity = older[..., :3], older[..., 3:]
+    change = old_position - new_position
+    start_slope = -control_dt * new_velocity
+    end_slope = -control_dt * old_velocity
+    curve = (1.0 - share) * (start_slope - change) - share * (end_slope - change)
+    position = new_position + share * (change + (1.0 - share) * curve)
+    velocity = new_velocity + share * (old_velocity - new_velocity)
+    return position, velocity
 
 
 def _add_errors(world: World, name: str, value: jax.Array, noises: jax.Array) -> jax.Array:
+    """A measured value: the true one with the bias and the noise of the terms with its name.
+
+    Args:
+      world: the values that the episode sampled.
+      name: of the terms, before `_bias` and `_noise`.
+      value: true value [...].
+      noises: normally distributed numbers of its shape, with mean 0 and variance 1.
+    """
     if f"{name}_bias" in world:
         value = value + world[f"{name}_bias"]
     if f"{name}_noise" in world:

@@ -1,6 +1,7 @@
 """The environment for brax, with this project's physics."""
 
 import copy
+import dataclasses
 import functools
 import warnings
 from collections.abc import Sequence
@@ -25,6 +26,8 @@ from bounce_mjx.world.config import WorldConfig
 ENV_NAME = "bounce_ball"
 
 
+# A dataclass without fields: TorchRL turns every field that it finds in a state into a tensor.
+@dataclasses.dataclass(init=False, eq=False)
 class _Model:
     """A model as a static field of a state; equal only to itself."""
 
@@ -109,7 +112,7 @@ class BraxBounceBall(brax.envs.Env):
 
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one control step under the action [action_size]."""
-        plain = state.replace(pipeline_state=state.pipeline_state.task)
+        plain = state.replace(pipeline_state=_complete(state.pipeline_state.task))
         return self._to_brax(self.task.step(plain, action))
 
     def _to_brax(self, state: State) -> State:
@@ -144,6 +147,16 @@ class BraxBounceBall(brax.envs.Env):
         """
         choose_opengl()
         return image.render_array(self.sys, trajectory, height, width, camera)
+
+
+def _complete(state: EnvState) -> EnvState:
+    """The state with its parts that hold no arrays, which TorchRL drops."""
+    dropped = {
+        name: default
+        for name, default in EnvState._field_defaults.items()
+        if getattr(state, name) is None
+    }
+    return state._replace(**dropped)
 
 
 def _drawable(mj_model: mujoco.MjModel) -> mujoco.MjModel:

@@ -16,7 +16,8 @@ from brax.training.agents.ppo import networks as ppo_networks
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
-from bounce_mjx.runs.config import TrainConfig, read_preset
+from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.settings import read_preset
 
 BraxPolicy = Callable[[jax.Array, jax.Array], tuple[jax.Array, dict[str, Any]]]
 """(observation [..., N], key) -> (action [..., A], extras)."""
@@ -70,7 +71,7 @@ def ppo_settings(config: TrainConfig | None = None) -> dict[str, Any]:
         num_minibatches=ppo.num_minibatches,
         num_updates_per_batch=ppo.num_epochs,
         learning_rate=ppo.learning_rate,
-        learning_rate_schedule="ADAPTIVE_KL",
+        learning_rate_schedule="ADAPTIVE_KL" if ppo.target_kl > 0.0 else "NONE",
         learning_rate_schedule_min_lr=ppo.min_learning_rate,
         learning_rate_schedule_max_lr=ppo.max_learning_rate,
         desired_kl=ppo.target_kl,
@@ -97,11 +98,14 @@ def network_settings(config: TrainConfig | None = None) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def device_put_replicated() -> Iterator[None]:
-    """Provides `jax.device_put_replicated` inside a `with` block: brax 0.14.2 calls it in
-    `ppo.train`, `sac.train` and `apg.train`, but JAX 0.10 removed it.
+    """Provides `jax.device_put_replicated` inside a `with` block, where JAX lacks it: brax 0.14.2
+    calls it in `ppo.train`, `sac.train` and `apg.train`, but JAX 0.10 removed it.
 
     Not thread-safe: the function is added to the module `jax` and removed at the end.
     """
+    if hasattr(jax, "device_put_replicated"):
+        yield
+        return
     jax.device_put_replicated = replicate
     try:
         yield

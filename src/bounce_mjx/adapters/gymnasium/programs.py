@@ -1,7 +1,7 @@
 """B episodes on JAX that start and end separately, and their compiled functions.
 
-Each environment has its own stream of random numbers, so that it samples the same episodes in a
-batch of any size. Batches of equal configs and sizes share their programs.
+Each episode has its own random key, so that a seed starts the same one in a batch of any size.
+Batches of equal configs and sizes share their programs.
 """
 
 import functools
@@ -10,37 +10,22 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from bounce_mjx.env.env import Env, State
+from bounce_mjx.env.env import Env, EnvState, State
 from bounce_mjx.training.setup import cache_compilations
 from bounce_mjx.world.config import WorldConfig
 
 
 class Episodes(NamedTuple):
-    """State of the B episodes."""
+    """State of the B episodes. A step takes and returns few arrays, as each costs a microsecond."""
 
-    env: State
+    state: EnvState
     """Environment states, the batch last in every array."""
-    length: jax.Array
-    """Steps since the reset [B], int32."""
-    key: jax.Array
-    """Key of each environment's later resets [..., B]."""
-
-
-class Step(NamedTuple):
-    """Result of one step of B environments."""
-
     observation: jax.Array
-    """Observation for the next action [B, N]."""
-    final_observation: jax.Array
-    """Observation after the step, before any reset [B, N]."""
-    reward: jax.Array
-    """Reward [B]; 0 where the step only reset the environment."""
-    terminated: jax.Array
-    """Whether the task ended the episode [B], bool."""
-    truncated: jax.Array
-    """Whether the time limit ended the episode [B], bool."""
+    """Observations [N, B]."""
     metrics: jax.Array
     """The environment's metrics in the order of their names [M, B]."""
+    length: jax.Array
+    """Steps since the reset [B], int32."""
 
 
 class Programs:
@@ -52,34 +37,35 @@ class Programs:
         self.start = jax.jit(self._start)
         self.step = jax.jit(self._step, donate_argnums=0)
 
+    @functools.cached_property
+    def metric_names(self) -> tuple[str, ...]:
+        """Names of the environment's metrics, sorted."""
+        return tuple(sorted(jax.eval_shape(self.task.reset, jax.random.PRNGKey(0)).metrics))
+
     def _start(
         self,
         episodes: Episodes | None,
         mask: jax.Array,
         seeds: jax.Array,
-        seeded: jax.Array,
         commands: dict[str, jax.Array],
     ) -> Episodes:
         """New episodes where the mask [B] is true; `episodes` is None before the first ones.
 
         Args:
-          seeds: [B]; where `seeded` [B] is false, the environment continues its random numbers.
+          seeds: of the new episodes [B], uint32.
           commands: each [B]; NaN samples one.
         """
-        keys = jax.vmap(jax.random.PRNGKey, out_axes=-1)(seeds)
-        if episodes is not None:
-            keys = jnp.where(seeded, keys, episodes.key)
-        keys, now = jax.vmap(jax.random.split, -1, -1)(keys)
 
-        def reset_one(key: jax.Array, commands: dict[str, jax.Array]) -> State:
+        def first_state(key: jax.Array, commands: dict[str, jax.Array]) -> State:
             ranges = self.task.ranges()
-            for name, own in self.task.config.commands.items():
-                ends, given = (own.low, own.high), commands[name]
-                ranges[name] = tuple(jnp.where(jnp.isnan(given), end, given) for end in ends)
+            for name, command in self.task.config.commands.items():
+                low, high, given = command.low, command.high, commands[name]
+                is_free = jnp.isnan(given)
+                ranges[name] = jnp.where(is_free, low, given), jnp.where(is_free, high, given)
             return self.task.reset(key, ranges)
 
-        env = jax.vmap(reset_one, -1, -1)(now, commands)
-        started = Episodes(env, jnp.zeros(seeds.shape, jnp.int32), keys)
+        states = jax.vmap(first_state, -1, -1)(_keys(seeds), commands)
+        started = self._episodes(states, jnp.zeros(seeds.shape, jnp.int32))
         return started if episodes is None else _choose(mask, started, episodes)
 
     def _step(
@@ -87,36 +73,46 @@ class Programs:
         episodes: Episodes,
         actions: jax.Array,
         limit: jax.Array,
+        seeds: jax.Array,
         reset_before: jax.Array,
         reset_after: jax.Array,
-    ) -> tuple[Episodes, Step]:
+    ) -> tuple[Episodes, jax.Array]:
         """Advances every environment under the actions [B, n].
 
         Args:
           limit: time limit of an episode in steps [].
+          seeds: of the episodes that start within this step [B], uint32.
           reset_before: environments that start a new episode instead of a step [B], bool.
           reset_after: whether an ended episode is followed by a new one in the same step [].
+
+        Returns:
+          The episodes, and the result as one array [2 N + 3 + M, B], because each transfer takes
+          time: the observation for the next action, the one before any reset, the reward (0 where
+          the step only reset the environment), whether the task ended the episode, whether the
+          time limit did, and the metrics.
         """
-        keys, now = jax.vmap(jax.random.split, -1, -1)(episodes.key)
-        fresh = jax.vmap(self.task.reset, -1, -1)(now)
-        stepped = jax.vmap(self.task.step, -1, -1)(episodes.env, actions.T)
+        before = State(episodes.state, obs=None, reward=None, done=None)
+        stepped = jax.vmap(self.task.step, -1, -1)(before, actions.T)
         length = episodes.length + 1
         terminated = (stepped.done > 0) & ~reset_before
         # The limit counts even if the task ended the episode too, as in Gymnasium's TimeLimit.
         truncated = (length >= limit) & ~reset_before
-        after = _choose(
-            reset_before | (reset_after & (terminated | truncated)),
-            Episodes(fresh, jnp.zeros_like(length), keys),
-            Episodes(stepped, length, episodes.key),
-        )
-        return after, Step(
-            observation=after.env.obs.T.astype(jnp.float32),
-            final_observation=stepped.obs.T.astype(jnp.float32),
-            reward=jnp.where(reset_before, 0.0, stepped.reward),
-            terminated=terminated,
-            truncated=truncated,
-            metrics=jnp.stack([stepped.metrics[name] for name in sorted(stepped.metrics)]),
-        )
+        continued = self._episodes(stepped, length)
+
+        restarts = reset_before | (reset_after & (terminated | truncated))
+
+        def restart() -> Episodes:
+            states = jax.vmap(self.task.reset, -1, -1)(_keys(seeds))
+            return _choose(restarts, self._episodes(states, jnp.zeros_like(length)), continued)
+
+        after = jax.lax.cond(jnp.any(restarts), restart, lambda: continued)
+        reward = jnp.where(reset_before, 0.0, stepped.reward)
+        rows = [after.observation, stepped.obs, reward, terminated, truncated, continued.metrics]
+        return after, jnp.vstack(rows)
+
+    def _episodes(self, states: State, length: jax.Array) -> Episodes:
+        metrics = jnp.stack([states.metrics[name] for name in sorted(states.metrics)])
+        return Episodes(states.pipeline_state, states.obs, metrics, length)
 
 
 def shared_programs(config: WorldConfig) -> Programs:
@@ -130,6 +126,10 @@ def shared_programs(config: WorldConfig) -> Programs:
 def _programs(config: WorldConfig, edited: int | None) -> Programs:
     del edited
     return Programs(config)
+
+
+def _keys(seeds: jax.Array) -> jax.Array:
+    return jax.vmap(jax.random.PRNGKey, out_axes=-1)(seeds)
 
 
 def _choose(mask: jax.Array, chosen: Episodes, other: Episodes) -> Episodes:

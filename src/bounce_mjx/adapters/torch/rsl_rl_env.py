@@ -26,7 +26,9 @@ class RslRlVecEnv(VecEnv):
         self.max_episode_length = env.episode_steps
         self.device = env.device
         self.cfg = env.env.config
-        self.step_dt = env.env.dt
+        self.step_dt, self.physics_dt = env.env.dt, self.cfg.physics_dt
+        self.render_mode = None
+        self._seed: int | None = None
         self._observations = self._groups(*env.reset())
         self.result: StepResult | None = None
         """Result of the last step."""
@@ -36,9 +38,15 @@ class RslRlVecEnv(VecEnv):
         """The environments themselves, as there is no wrapper around them."""
         return self
 
+    def seed(self, seed: int = -1) -> int:
+        """Sets the seed of the next `reset`; -1 continues with the present random numbers."""
+        self._seed = None if seed < 0 else seed
+        return seed
+
     def reset(self) -> tuple[TensorDict, dict[str, Any]]:
         """Starts a new episode in every environment: observations and empty extras."""
-        self._observations = self._groups(*self.env.reset())
+        self._observations = self._groups(*self.env.reset(self._seed))
+        self._seed = None
         return self._observations, {}
 
     def close(self) -> None:

@@ -1,7 +1,8 @@
 """Batched environments for PyTorch: `env/vector.py` with tensors.
 
 Tensors and arrays share their memory through DLPack, on the CPU and on CUDA. The host never waits
-for the device, because DLPack makes each library's stream wait for the other's.
+for the device, because DLPack makes each library's stream wait for the other's. The state is
+donated to the next step, so a step returns no view of it.
 """
 
 from typing import NamedTuple
@@ -10,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import torch
 
+from bounce_mjx.adapters.torch.packing import Layout
 from bounce_mjx.env import vector
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
@@ -18,7 +20,7 @@ from bounce_mjx.tasks.registry import DEFAULT, task_config
 
 
 class StepResult(NamedTuple):
-    """Result of one step of B environments."""
+    """Result of one step of B environments, as tensors in one block of memory."""
 
     observation: torch.Tensor
     """Observation for the next action [B, N]; after the end of an episode, the first observation of
@@ -36,14 +38,11 @@ class StepResult(NamedTuple):
     """Whether the task ended the episode [B], bool."""
     truncated: torch.Tensor
     """Whether only the time limit ended the episode [B], bool."""
+    done: torch.Tensor
+    """Whether the episode ended [B], bool."""
     metrics: torch.Tensor
     """Means over the batch [M] of the environment's metrics, named by
     `TorchVectorEnv.metric_names`."""
-
-    @property
-    def done(self) -> torch.Tensor:
-        """Whether the episode ended [B], bool."""
-        return self.terminated | self.truncated
 
 
 class TorchVectorEnv:
@@ -83,9 +82,13 @@ class TorchVectorEnv:
         metrics = jax.eval_shape(self.env.reset, self._key).metrics
         self.critic_metrics = matching_metrics(critic_metrics, metrics)
         self.metric_names = tuple(metrics)
-        self._jit_start = jax.jit(self._start)
-        self._jit_step = jax.jit(self._step, donate_argnums=0)
-        self._carried: _Carried | None = None
+        action = jax.ShapeDtypeStruct((num_envs, self.num_actions), jnp.float32)
+        carried, *_ = jax.eval_shape(self._start, self._key)
+        _, result = jax.eval_shape(self._step, carried, action)
+        self._carried_layout, self._result_layout = Layout(carried), Layout(result)
+        self._jit_start = jax.jit(self._packed_start)
+        self._jit_step = jax.jit(self._packed_step, donate_argnums=0)
+        self._block: jax.Array | None = None
 
     def reset(self, seed: int | None = None) -> tuple[torch.Tensor, torch.Tensor]:
         """Starts a new episode in every environment; a `seed` seeds all following resets. It
@@ -98,7 +101,7 @@ class TorchVectorEnv:
         if seed is not None:
             self._key = _committed_key(seed)
         self._key, key = jax.random.split(self._key)
-        self._carried, observation, critic_metrics = self._jit_start(key)
+        self._block, observation, critic_metrics = self._jit_start(key)
         return torch.from_dlpack(observation), torch.from_dlpack(critic_metrics)
 
     def step(self, action: torch.Tensor) -> StepResult:
@@ -120,29 +123,30 @@ class TorchVectorEnv:
                 f"the action is {action.dtype} {tuple(action.shape)} on {action.device}, but must "
                 f"be torch.float32 {(self.num_envs, self.num_actions)} on {self.device}; convert it"
             )
-        if self._carried is None:
+        if self._block is None:
             raise UserError("step was called before reset; call reset first")
         shared = jax.dlpack.from_dlpack(action.detach().contiguous())
-        self._carried, result = self._jit_step(self._carried, shared)
-        return StepResult(*map(torch.from_dlpack, result))
+        self._block, result = self._jit_step(self._block, shared)
+        return self._result_layout.views(torch.from_dlpack(result))
 
     @property
     def clock(self) -> torch.Tensor:
         """Steps of each episode that count towards its time limit [B], int32; a copy. Assign
         different values to spread the time-outs of episodes that began together."""
-        if self._carried is None:
-            self.reset()
         # A copy, because the next step reuses the state's memory.
-        return torch.from_dlpack(jnp.copy(self._carried.state.clock))
+        return torch.from_dlpack(jnp.copy(self._carried().state.clock))
 
     @clock.setter
     def clock(self, value: torch.Tensor) -> None:
-        if self._carried is None:
+        clock = jax.dlpack.from_dlpack(value.to(self.device, torch.int32, copy=True).contiguous())
+        carried = self._carried()
+        state = carried.state._replace(clock=clock)
+        self._block = self._carried_layout.pack(carried._replace(state=state))
+
+    def _carried(self) -> "_Carried":
+        if self._block is None:
             self.reset()
-        shared = jax.dlpack.from_dlpack(value.to(self.device, torch.int32, copy=True).contiguous())
-        # Copied by JAX too, because the next step reuses the state's memory.
-        state = self._carried.state._replace(clock=jnp.array(shared))
-        self._carried = self._carried._replace(state=state)
+        return self._carried_layout.unpack(self._block)
 
     def _start(self, key: jax.Array) -> tuple["_Carried", jax.Array, jax.Array]:
         key, reset_key = jax.random.split(key)
@@ -150,7 +154,15 @@ class TorchVectorEnv:
         ranges = vector.ranges_after(self.env, steps, self.num_envs)
         state = vector.reset(self.env, reset_key, self.num_envs, ranges)
         critic_metrics = self._critic_metrics(state.env.metrics)
-        return _Carried(state, key, steps), vector.observe(state), critic_metrics
+        return _Carried(_slim(state), key, steps), vector.observe(state), critic_metrics
+
+    def _packed_start(self, key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        carried, observation, critic_metrics = self._start(key)
+        return self._carried_layout.pack(carried), observation, critic_metrics
+
+    def _packed_step(self, block: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
+        carried, result = self._step(self._carried_layout.unpack(block), action)
+        return self._carried_layout.pack(carried), self._result_layout.pack(result)
 
     def _step(self, carried: "_Carried", action: jax.Array) -> tuple["_Carried", StepResult]:
         key, reset_key = jax.random.split(carried.key)
@@ -168,9 +180,10 @@ class TorchVectorEnv:
             reward=self._reward_scale * result.reward,
             terminated=result.terminated,
             truncated=result.truncated,
+            done=result.terminated | result.truncated,
             metrics=metrics.mean(axis=1),
         )
-        return _Carried(state, key, steps), arrays
+        return _Carried(_slim(state), key, steps), arrays
 
     def _critic_metrics(self, metrics: dict[str, jax.Array]) -> jax.Array:
         """The critic metrics [B, K]."""
@@ -185,6 +198,11 @@ class _Carried(NamedTuple):
     key: jax.Array
     steps: jax.Array | None
     """Steps since the last reset of all environments [], int32; None without a warm-up."""
+
+
+def _slim(state: vector.VectorState) -> vector.VectorState:
+    """The state without the fields that no step reads; each array that passes takes time."""
+    return state._replace(env=state.env.replace(obs=None, reward=None, done=None, metrics={}))
 
 
 def _committed_key(seed: int) -> jax.Array:

@@ -33,6 +33,8 @@ from bounce_mjx.physics.scalars import (
 )
 
 SquareMatrix = list[list[Scalar]]
+Factor = tuple[SquareMatrix, list[Scalar]]
+"""A lower Cholesky factor, and the reciprocals of its diagonal."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -191,7 +193,7 @@ def point_velocities(links: Sequence[Link], pose: Pose, point: Vec) -> Iterator[
         yield axis if link.slides else cross(axis, point - origin)
 
 
-def cholesky(matrix: SquareMatrix) -> tuple[SquareMatrix, list[Scalar]]:
+def cholesky(matrix: SquareMatrix) -> Factor:
     """Lower Cholesky factor of a symmetric positive definite matrix, and the reciprocals of its
     diagonal."""
     n = len(matrix)
@@ -207,7 +209,7 @@ def cholesky(matrix: SquareMatrix) -> tuple[SquareMatrix, list[Scalar]]:
     return triangle, inverse_diagonal
 
 
-def solve_lower(factor: tuple[SquareMatrix, list[Scalar]], b: Sequence[Scalar]) -> list[Scalar]:
+def solve_lower(factor: Factor, b: Sequence[Scalar]) -> list[Scalar]:
     """L^-1 b for the factor L of `cholesky`."""
     x: list[Scalar] = []
     for row, inverse, entry in zip(*factor, b, strict=True):
@@ -215,7 +217,7 @@ def solve_lower(factor: tuple[SquareMatrix, list[Scalar]], b: Sequence[Scalar]) 
     return x
 
 
-def solve_upper(factor: tuple[SquareMatrix, list[Scalar]], b: Sequence[Scalar]) -> list[Scalar]:
+def solve_upper(factor: Factor, b: Sequence[Scalar]) -> list[Scalar]:
     """L^-T b for the factor L of `cholesky`."""
     triangle, inverse_diagonal = factor
     x = list(b)

@@ -1,63 +1,25 @@
-"""Step of the fused engine, unrolled into scalar arithmetic while tracing.
+"""Steps of the fused engine, unrolled into scalar arithmetic while tracing.
 
 Under `jax.vmap` each scalar becomes one array over the batch. XLA fuses a physics step into a few
-loops; on a GPU one kernel computes all physics steps of a control step (`gpu/elementwise.py`).
+loops; on a GPU one kernel computes all physics steps of a control step (`gpu/elementwise.py`). One
+physics step is `forward.substep`.
 """
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from bounce_mjx.gpu.elementwise import elementwise
-from bounce_mjx.physics.control import Control, drag, servo_target
-from bounce_mjx.physics.fused import chain, joint_friction
-from bounce_mjx.physics.fused.model import FusedModel, Servo, read_model
-from bounce_mjx.physics.fused.response import contact_response, paddle_origin
+from bounce_mjx.physics.control import Control, servo_target
+from bounce_mjx.physics.fused import chain
+from bounce_mjx.physics.fused.ball import Ball, read_ball, spin_in_ball, turn
+from bounce_mjx.physics.fused.constraint import paddle_origin
+from bounce_mjx.physics.fused.forward import Motion, substep
+from bounce_mjx.physics.fused.model import FusedModel, read_model
 from bounce_mjx.physics.parameters import PhysicsParameters, PhysicsState
-from bounce_mjx.physics.scalars import (
-    ZERO3,
-    Quaternion,
-    Scalar,
-    Vec,
-    add,
-    mul,
-    not_inlined,
-    quaternion_matrix,
-    quaternion_product,
-    scalars_of,
-    sine_cosine,
-    sub,
-)
-
-
-class Turning(NamedTuple):
-    """Spin and orientation of the ball."""
-
-    spin: Vec
-    """Angular velocity in the world, rad/s. Without a torque it is constant for a sphere, both in
-    the world and in the ball's frame."""
-    orientation: Quaternion
-    """Unit quaternion w, x, y, z."""
-
-
-class Ball(NamedTuple):
-    """Coordinates of one ball."""
-
-    position: Vec
-    velocity: Vec
-    turning: Turning | None
-    """Spin and orientation; None if the spin is constant."""
-
-
-class Motion(NamedTuple):
-    """Coordinates changed by a physics step, one scalar each."""
-
-    q: tuple[Scalar, ...]
-    v: tuple[Scalar, ...]
-    balls: tuple[Ball, ...]
+from bounce_mjx.physics.scalars import ZERO3, Scalar, Vec, scalars_of
 
 
 def step(
@@ -74,48 +36,34 @@ def step(
     centre and the spin stays constant, so one rotation over the whole interval updates the
     orientation.
     """
-    at = model.addresses
-    qpos, qvel = (_entries(x, range(len(x))) for x in (state.qpos, state.qvel))
-    slides = any(name.startswith("pair_friction[") for name in parameters.entries or {})
-    slides = slides or parameters.contact_friction is not None
-    turns = slides or model.contacts[0].friction is not None
-    turnings = [
-        read_turning(_entries(qpos, x.qpos[3:]), _entries(qvel, x.qvel[3:])) for x in at.balls
-    ]
-    velocities = [_entries(qvel, x.qvel[:3]) for x in at.balls]
-    if control.ball_push is not None:
-        pushes = jnp.reshape(control.ball_push, (-1, 3))
-        velocities = [v + _entries(pushes[k], range(3)) for k, v in enumerate(velocities)]
+    addresses = model.addresses
+    qpos = [state.qpos[i] for i in range(len(state.qpos))]
+    qvel = [state.qvel[i] for i in range(len(state.qvel))]
     balls = [
-        Ball(_entries(qpos, x.qpos[:3]), velocity, turning if turns else None)
-        for x, velocity, turning in zip(at.balls, velocities, turnings, strict=True)
+        read_ball([qpos[i] for i in at.qpos], [qvel[i] for i in at.qvel]) for at in addresses.balls
     ]
-    motion = Motion(_entries(qpos, at.arm_qpos), _entries(qvel, at.arm_qvel), tuple(balls))
-    leaves, tree = jax.tree.flatten(motion)
-    inputs = (_arm_control(control, at.actuators), parameters)
-    numbers, given = jax.tree.flatten(scalars_of(inputs, state.qpos.dtype))
-    advance = elementwise(_substeps(model, tree, given, num_substeps), num_results=len(leaves))
-    motion = tree.unflatten(advance(*leaves, *numbers))
+    if control.ball_push is not None:
+        balls = _pushed(balls, control.ball_push)
+    spins_change = _has_sliding_friction(model, parameters)
+    flying = balls if spins_change else [ball._replace(turning=None) for ball in balls]
+    motion = Motion(
+        q=Vec(qpos[i] for i in addresses.arm_qpos),
+        v=Vec(qvel[i] for i in addresses.arm_qvel),
+        balls=tuple(flying),
+    )
+    motion = _run(model, parameters, control, motion, num_substeps)
 
-    qpos, qvel = list(qpos), list(qvel)
-    _put(qpos, at.arm_qpos, motion.q)
-    _put(qvel, at.arm_qvel, motion.v)
-    for x, ball, before in zip(at.balls, motion.balls, turnings, strict=True):
-        after = ball.turning or advance_turning(before, ZERO3, num_substeps * model.dt)
-        _put(qpos, x.qpos, (*ball.position, *after.orientation))
-        _put(qvel, x.qvel[:3], ball.velocity)
-        if turns:
-            _put(qvel, x.qvel[3:], quaternion_matrix(after.orientation).T @ after.spin)
+    _put(qpos, addresses.arm_qpos, motion.q)
+    _put(qvel, addresses.arm_qvel, motion.v)
+    for at, ball, ball_before in zip(addresses.balls, motion.balls, balls, strict=True):
+        if spins_change:
+            turning = ball.turning
+            _put(qvel, at.qvel[3:], spin_in_ball(turning))
+        else:
+            turning = turn(ball_before.turning, ZERO3, num_substeps * model.dt)
+        _put(qpos, at.qpos, (*ball.position, *turning.orientation))
+        _put(qvel, at.qvel[:3], ball.velocity)
     return PhysicsState(jnp.stack(qpos), jnp.stack(qvel))
-
-
-def _entries(coordinates: jax.Array | Sequence[Scalar], indices: Sequence[int]) -> Vec:
-    return Vec(coordinates[i] for i in indices)
-
-
-def _put(coordinates: list[Scalar], indices: Sequence[int], values: Sequence[Scalar]) -> None:
-    for i, value in zip(indices, values, strict=True):
-        coordinates[i] = value
 
 
 def paddle_position(model: FusedModel, parameters: PhysicsParameters, qpos: jax.Array) -> jax.Array:
@@ -125,10 +73,49 @@ def paddle_position(model: FusedModel, parameters: PhysicsParameters, qpos: jax.
     relevant = PhysicsParameters(
         paddle_position=parameters.paddle_position, entries=entries or None
     )
-    numbers, given = jax.tree.flatten(scalars_of(relevant, qpos.dtype))
+    numbers, structure = jax.tree.flatten(scalars_of(relevant, qpos.dtype))
     # A separate kernel: XLA takes long to fuse such a chain with the surrounding program.
-    position = elementwise(_paddle_position(model, given), num_results=3)
+    position = elementwise(_paddle_position(model, structure), num_results=3)
     return jnp.stack(position(*(qpos[i] for i in model.addresses.arm_qpos), *numbers))
+
+
+def _has_sliding_friction(model: FusedModel, parameters: PhysicsParameters) -> bool:
+    """Whether a contact of this environment can have sliding friction."""
+    if model.contacts[0].friction is not None or parameters.contact_friction is not None:
+        return True
+    return any(name.startswith("pair_friction[") for name in parameters.entries or {})
+
+
+def _pushed(balls: Sequence[Ball], ball_push: jax.Array) -> list[Ball]:
+    """The balls after `Control.ball_push`."""
+    pushes = jnp.reshape(ball_push, (-1, 3))
+    pushed = []
+    for ball, push in zip(balls, pushes, strict=True):
+        velocity = ball.velocity + Vec(push[i] for i in range(3))
+        pushed.append(ball._replace(velocity=velocity))
+    return pushed
+
+
+def _put(coordinates: list[Scalar], indices: Sequence[int], values: Sequence[Scalar]) -> None:
+    for i, value in zip(indices, values, strict=True):
+        coordinates[i] = value
+
+
+def _run(
+    model: FusedModel,
+    parameters: PhysicsParameters,
+    control: Control,
+    motion: Motion,
+    num_substeps: int,
+) -> Motion:
+    """The motion after some physics steps."""
+    coordinates, motion_structure = jax.tree.flatten(motion)
+    inputs = (_arm_control(control, model.addresses.actuators), parameters)
+    dtype = coordinates[0].dtype
+    numbers, input_structure = jax.tree.flatten(scalars_of(inputs, dtype))
+    substeps = _substeps(model, motion_structure, input_structure, num_substeps)
+    advance = elementwise(substeps, num_results=len(coordinates))
+    return motion_structure.unflatten(advance(*coordinates, *numbers))
 
 
 def _arm_control(control: Control, actuators: tuple[int, ...]) -> Control:
@@ -143,27 +130,29 @@ def _arm_control(control: Control, actuators: tuple[int, ...]) -> Control:
 @functools.lru_cache(maxsize=16)
 def _substeps(
     model: FusedModel,
-    coordinates: jax.tree_util.PyTreeDef,
-    given: jax.tree_util.PyTreeDef,
+    motion_structure: jax.tree_util.PyTreeDef,
+    input_structure: jax.tree_util.PyTreeDef,
     num_substeps: int,
 ) -> Callable[..., tuple[Scalar, ...]]:
     """Physics steps as a function of scalars.
 
-    Its arguments are the leaves of a `Motion` (tree structure `coordinates`), then the leaves of
-    the `Control` and the parameters (tree structure `given`). Thanks to the cache and the inline
-    jit, JAX traces this long function once for all programs; a trace takes some tenths of a second.
+    Its arguments are the leaves of a `Motion`, then those of the `Control` and the parameters. The
+    tree structures belong to the cache's key, as they say which inputs there are (whether the balls
+    turn, which disturbances act, which parameters are given), and other inputs are another program.
+    Thanks to the cache and the inline jit, JAX traces this long function once for all programs; a
+    trace takes some tenths of a second.
     """
-    num_coordinates = coordinates.num_leaves
+    num_coordinates = motion_structure.num_leaves
 
     def substeps(*scalars: Scalar) -> tuple[Scalar, ...]:
-        control, parameters = given.unflatten(scalars[num_coordinates:])
-        world = read_model(model.mj_model, parameters)
-        motion = jax.lax.fori_loop(
-            0,
-            num_substeps,
-            lambda i, motion: substep(world, motion, _targets(control, i), control.air_drag),
-            coordinates.unflatten(scalars[:num_coordinates]),
-        )
+        motion = motion_structure.unflatten(scalars[:num_coordinates])
+        control, parameters = input_structure.unflatten(scalars[num_coordinates:])
+        model_of_world = read_model(model.mj_model, parameters)
+
+        def one_step(i: jax.Array, motion: Motion) -> Motion:
+            return substep(model_of_world, motion, _targets(control, i), control.air_drag)
+
+        motion = jax.lax.fori_loop(0, num_substeps, one_step, motion)
         return tuple(jax.tree.leaves(motion))
 
     return jax.jit(substeps, inline=True)
@@ -185,102 +174,15 @@ def _targets(control: Control, step: jax.Array) -> tuple[Scalar, ...]:
 
 @functools.lru_cache(maxsize=16)
 def _paddle_position(
-    model: FusedModel, given: jax.tree_util.PyTreeDef
+    model: FusedModel, structure: jax.tree_util.PyTreeDef
 ) -> Callable[..., tuple[Scalar, ...]]:
     """`paddle_position` as a function of the joint angles and the given parameters; cached
     like `_substeps`."""
-    n = len(model.links)
+    num_joints = len(model.links)
 
     def position(*scalars: Scalar) -> tuple[Scalar, ...]:
-        world = read_model(model.mj_model, given.unflatten(scalars[n:]))
-        return tuple(paddle_origin(world, chain.forward_kinematics(world.links, scalars[:n])))
+        model_of_world = read_model(model.mj_model, structure.unflatten(scalars[num_joints:]))
+        pose = chain.forward_kinematics(model_of_world.links, scalars[:num_joints])
+        return tuple(paddle_origin(model_of_world, pose))
 
     return jax.jit(position, inline=True)
-
-
-def substep(
-    model: FusedModel, motion: Motion, targets: tuple[Scalar, ...], air_drag: Scalar | None = None
-) -> Motion:
-    """One physics step: the equivalent of `mj_step` with the integrators implicitfast and Euler:
-    semi-implicit Euler, implicit in the velocity-dependent forces of joint damping and, with
-    implicitfast, of servos (documentation, "Computation", numerical integration)."""
-    dt, links, balls = model.dt, model.links, motion.balls
-    frictional = balls[0].turning is not None or any(map(joint_friction.has_friction, links))
-    # The programs of models with friction are long.
-    keep = not_inlined if frictional else lambda values: values
-    pose = keep(chain.forward_kinematics(links, motion.q))
-    bias = keep(chain.bias_force(links, pose, motion.v, model.gravity))
-    inertia = keep(chain.mass_matrix(links, pose))
-    floating = chain.floating_force(links, pose, model.gravity)
-    applied, implicit = [], [list(row) for row in inertia]
-    for i, (link, servo, target, q, v) in enumerate(
-        zip(links, model.servos, targets, motion.q, motion.v, strict=True)
-    ):
-        force, derivative = servo_force(servo, target, q, v, floating[i])
-        spring = mul(link.stiffness, sub(q, link.spring_position))
-        applied.append(force - link.damping * v - add(bias[i], spring))
-        damping = link.damping if model.implicit_damping else 0.0
-        if model.implicit_servos:
-            damping = damping - derivative
-        implicit[i][i] = add(implicit[i][i], dt * damping)
-    factor = keep(chain.cholesky(inertia))
-    free = [model.gravity * ball.weight for ball in model.balls]
-    if air_drag is not None:
-        free = [a + drag(air_drag, ball.velocity) for a, ball in zip(free, balls, strict=True)]
-    torque, *pushes = contact_response(
-        model, pose, factor, motion.v, chain.solve_lower(factor, applied), balls, free, keep
-    )
-    factor = keep(chain.cholesky(implicit))
-    half = chain.solve_lower(factor, list(map(add, applied, torque)))
-    acceleration = chain.solve_upper(factor, half)
-    v = Vec(a + dt * b for a, b in zip(motion.v, acceleration, strict=True))
-    q = Vec(a + dt * b for a, b in zip(motion.q, v, strict=True))
-    moved = []
-    for ball, *accelerations in zip(balls, free, *pushes, strict=True):
-        velocity = ball.velocity + (accelerations[0] + accelerations[1]) * dt
-        turning = ball.turning and advance_turning(ball.turning, accelerations[2], dt)
-        moved.append(Ball(ball.position + velocity * dt, velocity, turning))
-    return Motion(q, v, tuple(moved))
-
-
-def servo_force(
-    servo: Servo, target: Scalar, q: Scalar, v: Scalar, carried: Scalar
-) -> tuple[Scalar, Scalar]:
-    """Force of a servo and of gravity compensation at a joint (N m, N) for the servo target, and
-    the servo's derivative with respect to the velocity, which is 0 at the servo's force limit. The
-    limit of the joint does not change MuJoCo's derivative.
-
-    Args:
-      carried: force of the gravity compensation.
-    """
-    if servo.ctrl_range is not None:
-        target = jnp.clip(target, *servo.ctrl_range)
-    force = servo.gain * target + servo.stiffness * q + servo.damping * v + servo.bias
-    derivative = servo.damping
-    if servo.force_range is not None:
-        least, most = servo.force_range
-        derivative = jnp.where((force > least) & (force < most), derivative, 0.0)
-        force = jnp.clip(force, least, most)
-    if servo.carries_weight:
-        force, carried = add(force, carried), 0.0
-    if servo.joint_range is not None:
-        force = jnp.clip(force, *servo.joint_range)
-    return add(force, carried), derivative
-
-
-def read_turning(quaternion: Quaternion, spin: Vec) -> Turning:
-    """Spin in the world and normalised orientation from MuJoCo's coordinates."""
-    q = Vec(quaternion)
-    orientation = tuple(q * jax.lax.rsqrt(q @ q))
-    return Turning(quaternion_matrix(orientation) @ spin, orientation)
-
-
-def advance_turning(turning: Turning, acceleration: Vec, dt: float) -> Turning:
-    """Spin and orientation after a time dt, in which the new spin turns the orientation."""
-    spin = turning.spin + acceleration * dt
-    squared = spin @ spin
-    still = squared < float(jnp.finfo(squared.dtype).tiny)
-    inverse_speed = jax.lax.rsqrt(jnp.where(still, 1.0, squared))
-    sine, cosine = sine_cosine(0.5 * dt * (squared * inverse_speed))
-    rotation = (cosine, *(spin * (sine * inverse_speed)))
-    return Turning(spin, quaternion_product(rotation, turning.orientation))

@@ -23,6 +23,7 @@ Every state runs the same operations, so that the threads of a GPU kernel do not
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -48,10 +49,22 @@ from bounce_mjx.physics.scalars import (
 # to 0.99999, all reach rounding error; with 16 and 6 steps, 373 do not.
 _NEWTON_STEPS = 24
 _SEARCH_STEPS = 10
-_EDGES = tuple(map(Vec, ((1.0, 1.0, 0.0), (1.0, -1.0, 0.0), (1.0, 0.0, 1.0), (1.0, 0.0, -1.0))))
+_EDGES = (
+    Vec((1.0, 1.0, 0.0)),
+    Vec((1.0, -1.0, 0.0)),
+    Vec((1.0, 0.0, 1.0)),
+    Vec((1.0, 0.0, -1.0)),
+)
 Scalars = tuple[Scalar, ...]
-Cone = tuple[jax.Array, Scalar]
-"""Whether a contact exists, and the regulariser of each edge of its pyramid, 1/kg."""
+
+
+class Cone(NamedTuple):
+    """The pyramid of one of several contacts."""
+
+    is_touching: jax.Array
+    """Whether the contact exists."""
+    regulariser: Scalar
+    """R of the coefficient of each edge, 1/kg."""
 
 
 def edge_regulariser(model: ContactModel, softness: Scalar) -> Scalar:
@@ -64,14 +77,49 @@ def edge_regulariser(model: ContactModel, softness: Scalar) -> Scalar:
     return 2.0 * (mul(squared, 1.0 / model.impratio) * softness) * add(1.0, squared)
 
 
+class _Pyramid(NamedTuple):
+    """The problem of one contact in units of the cone (`pyramid_force`), from its symmetric matrix
+    Q and its offsets c."""
+
+    q00: Scalar
+    q01: Scalar
+    q02: Scalar
+    q11: Scalar
+    q12: Scalar
+    q22: Scalar
+    c0: Scalar
+    c1: Scalar
+    c2: Scalar
+    regulariser: Scalar
+    """R of each edge's coefficient, 1/kg."""
+
+
+class _Candidate(NamedTuple):
+    """The solution of `pyramid_force` if one set of edges is active."""
+
+    force: Scalars
+    """x [3] in units of the cone."""
+    score: jax.Array
+    """Least slack of the conditions that make it the solution: negative where one is broken."""
+
+
 def pyramid_force(
     model: ContactModel, matrix: Sequence[Scalar], offsets: Sequence[Scalar], softness: Scalar
 ) -> Scalars:
-    """Force [normal, first and second tangent] of a contact, N.
+    """Force [normal, first and second tangent] of a contact, N, in closed form.
 
-    The first tangent's two edges have four active sets. Each is eliminated in turn, and the second
-    tangent's pair of edges is solved in closed form; the solution is the active set with the right
-    signs. Sums and differences of the coefficients of a pair avoid cancellation at small friction.
+    With the coefficients a_i >= 0 of the four edges, x = (s1 + s2, t1, t2), where s1 = a_1 + a_2
+    and t1 = a_1 - a_2 belong to the edges (1, +-1, 0), s2 and t2 to (1, 0, +-1). Since
+    a_1^2 + a_2^2 = (s1^2 + t1^2) / 2, the objective is, with h = R / 2,
+
+        1/2 x.Q x + c.x + h/2 (s1^2 + t1^2 + s2^2 + t2^2),    s1 >= |t1|, s2 >= |t2|
+
+    The first pair of edges has four active sets: none, both, the first or the second edge. Each
+    function below assumes one of them, eliminates s1 and t1, which gives a problem of the same form
+    for s2 and t2 alone (`_pair_minimum`), and scores the result. The problem is strictly convex, so
+    exactly one set fits, up to rounding: the one with the highest score. Sums and differences of
+    the coefficients avoid cancellation at small friction, and so do the products that are written
+    out where a difference of two large ones is expected.
 
     Args:
       matrix: J M^-1 J^T, the upper triangle row by row, 1/kg.
@@ -81,95 +129,137 @@ def pyramid_force(
     units = (1.0, *model.friction)
     pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
     q = [mul(entry, mul(units[i], units[j])) for entry, (i, j) in zip(matrix, pairs, strict=True)]
-    regulariser = edge_regulariser(model, softness)
-    q00, q01, q02, q11, q12, q22 = q
-    c0, c1, c2 = map(mul, offsets, units)
-    h = 0.5 * regulariser
+    c = map(mul, offsets, units)
+    problem = _Pyramid(*q, *c, edge_regulariser(model, softness))
 
-    # Neither edge of the first pair is active.
-    s2, t2 = _pair(q00, q02, q22, c0, c2, regulariser)
-    push = c0 + q00 * s2 + q02 * t2
-    pull = c1 + q01 * s2 + q12 * t2
-    none = (s2, jnp.zeros_like(t2), t2), push - jnp.abs(pull)
+    best = _better(_without_first_pair(problem), _with_first_pair(problem))
 
-    # Both edges are active.
-    k00, k11 = q00 + h, q11 + h
-    i = 1.0 / (k00 * k11 - q01 * q01)
-    p00 = h * (q00 * k11 - q01 * q01) * i
-    p02 = h * (k11 * q02 - q01 * q12) * i
-    p22 = q22 - (k11 * q02 * q02 - 2.0 * q01 * q02 * q12 + k00 * q12 * q12) * i
-    g0 = h * (k11 * c0 - q01 * c1) * i
-    g2 = c2 - (k11 * q02 * c0 - q01 * (q02 * c1 + q12 * c0) + k00 * q12 * c1) * i
-    s2, t2 = _pair(p00, p02, p22, g0, g2, regulariser)
-    push = c0 + q00 * s2 + q02 * t2
-    pull = c1 + q01 * s2 + q12 * t2
-    s1 = (q01 * pull - k11 * push) * i
-    t1 = (q01 * push - k00 * pull) * i
-    both = (s1 + s2, t1, t2), (s1 - jnp.abs(t1)) * q00
+    def try_edge(edge: jax.Array, best: _Candidate) -> _Candidate:
+        sign = 1.0 - 2.0 * lax.convert_element_type(edge, problem.q01.dtype)
+        return _better(best, _with_one_edge(problem, sign))
 
-    # One edge is active: the first, or its opposite.
-    def one(i: jax.Array, best: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        sign = 1.0 - 2.0 * lax.convert_element_type(i, q01.dtype)
-        q_01, q_12, c_1 = sign * q01, sign * q12, sign * c1
-        r0, r2, g = q00 + q_01, q02 + q_12, c0 + c_1
-        rest = q_01 + q11 + regulariser
-        inverse = 1.0 / (r0 + rest)
-        s2, t2 = _pair(
-            (q00 * (q11 + regulariser) - q01 * q01) * inverse,
-            (q02 * rest - q_12 * r0) * inverse,
-            q22 - r2 * r2 * inverse,
-            (c0 * rest - c_1 * r0) * inverse,
-            c2 - r2 * g * inverse,
-            regulariser,
-        )
-        lack = g + r0 * s2 + r2 * t2
-        f = -lack * inverse
-        n = s2 + f
-        other = (c0 + q00 * n + q_01 * f + q02 * t2) - (c_1 + q_01 * n + q11 * f + q_12 * t2)
-        return _better(best, ((n, sign * f, t2), jnp.minimum(-lack, other)))
-
-    x, _ = lax.fori_loop(0, 2, one, _better(none, both))
-    return tuple(map(mul, x, units))
+    best = lax.fori_loop(0, 2, try_edge, best)
+    return tuple(map(mul, best.force, units))
 
 
-def _better(
-    a: tuple[Scalars, jax.Array], b: tuple[Scalars, jax.Array]
-) -> tuple[Scalars, jax.Array]:
+def _better(a: _Candidate, b: _Candidate) -> _Candidate:
     """The candidate with the higher score."""
-    (x, x_score), (y, y_score) = a, b
-    chosen = tuple(jnp.where(y_score > x_score, j, i) for i, j in zip(x, y, strict=True))
-    return chosen, jnp.maximum(x_score, y_score)
+    is_better = b.score > a.score
+    force = tuple(jnp.where(is_better, y, x) for x, y in zip(a.force, b.force, strict=True))
+    return _Candidate(force, jnp.maximum(a.score, b.score))
 
 
-def _pair(p00, p02, p22, g0, g2, regulariser) -> tuple[jax.Array, jax.Array]:
-    """Sum s and difference t of the nonnegative coefficients of the edges (1, 1) and (1, -1)."""
+def _without_first_pair(problem: _Pyramid) -> _Candidate:
+    """Neither edge of the first pair is active: s1 = t1 = 0. The gradients along them,
+    normal +- tangent, must not be negative."""
+    q00, q01, q02, _, q12, q22, c0, c1, c2, regulariser = problem
+    s2, t2 = _pair_minimum(q00, q02, q22, c0, c2, regulariser)
+    normal_gradient = c0 + q00 * s2 + q02 * t2
+    tangent_gradient = c1 + q01 * s2 + q12 * t2
+    force = (s2, jnp.zeros_like(t2), t2)
+    return _Candidate(force, normal_gradient - jnp.abs(tangent_gradient))
+
+
+def _with_first_pair(problem: _Pyramid) -> _Candidate:
+    """Both edges of the first pair are active, so s1 and t1 make their gradients 0:
+
+        [q00 + h, q01; q01, q11 + h] (s1, t1) = -(normal_gradient, tangent_gradient)
+
+    Both coefficients must be positive: s1 > |t1|.
+    """
+    q00, q01, q02, q11, q12, q22, c0, c1, c2, regulariser = problem
     h = 0.5 * regulariser
-    k00, k22 = p00 + h, p22 + h
+    k00 = q00 + h
+    k11 = q11 + h
+    inverse_determinant = 1.0 / (k00 * k11 - q01 * q01)
+    # The Schur complement in s2 and t2; with k00 = q00 + h, its first row has the factor h.
+    p00 = h * (q00 * k11 - q01 * q01) * inverse_determinant
+    p02 = h * (k11 * q02 - q01 * q12) * inverse_determinant
+    eliminated = k11 * q02 * q02 - 2.0 * q01 * q02 * q12 + k00 * q12 * q12
+    p22 = q22 - eliminated * inverse_determinant
+    g0 = h * (k11 * c0 - q01 * c1) * inverse_determinant
+    eliminated = k11 * q02 * c0 - q01 * (q02 * c1 + q12 * c0) + k00 * q12 * c1
+    g2 = c2 - eliminated * inverse_determinant
+    s2, t2 = _pair_minimum(p00, p02, p22, g0, g2, regulariser)
+
+    normal_gradient = c0 + q00 * s2 + q02 * t2
+    tangent_gradient = c1 + q01 * s2 + q12 * t2
+    s1 = (q01 * tangent_gradient - k11 * normal_gradient) * inverse_determinant
+    t1 = (q01 * normal_gradient - k00 * tangent_gradient) * inverse_determinant
+    # In the unit of a gradient, as the other scores.
+    return _Candidate((s1 + s2, t1, t2), (s1 - jnp.abs(t1)) * q00)
+
+
+def _with_one_edge(problem: _Pyramid, sign: jax.Array) -> _Candidate:
+    """One edge of the first pair, (1, sign, 0), is active with the coefficient a, which makes its
+    gradient 0: a = -(g + r0 s2 + r2 t2) / (r0 + rest), where r0 and r2 are the edge's products with
+    the directions of s2 and t2, g that with c, and the denominator e.Q e + R. The coefficient must
+    be positive, and the gradient along the other edge must not be negative."""
+    q00, q01, q02, q11, q12, q22, c0, c1, c2, regulariser = problem
+    # The tangent's sign turned, so that the edge is (1, 1, 0).
+    signed_q01 = sign * q01
+    signed_q12 = sign * q12
+    signed_c1 = sign * c1
+    r0 = q00 + signed_q01
+    r2 = q02 + signed_q12
+    g = c0 + signed_c1
+    rest = signed_q01 + q11 + regulariser
+    inverse = 1.0 / (r0 + rest)
+    # The Schur complement in s2 and t2, with q00 = r0 - signed_q01 inserted against cancellation.
+    s2, t2 = _pair_minimum(
+        (q00 * (q11 + regulariser) - q01 * q01) * inverse,
+        (q02 * rest - signed_q12 * r0) * inverse,
+        q22 - r2 * r2 * inverse,
+        (c0 * rest - signed_c1 * r0) * inverse,
+        c2 - r2 * g * inverse,
+        regulariser,
+    )
+    edge_gradient = g + r0 * s2 + r2 * t2
+    coefficient = -edge_gradient * inverse
+    normal = s2 + coefficient
+    normal_gradient = c0 + q00 * normal + signed_q01 * coefficient + q02 * t2
+    tangent_gradient = signed_c1 + signed_q01 * normal + q11 * coefficient + signed_q12 * t2
+    other_edge_gradient = normal_gradient - tangent_gradient
+    score = jnp.minimum(-edge_gradient, other_edge_gradient)
+    return _Candidate((normal, sign * coefficient, t2), score)
+
+
+def _pair_minimum(
+    p00: Scalar, p02: Scalar, p22: Scalar, g0: Scalar, g2: Scalar, regulariser: Scalar
+) -> tuple[jax.Array, jax.Array]:
+    """Sum s and difference t of the coefficients of the edges (1, 0, +-1) at the minimum of
+
+    1/2 (p00 s^2 + 2 p02 s t + p22 t^2) + g0 s + g2 t + h/2 (s^2 + t^2),    s >= |t|
+    """
+    h = 0.5 * regulariser
+    k00 = p00 + h
+    k22 = p22 + h
     inverse_determinant = 1.0 / (k00 * k22 - p02 * p02)
-    s = (p02 * g2 - k22 * g0) * inverse_determinant
-    t = (p02 * g0 - k00 * g2) * inverse_determinant
-    both = s >= jnp.abs(t)
-    diagonal, off = p00 + p22 + regulariser, p00 - p22
+    s_both = (p02 * g2 - k22 * g0) * inverse_determinant
+    t_both = (p02 * g0 - k00 * g2) * inverse_determinant
+    both_active = s_both >= jnp.abs(t_both)
+    # At most one edge is active: the one that leaves the larger gradient on the other.
+    diagonal = p00 + p22 + regulariser
+    off_diagonal = p00 - p22
     plus = jnp.maximum(-(g0 + g2) / (diagonal + 2.0 * p02), 0.0)
     minus = jnp.maximum(-(g0 - g2) / (diagonal - 2.0 * p02), 0.0)
-    # One edge is active: the one that leaves the larger gradient on the other.
-    first = g0 - g2 + off * plus >= g0 + g2 + off * minus
-    s_one = jnp.where(first, plus, minus)
-    t_one = jnp.where(first, plus, -minus)
-    return jnp.where(both, s, s_one), jnp.where(both, t, t_one)
+    plus_active = g0 - g2 + off_diagonal * plus >= g0 + g2 + off_diagonal * minus
+    s_one = jnp.where(plus_active, plus, minus)
+    t_one = jnp.where(plus_active, plus, -minus)
+    return jnp.where(both_active, s_both, s_one), jnp.where(both_active, t_both, t_one)
 
 
 def coupled_forces(
     models: Sequence[ContactModel],
-    touching: Sequence[jax.Array],
+    is_touching: Sequence[jax.Array],
     matrix: Sequence[Scalar],
     offsets: Sequence[Scalar],
     softnesses: Sequence[Scalar],
-) -> tuple[Scalar, ...]:
+) -> Scalars:
     """Forces [3 k] of k contacts (N): normal, first and second tangent of each.
 
     Args:
-      touching: whether each contact exists.
+      is_touching: whether each contact exists.
       matrix: J M^-1 J^T, the upper triangle row by row, 1/kg.
       offsets: J a0 - aref, m/s^2.
       softnesses: regularisers of the normal forces without friction, 1/kg.
@@ -177,58 +267,75 @@ def coupled_forces(
     units = [unit for model in models for unit in (1.0, *model.friction)]
     size = len(units)
     upper = upper_rows(matrix, size)
-    q = [
-        [mul(upper[min(i, j)][abs(i - j)], mul(units[i], units[j])) for j in range(size)]
-        for i in range(size)
-    ]
-    c = list(map(mul, offsets, units))
-    cones = [
-        (touches, edge_regulariser(model, softness))
-        for model, touches, softness in zip(models, touching, softnesses, strict=True)
-    ]
+    q: list[list[Scalar]] = []
+    for i in range(size):
+        row = [upper[min(i, j)][abs(i - j)] for j in range(size)]
+        q.append([mul(entry, mul(units[i], units[j])) for j, entry in enumerate(row)])
+    c = [mul(offset, unit) for offset, unit in zip(offsets, units, strict=True)]
+    cones = []
+    for model, touches, softness in zip(models, is_touching, softnesses, strict=True):
+        cones.append(Cone(touches, edge_regulariser(model, softness)))
     q, c = not_inlined((q, c))
 
-    def newton_step(_, x: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
+    def newton_step(_: jax.Array, x: Scalars) -> Scalars:
         return _newton_step(cones, q, c, x)
 
-    start = tuple(map(zero_like, c))
+    start = tuple(zero_like(entry) for entry in c)
     x = lax.fori_loop(0, _NEWTON_STEPS, newton_step, start)
-    return tuple(map(mul, x, units))
+    return tuple(mul(entry, unit) for entry, unit in zip(x, units, strict=True))
 
 
 def _newton_step(
-    cones: Sequence[Cone], q: list[list[Scalar]], c: list[Scalar], x: Sequence[Scalar]
-) -> tuple[Scalar, ...]:
+    cones: Sequence[Cone], q: list[list[Scalar]], c: list[Scalar], x: Scalars
+) -> Scalars:
     """Forces after one step of Newton's method with a line search.
 
-    With the derivative -L L^T of f, the step s solves s + L L^T Q s = f - x.
+    The residual is f(y) - x at the acceleration y = c + Q x. With the derivative -L L^T of f, the
+    step d solves (I + L L^T Q) d = residual. Woodbury's formula leaves a symmetric system in as
+    many unknowns z as L has columns:
+
+        (I + L^T Q L) z = L^T Q residual,    d = residual - L z
     """
     y = [add(entry, dot(row, x)) for entry, row in zip(c, q, strict=True)]
     forces, factors = _response(cones, y)
-    lack = [sub(f, entry) for f, entry in zip(forces, x, strict=True)]
-    q_lack = [dot(row, lack) for row in q]
-    # Columns of L with the first entry's row, and Q L.
-    columns = [(3 * k, column) for k, factor in enumerate(factors) for column in factor]
-    q_columns = [[dot(row[k : k + 3], column) for row in q] for k, column in columns]
-    system = [[dot(column, q_column[k : k + 3]) for q_column in q_columns] for k, column in columns]
-    for i, row in enumerate(system):
-        row[i] = add(row[i], 1.0)
+    residual = [sub(force, entry) for force, entry in zip(forces, x, strict=True)]
+    q_residual = [dot(row, residual) for row in q]
+    # The columns of L: three entries, of which the first stands in the row `start`.
+    starts, columns = [], []
+    for contact, factor in enumerate(factors):
+        for column in factor:
+            starts.append(3 * contact)
+            columns.append(column)
+    q_columns = []
+    for start, column in zip(starts, columns, strict=True):
+        q_columns.append([dot(row[start : start + 3], column) for row in q])
+    system = []
+    right_hand_side = []
+    for i, (start, column) in enumerate(zip(starts, columns, strict=True)):
+        system_row = [dot(column, q_column[start : start + 3]) for q_column in q_columns]
+        system_row[i] = add(system_row[i], 1.0)
+        system.append(system_row)
+        right_hand_side.append(dot(column, q_residual[start : start + 3]))
     factor = not_inlined(chain.cholesky(system))
-    pulls = [dot(column, q_lack[k : k + 3]) for k, column in columns]
-    z = chain.solve_upper(factor, chain.solve_lower(factor, pulls))
-    step, y_step = list(lack), list(q_lack)
-    for (k, column), q_column, size in zip(columns, q_columns, z, strict=True):
+    z = chain.solve_upper(factor, chain.solve_lower(factor, right_hand_side))
+
+    step = list(residual)
+    y_step = list(q_residual)
+    for start, column, q_column, size in zip(starts, columns, q_columns, z, strict=True):
         for i in range(3):
-            step[k + i] = sub(step[k + i], mul(column[i], size))
+            step[start + i] = sub(step[start + i], mul(column[i], size))
         y_step = [sub(a, mul(b, size)) for a, b in zip(y_step, q_column, strict=True)]
     x, y, step, y_step = not_inlined((list(x), y, step, y_step))
-    return tuple(_ahead(x, _line_search(cones, (x, y), (step, y_step)), step))
+    length = _line_search(cones, x, y, step, y_step)
+    return tuple(_ahead(x, length, step))
 
 
 def _line_search(
     cones: Sequence[Cone],
-    start: tuple[list[Scalar], list[Scalar]],
-    step: tuple[list[Scalar], list[Scalar]],
+    x: list[Scalar],
+    y: list[Scalar],
+    step: list[Scalar],
+    y_step: list[Scalar],
 ) -> Scalar:
     """Length, from 0 to 2, of a step of the forces x and the accelerations y to the minimum of
     MuJoCo's primal objective along it, where its increasing slope is 0.
@@ -236,29 +343,32 @@ def _line_search(
     Between its kinks the slope is straight, so Newton's method within a bracket finds its zero
     exactly.
     """
-    (x, y), (x_step, y_step) = start, step
 
     def slope(length: Scalar) -> tuple[Scalar, Scalar]:
         """The slope, and its derivative."""
         forces, factors = _response(cones, _ahead(y, length, y_step))
-        lack = [sub(a, f) for a, f in zip(_ahead(x, length, x_step), forces, strict=True)]
-        rise = dot(y_step, x_step)
+        difference = [sub(a, f) for a, f in zip(_ahead(x, length, step), forces, strict=True)]
+        derivative = dot(y_step, step)
         for k, factor in enumerate(factors):
             for column in factor:
-                pull = dot(column, y_step[3 * k : 3 * k + 3])
-                rise = add(rise, mul(pull, pull))
-        return dot(y_step, lack), rise
+                along = dot(column, y_step[3 * k : 3 * k + 3])
+                derivative = add(derivative, mul(along, along))
+        return dot(y_step, difference), derivative
 
-    def newton(_, bracket: tuple[Scalar, Scalar, Scalar]) -> tuple[Scalar, Scalar, Scalar]:
+    def newton(_: jax.Array, bracket: tuple[Scalar, Scalar, Scalar]) -> tuple[Scalar, ...]:
         low, high, length = bracket
-        here, rise = slope(length)
-        low, high = jnp.where(here < 0.0, length, low), jnp.where(here < 0.0, high, length)
-        length = length - here / jnp.maximum(rise, float(jnp.finfo(rise.dtype).tiny))
-        inside = (length > low) & (length < high)
-        return low, high, jnp.where(inside, length, 0.5 * (low + high))
+        value, derivative = slope(length)
+        is_before_zero = value < 0.0
+        low = jnp.where(is_before_zero, length, low)
+        high = jnp.where(is_before_zero, high, length)
+        smallest = float(jnp.finfo(derivative.dtype).tiny)
+        length = length - value / jnp.maximum(derivative, smallest)
+        is_inside = (length > low) & (length < high)
+        return low, high, jnp.where(is_inside, length, 0.5 * (low + high))
 
     zero = zero_like(y_step[0])
-    return lax.fori_loop(0, _SEARCH_STEPS, newton, (zero, zero + 2.0, zero + 1.0))[2]
+    _, _, length = lax.fori_loop(0, _SEARCH_STEPS, newton, (zero, zero + 2.0, zero + 1.0))
+    return length
 
 
 def _ahead(start: list[Scalar], length: Scalar, step: list[Scalar]) -> list[Scalar]:
@@ -269,14 +379,18 @@ def _response(
     cones: Sequence[Cone], y: Sequence[Scalar]
 ) -> tuple[list[Scalar], list[tuple[Vec, ...]]]:
     """f(y) [3 k], and for each contact the columns of L, one for each edge of its pyramid."""
-    forces, factors = [], []
-    for k, (touches, regulariser) in enumerate(cones):
-        own, columns, root = Vec(y[3 * k : 3 * k + 3]), [], lax.rsqrt(regulariser)
+    forces: list[Scalar] = []
+    factors = []
+    for contact, cone in enumerate(cones):
+        acceleration = Vec(y[3 * contact : 3 * contact + 3])
+        root = lax.rsqrt(cone.regulariser)
         force = ZERO3
+        columns = []
         for edge in _EDGES:
-            pull = edge @ own
-            column = edge * jnp.where(touches & (pull < 0.0), root, 0.0)
-            force = force - column * (pull * root)
+            along_edge = edge @ acceleration
+            is_active = cone.is_touching & (along_edge < 0.0)
+            column = edge * jnp.where(is_active, root, 0.0)
+            force = force - column * (along_edge * root)
             columns.append(column)
         forces += force
         factors.append(tuple(columns))

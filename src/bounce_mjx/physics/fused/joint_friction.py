@@ -32,6 +32,7 @@ from bounce_mjx.physics.scalars import (
     neg,
     not_inlined,
     sub,
+    upper_rows,
     zero_like,
 )
 
@@ -60,7 +61,7 @@ class DryFrictionProblem(NamedTuple):
     contact_matrix: tuple[Scalar, ...]
     """J A J^T with the ball's share, the upper triangle row by row."""
     contact_offset: tuple[Scalar, ...]
-    """J a0 [c], up to a constant."""
+    """J a0 - aref of the contact [c], without dry friction, m/s^2."""
 
 
 def has_friction(link: chain.Link) -> bool:
@@ -70,7 +71,7 @@ def has_friction(link: chain.Link) -> bool:
 
 def contact_and_friction(
     links: Sequence[chain.Link],
-    factor: tuple[chain.SquareMatrix, list[Scalar]],
+    factor: chain.Factor,
     joint_velocity: Scalars,
     half_applied: Scalars,
     half_rows: Sequence[Scalars],
@@ -92,41 +93,69 @@ def contact_and_friction(
     friction: list[Scalar] = [0.0] * len(links)
     if not joints:
         return contact_force(contact_matrix, contact_offset), friction
-    units = [[1.0 if i == j else 0.0 for i in range(len(links))] for j in joints]
-    half = not_inlined([chain.solve_lower(factor, unit) for unit in units])
-    matrix = [[dot(a, b) for b in half] for a in half]
-    for i, j in enumerate(joints):
-        matrix[i][i] = add(matrix[i][i], links[j].friction_softness)
-    problem = not_inlined(
-        DryFrictionProblem(
-            matrix=matrix,
-            inverse_diagonal=[1.0 / matrix[i][i] for i in range(len(joints))],
-            offset=[
-                add(dot(column, half_applied), mul(links[j].friction_damping, joint_velocity[j]))
-                for j, column in zip(joints, half, strict=True)
-            ],
-            coupling=[[dot(row, column) for column in half] for row in half_rows],
-            contact_matrix=contact_matrix,
-            contact_offset=contact_offset,
-        )
+    problem = _problem(
+        links,
+        joints,
+        factor,
+        joint_velocity,
+        half_applied,
+        half_rows,
+        contact_matrix,
+        contact_offset,
     )
     limits = [links[j].frictionloss for j in joints]
 
-    def one_round(_, forces):
-        contact, solved = forces
+    def one_round(_: int, forces: tuple[Scalars, Scalars]) -> tuple[Scalars, Scalars]:
+        contact, joint_forces = forces
         for _ in range(_SWEEPS):
-            solved = not_inlined(_sweep(problem, limits, contact, solved))
+            joint_forces = not_inlined(_sweep(problem, limits, contact, joint_forces))
             if len(contact) == 1:
                 # Without sliding friction the contact's force costs next to nothing.
-                contact = contact_force(problem.contact_matrix, _contact_offset(problem, solved))
-        return not_inlined(_eliminate_sticking(problem, limits, solved, contact_force))
+                offset = _contact_offset(problem, joint_forces)
+                contact = contact_force(problem.contact_matrix, offset)
+        return not_inlined(_eliminate_sticking(problem, limits, joint_forces, contact_force))
 
-    none = tuple(map(zero_like, problem.offset))
-    start = contact_force(problem.contact_matrix, problem.contact_offset), none
-    contact, solved = lax.fori_loop(0, _ROUNDS, one_round, start)
-    for j, force in zip(joints, solved, strict=True):
-        friction[j] = force
+    contact = contact_force(problem.contact_matrix, problem.contact_offset)
+    no_friction = tuple(zero_like(offset) for offset in problem.offset)
+    contact, joint_forces = lax.fori_loop(0, _ROUNDS, one_round, (contact, no_friction))
+    for joint, force in zip(joints, joint_forces, strict=True):
+        friction[joint] = force
     return contact, friction
+
+
+def _problem(
+    links: Sequence[chain.Link],
+    joints: Sequence[int],
+    factor: chain.Factor,
+    joint_velocity: Scalars,
+    half_applied: Scalars,
+    half_rows: Sequence[Scalars],
+    contact_matrix: tuple[Scalar, ...],
+    contact_offset: tuple[Scalar, ...],
+) -> DryFrictionProblem:
+    """The problem of the joints with dry friction, for the arguments of `contact_and_friction`."""
+    half_columns = []
+    for joint in joints:
+        unit = [0.0] * len(links)
+        unit[joint] = 1.0
+        half_columns.append(chain.solve_lower(factor, unit))
+    half_columns = not_inlined(half_columns)
+    matrix = [[dot(a, b) for b in half_columns] for a in half_columns]
+    offset = []
+    for i, joint in enumerate(joints):
+        matrix[i][i] = add(matrix[i][i], links[joint].friction_softness)
+        free_acceleration = dot(half_columns[i], half_applied)
+        damping = mul(links[joint].friction_damping, joint_velocity[joint])
+        offset.append(add(free_acceleration, damping))
+    problem = DryFrictionProblem(
+        matrix=matrix,
+        inverse_diagonal=[1.0 / matrix[i][i] for i in range(len(joints))],
+        offset=offset,
+        coupling=[[dot(row, column) for column in half_columns] for row in half_rows],
+        contact_matrix=contact_matrix,
+        contact_offset=contact_offset,
+    )
+    return not_inlined(problem)
 
 
 def _sweep(
@@ -134,14 +163,13 @@ def _sweep(
 ) -> tuple[Scalar, ...]:
     """Dry friction after each joint in turn took its best value for the present ones of the others
     (projected Gauss-Seidel)."""
-    new = list(friction)
+    swept = list(friction)
     for j, (row, limit) in enumerate(zip(problem.matrix, limits, strict=True)):
-        pull = dot([row[j] for row in problem.coupling], contact)
-        pull = add(
-            add(problem.offset[j], pull), dot(row[:j] + row[j + 1 :], new[:j] + new[j + 1 :])
-        )
-        new[j] = _clip(neg(mul(pull, problem.inverse_diagonal[j])), limit)
-    return tuple(new)
+        by_contact = dot([coupling[j] for coupling in problem.coupling], contact)
+        by_others = dot(row[:j] + row[j + 1 :], swept[:j] + swept[j + 1 :])
+        acceleration = add(add(problem.offset[j], by_contact), by_others)
+        swept[j] = _clip(neg(mul(acceleration, problem.inverse_diagonal[j])), limit)
+    return tuple(swept)
 
 
 def _eliminate_sticking(
@@ -149,42 +177,59 @@ def _eliminate_sticking(
 ) -> tuple[tuple[Scalar, ...], tuple[Scalar, ...]]:
     """Contact force and dry friction that are exact if each joint below its limit sticks, and if
     each other joint keeps its friction."""
-    sticks = [
-        lax.convert_element_type(jnp.abs(f) < limit, f.dtype)
-        for f, limit in zip(friction, limits, strict=True)
-    ]
-    kept = [sub(f, mul(f, s)) for f, s in zip(friction, sticks, strict=True)]
+    sticks = []
+    sliding_friction = []
+    for force, limit in zip(friction, limits, strict=True):
+        stick = lax.convert_element_type(jnp.abs(force) < limit, force.dtype)
+        sticks.append(stick)
+        sliding_friction.append(sub(force, mul(force, stick)))
     # A sliding joint keeps only its diagonal entry, and its right-hand side is zero.
-    masked = [
-        [entry if i == j else mul(entry, mul(sticks[i], sticks[j])) for j, entry in enumerate(row)]
-        for i, row in enumerate(problem.matrix)
-    ]
+    masked = []
+    right_hand_side = []
+    for i, row in enumerate(problem.matrix):
+        masked_row = [mul(entry, mul(sticks[i], sticks[j])) for j, entry in enumerate(row)]
+        masked_row[i] = row[i]
+        masked.append(masked_row)
+        acceleration = add(problem.offset[i], dot(row, sliding_friction))
+        right_hand_side.append(mul(sticks[i], acceleration))
     factor = not_inlined(chain.cholesky(masked))
-    pulls = [
-        mul(s, add(x, dot(row, kept)))
-        for s, x, row in zip(sticks, problem.offset, problem.matrix, strict=True)
-    ]
-    half = chain.solve_lower(factor, pulls)
-    half_rows = [chain.solve_lower(factor, list(map(mul, row, sticks))) for row in problem.coupling]
+    half = chain.solve_lower(factor, right_hand_side)
+    half_rows = []
+    for row in problem.coupling:
+        masked_row = [mul(entry, stick) for entry, stick in zip(row, sticks, strict=True)]
+        half_rows.append(chain.solve_lower(factor, masked_row))
     half, half_rows = not_inlined((half, half_rows))
-    size = len(half_rows)
-    pairs = [(i, j) for i in range(size) for j in range(i, size)]
+
     contact = contact_force(
-        tuple(
-            sub(entry, dot(half_rows[i], half_rows[j]))
-            for entry, (i, j) in zip(problem.contact_matrix, pairs, strict=True)
-        ),
+        _reduced_matrix(problem, half_rows),
         tuple(
             sub(offset, dot(row, half))
-            for offset, row in zip(_contact_offset(problem, kept), half_rows, strict=True)
+            for offset, row in zip(
+                _contact_offset(problem, sliding_friction), half_rows, strict=True
+            )
         ),
     )
     for row, force in zip(half_rows, contact, strict=True):
-        half = [add(x, mul(entry, force)) for x, entry in zip(half, row, strict=True)]
-    change = chain.solve_upper(factor, half)
-    return contact, tuple(
-        _clip(sub(f, x), limit) for f, x, limit in zip(kept, change, limits, strict=True)
-    )
+        half = [
+            add(entry, mul(row_entry, force)) for entry, row_entry in zip(half, row, strict=True)
+        ]
+    changes = chain.solve_upper(factor, half)
+    solved = []
+    for force, change, limit in zip(sliding_friction, changes, limits, strict=True):
+        solved.append(_clip(sub(force, change), limit))
+    return contact, tuple(solved)
+
+
+def _reduced_matrix(
+    problem: DryFrictionProblem, half_rows: Sequence[Scalars]
+) -> tuple[Scalar, ...]:
+    """`contact_matrix` without the sticking joints: its Schur complement."""
+    upper = upper_rows(problem.contact_matrix, len(half_rows))
+    entries = []
+    for i in range(len(half_rows)):
+        for j in range(i, len(half_rows)):
+            entries.append(sub(upper[i][j - i], dot(half_rows[i], half_rows[j])))
+    return tuple(entries)
 
 
 def _contact_offset(problem: DryFrictionProblem, friction: Scalars) -> tuple[Scalar, ...]:

@@ -243,7 +243,8 @@ def _with_body(m: EditedModel, link: chain.Link, body: int, frame: Frame) -> cha
         shift = sub(lever if i == j else 0.0, mul(centre[i], centre[j]))
         return add(link.inertia[i][j], add(about_centre[i][j], mul(shift, mass)))
 
-    moment, floating = centre * mass, _gravity_compensation(m.model)[body].item()
+    moment = centre * mass
+    floating = m["body_gravcomp", body] if m.model.ngravcomp else 0.0
     return dataclasses.replace(
         link,
         mass=add(link.mass, mass),

@@ -10,7 +10,7 @@ from bounce_mjx.physics.scalars import Scalar, dot, neg, not_inlined, upper_rows
 
 
 def normal_forces(
-    touching: Sequence[jax.Array],
+    is_touching: Sequence[jax.Array],
     matrix: Sequence[Scalar],
     offsets: Sequence[Scalar],
     softnesses: Sequence[Scalar],
@@ -18,55 +18,65 @@ def normal_forces(
     """Forces (N) along the normals.
 
     Args:
-      touching: whether each contact exists.
+      is_touching: whether each contact exists.
       matrix: J M^-1 J^T, the upper triangle row by row, 1/kg.
       offsets: J a0 - aref, m/s^2.
       softnesses: regularisers, 1/kg.
     """
-    rows = upper_rows(matrix, len(touching))
+    rows = upper_rows(matrix, len(is_touching))
     for row, softness in zip(rows, softnesses, strict=True):
         row[0] = row[0] + softness
-    pushes = list(map(neg, offsets))
-    if len(touching) == 1:
-        forces = nonnegative(rows, pushes)
+    linear = [neg(offset) for offset in offsets]
+    if len(is_touching) == 1:
+        forces = nonnegative(rows, linear)
     else:
-        problem = not_inlined(_with_touching_alone(rows, pushes, touching))
-        forces = not_inlined(nonnegative(*problem))
-    return tuple(jnp.where(t, force, 0.0) for t, force in zip(touching, forces, strict=True))
+        rows, linear = not_inlined(_with_touching_alone(rows, linear, is_touching))
+        forces = not_inlined(nonnegative(rows, linear))
+    return tuple(
+        jnp.where(touches, force, 0.0) for touches, force in zip(is_touching, forces, strict=True)
+    )
 
 
 def _with_touching_alone(
-    rows: list[list[Scalar]], pushes: list[Scalar], touches: Sequence[jax.Array]
+    rows: list[list[Scalar]], linear: list[Scalar], is_touching: Sequence[jax.Array]
 ) -> tuple[list[list[Scalar]], list[Scalar]]:
     """The problem in which a contact that does not touch has no force and no effect."""
-    masked = [
-        [
-            row[0],
-            *(jnp.where(t & u, x, 0.0) for u, x in zip(touches[i + 1 :], row[1:], strict=True)),
-        ]
-        for i, (t, row) in enumerate(zip(touches, rows, strict=True))
+    masked_rows = []
+    for i, (diagonal, *off_diagonal) in enumerate(rows):
+        masked_row = [diagonal]
+        for entry, other_touches in zip(off_diagonal, is_touching[i + 1 :], strict=True):
+            masked_row.append(jnp.where(is_touching[i] & other_touches, entry, 0.0))
+        masked_rows.append(masked_row)
+    masked_linear = [
+        jnp.where(touches, entry, 0.0) for touches, entry in zip(is_touching, linear, strict=True)
     ]
-    return masked, [jnp.where(t, x, 0.0) for t, x in zip(touches, pushes, strict=True)]
+    return masked_rows, masked_linear
 
 
-def nonnegative(rows: list[list[Scalar]], push: list[Scalar]) -> list[Scalar]:
-    """Minimum of 1/2 x.Q x - push.x over x >= 0 for a positive definite Q, given by `upper_rows`.
+def nonnegative(rows: list[list[Scalar]], linear: list[Scalar]) -> list[Scalar]:
+    """Minimum of 1/2 x.Q x - linear.x over x >= 0 for a positive definite Q, given by `upper_rows`.
 
     Without the first entry, the others have their minimum. If the first entry's gradient does not
     pull it from zero there, this is the solution. Otherwise, the first entry is positive, and its
-    elimination leaves a problem of the others.
+    elimination (the Schur complement) leaves a problem of the others.
     """
-    (pivot, *row), *rest = rows
-    first, *others = push
-    if not rest:
-        return [jnp.maximum(first / pivot, 0.0)]
-    without = nonnegative(rest, others)
-    ratios = [x / pivot for x in row]
-    left = [
-        [x - ratio * y for x, y in zip(entries, row[i:], strict=True)]
-        for i, (entries, ratio) in enumerate(zip(rest, ratios, strict=True))
+    (pivot, *first_row), *other_rows = rows
+    first_linear, *other_linear = linear
+    if not other_rows:
+        return [jnp.maximum(first_linear / pivot, 0.0)]
+    without_first = nonnegative(other_rows, other_linear)
+
+    ratios = [entry / pivot for entry in first_row]
+    reduced_rows = []
+    for i, (row, ratio) in enumerate(zip(other_rows, ratios, strict=True)):
+        pairs = zip(row, first_row[i:], strict=True)
+        reduced_rows.append([entry - ratio * first_entry for entry, first_entry in pairs])
+    reduced_linear = [
+        entry - ratio * first_linear for entry, ratio in zip(other_linear, ratios, strict=True)
     ]
-    with_first = nonnegative(left, [x - r * first for x, r in zip(others, ratios, strict=True)])
-    pushed = first - dot(row, without) > 0.0
-    solved = [jnp.where(pushed, x, y) for x, y in zip(with_first, without, strict=True)]
-    return [jnp.where(pushed, first / pivot - dot(ratios, with_first), 0.0), *solved]
+    with_first = nonnegative(reduced_rows, reduced_linear)
+
+    is_pulled = first_linear - dot(first_row, without_first) > 0.0
+    others = [jnp.where(is_pulled, a, b) for a, b in zip(with_first, without_first, strict=True)]
+    first = jnp.where(is_pulled, first_linear / pivot - dot(ratios, with_first), 0.0)
+    return [first, *others]

@@ -1,0 +1,293 @@
+"""What cannot be true is no measurement: a robot's sample against the last one that can be true.
+
+One sample that cannot be true is bridged: the last values hold for a step. The second one in a row
+raises. Each reason here is a row of the table in docs/real-robot.md.
+"""
+
+import math
+
+import numpy as np
+
+from bounce_mjx.deploy.metadata import Metadata, largest_term
+from bounce_mjx.errors import UserError
+
+Measurements = dict[str, np.ndarray]
+
+# An angle outside its range; the first one from the start pose, and from commands at rest, rad.
+_OUTSIDE, _NEAR, _AT_REST = 0.5, 0.5, 0.1
+# The start pose in another order or with other signs, beside the noise of a start, rad.
+_SAME = 0.1
+# Share of an arm's own limit of velocity that no joint reaches.
+_OVERSPEED = 1.2
+# Largest noise in standard deviations, and the resolution of an encoder, rad.
+_LARGEST_NOISE, _RESOLUTION = 8.0, 2e-3
+# Calls at one time, and a pause, s.
+_MOST_STANDING, _PAUSE = 50, 1.0
+
+_OF_ARM = ("joint_angles", "joint_velocities")
+_OF_BALL = (
+    "ball_position",
+    "ball_velocity",
+    "ball_age",
+    "ball_quaternion",
+    "ball_angular_velocity",
+)
+
+
+class ImpossibleMeasurement(UserError):
+    """A measurement that cannot be true."""
+
+    def __init__(self, fault: str, reason: str):
+        super().__init__(reason)
+        self.fault = fault
+        """Code of what is wrong, of the table in docs/real-robot.md."""
+
+
+class UnconfirmedSample(ImpossibleMeasurement):
+    """First joint angles that the next sample has to confirm."""
+
+    def __init__(self, reason: str):
+        super().__init__("first_sample", reason)
+
+
+class Samples:
+    """The last sample that can be true, with which the next one is compared."""
+
+    def __init__(self, metadata: Metadata):
+        """Bounds of what a policy's worlds can hold."""
+        self._metadata, limits = metadata, metadata.limits
+        self._fastest = np.full(len(metadata.joint_names), metadata.max_joint_velocity)
+        if limits is not None:
+            self._fastest = _OVERSPEED * np.array(limits.velocity)
+        largest = math.sqrt(2.0) * _LARGEST_NOISE
+        self._noise = _RESOLUTION + largest * largest_term(metadata, "joint_angle_noise")
+        self._ball_noise = 1e-3 + largest * largest_term(metadata, "ball_position_noise")
+        ranges = [(-np.inf, np.inf) if x is None else x for x in metadata.joint_ranges]
+        self._low, self._high = np.array(ranges).T
+        self._start = np.array(metadata.default_joint_angles)
+        self.forget()
+
+    def forget(self, near: np.ndarray | None = None) -> None:
+        """Forgets the last sample; the next one is a first one.
+
+        Args:
+          near: commands [J] (rad) at which the arm has rested; by default, the start pose.
+        """
+        self._place, self._room = self._start, _NEAR + self._metadata.start_noise
+        if near is not None:
+            self._place, self._room = near, _AT_REST
+        self._last: Measurements = {}
+        self._bridged: set[str] = set()
+        self._unconfirmed: np.ndarray | None = None
+        self._standing = 0
+        self._arm_time = self._now = self._taken = 0.0
+        # The newest picture, what speaks against it, and whether the one before holds in its place.
+        self._seen: np.ndarray | None = None
+        self._doubt: tuple[str, str] | None = None
+        self._is_held = False
+
+    def rest(self, angles: np.ndarray) -> None:
+        """The arm rests at angles [J], rad; everything else is forgotten."""
+        self.forget()
+        self._last = {"joint_angles": angles, "joint_velocities": np.zeros(len(angles))}
+
+    def take(self, measured: Measurements) -> Measurements:
+        """The sample, with the last values in place of those that cannot be true.
+
+        Args:
+          measured: arrays by name, as for `OnnxNetwork.step`, and `time` [1].
+
+        Raises:
+          ImpossibleMeasurement: it cannot be true, and nor could the one before, or there is none.
+        """
+        measured = dict(measured)
+        if "time" in measured:
+            self._take_time(measured)
+        else:
+            self._now += self._metadata.control_dt
+        if "joint_angles" in measured:
+            self._take_angles(measured)
+        if "ball_position" in measured:
+            self._take_picture(measured)
+        return measured
+
+    def _take_time(self, measured: Measurements) -> None:
+        """Passes the time, which goes on."""
+        time, last = measured["time"], self._last.get("time")
+        if last is None:
+            self._last["time"] = time
+            return
+        elapsed = float(time[0] - last[0])
+        self._standing = self._standing + 1 if elapsed == 0.0 else 0
+        if self._standing >= _MOST_STANDING:
+            raise ImpossibleMeasurement(
+                "time",
+                f"the time has stood at {time[0]:.10g} s for {self._standing} calls; give the "
+                "time of each sample, or none",
+            )
+        if elapsed < -self._metadata.control_dt:
+            reason = (
+                f"the time went back by {-elapsed:.3g} s; give seconds of one clock, and call "
+                "reset if it starts again"
+            )
+            if elapsed <= -_PAUSE:
+                raise ImpossibleMeasurement("time", reason)
+            self._bridge(measured, ("time",), "time", reason)
+            return
+        self._bridged.discard("time")
+        if elapsed > 0.0:
+            self._last["time"] = time
+            self._now += elapsed
+
+    def _take_angles(self, measured: Measurements) -> None:
+        """Believes the arm's sample, or bridges it."""
+        angles, last = measured["joint_angles"], self._last.get("joint_angles")
+        is_outside = self._outside(angles).max() > _OUTSIDE
+        if is_outside:
+            angles = measured["joint_angles"] = self._unwrapped(angles)
+        if last is None:
+            self._check_first(angles)
+            last = angles
+        elapsed = max(self._now - self._arm_time, self._metadata.control_dt)
+        moved = np.abs(angles - last) - (self._fastest * elapsed + self._noise)
+        if moved.max() > 0.0:
+            joint = int(np.argmax(moved))
+            turned = abs(abs(angles[joint] - last[joint]) - 2.0 * math.pi) < 0.2
+            reason = (
+                f"the angle of {self._metadata.joint_names[joint]} is {angles[joint]:.3g} rad, "
+                f"{abs(angles[joint] - last[joint]):.3g} rad from {1e3 * elapsed:.0f} ms before, "
+                "farther than it moves; "
+            )
+            remedy = "give unwrapped angles" if turned else "check the encoder, or call reset"
+            self._bridge(measured, _OF_ARM, "joint_jump", reason + remedy)
+            return
+        if is_outside:
+            self._check_range(angles)
+        velocities = measured.get("joint_velocities", self._fastest)
+        too_fast = np.abs(velocities) - self._fastest
+        if too_fast.max() > 0.0:
+            joint = int(np.argmax(too_fast))
+            reason = (
+                f"{self._metadata.joint_names[joint]} has {velocities[joint]:.3g} rad/s, and moves "
+                f"at most at {self._fastest[joint]:.3g} (rad/s); stop the arm"
+            )
+            self._bridge(measured, _OF_ARM, "joint_speed", reason)
+            return
+        self._believe(measured, _OF_ARM)
+        self._arm_time = self._now
+
+    def _outside(self, angles: np.ndarray) -> np.ndarray:
+        """How far each joint is outside of its range [J], rad; negative inside."""
+        return np.maximum(self._low - angles, angles - self._high)
+
+    def _check_range(self, angles: np.ndarray) -> None:
+        outside = self._outside(angles)
+        if outside.max() > _OUTSIDE:
+            joint = int(np.argmax(outside))
+            raise ImpossibleMeasurement(
+                "joint_range",
+                f"the angle of {self._metadata.joint_names[joint]} is {angles[joint]:.3g}, but the "
+                f"training had {self._low[joint]:.3g} to {self._high[joint]:.3g} (rad); give this "
+                "unit, and the policy's order",
+            )
+
+    def _check_first(self, angles: np.ndarray) -> None:
+        """A first sample is believed near the start pose, or if the next one agrees with it."""
+        metadata = self._metadata
+        if not np.any(angles) and np.any(self._start):
+            raise UnconfirmedSample(
+                "all joint angles are 0, as of a driver without data; wait for its first sample"
+            )
+        self._check_range(angles)
+        far = float(np.max(np.abs(angles - self._place)))
+        if far <= self._room:
+            return
+        reordered = np.abs(np.sort(np.abs(angles)) - np.sort(np.abs(self._start)))
+        if np.max(reordered) <= _SAME + metadata.start_noise:
+            raise ImpossibleMeasurement(
+                "joint_order",
+                "the joint angles fit the start pose in another order or with other signs; give "
+                f"those of {', '.join(metadata.joint_names)}, or load_policy the driver's "
+                "joint_names",
+            )
+        last, self._unconfirmed = self._unconfirmed, angles
+        reach = self._fastest * metadata.control_dt + self._noise
+        if last is None or np.any(np.abs(angles - last) > reach):
+            raise UnconfirmedSample(
+                f"the first joint angles are {far:.3g} rad from where the arm starts; they count "
+                "when the next sample confirms them"
+            )
+
+    def _unwrapped(self, angles: np.ndarray) -> np.ndarray:
+        """Angles far outside of their range by whole turns, where the range has one reading."""
+        first = np.ceil((self._low - angles) / (2.0 * math.pi))
+        last = np.floor((self._high - angles) / (2.0 * math.pi))
+        has_one = (self._outside(angles) > _OUTSIDE) & (first == last)
+        return angles + 2.0 * math.pi * np.where(has_one, first, 0.0)
+
+    def _take_picture(self, measured: Measurements) -> None:
+        """Believes the picture of the balls, or bridges it until the next one."""
+        balls = measured["ball_position"].reshape(-1, 3)
+        taken = self._now - (float(measured["ball_age"][0]) if "ball_age" in measured else 0.0)
+        is_new = self._seen is None or (balls != self._seen).any()
+        if is_new:
+            self._seen, self._is_held = balls, False
+            self._doubt = self._doubt_of(balls, measured.get("ball_velocity"), taken)
+        if self._doubt is None:
+            self._believe(measured, _OF_BALL)
+            self._taken = taken if is_new else self._taken
+        elif self._is_held:
+            self._hold(measured, _OF_BALL)
+        else:
+            self._bridge(measured, _OF_BALL, *self._doubt)
+            self._is_held = True
+
+    def _doubt_of(
+        self, balls: np.ndarray, velocities: np.ndarray | None, taken: float
+    ) -> tuple[str, str] | None:
+        """Fault and reason of a new picture of the balls [B, 3] that cannot be true, else None."""
+        bounds, last = self._metadata.ball, self._last.get("ball_position")
+        if (distance := _longest(balls)) > bounds.distance:
+            return "ball_place", (
+                f"the distance of ball_position is {distance:.3g}, but the training had 0 to "
+                f"{bounds.distance:.3g} (m); give this unit, and the robot's frame"
+            )
+        if velocities is not None:
+            speed = _longest(velocities.reshape(-1, 3))
+            if speed > bounds.speed:
+                return "ball_speed", (
+                    f"the ball has {speed:.3g} m/s, but the training had at most "
+                    f"{bounds.speed:.3g} (m/s); give this unit"
+                )
+        if last is not None:
+            between = max(taken - self._taken, self._metadata.control_dt)
+            flown = _longest(balls - last.reshape(-1, 3))
+            if flown > bounds.speed * between + self._ball_noise:
+                return "ball_speed", (
+                    f"the ball is {flown:.3g} m from {1e3 * between:.0f} ms before, farther than "
+                    "it flies; check the camera, or call reset before a new ball"
+                )
+        return None
+
+    def _believe(self, measured: Measurements, names: tuple[str, ...]) -> None:
+        self._bridged.discard(names[0])
+        self._last |= {name: measured[name] for name in names if name in measured}
+
+    def _bridge(
+        self, measured: Measurements, names: tuple[str, ...], fault: str, reason: str
+    ) -> None:
+        """Puts the last values of some measurements in place, once in a row."""
+        if names[0] in self._bridged or names[0] not in self._last:
+            raise ImpossibleMeasurement(fault, reason)
+        self._bridged.add(names[0])
+        self._hold(measured, names)
+
+    def _hold(self, measured: Measurements, names: tuple[str, ...]) -> None:
+        measured |= {name: self._last[name] for name in names if name in measured}
+        if "ball_age" in measured and names == _OF_BALL:
+            measured["ball_age"] = np.array([self._now - self._taken])
+
+
+def _longest(vectors: np.ndarray) -> float:
+    """Length of the longest of vectors [B, 3]."""
+    return max(math.hypot(*vector) for vector in vectors.tolist())

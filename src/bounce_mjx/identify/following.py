@@ -1,0 +1,107 @@
+"""The simplest model of an arm: every joint follows its command, late by the same time, with a
+constant offset of its own.
+
+It needs no simulation. A fit of the robot's physics has to explain a log at least as well.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from bounce_mjx.identify.log import JOINT_GAP, Log
+
+SETTLING = 0.3
+"""Time after the start of a log, or a gap, until the arm has forgotten the unknown commands before
+it, s: the longest latency and a few of the longest lags."""
+_STEP = 2e-3
+# Commands that change by less show no delay, rad.
+_STILL = 5e-3
+# Rows that a search over delays looks at; the best one is refined on all.
+_ROWS = 2000
+# Largest residual that counts whole in the size of the error, in medians of the absolute ones.
+_OUTLIER = 6.0
+
+
+class Following(NamedTuple):
+    """How the joints follow their commands."""
+
+    delay: float
+    """Time from a command to the angle, of all joints, s."""
+    offsets: np.ndarray
+    """Measured less commanded angle [n], rad."""
+    errors: np.ndarray
+    """Root mean square [n] of what is left, without outliers, rad."""
+
+
+def find_settled(log: Log) -> np.ndarray:
+    """Which joint angles [T] no longer depend on the targets before the log or in a gap."""
+    begins = log.times[np.flatnonzero(np.diff(log.times) > JOINT_GAP) + 1]
+    begins = np.concatenate([[max(log.times[0], log.target_times[0])], begins])
+    last = np.maximum(np.searchsorted(begins, log.times, side="right") - 1, 0)
+    return log.times - begins[last] >= SETTLING
+
+
+def does_move(log: Log) -> bool:
+    """Whether any command of a log changes."""
+    return bool(np.max(np.ptp(log.servo_targets, axis=0)) > _STILL)
+
+
+def commanded(log: Log, times: np.ndarray) -> np.ndarray:
+    """The commands [T, n] at times [T], interpolated between those that were sent."""
+    return np.stack([np.interp(times, log.target_times, c) for c in log.servo_targets.T], axis=1)
+
+
+def follow(log: Log, rows: np.ndarray, shortest: float = -0.05, longest: float = 0.4) -> Following:
+    """Fits the common delay and each joint's offset by least squares.
+
+    Args:
+      rows: which joint angles [T] count.
+      shortest: smallest delay that is tried, s.
+      longest: largest one, s.
+    """
+    chosen = np.flatnonzero(rows)
+    if not does_move(log):
+        shortest, longest = 0.0, _STEP
+    few = chosen[:: max(len(chosen) // _ROWS, 1)]
+
+    def spread(delay: float, at: np.ndarray) -> float:
+        residuals = log.joint_angles[at] - commanded(log, log.times[at] - delay)
+        return float(np.sum(np.abs(residuals - np.median(residuals, axis=0))))
+
+    tried = np.arange(shortest, longest, _STEP)
+    best = tried[np.argmin([spread(delay, few) for delay in tried])]
+    ends = max(best - _STEP, shortest), best + _STEP
+    delay = float(minimize_scalar(spread, bounds=ends, args=(chosen,), method="bounded").x)
+    residuals = log.joint_angles[chosen] - commanded(log, log.times[chosen] - delay)
+    offsets = np.median(residuals, axis=0)
+    return Following(delay, offsets, error_size(residuals - offsets))
+
+
+def set_points(log: Log, delay: float, dt: float) -> Log:
+    """The log with commands in every physics step, between those of the log, if the joints follow
+    too early for commands that are held: those are then a controller's own set points, recorded
+    now and then.
+
+    Args:
+      delay: time from a command to the angle, s.
+      dt: physics step, s.
+    """
+    if delay >= 0.5 * float(np.median(np.diff(log.target_times))):
+        return log
+    times = np.arange(log.target_times[0], log.target_times[-1], dt)
+    return log._replace(target_times=times, servo_targets=commanded(log, times))
+
+
+def error_size(residuals: np.ndarray) -> np.ndarray:
+    """Root mean square [n] of residuals [T, n], of which outliers count no more than at their
+    bound."""
+    size = np.abs(residuals)
+    most = np.maximum(_OUTLIER * np.median(size, axis=0), 1e-9)
+    return np.sqrt(np.mean(np.minimum(size, most) ** 2, axis=0))
+
+
+def held_out_error(log: Log, following: Following, rows: np.ndarray) -> np.ndarray:
+    """Root mean square [n] of what the model leaves in other rows [T] of a log, rad."""
+    expected = commanded(log, log.times[rows] - following.delay) + following.offsets
+    return error_size(log.joint_angles[rows] - expected)

@@ -1,0 +1,251 @@
+"""Effect of the contacts, and of the joints' dry friction, on the arm and the balls.
+
+Each contact has one row of the Jacobian along its normal, and two more along its tangents if it has
+sliding friction. Source: MuJoCo's documentation, "Computation" (constraint model, reference
+acceleration, diagonal regulariser).
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from bounce_mjx.physics.fused import chain, joint_friction
+from bounce_mjx.physics.fused import contact as geometry
+from bounce_mjx.physics.fused.ball import Ball
+from bounce_mjx.physics.fused.friction import coupled_forces, pyramid_force
+from bounce_mjx.physics.fused.model import FusedModel
+from bounce_mjx.physics.fused.normals import normal_forces
+from bounce_mjx.physics.scalars import ZERO3, Scalar, Vec, add, dot, mul
+
+Scalars = tuple[Scalar, ...]
+
+
+class ConstraintForces(NamedTuple):
+    """What the contacts and dry friction do."""
+
+    joint_force: list[Scalar]
+    """Forces [n] at the joints, N m or N."""
+    ball_accelerations: list[Vec]
+    """Acceleration of each ball in the world, m/s^2."""
+    ball_angular_accelerations: list[Vec]
+    """Angular acceleration of each ball in the world, rad/s^2."""
+
+
+class Row(NamedTuple):
+    """A row of the contacts' Jacobian: along a normal, or along a tangent of a contact with
+    friction."""
+
+    contact: geometry.ContactModel
+    axis: Vec
+    """Unit vector in the world."""
+    torques: dict[int, Vec]
+    """Torque on each ball (by its index) from a unit force along a tangent, m. Two balls that
+    touch get the same torque: force and lever change sign from one to the other."""
+    joints: list[Scalar]
+    """Entries [n] of the joints."""
+    reference: Scalar
+    """Position part of the reference acceleration's negative, m/s^2: stiffness, impedance and
+    (negative) distance along the normal; 0 along a tangent."""
+
+
+def fwd_constraint(
+    model: FusedModel,
+    pose: chain.Pose,
+    mass_factor: chain.Factor,
+    joint_velocity: Sequence[Scalar],
+    half_acceleration: Sequence[Scalar],
+    balls: Sequence[Ball],
+    free_accelerations: Sequence[Vec],
+    keep: Callable[[Any], Any],
+) -> ConstraintForces:
+    """Forces of the contacts and of dry friction.
+
+    Args:
+      mass_factor: Cholesky factor L of the arm's mass matrix.
+      joint_velocity: velocities [n] of the joints, rad/s or m/s.
+      half_acceleration: L^-1 times the joint forces [n] without contacts and dry friction.
+      free_accelerations: the balls' accelerations without the contacts.
+      keep: `forward.Keep`.
+    """
+    contacts = [keep(contact) for contact in _contacts(model, pose, balls)]
+    rows: list[Row] = []
+    softnesses = []
+    for pair, contact in zip(model.contacts, contacts, strict=True):
+        impedance = geometry.impedance(pair, contact.distance)
+        rows += _contact_rows(model, pose, pair, contact, impedance, balls, keep)
+        softnesses.append(softness(pair, impedance))
+
+    half_rows = [chain.solve_lower(mass_factor, row.joints) for row in rows]
+    half_rows, half_acceleration = keep((half_rows, list(half_acceleration)))
+    matrix = _inverse_inertia(model, rows, half_rows)
+    offsets = []
+    for row, half_row in zip(rows, half_rows, strict=True):
+        free_acceleration = add(
+            row.axis @ geometry.relative(row.contact, free_accelerations),
+            dot(half_row, half_acceleration),
+        )
+        speed = _speed(row, balls, joint_velocity)
+        damped = add(free_acceleration, mul(row.contact.damping, speed))
+        offsets.append(add(damped, row.reference))
+    matrix, offsets = keep((matrix, tuple(offsets)))
+    is_touching = [contact.distance < 0.0 for contact in contacts]
+
+    def contact_forces(matrix: Scalars, offsets: Scalars) -> Scalars:
+        first, *others = model.contacts
+        if first.friction is None:
+            return normal_forces(is_touching, matrix, offsets, softnesses)
+        if others:
+            return coupled_forces(model.contacts, is_touching, matrix, offsets, softnesses)
+        force = pyramid_force(first, matrix, offsets, softnesses[0])
+        return tuple(jnp.where(is_touching[0], component, 0.0) for component in force)
+
+    forces, dry_friction = joint_friction.contact_and_friction(
+        model.links,
+        mass_factor,
+        joint_velocity,
+        half_acceleration,
+        half_rows,
+        matrix,
+        offsets,
+        contact_forces,
+    )
+    forces = keep(forces)
+    joint_force = []
+    for joint, friction in enumerate(dry_friction):
+        column = [row.joints[joint] for row in rows]
+        joint_force.append(add(dot(column, forces), friction))
+    accelerations, angular_accelerations = _ball_accelerations(model, rows, forces)
+    return ConstraintForces(joint_force, accelerations, angular_accelerations)
+
+
+def paddle_origin(model: FusedModel, pose: chain.Pose) -> Vec:
+    """Centre of the paddle in the world, m."""
+    return pose.world_origin[-1] + pose.world_rotation[-1] @ model.paddle_origin
+
+
+def softness(pair: geometry.ContactModel, impedance: Scalar) -> Scalar:
+    """Regulariser R of the normal force without friction, 1/kg: (1 - d) / d times the approximate
+    diagonal of J M^-1 J^T, which MuJoCo takes at the reference pose."""
+    return (1.0 - impedance) / impedance * add(*pair.inverse_weights)
+
+
+def _contacts(model: FusedModel, pose: chain.Pose, balls: Sequence[Ball]) -> list[geometry.Contact]:
+    """Geometry of each of `FusedModel.contacts`."""
+    origin = paddle_origin(model, pose)
+    rotation = pose.world_rotation[-1] @ model.paddle_rotation
+    contacts = []
+    for pair in model.contacts:
+        centres = [balls[i].position for i in pair.balls]
+        radii = [model.balls[i].radius for i in pair.balls]
+        if len(pair.balls) == 1:
+            contact = geometry.sphere_box(
+                *radii, *centres, model.paddle_half_size, origin, rotation
+            )
+        else:
+            contact = geometry.sphere_sphere(*radii, *centres)
+        contacts.append(contact)
+    return contacts
+
+
+def _contact_rows(
+    model: FusedModel,
+    pose: chain.Pose,
+    pair: geometry.ContactModel,
+    contact: geometry.Contact,
+    impedance: Scalar,
+    balls: Sequence[Ball],
+    keep: Callable[[Any], Any],
+) -> list[Row]:
+    """The rows of a contact: the normal, and with friction the first and second tangent."""
+    normal = contact.normal
+    first_ball = pair.balls[0]
+    # A force along the normal has the same torque at the contact point and at the ball's centre.
+    point = balls[first_ball].position
+    reference = mul(mul(pair.stiffness, impedance), contact.distance)
+    axes = [normal]
+    torques: list[dict[int, Vec]] = [{}]
+    references = [reference]
+    if pair.friction is not None:
+        first_tangent, second_tangent = keep(geometry.tangents(normal))
+        # From the contact point, midway between the surfaces, to each ball's centre.
+        levers = {i: model.balls[i].radius + 0.5 * contact.distance for i in pair.balls}
+        axes += [first_tangent, second_tangent]
+        torques.append({i: second_tangent * -lever for i, lever in levers.items()})
+        torques.append({i: first_tangent * lever for i, lever in levers.items()})
+        references += [0.0, 0.0]
+        point = point - normal * levers[first_ball]
+    joints = _joint_entries(model, pose, pair, axes, point, keep)
+    rows = []
+    for k, axis in enumerate(axes):
+        rows.append(Row(pair, axis, torques[k], joints[k], references[k]))
+    return rows
+
+
+def _joint_entries(
+    model: FusedModel,
+    pose: chain.Pose,
+    pair: geometry.ContactModel,
+    axes: Sequence[Vec],
+    point: Vec,
+    keep: Callable[[Any], Any],
+) -> list[list[Scalar]]:
+    """Entries [n] of the joints along each axis: the paddle's velocity at a point counts against
+    the ball's; two balls that touch do not touch the arm."""
+    if len(pair.balls) == 2:
+        return [[0.0] * len(model.links) for _ in axes]
+    point_velocities = list(chain.point_velocities(model.links, pose, point))
+    entries = []
+    for axis in axes:
+        against_ball = -axis
+        entries.append([against_ball @ velocity for velocity in point_velocities])
+    return keep(entries)
+
+
+def _inverse_inertia(
+    model: FusedModel, rows: Sequence[Row], half_rows: Sequence[Sequence[Scalar]]
+) -> Scalars:
+    """J M^-1 J^T, the upper triangle row by row, 1/kg."""
+    entries = []
+    for i in range(len(rows)):
+        for j in range(i, len(rows)):
+            by_arm = dot(half_rows[i], half_rows[j])
+            entries.append(add(by_arm, _inverse_inertia_by_balls(model, rows[i], rows[j])))
+    return tuple(entries)
+
+
+def _inverse_inertia_by_balls(model: FusedModel, a: Row, b: Row) -> Scalar:
+    """Share of the balls in an entry of J M^-1 J^T, 1/kg."""
+    share: Scalar = 0.0
+    if a.contact is b.contact and a is not b:
+        return share
+    for i, sign in geometry.shared_balls(a.contact, b.contact):
+        along = 1.0 if a is b else a.axis @ b.axis
+        share = add(share, mul(along, sign / model.balls[i].mass))
+        if a.torques and b.torques:
+            share = add(share, a.torques[i] @ b.torques[i] / model.balls[i].inertia)
+    return share
+
+
+def _speed(row: Row, balls: Sequence[Ball], joint_velocity: Sequence[Scalar]) -> Scalar:
+    """Relative velocity of a contact along a row, m/s: J times the velocities."""
+    speed = row.axis @ geometry.relative(row.contact, [ball.velocity for ball in balls])
+    for i, torque in row.torques.items():
+        speed = add(speed, torque @ balls[i].turning.spin)
+    return add(speed, dot(row.joints, joint_velocity))
+
+
+def _ball_accelerations(
+    model: FusedModel, rows: Sequence[Row], forces: Sequence[Scalar]
+) -> tuple[list[Vec], list[Vec]]:
+    """Accelerations and angular accelerations of the balls by the contacts' forces."""
+    accelerations = [ZERO3] * len(model.balls)
+    angular_accelerations = [ZERO3] * len(model.balls)
+    for row, force in zip(rows, forces, strict=True):
+        for i in row.contact.balls:
+            along_axis = mul(force, geometry.side(row.contact, i) / model.balls[i].mass)
+            accelerations[i] = accelerations[i] + row.axis * along_axis
+        for i, torque in row.torques.items():
+            along_torque = mul(force, 1.0 / model.balls[i].inertia)
+            angular_accelerations[i] = angular_accelerations[i] + torque * along_torque
+    return accelerations, angular_accelerations

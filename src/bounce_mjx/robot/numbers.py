@@ -1,0 +1,46 @@
+"""The numbers of a compiled model on which a simulation depends."""
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from bounce_mjx.errors import UserError
+
+# Starts of the names of a model's fields with physics in them, and those of colours among them.
+_PHYSICAL = ("body_", "jnt_", "dof_", "geom_", "pair_", "actuator_", "eq_", "tendon_", "qpos")
+_PICTURED = ("geom_rgba", "geom_matid", "geom_group")
+# Fields that MuJoCo's compiler can compute from others.
+_DERIVED = frozenset(
+    "actuator_acc0 actuator_length0 body_inertia body_invweight0 body_subtreemass dof_M0 "
+    "dof_invweight0 dof_length geom_aabb geom_rbound".split()
+)
+
+
+def physical_fields(mj_model: mujoco.MjModel) -> list[str]:
+    """Names of the model's fields with physics in them, not colours."""
+    names = [name for name in dir(mj_model) if name.startswith(_PHYSICAL)]
+    return [name for name in names if not name.startswith(_PICTURED)]
+
+
+def check_numbers(mj_model: mujoco.MjModel) -> None:
+    """Refuses numbers that MuJoCo compiles, and that nothing can simulate.
+
+    Raises:
+      UserError: a number is not finite, or a joint gains energy; the text starts with the number.
+    """
+    for name in ("dof_damping", "dof_frictionloss", "dof_armature"):
+        least = np.min(getattr(mj_model, name), initial=0.0)
+        if least < 0.0:
+            raise UserError(f"the negative number {least:g} in {name}; give 0 or more")
+    fields: list[tuple[Any, str]] = [(mj_model, name) for name in physical_fields(mj_model)]
+    fields += [(mj_model.opt, name) for name in ("gravity", "wind", "density", "viscosity")]
+    # Derived fields come last: the sentence must name a number that is in the file.
+    fields.sort(key=lambda field: field[1] in _DERIVED)
+    for owner, name in fields:
+        values = np.asarray(getattr(owner, name))
+        if not np.issubdtype(values.dtype, np.floating):
+            continue
+        wrong = values[~np.isfinite(values)]
+        if wrong.size:
+            raise UserError(f"the number {wrong[0]} in {name}; give finite numbers")

@@ -1,0 +1,143 @@
+"""Files of settings by name: presets, robots and worlds; and which preset this machine has."""
+
+import importlib.metadata
+import importlib.util
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from bounce_mjx.config.files import read_mapping
+from bounce_mjx.errors import UserError, shorten
+from bounce_mjx.lazy import jax
+from bounce_mjx.resources import resource_path
+from bounce_mjx.robot.config import is_packaged
+from bounce_mjx.tasks.registry import is_file, source_file
+
+BASE = "base"
+"""Key of a config file with the name of the preset on which it lies, or null for none."""
+SOURCES = "sources"
+"""Key of a run's config with the settings that each layer set."""
+PRESETS = "configs"
+"""Folder of the package with presets; a folder in it, of a task's name, has the task's own."""
+ROBOTS = "configs/robots"
+"""Folder of the package with configs of robots."""
+WORLDS = "configs/worlds"
+"""Folder of the package with named worlds."""
+
+_EXAMPLE = "configs/default.yaml"
+
+
+class PresetFiles(NamedTuple):
+    """The files of a config; each lies on those before it."""
+
+    machine: Path | None
+    """The preset for this machine, where the user names no other one."""
+    named: Path | None
+    """The preset that the user names."""
+    own: tuple[Path, ...]
+    """The user's files."""
+
+
+def preset_files(config: Sequence[Path], task: str, machine: Path | None = None) -> PresetFiles:
+    """The files of a config.
+
+    A file lies on the preset for this machine, or on the one that its key `base` names; with `base:
+    null`, as in the presets and in a run's config, it stands alone.
+
+    Args:
+      config: YAML files, or names of files in configs/. A task may have its own preset of a name,
+        in the folder of configs/ that has the task's name.
+      machine: name of the preset for this machine, where JAX's devices may not start yet.
+
+    Raises:
+      UserError: a file is missing or invalid, or names a base that is not used.
+    """
+    of_task = f"{PRESETS}/{task}"
+    files = [named_file(named_file(file, of_task), PRESETS, "preset") for file in config]
+    bases = {file: values[BASE] for file in files if BASE in (values := read_config_file(file))}
+    for file in files[1:]:
+        if bases.get(file) is not None:
+            raise UserError(f"{file} lies on {files[0]}, so its {BASE} is not used; give it first")
+    if not files or files[0] not in bases:
+        base = machine or default_preset(has_accelerator())
+        return PresetFiles(_preset(str(base), of_task), None, tuple(files))
+    base = bases[files[0]]
+    if base is not None:
+        named = _preset(str(base), of_task)
+        if named is None:
+            raise UserError(
+                f"{files[0]}: {BASE} is {shorten(repr(base))}; give the name of a preset, or null"
+            )
+        return PresetFiles(None, named, tuple(files))
+    if files[0].resolve().is_relative_to(resource_path(PRESETS).resolve()):
+        return PresetFiles(None, files[0], tuple(files[1:]))
+    return PresetFiles(None, None, tuple(files))
+
+
+def _preset(name: str, of_task: str) -> Path | None:
+    """The preset of a name, a task's own one first."""
+    paths = [resource_path(f"{folder}/{name}.yaml") for folder in (of_task, PRESETS)]
+    return next((path for path in paths if os.path.isfile(path)), None)
+
+
+def named_file(path: Path, folder: str, kind: str | None = None) -> Path:
+    """The YAML file in a folder of the package that a word names; the path itself if there is none,
+    or if it is a file.
+
+    Args:
+      kind: kind of the file, to refuse a word that is neither a file nor a name.
+    """
+    if str(path) != path.stem or os.path.isfile(path):
+        return path
+    named = resource_path(f"{folder}/{path}.yaml")
+    if kind is None or os.path.isfile(named):
+        return named if os.path.isfile(named) else path
+    names = sorted(file.stem for file in resource_path(folder).glob("*.yaml"))
+    names = [name for name in names if not name.startswith("robustness")]
+    raise UserError(
+        f"no {kind} is named {shorten(str(path))}; give one of {', '.join(names)}, or a YAML file"
+    )
+
+
+def shown_file(file: Path) -> str:
+    """A config file for the user's eyes: one of the package's without the package's folder."""
+    package = resource_path(PRESETS).parent
+    return str(file.relative_to(package) if file.is_relative_to(package) else file)
+
+
+def read_config_file(
+    path: Path, kind: str = "config file", example: str = _EXAMPLE
+) -> dict[str, Any]:
+    """The values of a config file (`read_mapping`), with absolute paths of the MJCF file and of the
+    files of the task and the algorithm, which start at the folder of the file."""
+    values = read_mapping(path, kind, example)
+    for key in {"task", "algorithm"} & values.keys():
+        name = str(values[key])
+        if is_file(name):
+            file, _, attribute = name.rpartition(":")
+            name = f"{source_file(f'{path.parent / Path(file).expanduser()}:')}:{attribute}"
+        values = values | {key: name}
+    env = values.get("env")
+    mjcf = env.get("mjcf") if isinstance(env, dict) else None
+    if isinstance(mjcf, str) and not mjcf.startswith("~") and not is_packaged(Path(mjcf)):
+        values = values | {"env": env | {"mjcf": str(path.parent / mjcf)}}
+    return values
+
+
+def default_preset(accelerator: bool) -> Path:
+    """The preset for a machine with an accelerator, or without one; both have the same task."""
+    return Path("default" if accelerator else "cpu")
+
+
+def has_accelerator() -> bool:
+    """Whether JAX computes on an accelerator by default. This starts JAX's devices if a plugin for
+    one is installed."""
+    return has_plugin() and jax.default_backend() != "cpu"
+
+
+def has_plugin() -> bool:
+    """Whether a plugin of JAX's for an accelerator is installed."""
+    plugins = importlib.metadata.entry_points(group="jax_plugins")
+    names = ("jax_plugins", "libtpu")
+    return bool(plugins) or any(importlib.util.find_spec(name) for name in names)

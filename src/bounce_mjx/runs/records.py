@@ -1,0 +1,88 @@
+"""A checkpoint, and what it says about itself: its steps, its config and its evaluation.
+
+A `UserError` refuses a checkpoint of which a file is damaged.
+"""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pydantic
+
+from bounce_mjx.errors import UserError, reason_of, shorten, warn_once
+from bounce_mjx.evaluation.results import Report
+from bounce_mjx.runs.files import MANIFEST_FILE, check_integrity
+
+RECORD = "record"
+"""Item of a checkpoint with its `Record`."""
+
+# Version 0.1 wrote a checkpoint's plain data into this file.
+_OLD_RECORD = "run.json"
+
+
+class Checkpoint(NamedTuple):
+    """Location of a checkpoint."""
+
+    run: Path
+    """The run's folder."""
+    folder: Path
+    """The checkpoint's own folder."""
+    steps: int
+    """Its number: the environment steps trained, or one more where a checkpoint without an
+    evaluation had that number."""
+
+    @property
+    def is_old(self) -> bool:
+        """Whether version 0.1 wrote it."""
+        return (self.folder / _OLD_RECORD).is_file()
+
+
+class Record(pydantic.BaseModel):
+    """The plain data of a checkpoint."""
+
+    steps: int
+    config: dict[str, Any]
+    progress: dict[str, Any]
+    """The evaluations so far (`Progress`); with several seeds, a list of them under "seeds"."""
+    report: Report | None = None
+    """The evaluation of its policy; None if it was not evaluated."""
+
+    @pydantic.model_validator(mode="before")
+    @classmethod
+    def _find_report(cls, plain: Any) -> Any:
+        """Earlier versions stored the evaluation of the best policy alone, in its `progress`."""
+        if not isinstance(plain, dict) or "report" in plain:
+            return plain
+        progress = plain.get("progress")
+        is_best = isinstance(progress, dict) and progress.get("best_steps") == plain.get("steps")
+        return plain | {"report": progress.get("best") if is_best else None}
+
+
+class DamagedCheckpoint(UserError):
+    """A file of a checkpoint is damaged, missing, or of another version."""
+
+    def __init__(self, checkpoint: Checkpoint, error: Exception):
+        reason = shorten(reason_of(error), 200)
+        self.damage = (
+            f"the checkpoint {checkpoint.folder} is damaged or of another version ({reason})"
+        )
+        super().__init__(f"{self.damage}; give another checkpoint")
+
+
+def verify(checkpoint: Checkpoint) -> Record:
+    """Compares every file of a checkpoint with its manifest, and reads its record.
+
+    Raises:
+      DamagedCheckpoint: a file is not as it was written.
+    """
+    folder = checkpoint.folder
+    try:
+        if (folder / MANIFEST_FILE).exists():
+            check_integrity(folder)
+        else:
+            # An earlier version was killed before it wrote the manifest.
+            warn_once(f"{folder} has no {MANIFEST_FILE} to find damage by")
+        name = _OLD_RECORD if checkpoint.is_old else f"{RECORD}/metadata"
+        return Record.model_validate_json((folder / name).read_bytes())
+    # One of pydantic's is a ValueError.
+    except (OSError, ValueError) as error:
+        raise DamagedCheckpoint(checkpoint, error) from error

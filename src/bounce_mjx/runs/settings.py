@@ -1,0 +1,460 @@
+"""The settings of a training, from wherever they come.
+
+They are layers, and a later one wins:
+
+    1. the defaults of the task and of the algorithm
+    2. the preset for this machine
+    3. what the user's own algorithm changes of PPO's defaults
+    4. a preset that the user names, in place of the machine's
+    5. --warm-start: the environment and the networks of a policy
+    6. the user's files, each on those before it
+    7. --robot
+    8. --world
+    9. what the user says: flags of the command, or arguments of `train`
+
+A resumed run has two: its own config, and what the user says. `stack` finds the layers below the
+user's. `Stack.config` merges all of them and validates the result, once; the config then knows what
+set each of its values (`TrainConfig.sources`).
+"""
+
+import dataclasses
+import functools
+import itertools
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import pydantic
+from pydantic.fields import FieldInfo
+
+from bounce_mjx.config.command_line import Flag
+from bounce_mjx.config.files import differing_keys, flat
+from bounce_mjx.config.settings import StrictModel, merged, nested
+from bounce_mjx.config.validation import describe, key_of
+from bounce_mjx.errors import UserError, shorten
+from bounce_mjx.learning.config import PPO_NAME, PPOConfig, find_algorithm
+from bounce_mjx.resources import POLICIES
+from bounce_mjx.runs.config import (
+    TrainConfig,
+    fields_of,
+    load_run_config,
+    runs_folder,
+    unnamed_code,
+)
+from bounce_mjx.runs.presets import BASE, SOURCES, preset_files, read_config_file, shown_file
+from bounce_mjx.runs.worlds import Layer, robot_and_world
+from bounce_mjx.task.task import Task
+from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file, is_same_code
+from bounce_mjx.world.named import without_idle_curriculum
+
+FLAGS = "flags"
+"""Source of the settings on a command line."""
+PYTHON = "train"
+"""Source of the arguments of `train`."""
+
+
+class Choice(StrictModel):
+    """What decides which layers there are: flags of the command, and arguments of `train`."""
+
+    config: Annotated[tuple[Path, ...], Flag(metavar="NAME|FILE", is_repeated=True)] = ()
+    """Preset, such as cpu or finetune (a YAML file in configs/), or a YAML file of yours. A task's
+    own preset of that name, such as configs/track/cpu.yaml, has priority. The default is default on
+    an accelerator, and cpu on a CPU. A file of yours lies on that default, or on the preset that
+    its key base names. Given again, each file lies on those before it."""
+    robot: Annotated[Path | None, Flag(metavar="NAME|FILE")] = None
+    """Config of a robot on top of the preset: the file that bounce-mjx adopt wrote, or the name of
+    one in configs/robots/ (ur5e, panda or iiwa)."""
+    world: Annotated[Path | None, Flag(metavar="NAME|FILE")] = None
+    """Named world in place of the preset's: a YAML file, or the name of one in configs/worlds/
+    (ur5e_rtde, panda_fci, iiwa_fri or fast_servo). It may have a robot."""
+    resume: Path | None = None
+    """Folder of a run, or latest for the newest run, to continue in place from its newest
+    checkpoint; or a checkpoint in it, which then counts as the newest. The other flags may then
+    change only total-steps, eval-every, eval-episodes, screening-episodes, eval-seed,
+    stop-when-solved, num-devices and log-dir. With total-steps, a run that has met all results
+    continues."""
+
+    task: str | None = None
+    algorithm: str | None = None
+    warm_start: Path | None = None
+    log_dir: Path | None = None
+
+
+# Reading: what lies on what ---------------------------------------------------------------------
+
+
+def stack(choice: Choice, machine: Path | None = None, whole: TrainConfig | None = None) -> "Stack":
+    """The layers of a choice, without what the user says.
+
+    Args:
+      machine: name of the preset for this machine, where JAX's devices may not start yet.
+      whole: a config that takes the place of files, and stands alone.
+
+    Raises:
+      UserError: a file or a run is missing or wrong, two parts of the choice exclude each other, or
+        a task or an algorithm is a file that the user has not named.
+    """
+    if choice.resume is not None:
+        return _stack_of_run(choice, whole)
+    given = [file for file in choice.config if os.path.isfile(file)]
+    files = [_layer_of_file(file) for file in given] if whole is None else [_layer_of(whole)]
+    policy = _policy(choice, files, whole)
+    task_name, task = _task(choice, files, policy, whole)
+    machines, named = [], []
+    if whole is None:
+        found = preset_files(choice.config, task_name, machine)
+        machines = [_layer_of_file(file) for file in [found.machine] if file is not None]
+        named = [_layer_of_file(file) for file in [found.named] if file is not None]
+        files = [_layer_of_file(file) for file in found.own]
+    algorithm_name, algorithm = _algorithm(choice, [*machines, *named, *files], whole)
+    changed = _changed_defaults(algorithm)
+    start = [] if policy is None else [policy.layer(is_in_world=choice.world is not None)]
+    trained = None if policy is None else policy.config.env
+    robot, world = robot_and_world(choice.robot, choice.world, task, trained)
+    decided = {"task": task_name, "algorithm": algorithm_name}
+    if policy is not None:
+        decided["warm_start"] = policy.start
+    return Stack(
+        task=task,
+        algorithm=algorithm,
+        layers=(*machines, *changed, *named, *start, *files, *robot, *world),
+        decided=decided,
+        notes=(*_notes(changed, named, "ppo."), *_notes(named, start, "env.")),
+    )
+
+
+def _stack_of_run(choice: Choice, whole: TrainConfig | None) -> "Stack":
+    """The layer of a run that is resumed."""
+    from bounce_mjx.runs.folders import find_run, named_run
+
+    excluded = {"config": choice.config or whole, "robot": choice.robot, "world": choice.world}
+    for name, value in excluded.items():
+        if value:
+            raise UserError(f"--{name} and --resume cannot be combined; leave one out")
+    log_dir = choice.log_dir or runs_folder(find_task(choice.task or DEFAULT))
+    resume = named_run(choice.resume, log_dir)
+    run = find_run(resume)
+    config = load_run_config(run, choice.task, choice.algorithm)
+    for key in ("task", "algorithm"):
+        given, own = getattr(choice, key), getattr(config, key)
+        if given is not None and not is_same_code(own, given):
+            raise UserError(
+                f"--resume cannot change the {key}, and {given} differs from {own}; restore "
+                "it, name the run's copy, or start a new run"
+            )
+    if is_file(config.algorithm) and choice.algorithm is None:
+        raise unnamed_code(f"the run {run}", "algorithm", config.algorithm)
+    return Stack(
+        task=config.env.task,
+        algorithm=type(config.ppo),
+        layers=(Layer(f"the run {run}", config.model_dump()),),
+        decided={"task": config.task, "algorithm": config.algorithm},
+        resume=resume,
+        resumed=config,
+    )
+
+
+def _layer_of_file(file: Path) -> Layer:
+    values = read_config_file(file)
+    return Layer(shown_file(file), {k: v for k, v in values.items() if k not in (BASE, SOURCES)})
+
+
+def _layer_of(config: TrainConfig) -> Layer:
+    return Layer("config", config.model_dump())
+
+
+def _last(layers: Sequence[Layer], key: str) -> Any:
+    """The value of a key in the last layer that has it; None without one."""
+    return next((layer.values[key] for layer in reversed(layers) if key in layer.values), None)
+
+
+def _task(
+    choice: Choice,
+    files: Sequence[Layer],
+    policy: "_Policy | None",
+    whole: TrainConfig | None,
+) -> tuple[str, type[Task]]:
+    """Name and class of the task: the user's, the files', or that of the policy.
+
+    Raises:
+      UserError: there is none, or it is a file that the user has not named.
+    """
+    if whole is not None:
+        if choice.task is not None and not is_same_code(choice.task, whole.task):
+            raise UserError(
+                f"the config is of the task {whole.task}, and task is {choice.task}; leave it out"
+            )
+        return whole.task, whole.env.task
+    if choice.task is not None:
+        return choice.task, find_task(choice.task)
+    name = _last(files, "task")
+    if name is not None:
+        if is_file(name):
+            raise unnamed_code(_sources_of(files), "task", name)
+        return name, find_task(name)
+    if policy is not None:
+        return policy.config.task, policy.config.env.task
+    return DEFAULT, find_task(DEFAULT)
+
+
+def _algorithm(
+    choice: Choice, layers: Sequence[Layer], whole: TrainConfig | None
+) -> tuple[str, type[PPOConfig]]:
+    """Name and settings of the algorithm.
+
+    Raises:
+      UserError: there is none, or it is a file that the user has not named.
+    """
+    if whole is not None and choice.algorithm is None:
+        return whole.algorithm, type(whole.ppo)
+    name = choice.algorithm or _last(layers, "algorithm") or PPO_NAME
+    if choice.algorithm is None and is_file(name):
+        raise unnamed_code(_sources_of(layers), "algorithm", name)
+    # Without the import of JAX.
+    return name, PPOConfig if name == PPO_NAME else find_algorithm(name).Config
+
+
+def _sources_of(layers: Sequence[Layer]) -> str:
+    return " on ".join(layer.source for layer in reversed(layers))
+
+
+def _changed_defaults(algorithm: type[PPOConfig]) -> list[Layer]:
+    """What an algorithm of the user's changes of PPO's defaults: it means these values, unlike a
+    preset that was made for PPO."""
+    own = {key: algorithm.model_fields[key].default for key in PPOConfig.model_fields}
+    known = {key: field.default for key, field in PPOConfig.model_fields.items()}
+    changed = {key: value for key, value in own.items() if value != known[key]}
+    return [Layer(f"defaults of {algorithm.__qualname__}", {"ppo": changed})] if changed else []
+
+
+def _notes(below: list[Layer], above: list[Layer], prefix: str) -> list[str]:
+    """A line where a layer changes settings, whose keys begin with a prefix, of one below it."""
+    notes = []
+    for lower, upper in itertools.product(below, above):
+        one, other = flat(lower.values), flat(upper.values)
+        shared = [key for key in one if key.startswith(prefix) and key in other]
+        changed = [key for key in shared if _plain(one[key]) != _plain(other[key])]
+        if changed:
+            notes.append(f"{upper.source} wins over {lower.source}: {', '.join(changed)}")
+    return notes
+
+
+def _plain(value: Any) -> Any:
+    """A value as YAML and Python alike have it."""
+    return list(value) if isinstance(value, tuple) else value
+
+
+class _Policy(NamedTuple):
+    """The policy of a warm start."""
+
+    start: Path
+    """Its name, or its checkpoint's folder."""
+    config: TrainConfig
+    """The config of its run."""
+
+    def layer(self, is_in_world: bool) -> Layer:
+        """Its environment and its networks. A named world replaces the randomisation."""
+        from bounce_mjx.runs.checkpoints import NETWORK_KEYS
+
+        env = self.config.env.model_dump()
+        if is_in_world:
+            del env["randomization"]
+        networks = self.config.ppo.model_dump(include={*NETWORK_KEYS, "critic_metrics"})
+        return Layer(f"the warm start {self.start}", {"env": env, "ppo": networks})
+
+
+def _policy(choice: Choice, files: Sequence[Layer], whole: TrainConfig | None) -> _Policy | None:
+    """The policy of the warm start that the user or a file asks for.
+
+    Raises:
+      UserError: there is none, or a robot is given too.
+    """
+    if "warm_start" in choice.model_fields_set:
+        path = choice.warm_start
+    else:
+        # A whole config has its environment already.
+        path = _last(files, "warm_start") if whole is None else None
+    if path is None:
+        return None
+    if choice.robot:
+        raise UserError("--warm-start and --robot cannot be combined; leave --robot out")
+    from bounce_mjx.runs.folders import choose_checkpoint, runs_in
+
+    task = choice.task or _last(files, "task")
+    if choice.task is None and task is not None and is_file(task) and whole is None:
+        raise unnamed_code(_sources_of(files), "task", task)
+    log_dir = choice.log_dir or _last(files, "log_dir")
+    if log_dir is None or not runs_in(Path(log_dir)):
+        log_dir = runs_folder(whole.env.task if whole else find_task(task or DEFAULT))
+    checkpoint = choose_checkpoint(Path(path), Path(log_dir))
+    config = load_run_config(checkpoint.run, task)
+    return _Policy(Path(path) if str(path) in POLICIES else checkpoint.folder, config)
+
+
+# Merging and validating -------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Stack:
+    """The layers below what the user says, the lowest first."""
+
+    task: type[Task]
+    algorithm: type[PPOConfig]
+    """The settings of the algorithm."""
+    layers: tuple[Layer, ...]
+    decided: dict[str, Any]
+    """Values that no layer changes any more, such as the checkpoint that a warm start found."""
+    notes: tuple[str, ...] = ()
+    """Where a layer wins over another one that a user may have expected to win."""
+    resume: Path | None = None
+    """The resumed run's folder, or a checkpoint in it."""
+    resumed: TrainConfig | None = None
+    """Its config."""
+
+    @functools.cached_property
+    def fields(self) -> dict[str, FieldInfo]:
+        """The settings that there are, by dotted key."""
+        return fields_of(self.task.Config, self.algorithm)
+
+    @property
+    def title(self) -> str:
+        """The sources of the layers, the last first."""
+        return _sources_of(self.layers)
+
+    def config(
+        self,
+        said: Mapping[str, Any] | None = None,
+        flags: Mapping[str, str] | None = None,
+        prog: str = "",
+    ) -> TrainConfig:
+        """The typed config, with what the user says on top.
+
+        Args:
+          said: values by their keys. A key may be dotted, and one of `env` or `ppo` stand alone:
+            num_envs for ppo.num_envs.
+          flags: the flags of a command line by dotted key, for errors; None in Python.
+          prog: the command, for errors.
+
+        Raises:
+          UserError: a key is unknown, a value is out of range, or it must be that of the resumed
+            run. The error names the layer that set it.
+        """
+        user = Layer(PYTHON if flags is None else FLAGS, self._nested(said or {}))
+        layers = [*self.layers, *self._go_on(user), user]
+        values, sources = _merge(layers)
+        values = merged(values, self.decided)
+        try:
+            config = self._validated(values)
+        except _Mistake as mistake:
+            source = _source_of(mistake.key, layers)
+            text = describe(mistake.error, self.fields, flags or {}, mistake.group)
+            if flags is not None and source == FLAGS:
+                raise UserError(f"{text} (see {prog} --help)") from mistake.error
+            raise UserError(f"{shorten(source)}: {text}") from mistake.error
+        if self.resumed is not None:
+            _check_resumable(self.resumed, config)
+            own = dict.fromkeys(flat(user.values), user.source)
+            sources = self.resumed.sources | own
+        config.set_sources(sources)
+        return config
+
+    def _nested(self, said: Mapping[str, Any]) -> dict[str, Any]:
+        """The user's values in their groups."""
+        values: dict[str, Any] = {}
+        for key, value in said.items():
+            plain = value.model_dump() if isinstance(value, pydantic.BaseModel) else value
+            values = merged(values, nested(self._full_key(key), plain))
+        return values
+
+    def _full_key(self, key: str) -> str:
+        """The dotted key of a setting or a group that stands alone; an unknown one stays."""
+        for full in (key, f"env.{key}", f"ppo.{key}"):
+            if any(field == full or field.startswith(f"{full}.") for field in self.fields):
+                return full
+        return key
+
+    def _go_on(self, user: Layer) -> list[Layer]:
+        """Of a run that ended as it had met all results, if more steps are asked for."""
+        if self.resume is None or "total_steps" not in user.values:
+            return []
+        from bounce_mjx.runs.folders import find_run, latest_checkpoint
+        from bounce_mjx.runs.progress import Progress
+        from bounce_mjx.runs.records import verify
+
+        checkpoint = latest_checkpoint(find_run(self.resume), self.resume)
+        progress = verify(checkpoint).progress
+        seeds = [Progress.model_validate(seed) for seed in progress.get("seeds", [progress])]
+        solved = all(seed.solved for seed in seeds)
+        return [Layer(user.source, {"stop_when_solved": False})] if solved else []
+
+    def _validated(self, values: dict[str, Any]) -> TrainConfig:
+        groups = {"env": self.task.Config, "ppo": self.algorithm}
+        typed = dict(values)
+        for name, kind in groups.items():
+            try:
+                typed[name] = kind.model_validate(values.get(name, {}))
+            except pydantic.ValidationError as error:
+                raise _Mistake(error, name) from error
+        try:
+            return TrainConfig.model_validate(typed)
+        except pydantic.ValidationError as error:
+            raise _Mistake(error, "") from error
+
+
+class _Mistake(Exception):
+    """A validation error of a group of settings."""
+
+    def __init__(self, error: pydantic.ValidationError, group: str):
+        self.error, self.group, self.key = error, group, key_of(error, group)
+
+
+def _merge(layers: Sequence[Layer]) -> tuple[dict[str, Any], dict[str, str]]:
+    """The values of the layers, the last one's first; and the source of each by its dotted key."""
+    values, sources = {}, {}
+    for layer in layers:
+        values = merged(values, layer.values)
+        if layer.is_world:
+            randomization = without_idle_curriculum(values["env"]["randomization"])
+            values["env"] = values["env"] | {"randomization": randomization}
+        sources |= dict.fromkeys(flat(layer.values), layer.source)
+    return values, sources
+
+
+def _source_of(key: str, layers: Sequence[Layer]) -> str:
+    """The last layer that set a key, or one of the settings that a rule of a group joins."""
+    for layer in reversed(layers):
+        for other in flat(layer.values):
+            if not key or f"{other}.".startswith(f"{key}.") or key.startswith(f"{other}."):
+                return layer.source
+    return layers[-1].source
+
+
+def _check_resumable(resumed: TrainConfig, config: TrainConfig) -> None:
+    from bounce_mjx.runs.checkpoints import RESUMABLE_KEYS
+
+    if changed := differing_keys(resumed, config) - RESUMABLE_KEYS:
+        raise UserError(
+            f"--resume cannot change {', '.join(sorted(changed))}; leave those flags out, or "
+            "start a new run"
+        )
+
+
+# Where no training follows ----------------------------------------------------------------------
+
+
+def read_preset(
+    config: Path | Sequence[Path] | None,
+    robot: Path | None = None,
+    task: str | None = None,
+    world: Path | None = None,
+    machine: Path | None = None,
+) -> TrainConfig:
+    """The config of presets, files, a robot and a world: see `Choice` and `stack`.
+
+    Raises:
+      UserError: as `stack` and `Stack.config`.
+    """
+    files = (config,) if isinstance(config, Path) else tuple(config or ())
+    choice = Choice(config=files, robot=robot, world=world, task=task)
+    return stack(choice, machine).config()

@@ -1,0 +1,132 @@
+"""Robots and named worlds as layers of settings."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from bounce_mjx.config.settings import merged
+from bounce_mjx.config.validation import validate
+from bounce_mjx.errors import UserError
+from bounce_mjx.runs.config import TrainConfig, task_in
+from bounce_mjx.runs.presets import ROBOTS, WORLDS, named_file, read_config_file, shown_file
+from bounce_mjx.task.task import Task
+from bounce_mjx.tasks.registry import DEFAULT
+from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.named import CURRICULUM, NamedWorld, read_world
+
+
+class Layer(NamedTuple):
+    """The settings of one source."""
+
+    source: str
+    """For people, such as configs/cpu.yaml."""
+    values: dict[str, Any]
+    """Nested, with the keys of `TrainConfig`."""
+    is_world: bool = False
+    """Whether it brings the whole randomisation: what a preset's curriculum says of other terms
+    then ends."""
+
+
+def robot_and_world(
+    robot: Path | None, world: Path | None, task: type[Task], trained: WorldConfig | None
+) -> tuple[list[Layer], list[Layer]]:
+    """The layers of a robot, which may be that of the world, and of a world: none or one of each.
+
+    Args:
+      robot: a file, or a name in configs/robots/.
+      world: a file, or a name in configs/worlds/.
+      trained: the environment of a policy that goes into the world, with its own robot.
+
+    Raises:
+      UserError: one of them is missing or wrong, or the world is of another robot.
+    """
+    robots = []
+    if robot is not None:
+        robots.append(_layer_of_robot(task, named_file(robot, ROBOTS, "robot")))
+    if world is None:
+        return robots, []
+    path = named_file(world, WORLDS, "world")
+    named = read_world(path)
+    if named.robot is not None:
+        if robots:
+            raise UserError(
+                f"{path} is for the robot {named.robot}, and a robot is given too; leave it out"
+            )
+        if trained is None:
+            robots.append(_layer_of_robot(task, _robot_of(named, path)))
+        else:
+            robots.append(_layer_of_same_robot(trained, named, path))
+    return robots, [_layer_of_world(task, named, path)]
+
+
+def in_world(config: TrainConfig, world: Path) -> tuple[TrainConfig, NamedWorld]:
+    """A run's config in a named world, with the observation and the actions of its policy.
+
+    Args:
+      world: a file, or the name of a file in configs/worlds/.
+
+    Raises:
+      UserError: the world is wrong, or of another robot than the run.
+    """
+    path = named_file(world, WORLDS, "world")
+    named, values = read_world(path), config.env.model_dump()
+    # The curriculum of the training goes too.
+    del values["randomization"]
+    if named.robot is not None:
+        values = merged(values, _layer_of_same_robot(config.env, named, path).values["env"])
+    values = merged(values, named.settings)
+    env = validate(type(config.env), values, f"the world {path}")
+    return config.model_copy(update={"env": env}), named
+
+
+def _layer_of_world(task: type[Task], world: NamedWorld, path: Path) -> Layer:
+    """A named world's settings. Its randomisation is the whole one, but for the curriculum, which
+    describes the training: a term that it does not have is as in the task."""
+    default = task.Config().randomization.model_dump(exclude=set(CURRICULUM))
+    values = merged({"env": {"randomization": default}}, {"env": world.settings})
+    return Layer(f"the world {shown_file(path)}", values, is_world=True)
+
+
+def _robot_of(world: NamedWorld, path: Path) -> Path:
+    """The file of a world's robot: one of the package's, or one relative to the world's file."""
+    robot = named_file(Path(world.robot), ROBOTS)
+    return robot if robot != Path(world.robot) else path.parent / robot
+
+
+def _read_robot(robot: Path) -> tuple[dict[str, Any], type[Task], WorldConfig]:
+    """The values of a robot's config, the task that it was written for, and its environment."""
+    values = read_config_file(robot, "robot's config file", f"{ROBOTS}/ur5e.yaml")
+    task = task_in(str(robot), values.pop("task", DEFAULT))
+    return values, task, validate(task.Config, values.get("env", {}), str(robot), "env")
+
+
+def _layer_of_robot(task: type[Task], robot: Path) -> Layer:
+    """A robot's settings for a task. Those of another task are replaced by the task's own for an
+    arm with this paddle."""
+    source = f"the robot {shown_file(robot)}"
+    values, its_task, env = _read_robot(robot)
+    if issubclass(task, its_task):
+        return Layer(source, values)
+    world_keys = {k: v for k, v in values.get("env", {}).items() if k in WorldConfig.model_fields}
+    # Imports JAX, which a command line alone does not need.
+    from bounce_mjx.robot.model import paddle_home
+
+    home = paddle_home(env.mjcf, env.robot, env.default_joint_angles)
+    return Layer(source, values | {"env": world_keys | task.Config.settings_at(home)})
+
+
+def _layer_of_same_robot(trained: WorldConfig, world: NamedWorld, path: Path) -> Layer:
+    """What a world's robot has, of a policy that was trained with it, such as its limits.
+
+    Raises:
+      UserError: the policy was trained with another robot.
+    """
+    robot = _robot_of(world, path)
+    _, _, own = _read_robot(robot)
+    files = {(arm.mjcf or Path()).name for arm in (own, trained)}
+    if len(files) > 1 or own.default_joint_angles != trained.default_joint_angles:
+        raise UserError(
+            f"the world {path} is for the robot {world.robot}, and the policy was trained "
+            "with another arm or start pose; give a world without a robot, such as fast_servo"
+        )
+    values = {"env": {"robot": own.robot.model_dump(exclude_unset=True)}}
+    return Layer(f"the robot {shown_file(robot)}", values)

@@ -1,0 +1,163 @@
+"""The saves of a training, in the background."""
+
+import concurrent.futures
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from bounce_mjx.evaluation.results import Report
+from bounce_mjx.runs import checkpoints
+from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.files import to_json, write_atomically
+from bounce_mjx.runs.progress import RESULTS_FILE
+from bounce_mjx.training import hosts
+from bounce_mjx.training.seeds import SeedRun
+from bounce_mjx.training.trainer import Snapshot
+
+
+@dataclasses.dataclass(frozen=True)
+class Save:
+    """A checkpoint to write; see `checkpoints.save_checkpoint`."""
+
+    run: Path
+    config: TrainConfig
+    steps: int
+    items: dict[str, Any]
+    progress: dict[str, Any]
+    report: Report | None = None
+    kept: int | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What a save has written."""
+
+    numbers: dict[str, int]
+    """Those of the checkpoints, by the name of the run's folder."""
+    problem: str | None = None
+    """Why something could not be written; None if everything was."""
+
+
+class Saver:
+    """Writes checkpoints and results in the background, one save after another.
+
+    A save that fails is lost, as the next one has newer data. It is said once, and so is the next
+    one that succeeds. On several hosts the leader alone writes, and all know what was written.
+    """
+
+    def __init__(
+        self,
+        run: Path,
+        config: TrainConfig,
+        seeds: Sequence[SeedRun],
+        pool: concurrent.futures.Executor,
+        say: Callable[[str], None],
+    ) -> None:
+        self._run, self._config, self._seeds = run, config, seeds
+        self._pool, self._say = pool, say
+        self._saving: concurrent.futures.Future[Outcome] | None = None
+        self._steps, self._is_failing = 0, False
+
+    def start(self, snapshot: Snapshot | None, steps: int, about: dict[str, Any]) -> None:
+        """Starts to save; the save before must have ended.
+
+        Args:
+          snapshot: the state; None saves the results alone.
+          steps: environment steps so far.
+          about: what results.json says in addition, see `Progress.results`.
+        """
+        if not hosts.is_leader():
+            return
+        self._steps = steps
+        saves = [] if snapshot is None else self._checkpoints(snapshot)
+        results = {
+            seed.run / RESULTS_FILE: to_json(seed.progress.results(**about))
+            for seed in self._seeds
+            if seed.progress.best is not None
+        }
+        self._saving = self._pool.submit(_write, saves, results)
+
+    def wait(self) -> None:
+        """Waits until nothing is being written."""
+        if self._saving is not None:
+            concurrent.futures.wait([self._saving])
+
+    def end(self, is_last: bool = False) -> str | None:
+        """Waits for the save that was started last, and tells the seeds what it has written.
+
+        Args:
+          is_last: whether no other save follows, so that a problem is the caller's to tell.
+
+        Returns:
+          Why something could not be written; None if everything was.
+        """
+        outcome = Outcome({})
+        if self._saving is not None:
+            outcome, self._saving = self._saving.result(), None
+            if not is_last:
+                self._say_change(outcome.problem)
+        numbers, problem = hosts.exchange([outcome.numbers, outcome.problem])[0]
+        for seed in self._seeds:
+            seed.end_save(numbers.get(seed.run.name), has_failed=problem is not None)
+        return problem
+
+    def _say_change(self, problem: str | None) -> None:
+        """Says that saving fails from now on, or that it succeeds again."""
+        if problem and not self._is_failing:
+            self._say(
+                f"the state is not saved, as {self._run} cannot be written ({problem}); training "
+                "continues, and tries again after each evaluation"
+            )
+        if self._is_failing and not problem:
+            self._say(f"the state is saved again, after {self._steps:,} steps")
+        self._is_failing = problem is not None
+
+    def _checkpoints(self, snapshot: Snapshot) -> list[Save]:
+        """The checkpoints to write. With one seed, the state and its policy; with several, each
+        policy that is the best of its seed, and then the state, whose record refers to them."""
+        # A copy, because the training reuses its buffers meanwhile.
+        policies, state, networks = jax.tree.map(np.array, snapshot)
+        training = {checkpoints.TRAINING: state}
+        progress = [seed.progress.model_dump() for seed in self._seeds]
+        is_alone, saves = len(self._seeds) == 1, []
+        for i, seed in enumerate(self._seeds):
+            if not is_alone and not seed.is_best:
+                continue
+            items = {checkpoints.POLICY: policies[i], **(training if is_alone else {})}
+            if networks is not None:
+                items[checkpoints.NETWORKS] = networks[i]
+            kept = None if seed.is_best or seed.saved is None else seed.saved.number
+            saves.append(
+                Save(seed.run, seed.config, self._steps, items, progress[i], seed.report, kept)
+            )
+        if not is_alone:
+            record = {"seeds": progress}
+            saves.append(Save(self._run, self._config, self._steps, training, record))
+        return saves
+
+
+def _write(saves: Sequence[Save], results: dict[Path, str]) -> Outcome:
+    """Writes checkpoints, and then files by name."""
+    numbers = {}
+    try:
+        for save in saves:
+            numbers[save.run.name] = checkpoints.save_checkpoint(
+                save.run,
+                save.config,
+                save.steps,
+                save.items,
+                save.progress,
+                save.report,
+                save.kept,
+            )
+        for path, content in results.items():
+            write_atomically(path, content)
+    except checkpoints.NotSavedError as error:
+        return Outcome(numbers, error.reason)
+    except OSError as error:
+        return Outcome(numbers, error.strerror)
+    return Outcome(numbers)

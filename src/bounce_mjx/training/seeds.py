@@ -1,0 +1,84 @@
+"""The seeds of a training run, and what each has reached."""
+
+import contextlib
+import dataclasses
+from pathlib import Path
+
+from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation.results import Report
+from bounce_mjx.learning.policy import Policy
+from bounce_mjx.runs import checkpoints, folders
+from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.progress import Progress
+
+
+@dataclasses.dataclass(frozen=True)
+class Best:
+    """The best policy of a seed."""
+
+    policy: Policy
+    report: Report
+    steps: int
+    number: int | None = None
+    """Of its checkpoint, once it is saved."""
+
+
+@dataclasses.dataclass
+class SeedRun:
+    """One seed of a training run."""
+
+    run: Path
+    """Folder of the seed's best checkpoint and log; with one seed, the run's folder itself."""
+    config: TrainConfig
+    """The config of this seed, as for a training of one seed."""
+    seconds: dict[str, float]
+    """Seconds by phase, for all seeds together."""
+    progress: Progress = dataclasses.field(default_factory=Progress)
+    report: Report | None = None
+    """The evaluation of the current policy; None before it."""
+    best: Best | None = None
+    saved: Best | None = None
+    """The best policy of those that were saved."""
+
+    @property
+    def is_best(self) -> bool:
+        """Whether the current policy is the best one, and is not saved yet."""
+        return self.best is not self.saved
+
+    def add_report(self, report: Report, policy: Policy, steps: int, seconds: float) -> None:
+        """Adds the evaluation of the current policy.
+
+        Args:
+          seconds: see `Progress.improves`.
+        """
+        self.report = report
+        if self.progress.improves(report, steps, seconds):
+            self.best = Best(policy, report, steps)
+
+    def end_save(self, number: int | None, has_failed: bool) -> None:
+        """Takes note of a save; a policy that could not be saved is not the best one.
+
+        Args:
+          number: that of the seed's checkpoint, if one was written.
+          has_failed: whether something could not be written.
+        """
+        if number is not None and self.is_best:
+            self.saved = self.best = dataclasses.replace(self.best, number=number)
+        if has_failed:
+            self._take_best(self.saved)
+
+    def recall_best(self, place: Path | None) -> None:
+        """Takes for the best what the best intact checkpoint in a folder of the run says."""
+        self.saved = None
+        with contextlib.suppress(UserError):
+            checkpoint = folders.best_checkpoint(self.run, place)
+            record = checkpoints.read_record(checkpoint)
+            if record.report is not None:
+                policy = checkpoints.read_policy(checkpoint, self.config)
+                self.saved = Best(policy, record.report, record.steps, checkpoint.steps)
+        self._take_best(self.saved)
+
+    def _take_best(self, best: Best | None) -> None:
+        self.best = best
+        self.progress.best = best and best.report
+        self.progress.best_steps = best.steps if best else 0

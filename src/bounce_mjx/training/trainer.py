@@ -1,0 +1,64 @@
+"""What the training job asks of a trainer."""
+
+import concurrent.futures
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from jax.sharding import Mesh
+
+from bounce_mjx.learning.policy import Policy
+
+Metrics = dict[str, np.ndarray]
+
+
+class Snapshot(NamedTuple):
+    """The policies and the state of a training run at one moment, as pytrees of NumPy arrays."""
+
+    policies: list[Policy]
+    """The policy of each seed."""
+    state: Any
+    """Everything that is needed to continue the training; numbers of at most 32 bits."""
+    networks: list[dict[str, Any]] | None = None
+    """What another training can start with, for each seed: "params" and "statistics" of both
+    networks."""
+
+
+class Trainer(Protocol):
+    """S independent runs of one algorithm, one for each seed.
+
+    The job makes one by calling a class, or a function, with the run's config and its environment;
+    it may raise a UserError there. Then it calls `compile`, `start` once, and `run` for each block;
+    after a block it may ask for a `snapshot`.
+    """
+
+    checked: Sequence[str]
+    """The quantities that must stay finite, in the order of their computation."""
+    mesh: Mesh
+    """The devices on which it trains."""
+
+    @property
+    def state_template(self) -> Any:
+        """Shapes and types of the state, `jax.ShapeDtypeStruct` as its leaves."""
+
+    def compile(self, pool: concurrent.futures.Executor) -> concurrent.futures.Future:
+        """Starts the compilation in a pool; the future is done when training can start."""
+
+    def start(self, state: Any = None, networks: Any = None) -> None:
+        """Starts from the seeds, or from the state of a `snapshot`.
+
+        Args:
+          networks: those of an earlier training, which each seed starts with, and the statistics of
+            their inputs (`checkpoints.read_start`).
+        """
+
+    def run(self) -> Metrics:
+        """Trains for a block of I iterations.
+
+        Returns:
+          Metrics, each [S, I]. "fault" is the number, from 1, of the first quantity of `checked`
+          that was not finite in an iteration; 0 if all were finite.
+        """
+
+    def snapshot(self) -> Snapshot:
+        """The policies and the whole state, in every process."""

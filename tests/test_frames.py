@@ -1,0 +1,92 @@
+"""What the viewers draw, from frames and models alone: shapes, frames at another rate, bars."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from bounce_mjx import BounceBall
+from bounce_mjx.env.env import State
+from bounce_mjx.task import term_names
+from bounce_mjx.tasks.bounce_rewards import BounceReward
+from bounce_mjx.viewers.browser import reward_bars
+from bounce_mjx.viewers.display import Display, body_scenes
+from bounce_mjx.viewers.simulation import EnvFrame, make_random_controller, resample
+
+
+def ramp(over: tuple[int, ...] = ()) -> EnvFrame:
+    """Eleven frames of one environment, 0.01 s apart; every value is the frame's time in steps."""
+    value = np.arange(11.0)[:, None]
+    wide = np.repeat(value[..., None], 3, axis=-1)
+    ended = np.zeros((11, 1), bool)
+    ended[list(over)] = True
+    command, metrics = {"height": value}, {"count": value}
+    return EnvFrame(value * 0.01, wide, wide[:, :, None], wide, command, metrics, ended, ended)
+
+
+def test_resampling_interpolates_positions() -> None:
+    frames = resample(ramp(), dt=0.01, fps=60)
+    times = np.arange(6) / 60
+    np.testing.assert_allclose(frames.time[:, 0], times)
+    for positions in (frames.qpos, frames.balls[:, 0], frames.paddle):
+        np.testing.assert_allclose(positions[:, 0, 0], 100 * times)
+    # Commands and metrics come from the last step.
+    for values in (frames.command["height"], frames.metrics["count"]):
+        np.testing.assert_array_equal(values[:, 0], np.floor(100 * times + 1e-9))
+
+
+def test_resampling_does_not_blend_two_episodes() -> None:
+    frames = resample(ramp(over=(3,)), dt=0.01, fps=60)
+    expected = 100 * np.arange(6) / 60
+    expected[2] = 3.0  # at 3.33 steps
+    np.testing.assert_allclose(frames.balls[:, 0, 0, 0], expected)
+
+
+SHAPES = """<mujoco><worldbody>
+  <body><geom type="sphere" size=".1"/></body>
+  <body><geom type="capsule" size=".1 .3"/></body>
+  <body><geom type="cylinder" size=".1 .3"/></body>
+  <body><geom type="box" size=".1 .3 .2"/></body>
+  <body><geom type="ellipsoid" size=".1 .3 .2"/></body>
+</worldbody></mujoco>"""
+
+
+def test_shapes_have_the_sizes_of_mujoco() -> None:
+    model = mujoco.MjModel.from_xml_string(SHAPES)
+    scenes = [scene for _, scene in body_scenes(model)]
+    assert len(scenes) == model.ngeom == 5
+    for box, scene in zip(model.geom_aabb, scenes, strict=True):
+        (mesh,) = scene.geometry.values()
+        center, half = box[:3], box[3:]
+        np.testing.assert_allclose(mesh.bounds, [center - half, center + half], rtol=0.01)
+        # The faces look outward.
+        assert np.all(np.einsum("ij,ij->i", mesh.face_normals, mesh.triangles_center) > 0.0)
+
+
+def test_every_shown_geom_is_in_the_meshes(env: BounceBall) -> None:
+    model = Display(env).model
+    shapes = {model.body(body).name: len(s.geometry) for body, s in body_scenes(model)}
+    shown = {model.body(body).name: int(model.body_geomnum[body]) for body in range(model.nbody)}
+    shown["world"] -= 1  # the floor
+    assert shapes == shown
+
+
+def test_random_actions_are_uniform(env: BounceBall) -> None:
+    states = State((), jnp.zeros((29, 500)), jnp.zeros(500), jnp.zeros(500))
+    control = make_random_controller(env)
+    actions = control(None, states, jax.random.PRNGKey(1))
+    assert actions.shape == (env.action_size, 500)
+    quartiles = np.quantile(actions, (0.0, 0.25, 0.75, 1.0))
+    np.testing.assert_allclose(quartiles, (-1, -0.5, 0.5, 1), atol=0.05)
+    assert np.all(control(None, states, jax.random.PRNGKey(2)) != actions)
+
+
+def test_reward_bars_show_every_term() -> None:
+    terms = dict.fromkeys(term_names(BounceReward), 0.0) | {"position": 2.0, "alignment": -1.25}
+    terms["sixteenth_term"] = 0.5
+    text = reward_bars(terms)
+    for name in terms:
+        assert text.count(f">{name.replace('_', ' ')}<") == 1
+    assert ">2.00<" in text and ">-1.25<" in text and "sum 1.25" in text
+    assert "-0.00" not in reward_bars({"a": -0.001})
+    assert ">&lt;i&gt;<" in reward_bars({"<i>": 1.0})

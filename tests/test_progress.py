@@ -1,0 +1,70 @@
+"""When a training is solved, and what its results may hold."""
+
+import json
+import math
+import os
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from bounce_mjx.evaluation.results import Report
+from bounce_mjx.runs.checkpoints import read_policy
+from bounce_mjx.runs.config import load_run_config
+from bounce_mjx.runs.files import to_json, write_output
+from bounce_mjx.runs.folders import pretrained_checkpoint
+from bounce_mjx.runs.progress import Progress
+from bounce_mjx.task import Result
+
+
+@pytest.mark.parametrize(
+    ("evaluations", "solved"),
+    [
+        ([(64, None)], False),
+        ([(64, None), (128, 1.0)], True),
+        ([(128, 0.5)], False),
+        # Half as many steps again.
+        ([(128, 0.5), (191, 0.5)], False),
+        ([(128, 0.5), (192, 0.5)], True),
+        ([(128, 0.5), (192, None)], True),
+        ([(128, 0.5), (160, 1.0)], True),
+    ],
+)
+def test_a_training_does_not_wait_long_for_a_margin(evaluations, solved: bool) -> None:
+    """Each evaluation has steps and a margin; None is a missed result."""
+    progress = Progress()
+    for steps, margin in evaluations:
+        result = Result("stable", "episodes, %", 0.0, ">= 99", margin is not None, margin)
+        progress.improves(Report((result,), {"mean_return": 1.0}), steps, 0.0)
+    assert progress.solved is solved
+
+
+def test_json_has_null_where_there_is_no_finite_number() -> None:
+    def refuse(constant: str) -> None:
+        raise AssertionError(constant)
+
+    text = to_json({"numpy": np.float64(math.nan), "tuple": (math.inf, 1)})
+    assert json.loads(text, parse_constant=refuse) == {"numpy": None, "tuple": [None, 1]}
+
+
+def test_json_holds_any_path() -> None:
+    path = os.fsdecode(b"a\xff")
+    assert json.loads(to_json({"path": path})) == {"path": path}
+
+
+def test_a_pipe_that_the_user_names_stays_one() -> None:
+    read, write = os.pipe()
+    write_output(Path(f"/dev/fd/{write}"), "results")
+    assert os.read(read, 100) == b"results"
+    os.close(read)
+    os.close(write)
+
+
+def test_a_policy_is_read_where_double_precision_is_on() -> None:
+    checkpoint = pretrained_checkpoint()
+    config = load_run_config(checkpoint.run)
+    single = read_policy(checkpoint, config)
+    with jax.enable_x64(True):
+        double = read_policy(checkpoint, config)
+    jax.tree.map(np.testing.assert_array_equal, single, double)

@@ -1,0 +1,239 @@
+"""Settings are layers: what wins, what says so, and that every way to say one is alike."""
+
+import contextlib
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+import bounce_mjx
+from arms import ARM
+from bounce_mjx.commands.main import main
+from bounce_mjx.config.command_line import flag_names
+from bounce_mjx.config.files import flat
+from bounce_mjx.config.settings import merged
+from bounce_mjx.errors import UserError
+from bounce_mjx.runs import presets
+from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.folders import create_run, pretrained_checkpoint
+from bounce_mjx.runs.settings import Choice, read_preset, stack
+from bounce_mjx.training import job
+from bounce_mjx.training.command import read_command
+from test_keys import KEYS, NEEDED, WITH, other, settings
+
+OWN = """
+from bounce_mjx.learning.ppo import PPO, PPOConfig
+class Own(PPO):
+    class Config(PPOConfig):
+        num_epochs: int = 1
+        "Passes."
+        own_cost: float = 0.5
+        "Weight."
+"""
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working directory on a machine without an accelerator."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(presets, "has_accelerator", lambda: False)
+    return tmp_path
+
+
+class Resolved(Exception):
+    """Carries the config of a training that does not begin."""
+
+
+def python(*args: Any, **kwargs: Any) -> TrainConfig:
+    """The config with which `bounce_mjx.train` would train."""
+
+    def stop(config: TrainConfig, *_: Any, **__: Any) -> None:
+        raise Resolved(config)
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Resolved) as caught:
+        patch.setattr(job, "train", stop)
+        bounce_mjx.train(*args, quiet=True, **kwargs)
+    return caught.value.args[0]
+
+
+def words(flag: str, value: Any) -> list[str]:
+    """A value on the command line."""
+    if isinstance(value, bool):
+        return [flag if value else flag.replace("--", "--no-", 1)]
+    if isinstance(value, dict):
+        return [flag, *(str(word) for item in value.items() for word in item)]
+    return [flag, *map(str, value)] if isinstance(value, list) else [flag, str(value)]
+
+
+def outcome(read: Callable[[], TrainConfig]) -> TrainConfig | None:
+    """A config; None where it is refused."""
+    try:
+        return read()
+    except UserError:
+        return None
+
+
+def leaves(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """The settings in nested values by dotted key; one of them is a mapping itself."""
+    found = {}
+    for name, value in values.items():
+        key = prefix + name
+        is_group = isinstance(value, dict) and key not in KEYS
+        found |= leaves(value, f"{key}.") if is_group else {key: value}
+    return found
+
+
+def given(key: str) -> dict[str, Any]:
+    """Another value of a key, nested, with the settings without which it has no effect."""
+    context = NEEDED.get(key) or WITH.get(key, {})
+    return merged({"env": context}, settings(key, other(key)))
+
+
+@pytest.mark.parametrize("group", ["", "env.", "env.reward.", "env.randomization.", "ppo."])
+def test_flag_file_and_python_are_alike_for_every_key(group: str, folder: Path) -> None:
+    """In a file a key has its whole name; as a flag and in Python one of `env` or `ppo` may stand
+    alone."""
+    (folder / "arm.xml").write_text(ARM)
+    (folder / "own.py").write_text(OWN)
+    groups = ("", "env.", "env.reward.", "env.randomization.", "ppo.")
+    keys = [k for k in KEYS if max(filter(k.startswith, groups), key=len) == group]
+    flags = flag_names(KEYS)
+    # A file cannot name code, and a run does not exist.
+    for key in set(keys) - {"algorithm", "warm_start"}:
+        values = given(key)
+        (folder / "my.yaml").write_text(yaml.safe_dump(values))
+        line = [word for k, v in leaves(values).items() for word in words(flags[k], v)]
+        alone = {k: v for name in ("env", "ppo") for k, v in values.get(name, {}).items()}
+        alone |= {k: v for k, v in values.items() if k not in ("env", "ppo")}
+        # An argument of `train` is called robot, as is a group of `env`.
+        short = values if "robot" in alone else alone
+        configs = [
+            outcome(lambda line=line: read_command(line).config),
+            outcome(lambda: read_command(["--config", "my.yaml"]).config),
+            outcome(lambda short=short: python(**short)),
+            outcome(lambda values=values: python(**values)),
+        ]
+        assert all(config == configs[0] for config in configs), key
+        if configs[0] is not None:
+            sources = [config.sources[key] for config in configs]
+            assert sources == ["flags", "my.yaml", "train", "train"]
+
+
+def test_a_source_wins_over_those_before_it(folder: Path) -> None:
+    """One key of each layer, which a later layer has too."""
+    (folder / "own.py").write_text(OWN)
+    (folder / "a.yaml").write_text("seed: 1\neval_seed: 1\neval_episodes: 1\nnum_seeds: 1")
+    (folder / "b.yaml").write_text("seed: 2\neval_seed: 2\neval_episodes: 2")
+    line = "--config a.yaml --config b.yaml --world ur5e_rtde --eval-seed 3 --action-scale 0.02"
+    config = read_command([*line.split(), "--algorithm", "own.py:Own"]).config
+    sources = config.sources
+    values = {
+        "ppo.num_envs": (512, "configs/cpu.yaml"),
+        "ppo.num_epochs": (1, "defaults of Own.Config"),
+        "ppo.own_cost": (0.5, "default"),
+        "num_seeds": (1, "a.yaml"),
+        "seed": (2, "b.yaml"),
+        "eval_seed": (3, "flags"),
+        "env.action_scale": (0.02, "flags"),
+        "env.robot.site": ("attachment_site", "the robot configs/robots/ur5e.yaml"),
+        "env.randomization.restitution": ((0.82, 0.92), "the world configs/worlds/ur5e_rtde.yaml"),
+    }
+    flatly = flat(config.model_dump())
+    assert {key: (flatly[key], sources[key]) for key in values} == values
+    run = create_run(config.model_copy(update={"log_dir": folder / "runs"}))
+    assert load_run_config(run, algorithm="own.py:Own").sources == sources
+    # Every source is read again, and none is a setting.
+    again = stack(Choice(config=(run / "config.yaml",), algorithm="own.py:Own")).config()
+    assert again.sources["seed"] == str(run / "config.yaml")
+
+
+def test_an_algorithms_own_default_wins_over_the_machines_preset_alone(folder: Path) -> None:
+    """A preset that the user names wins, and a line says so."""
+    (folder / "own.py").write_text(OWN)
+    named = Choice(config=(Path("cpu"),), algorithm="own.py:Own")
+    layers = stack(named)
+    assert layers.config().ppo.num_epochs == 4
+    assert layers.notes == ("configs/cpu.yaml wins over defaults of Own.Config: ppo.num_epochs",)
+    layers = stack(Choice(algorithm="own.py:Own"))
+    assert (layers.config().ppo.num_epochs, layers.notes) == (1, ())
+    (folder / "my.yaml").write_text("ppo: {num_epochs: 3}")
+    assert (
+        stack(Choice(config=(Path("my.yaml"),), algorithm="own.py:Own")).config().ppo.num_epochs
+        == 3
+    )
+
+
+def test_a_warm_start_is_alike_in_a_file(folder: Path) -> None:
+    """It brings the environment too, and what the file says lies on it."""
+    own = load_run_config(pretrained_checkpoint("robust_small").run)
+    (folder / "warm.yaml").write_text("warm_start: robust_small\nenv: {action_scale: 0.03}")
+    configs = [
+        read_command("--warm-start robust_small --action-scale 0.03".split()).config,
+        read_command(["--config", "warm.yaml"]).config,
+        python(warm_start="robust_small", action_scale=0.03),
+    ]
+    assert configs[0] == configs[1] == configs[2]
+    assert configs[0].env == own.env.model_copy(update={"action_scale": 0.03})
+    assert configs[0].ppo.hidden_layers == own.ppo.hidden_layers == (128, 128)
+    assert configs[1].sources["env.observation.action"] == "the warm start robust_small"
+    notes = stack(Choice(config=(Path("randomized"),), warm_start=Path("robust_small"))).notes
+    assert any("the warm start robust_small wins over configs/randomized.yaml" in x for x in notes)
+
+
+def test_a_whole_config_stands_alone_below_what_python_says() -> None:
+    whole = read_preset(Path("seed")).model_copy(update={"seed": 7})
+    config = python(config=whole, seed=5, num_envs=64)
+    ppo = whole.ppo.model_copy(update={"num_envs": 64})
+    assert config == whole.model_copy(update={"seed": 5, "ppo": ppo})
+    assert config.sources["seed"] == "train" and config.sources["ppo.num_epochs"] == "config"
+    for arguments, sentence in (
+        ({"nonsense": 5}, "train: unknown key nonsense; known keys here are"),
+        ({"num_env": 5}, "train: unknown key num_env; did you mean ppo.num_envs?"),
+        ({"task": "catch"}, "the config is of the task bounce, and task is catch; leave it out"),
+        ({"resume": "somewhere"}, "--config and --resume cannot be combined"),
+        ({"num_envs": 0}, "train: ppo.num_envs is 0, but must be greater than or equal to 1"),
+    ):
+        with pytest.raises(UserError) as caught:
+            bounce_mjx.train(config=whole, quiet=True, **arguments)
+        assert sentence in str(caught.value)
+
+
+def test_a_file_has_the_same_defaults_wherever_it_lies(folder: Path, monkeypatch) -> None:
+    """Also beside the presets, and where a folder has a preset's name."""
+    (folder / "cpu").mkdir()
+    assert read_command(["--config", "cpu"]).config == read_preset(None)
+    (folder / "configs").mkdir()
+    real = presets.resource_path
+    of_folder = lambda name: folder / name if name == "configs" else real(name)  # noqa: E731
+    expected = read_preset(None).model_copy(update={"seed": 3})
+    monkeypatch.setattr(presets, "resource_path", of_folder)
+    for path in (folder / "my.yaml", folder / "configs/my.yaml"):
+        path.write_text("seed: 3")
+        assert read_preset(path) == expected
+
+
+def test_a_mistake_names_the_layer_that_has_it(folder: Path, refused) -> None:
+    """Of a rule that joins several settings, the last one that set one of them."""
+    (folder / "a.yaml").write_text("ppo: {num_minibatches: 7}")
+    (folder / "b.yaml").write_text("seed: 1")
+    refused("train --config a.yaml --config b.yaml", "error: a.yaml: ppo: num_minibatches 7")
+    refused("train --config b.yaml --num-minibatches 7", "(see bounce-mjx train --help)")
+    refused("train --config b.yaml --seed -1", "--seed is -1", "(see bounce-mjx train --help)")
+
+
+def test_the_printed_config_is_a_config_and_says_its_sources(folder: Path) -> None:
+    said_by_user = "--seed 3 --randomization.restitution 0.8 0.9".split()
+    said_by_user += "--randomization.shares restitution 0.5".split()
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said):
+        main(["train", *said_by_user, "--print-config"])
+    lines = {line.partition(":")[0].strip(): line for line in said.getvalue().splitlines()}
+    assert lines["seed"].split() == ["seed:", "3", "#", "flags"]
+    assert lines["num_envs"].split() == ["num_envs:", "512", "#", "configs/cpu.yaml"]
+    assert lines["num_seeds"].split() == ["num_seeds:", "1", "#", "default"]
+    (folder / "again.yaml").write_text(said.getvalue())
+    again = read_command(["--config", "again.yaml"]).config
+    assert again == read_command(said_by_user).config
