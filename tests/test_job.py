@@ -438,6 +438,8 @@ def test_a_resumed_training_goes_on_from_what_is_intact(tmp_path: Path, wrong: s
     assert evaluated_steps(run) == [64, 128, 192]
     stored = {iterations_of(checkpoint) for checkpoint in stored_checkpoints(run)}
     assert stored == {best, 3}
+    # It may be repaired.
+    assert (run / f"checkpoints/{steps}.damaged/policy").is_dir()
 
 
 def test_a_policy_that_could_not_be_saved_is_not_the_best(tmp_path: Path, monkeypatch) -> None:

@@ -273,6 +273,16 @@ def _intact_checkpoints(run: Path, place: Path | None) -> dict[Checkpoint, Recor
     return intact or _intact_checkpoints(run, place)
 
 
+def set_damaged_aside(run: Path) -> None:
+    """Renames the damaged checkpoints of a run, so that no save removes what may be repaired."""
+    for checkpoint in stored_checkpoints(run):
+        try:
+            verify(checkpoint)
+        except DamagedCheckpoint:
+            with contextlib.suppress(OSError):
+                checkpoint.folder.rename(f"{checkpoint.folder}.damaged")
+
+
 def pretrained_checkpoint(name: str = PRETRAINED) -> Checkpoint:
     """Checkpoint of a policy in `POLICIES`."""
     return best_checkpoint(resource_path(POLICIES[name]))

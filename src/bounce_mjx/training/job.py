@@ -231,6 +231,8 @@ class Job:
         for seed, plain in zip(self.seeds, evaluated, strict=True):
             seed.progress = Progress.model_validate(plain)
             seed.recall_best(place if seed.run == self.run else None)
+            if hosts.is_leader():
+                folders.set_damaged_aside(seed.run)
         if self.is_finished():
             met = "has met all results" if self.is_solved() else "has been trained to its end"
             self.say(f"{self.run} {met}, {self.steps:,} steps; add --total-steps N to train on")
