@@ -8,7 +8,7 @@ are wide, and refuse the same quantity in another unit: millimetres, degrees or 
 import re
 import typing
 from collections.abc import Iterator
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import pydantic
 from pydantic import Field
@@ -108,6 +108,18 @@ class StrictModel(pydantic.BaseModel):
             if isinstance(field.default, StrictModel) and isinstance(values.get(name), dict)
         }
         return values | {name: merged(own, values[name]) for name, own in groups.items()}
+
+
+class Layer(NamedTuple):
+    """The settings of one source."""
+
+    source: str
+    """For people, such as configs/cpu.yaml."""
+    values: dict[str, Any]
+    """Nested, with the keys of a larger config."""
+    is_world: bool = False
+    """Whether it brings the whole randomisation: what a preset's curriculum says of other terms
+    then ends."""
 
 
 def types_in(kind: Any) -> Iterator[Any]:

@@ -1,9 +1,9 @@
 """Robots and named worlds as layers of settings."""
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from bounce_mjx.config.settings import merged
+from bounce_mjx.config.settings import Layer, merged
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
 from bounce_mjx.runs.config import TrainConfig, task_in
@@ -12,18 +12,6 @@ from bounce_mjx.task.task import Task
 from bounce_mjx.tasks.registry import DEFAULT
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.named import CURRICULUM, NamedWorld, read_world
-
-
-class Layer(NamedTuple):
-    """The settings of one source."""
-
-    source: str
-    """For people, such as configs/cpu.yaml."""
-    values: dict[str, Any]
-    """Nested, with the keys of `TrainConfig`."""
-    is_world: bool = False
-    """Whether it brings the whole randomisation: what a preset's curriculum says of other terms
-    then ends."""
 
 
 def robot_and_world(
