@@ -295,6 +295,63 @@ def test_training_is_a_function_of_its_key(trainer):
         assert np.any(np.asarray(a) != np.asarray(b)) and np.any(np.asarray(a) != before)
 
 
+@pytest.mark.usefixtures("float64")
+def test_learning_is_in_float32_with_physics_in_float64(trainer):
+    """And a jitted `run` takes its own result without another compilation."""
+    start = jax.eval_shape(trainer.init, jax.random.key(0))
+    state, _ = jax.eval_shape(lambda state: trainer.run(state, 1), start)
+    learned = (state.params, state.optimizer[1].nu, state.statistics, state.learning_rate)
+    assert {x.dtype for x in jax.tree.leaves(learned)} == {jnp.dtype("float32")}
+    types = [
+        [(x.shape, x.dtype, x.weak_type) for x in jax.tree.leaves(tree)] for tree in (start, state)
+    ]
+    assert types[0] == types[1]
+
+
+def product_types(program) -> list:
+    """Types of the matrix products of a program, in their order, also within its calls."""
+    types = []
+    for equation in program.eqns:
+        if equation.primitive.name == "dot_general":
+            types.append(equation.outvars[0].aval.dtype)
+        for inner in equation.params.values():
+            if hasattr(inner, "jaxpr"):
+                types += product_types(inner.jaxpr)
+    return types
+
+
+def test_hidden_layers_are_computed_in_bfloat16_and_outputs_not():
+    networks = policy.make_networks(two_state_config(), 2, 1, dtype="bfloat16")
+    for network in (networks.policy_network, networks.value_network):
+        params = network.init(jax.random.key(0))
+        assert {x.dtype for x in jax.tree.leaves(params)} == {jnp.dtype("float32")}
+        program = jax.make_jaxpr(network.apply)(params, jnp.zeros((1, 2)))
+        assert product_types(program.jaxpr) == [jnp.bfloat16, jnp.float32]
+
+
+def test_an_update_uses_the_normalisation_of_the_next_rollout():
+    """If the policy does not change, the KL divergence of an update is the divergence between the
+    policy on the rollout's own normalised observations and on the same observations normalised with
+    the statistics that include the rollout."""
+    config = two_state_config(num_envs=1024, learning_rate=1e-12, min_learning_rate=1e-12)
+    trainer = ppo.PPO(config, TwoStates(1.0), episode_steps=2)
+    before = jax.jit(trainer.init)(jax.random.key(0))
+    after, metrics = jax.jit(lambda state: trainer.run(state, 1))(before)
+    networks = policy.make_networks(config, 2, 1)
+    (old, deviation), (new, _) = (
+        networks.policy_network.apply(
+            before.params.policy, normalize(jnp.eye(2), state.statistics.normalizer)
+        )
+        for state in (before, after)
+    )
+    of_states = jnp.sum(jnp.square(new - old) / (2.0 * jnp.square(deviation)), axis=-1)
+    # All environments start in the first state; half of them then time out and are in the first
+    # state again.
+    divergence = 0.75 * of_states[0] + 0.25 * of_states[1]
+    assert divergence > 1e-5
+    np.testing.assert_allclose(metrics["policy/kl"][0], divergence, rtol=0.1)
+
+
 def test_the_objective_is_the_smaller_of_the_two(trainer, params):
     """Schulman et al. 2017, equation 7, at ratios of 0.5 and 1.5."""
     inputs, action, bound = jnp.ones((4, 3)), jnp.full((4, 1), 0.3), jnp.zeros((4, 1))

@@ -364,11 +364,12 @@ def test_names_of_the_scene_may_be_those_of_the_arm(tmp_path) -> None:
 
 
 def test_an_arm_in_degrees_has_the_start_pose_of_the_same_arm_in_radians(tmp_path) -> None:
-    """Though the last joint turns a flat paddle in its plane, where every angle scores alike."""
+    """Though the last joint turns a flat paddle in its plane, where every angle scores alike; and
+    far above the floor at any height of the base."""
     flat = {"position": (0.0, 0.0, 0.03), "quaternion": (1.0, 0.0, 0.0, 0.0)}
     config = RobotConfig.model_validate({"site": "tool", "paddle": flat})
-    radians = mjcf(arm(limits="-2.9 2.9"), motors(ARM_JOINTS))
-    degrees = mjcf(arm(limits="-166.1578 166.1578"), motors(ARM_JOINTS))
+    radians = mjcf(arm(limits="-2.9 2.9", base="0 0 1"), motors(ARM_JOINTS))
+    degrees = mjcf(arm(limits="-166.1578 166.1578", base="0 0 2"), motors(ARM_JOINTS))
     poses = []
     for text in (radians, degrees.replace("radian", "degree")):
         (tmp_path / "arm.xml").write_text(text)

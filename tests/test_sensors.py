@@ -69,6 +69,8 @@ class Watch(NamedTuple):
     """Servo targets [N, T, 6]."""
     privileged: dict
     """Metrics for the critic alone [N, T]."""
+    rewards: np.ndarray
+    """[N, T]."""
 
 
 @functools.cache
@@ -98,7 +100,7 @@ def watching(camera: bool, velocity: str):
                 metrics = {
                     n: x for n, x in state.metrics.items() if n.startswith(("world/", "true/"))
                 }
-                return state, (state.obs, control.ctrl, metrics)
+                return state, (state.obs, control.ctrl, metrics, state.reward)
 
             physics = PhysicsState(jnp.asarray(qpos[1:]), jnp.asarray(qvel[1:]))
             _, seen = jax.lax.scan(step, start, (jnp.asarray(actions), physics))
@@ -110,7 +112,7 @@ def watching(camera: bool, velocity: str):
         ranges = {name: PERFECT[name] for name in sensors} | changed
         ranges = {n: tuple(jnp.full(EPISODES, e) for e in r) for n, r in ranges.items()}
         keys = jax.random.split(jax.random.PRNGKey(0), EPISODES)
-        world, phase, first, obs, targets, privileged = jax.device_get(watch(ranges, keys))
+        world, phase, first, obs, targets, privileged, rewards = jax.device_get(watch(ranges, keys))
 
         def parts(obs: np.ndarray) -> dict[str, np.ndarray]:
             return {
@@ -120,7 +122,7 @@ def watching(camera: bool, velocity: str):
                 for part in env.layout.parts
             }
 
-        return Watch(world, phase, parts(first), parts(obs), actions, targets, privileged)
+        return Watch(world, phase, parts(first), parts(obs), actions, targets, privileged, rewards)
 
     return run
 
@@ -152,6 +154,15 @@ def pictures(world: dict, phase: float, w: int):
     for now in time:
         n = np.flatnonzero(taken + latency <= now + 1e-4 / rate)[-1]
         yield n, positions[n], velocities[n], now - taken[n]
+
+
+def test_the_reward_is_of_the_true_state(watch) -> None:
+    """Whatever the sensors measure."""
+    wrong, right = watch(**SENSORS), watch()
+    error = wrong.parts["ball_position"] - right.parts["ball_position"]
+    assert np.all(np.max(np.abs(error), axis=(1, 2, 3)) > 0.05)
+    np.testing.assert_array_equal(wrong.rewards, right.rewards)
+    assert np.std(right.rewards) > 0.0
 
 
 @pytest.mark.slow

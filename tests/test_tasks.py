@@ -271,6 +271,10 @@ def test_a_package_can_have_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
     monkeypatch.syspath_prepend(str(tmp_path))
     task = find_task("low")
     assert task.__name__ == "Dribble" and task_name(task) == "low"
+    (info / "entry_points.txt").write_text(f"[{registry.GROUP}]\ngone = my_tasks:Gone\n")
+    with pytest.raises(UserError, match="the task gone cannot be imported .*; install the package"):
+        find_task("gone")
+    (info / "entry_points.txt").write_text(f"[{registry.GROUP}]\nlow = my_tasks:Dribble\n")
     config = read_preset(None, task="low")
     assert "task: low\n" in dump_config(config) and config.log_dir == Path("runs/dribble")
 

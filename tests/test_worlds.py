@@ -47,6 +47,14 @@ def test_each_number_of_a_shipped_world_is_sourced_or_assumed(name: str) -> None
         ({"sources": {"randomization": "x", "robot": "y"}}, "has robot, but env has no"),
         ({"sources": {}, "assumed": []}, "randomization.action_latency has no source"),
         ({"assumed": ["frame_drop"]}, "has frame_drop, but env has no such key"),
+        ({"sources": {"randomization": " "}}, "randomization has an empty source"),
+        (
+            {
+                "env": {"randomization": {"warmup_steps": 5, "frame_drop": [0.0, 0.1]}},
+                "assumed": ["randomization.warmup_steps"],
+            },
+            "randomization.warmup_steps is assumed, but is no number to double",
+        ),
     ],
 )
 def test_a_mistake_is_one_sentence(tmp_path: Path, changes: dict, wrong: str) -> None:

@@ -41,7 +41,7 @@ def find_task(name: str) -> type[Task]:
     """The task of a name, of an entry point in `GROUP`, or of FILE.py:CLASS.
 
     Raises:
-      UserError: there is none, or its file cannot be imported.
+      UserError: there is none, or it cannot be imported.
     """
     if is_file(name):
         return class_in_file(name, Task)
@@ -53,7 +53,13 @@ def find_task(name: str) -> type[Task]:
             f"there is no task {shorten(name)!r} (known: {', '.join(sorted(known))}); {advice}"
         )
     module, _, attribute = known[name].partition(":")
-    return getattr(importlib.import_module(module), attribute)
+    try:
+        return getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise UserError(
+            f"the task {name} cannot be imported ({reason_of(error)}); install the package that "
+            "has it again"
+        ) from error
 
 
 def task_name(task: type[Task]) -> str:

@@ -43,6 +43,12 @@ class NamedWorld(StrictModel):
                     f"sources or assumed has {shorten(key)}, but env has no such key; give env "
                     "that key, or remove it from them"
                 )
+        for key, source in self.sources.items():
+            if not source.strip():
+                raise ValueError(f"{key} has an empty source; write one sentence")
+        for key in self.assumed:
+            if not _can_be_doubled(key, given[key]):
+                raise ValueError(f"{key} is assumed, but is no number to double; remove it")
         for key in given:
             if key.startswith("randomization.") and key.split(".")[1] in CURRICULUM:
                 continue
@@ -105,6 +111,15 @@ def read_world(path: Path) -> NamedWorld:
     """
     values = read_mapping(path, "world", "configs/worlds/ur5e_rtde.yaml")
     return validate(NamedWorld, values, str(path))
+
+
+def _can_be_doubled(key: str, value: Any) -> bool:
+    """Whether a setting is a number, or several; of the randomisation, a term."""
+    group, _, name = key.rpartition(".")
+    if group == "randomization" and name not in TERMS:
+        return False
+    numbers = np.ravel(np.array(value, object)).tolist()
+    return all(isinstance(x, int | float) and not isinstance(x, bool) for x in numbers)
 
 
 def _double(key: str, value: Any, nominals: Mapping[str, Any]) -> Any:
