@@ -21,6 +21,7 @@ from arms import ARM, ARM_JOINTS, arm, hinge, link, mjcf, motors, ur5e
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.commands import adopt as adopt_command
 from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation.contacts import ContactChecker
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.adopt import adopt, check_as_alone
 from bounce_mjx.robot.arm import build_arm, compile_spec, locate, read_spec
@@ -191,6 +192,12 @@ def test_the_start_pose_holds_the_paddle_level_at_the_target_point(env) -> None:
     point = reward.target_x, reward.target_y, reward.paddle_home_height
     np.testing.assert_allclose(paddle.xpos, point, atol=1e-3)
     assert config.ball_init_pos[:2] == point[:2] and paddle.xpos[0] > 0.15
+    # The paddle, which belongs to the last link, touches no other; the small arm's shapes overlap.
+    if config.mjcf == ur5e():
+        last = int(env.mj_model.body_weldid[env.mj_model.geom("blocker").bodyid[0]])
+        checker = ContactChecker(config, margin=0.0)
+        touching = checker.touching(np.array(config.default_joint_angles))
+        assert not any(last in pair for pair in touching)
     # The task keeps its heights above the paddle.
     assert np.isclose(config.ball_init_pos[2] - paddle.xpos[2], 0.4, atol=1e-3)
     assert np.allclose(

@@ -87,11 +87,15 @@ def describe(adoption: "Adoption") -> list[str]:
     strength = f"{pose.acceleration:.0f} m/s^2 upward in addition to holding the arm"
     if math.isinf(pose.acceleration):
         strength = "no force limit"
+    clearance = f"{adoption.clearance:.3f} m between the paddle and the arm's other links"
+    if adoption.clearance <= 0.0:
+        clearance = "none; the paddle touches another link, so choose --paddle.position yourself"
     kind = "kept" if adoption.config.servo_stiffness is None else "made from the reflected inertia"
     lines = [
         f"paddle: level at x {x:.3f}, y {y:.3f}, z {z:.3f} m; the reach is {pose.reach:.2f} m",
         f"manipulability: {pose.manipulability:.3f} (smallest singular value, 0.25 m per radian)",
         f"strength: {strength}",
+        f"clearance: {clearance}",
         f"servos: {kind}; action scale {adoption.action_scale:g} rad",
     ]
     for name, angle, inertia, servo in zip(

@@ -1,5 +1,6 @@
 """Adoption of an unknown arm: its pose, its servos, and the settings that follow from them."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,7 +11,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.robot import arm as arms
 from bounce_mjx.robot.config import RobotConfig
 from bounce_mjx.robot.model import find_addresses
-from bounce_mjx.robot.pose import PaddlePose, find_pose, mounts
+from bounce_mjx.robot.pose import PaddlePose, clearance, mounts, rank_poses
 
 # Velocity of a joint that the action 1 commands: rad/s of a hinge, m/s of a slide. The Peitian
 # arm's servos give 0.02 rad x 20000 / 200 = 2 rad/s.
@@ -21,6 +22,8 @@ _LARGEST_SPREAD = 4.0
 # Largest difference of an arm in the scene from its file compiled alone: MuJoCo rounds frames that
 # are almost the same.
 _EQUAL = 1e-6
+# Distance of the paddle from the arm's other links in the start pose, m.
+_LEAST_CLEARANCE = 0.01
 # Torque of a kept servo at the action 1, in multiples of the torque that holds the arm.
 _LEAST_HOLD = 1.5
 
@@ -32,6 +35,8 @@ class Adoption(NamedTuple):
     action_scale: float
     """Change of the servo target for an action of 1, rad; of a slide, m."""
     pose: PaddlePose
+    clearance: float
+    """Distance of the paddle from the arm's other links in the pose, m; negative inside one."""
     arm: arms.Arm
     servos: tuple[arms.ServoSettings, ...]
     """The servo of each acting joint."""
@@ -56,15 +61,16 @@ def adopt(mjcf: Path, config: RobotConfig, control_dt: float, is_mount_given: bo
     )
     with arms.naming(path):
         arm = arms.build_arm(path, config)
-        arm.spec.compiler.discardvisual = True
         # So every body stays: the search turns the paddle's.
         arm.spec.compiler.fusestatic = False
+        with_shapes = arms.compile_spec(arm.spec, path)
+        arm.spec.compiler.discardvisual = True
         model = arms.compile_spec(arm.spec, path)
         check_as_alone(arm, model)
         choices = [config.paddle] if is_mount_given else mounts(config.paddle)
         force_limits = [servo.force_limit for servo in arm.servos]
         try:
-            pose = find_pose(model, force_limits, choices)
+            poses = rank_poses(model, force_limits, choices)
         except UserError as error:
             if not arm.narrowed:
                 raise
@@ -72,13 +78,33 @@ def adopt(mjcf: Path, config: RobotConfig, control_dt: float, is_mount_given: bo
             raise UserError(
                 f"{error}; or widen the ctrlrange of the servos, which narrows {narrowed}"
             ) from error
+        pose, distance = _clear_pose(with_shapes, poses)
         servos, scale = _servos(model, arm, pose, control_dt)
         update = {"paddle": pose.mount}
         if servos is not arm.servos:
             columns = zip(arms.ServoSettings._fields, zip(*servos, strict=True), strict=True)
             update |= {f"servo_{name}": column for name, column in columns}
         adopted = RobotConfig.model_validate(config.model_copy(update=update).model_dump())
-        return Adoption(adopted, scale, pose, arms.build_arm(path, adopted), servos)
+        return Adoption(
+            config=adopted,
+            action_scale=scale,
+            pose=pose,
+            clearance=distance,
+            arm=arms.build_arm(path, adopted),
+            servos=servos,
+        )
+
+
+def _clear_pose(
+    with_shapes: mujoco.MjModel, poses: Sequence[PaddlePose]
+) -> tuple[PaddlePose, float]:
+    """The first pose in which the paddle keeps clear of the arm, and its distance, m; the best one
+    if there is none."""
+    for pose in poses:
+        distance = clearance(with_shapes, pose)
+        if distance >= _LEAST_CLEARANCE:
+            return pose, distance
+    return poses[0], clearance(with_shapes, poses[0])
 
 
 def _servos(

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.robot.arm import joint_name
+from bounce_mjx.robot.arm import HIDDEN_GROUP, joint_name
 from bounce_mjx.robot.config import PaddleConfig
 from bounce_mjx.robot.model import Addresses, find_addresses, joint_ranges
 
@@ -59,6 +59,8 @@ _LOWEST = 0.1
 # Heights that must be free of the arm around the paddle, m: the ball flies above, and a paddle that
 # lies flat on its site is 0.03 m above it.
 _BELOW, _HEADROOM = 0.02, 1.0
+# Largest distance of the paddle from a shape that is measured, m.
+_FAR = 0.5
 
 
 class PaddlePose(NamedTuple):
@@ -93,12 +95,12 @@ def mounts(paddle: PaddleConfig) -> list[PaddleConfig]:
     return [paddle.model_copy(update={"position": p, "quaternion": q}) for p, q in choices]
 
 
-def find_pose(
+def rank_poses(
     model: mujoco.MjModel,
     force_limits: Sequence[float | None],
     choices: Sequence[PaddleConfig],
-) -> PaddlePose:
-    """The best start pose of an arm in the task's scene.
+) -> list[PaddlePose]:
+    """Start poses of an arm in the task's scene, the best first.
 
     Args:
       model: the compiled scene; its paddle is moved.
@@ -131,7 +133,7 @@ def find_pose(
             f"paddle upward by {most:.1f} m/s^2 at most, and the task needs "
             f"{_LEAST_ACCELERATION:g}; raise the force limits of {names}"
         )
-    return search.best(strong)
+    return search.rank(strong)
 
 
 class _Search:
@@ -157,8 +159,6 @@ class _Search:
         width = np.where(self._is_hinge, np.pi, np.where(np.isinf(self._low), 0.5, np.inf))
         self._least_seed = self._inside(self._centre - width)
         self._greatest_seed = self._inside(self._centre + width)
-        # MuJoCo skips the transformation of a geom flagged as sharing its body's frame.
-        model.geom_sameframe[self._at.paddle_geom] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
         mujoco.mj_kinematics(model, self._data)
         self._base = self._data.xanchor[self._joints[0]].copy()
         self._reach = self._largest_distance()
@@ -179,16 +179,21 @@ class _Search:
             distances.append(np.hypot(*(paddle - self._base)[:2]))
         return float(max(distances))
 
-    def best(self, poses: Sequence[PaddlePose]) -> PaddlePose:
-        """The pose with the largest score; of equal ones, that nearest to the middle of the ranges.
+    def rank(self, poses: Sequence[PaddlePose]) -> list[PaddlePose]:
+        """The poses by their score; equal ones by their distance to the middle of the ranges.
 
         Without the second rule, rounding would choose: the last joint of an arm with a flat paddle
         turns it in its plane, and a symmetric arm has each pose twice.
         """
-        largest = max(pose.score for pose in poses)
-        equal = [pose for pose in poses if pose.score >= (1.0 - _EQUAL_SCORES) * largest]
         middle = self._centre + _SIDE
-        return min(equal, key=lambda pose: np.sum((pose.angles - middle) ** 2))
+        left = sorted(poses, key=lambda pose: -pose.score)
+        ranked: list[PaddlePose] = []
+        while left:
+            least = (1.0 - _EQUAL_SCORES) * left[0].score
+            equal = [pose for pose in left if pose.score >= least]
+            ranked += sorted(equal, key=lambda pose: np.sum((pose.angles - middle) ** 2))
+            left = left[len(equal) :]
+        return ranked
 
     def _forward(self, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Position [3] and normal [3] of the paddle."""
@@ -209,10 +214,7 @@ class _Search:
     def level_poses(self, choice: PaddleConfig) -> Iterator[PaddlePose]:
         """Poses with a level paddle in front of the robot, at many distances and heights, in which
         the arm is neither in the way of the ball nor in the floor."""
-        # The paddle's body has the frame of the site.
-        quaternion = np.array(choice.quaternion)
-        self._model.geom_quat[self._at.paddle_geom] = quaternion / np.linalg.norm(quaternion)
-        self._model.geom_pos[self._at.paddle_geom] = choice.position
+        place_paddle(self._model, choice)
         distances = self._reach * np.array([0.45, 0.6, 0.75])
         lowest = max(_LOWEST, self._base[2] - 0.3 * self._reach)
         heights = lowest + self._reach * np.array([0.0, 0.15, 0.3])
@@ -325,6 +327,45 @@ class _Search:
         spare = np.where(force > 0.0, self._limits - hold, self._limits + hold)
         moved = needed > 1e-9
         return float(np.min(spare[moved] / needed[moved], initial=np.inf))
+
+
+def clearance(model: mujoco.MjModel, pose: PaddlePose) -> float:
+    """Least distance of the paddle in a pose from the shapes of the other links and of the world,
+    m; negative if it is inside one, and at most `_FAR`.
+
+    Args:
+      model: the compiled scene with all its geoms; its paddle is moved.
+    """
+    addresses = find_addresses(model)
+    paddle = addresses.paddle_geom
+    place_paddle(model, pose.mount)
+    data = mujoco.MjData(model)
+    data.qpos[list(addresses.arm_qpos)] = pose.angles
+    mujoco.mj_kinematics(model, data)
+    link = model.body_weldid[model.geom_bodyid[paddle]]
+    balls = [ball.geom for ball in addresses.balls]
+    least = _FAR
+    for geom in range(model.ngeom):
+        body = model.geom_bodyid[geom]
+        own = model.geom_group[model.geom_bodyid == body]
+        # Where a link has shapes that touch, the others are its picture.
+        is_picture = HIDDEN_GROUP in own and model.geom_group[geom] != HIDDEN_GROUP
+        is_flat = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE
+        if is_picture or is_flat or geom in balls or model.body_weldid[body] == link:
+            continue
+        distance = mujoco.mj_geomDistance(model, data, paddle, geom, _FAR, None)
+        least = min(least, distance)
+    return least
+
+
+def place_paddle(model: mujoco.MjModel, mount: PaddleConfig) -> None:
+    """Moves the paddle of a compiled scene, whose body has the frame of the site."""
+    paddle = find_addresses(model).paddle_geom
+    quaternion = np.array(mount.quaternion)
+    model.geom_quat[paddle] = quaternion / np.linalg.norm(quaternion)
+    model.geom_pos[paddle] = mount.position
+    # MuJoCo skips the transformation of a geom flagged as sharing its body's frame.
+    model.geom_sameframe[paddle] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
 
 
 def _levelling_turn(normal: np.ndarray) -> np.ndarray:
