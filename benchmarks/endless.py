@@ -31,7 +31,7 @@ from bounce_mjx.evaluation.episodes import begin, reset_episodes, run_until
 from bounce_mjx.evaluation.suite import Condition, load_suite
 from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.runs.checkpoints import read_actor
-from bounce_mjx.runs.config import in_world
+from bounce_mjx.runs.worlds import in_world
 from bounce_mjx.training.setup import set_up_jax
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import TERMS, RandomizationConfig
