@@ -87,7 +87,10 @@ def exit_on_user_error() -> Iterator[None]:
 def _refused_device(error: BaseException | None) -> str | None:
     """Why JAX does not start, if an error or its cause says so; it may look like another one, such
     as a checkpoint that cannot be read."""
-    while error is not None:
+    # A cause may lead back to its own error.
+    seen: set[int] = set()
+    while error is not None and id(error) not in seen:
+        seen.add(id(error))
         reason = str(error)
         if isinstance(error, RuntimeError) and reason.startswith("Unable to initialize backend"):
             platforms = os.environ.get("JAX_PLATFORMS", "")
