@@ -12,6 +12,7 @@ from scipy.optimize import minimize
 
 from bounce_mjx.env.env import world_model
 from bounce_mjx.errors import UserError
+from bounce_mjx.identify import world
 from bounce_mjx.identify.doctor import examine
 from bounce_mjx.identify.fit import (
     Fit,
@@ -258,6 +259,11 @@ def test_the_page_begins_with_the_answer() -> None:
     better = identification_page(found, [log], checkups, NAMES, Path("world.yaml"), [])
     assert "bounce-mjx identify LOG --check world.yaml" in better
     assert all(entry.label in page for entry in estimates(found, NAMES))
+
+
+def test_each_unknown_has_a_motion_that_would_show_it() -> None:
+    shown = {name for names in world._MOTIONS.values() for name in names.split()}
+    assert shown >= Layout(6, True, 0.001, camera_rotation=0.01).terms.keys()
 
 
 def test_what_is_not_shown_is_as_well_known_as_before() -> None:

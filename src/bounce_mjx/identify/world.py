@@ -39,7 +39,7 @@ _MOTIONS = {
     "long flights, and a level under the base,": "gravity_tilt",
     "a known weight on the paddle, or slow motions in other postures,": "link_mass servo_gain",
     "faster motions (bounce-mjx excite --max-velocity)": "servo_damping servo_lag action_latency",
-    "slow motions there and back (bounce-mjx excite)": "joint_frictionloss",
+    "slow motions there and back (bounce-mjx excite)": "joint_frictionloss servo_offset",
     "balls with spin, or thrown from the side,": "contact_friction",
     "higher flights": "air_drag",
     "more bounces, at several target heights,": "ball_latency restitution",
