@@ -233,13 +233,6 @@ def minimise(
     return fit
 
 
-def cost_of(problem: Problem, fit: Fit, weights: np.ndarray) -> float:
-    """Half the sum of squared residuals and the prior's, of a fit whose starts are their guess."""
-    white = problem.whiten(problem.predict(fit.vector, fit.starts), weights)
-    from_mean = (fit.vector - problem.layout.mean) / problem.layout.deviation
-    return float(0.5 * np.sum(white**2) + 0.5 * np.sum(from_mean**2))
-
-
 def _bounded_step(hessian: np.ndarray, slope: np.ndarray, room: np.ndarray) -> np.ndarray:
     """The change x [F] within bounds that minimises x' hessian x / 2 + slope' x.
 
