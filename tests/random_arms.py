@@ -12,7 +12,7 @@ def random_arm(num_joints: int, seed: int) -> mujoco.MjModel:
     """An arm of hinges and slides that holds a level paddle, and a ball.
 
     The joints have anchors, skew axes, references, springs, damping, armature and dry friction; the
-    servos have gears, biases and limits; bodies are welded to the base, to links and to the paddle,
+    servos have gears and limits; bodies are welded to the base, to links and to the paddle,
     each with its own inertial frame and share of gravity compensation. Two joints share one body.
     MuJoCo's solver converges to rounding error.
     """
@@ -119,7 +119,7 @@ def _add_joint(
         biastype=mujoco.mjtBias.mjBIAS_AFFINE,
     )
     servo.gainprm[0] = kp
-    servo.biasprm[:3] = (1.0, -kp, -kv)
+    servo.biasprm[:3] = (0.0, -kp, -kv)
     if index % 3 != 1:
         servo.forcelimited = True
         servo.forcerange = (-rng.uniform(60.0, 150.0), rng.uniform(60.0, 150.0))

@@ -66,11 +66,14 @@ ADOPTED = {
     "mjcf": "arm.xml", "default_joint_angles": [0.0] * 6, "robot": {"site": "tool"} | SERVOS,
     "ball_init_pos": [0.0, 0.0, 5.0], "target_height_range": [5.0, 6.0],
 }  # fmt: skip
-OF_SITE = [k for k in KEYS if k.startswith("env.robot.") and "limits" not in k]
+FOR_ANY_ROBOT = ("env.robot.limits.", "env.robot.gravity_compensation")
+OF_SITE = [k for k in KEYS if k.startswith("env.robot.") and not k.startswith(FOR_ANY_ROBOT)]
+VARIED = {"restitution": [0.8, 0.9]}
 NEEDED = {
     "env.action.max_lead": {"action": {"base": "target"}},
     "env.observation.servo_lead": {"action": {"base": "target"}},
-    "env.randomization.first_command_range": {"randomization": {"warmup_steps": 1000}},
+    "env.randomization.first_command_range": {"randomization": VARIED | {"warmup_steps": 1000}},
+    "env.randomization.warmup_steps": {"randomization": VARIED},
     "env.randomization.push_interval": {"randomization": {"push_speed": [0.1, 0.1]}},
     **{f"env.robot.limits.{name}": WITH_LIMITS for name in LIMITS},
     **dict.fromkeys(OF_SITE, ADOPTED),
@@ -79,8 +82,8 @@ NEEDED = {
 }
 # Keys that describe others, and have an effect with them alone.
 WITH = {
-    "env.randomization.share": {"randomization": {"restitution": [0.8, 0.9]}},
-    "env.randomization.shares": {"randomization": {"restitution": [0.8, 0.9]}},
+    "env.randomization.share": {"randomization": VARIED},
+    "env.randomization.shares": {"randomization": VARIED},
 }
 
 

@@ -92,6 +92,7 @@ def test_an_installed_release_trains_evaluates_exports_and_acts(
         "import numpy, bounce_mjx; p = bounce_mjx.load_policy('policy.onnx')\n"
         "shapes = {'joint_angles': 6, 'joint_velocities': 6, 'target_height': ()}\n"
         "values = {name: numpy.zeros(shapes.get(name, 3)) for name in p.needs}\n"
+        "values['joint_angles'] = p.metadata.default_joint_angles\n"
         "print(bounce_mjx.__file__, p.step(values).shape)"
     )
     package, shape = call(python, "-c", acts, folder=other).split(maxsplit=1)

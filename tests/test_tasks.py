@@ -76,8 +76,13 @@ def test_a_task_without_events_goes_through_every_command(
     command("export", *task, "--onnx", "rest.onnx")
     policy, again = load_policy("rest.onnx"), load_policy(folder, task=REST)
     assert again.metadata == policy.metadata
-    sizes = {"joint_angles": 6, "joint_velocities": 6, "ball_position": 3, "ball_velocity": 3}
-    assert policy.step({name: np.zeros(sizes[name]) for name in policy.needs}).shape == (6,)
+    measured = {
+        "joint_angles": policy.metadata.default_joint_angles,
+        "joint_velocities": np.zeros(6),
+        "ball_position": (0.58856, 0.0, 0.075),
+        "ball_velocity": np.zeros(3),
+    }
+    assert policy.step({name: measured[name] for name in policy.needs}).shape == (6,)
 
 
 def test_a_command_that_the_policy_does_not_see_is_refused() -> None:
