@@ -19,7 +19,7 @@ CHECKOUT = Path(__file__).parent.parent
 COPIED = "src", "tests", "mjcf", "configs", "pretrained", "examples", "benchmarks", "docs"
 SINGLE = "pyproject.toml", "train_jax.py", "README.md", "CHANGELOG.md", "CONTRIBUTING.md"
 
-REWARDS, BOUNCE = "tasks/bounce_rewards.py", "tasks/bounce.py"
+REWARDS, BOUNCE = "task/bounce_rewards.py", "task/bounce.py"
 ENV, VECTOR, ACTUATION = "env/env.py", "env/vector.py", "world/actuation.py"
 SENSING, RANDOMIZATION = "world/sensing.py", "world/randomization.py"
 PPO, STATISTICS = "learning/ppo.py", "learning/statistics.py"

@@ -14,7 +14,7 @@ from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
 from bounce_mjx.task import Kinematics, Step
-from bounce_mjx.tasks.bounce import Bounce, BounceState
+from bounce_mjx.task.bounce import Bounce, BounceState
 from bounce_mjx.world.config import PADDLE_HOME
 from reward_reference import REFERENCE_WEIGHTS, reference_terms
 

@@ -22,7 +22,7 @@ from bounce_mjx.learning.statistics import (
     normalize,
     update,
 )
-from bounce_mjx.tasks.bounce import BounceConfig
+from bounce_mjx.task.bounce import BounceConfig
 
 OBSERVATION = BounceConfig().layout
 

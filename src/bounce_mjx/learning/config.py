@@ -7,7 +7,7 @@ from pydantic import Field
 
 from bounce_mjx.config import settings
 from bounce_mjx.errors import UserError, shorten
-from bounce_mjx.tasks.registry import class_in_file, is_file
+from bounce_mjx.task.registry import class_in_file, is_file
 
 PPO_NAME = "ppo"
 """Name of the algorithm of this package."""

@@ -34,7 +34,7 @@ from bounce_mjx.runs import folders
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config, runs_folder
 from bounce_mjx.runs.files import plain_path, seal, to_plain
 from bounce_mjx.runs.records import RECORD, Checkpoint, DamagedCheckpoint, Record, verify
-from bounce_mjx.tasks.registry import is_file
+from bounce_mjx.task.registry import is_file
 
 POLICY, TRAINING, NETWORKS = "policy", "training", "networks"
 """Items of a checkpoint: what acts; what a training continues from; both networks, with which

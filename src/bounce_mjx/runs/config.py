@@ -17,9 +17,9 @@ from bounce_mjx.learning.config import PPO_NAME, PPOConfig, find_algorithm
 from bounce_mjx.robot.config import is_packaged
 from bounce_mjx.runs.files import check_integrity
 from bounce_mjx.runs.presets import BASE, SOURCES, read_config_file
+from bounce_mjx.task import registry
+from bounce_mjx.task.registry import DEFAULT, find_task, is_file
 from bounce_mjx.task.task import Task
-from bounce_mjx.tasks import registry
-from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file
 from bounce_mjx.world.config import WorldConfig
 
 CONFIG_FILE = "config.yaml"

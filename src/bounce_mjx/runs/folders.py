@@ -39,7 +39,7 @@ from bounce_mjx.runs.files import seal, writable, write_atomically
 from bounce_mjx.runs.presets import BASE
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.records import Checkpoint, DamagedCheckpoint, Record, verify
-from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file, read_source, source_file
+from bounce_mjx.task.registry import DEFAULT, find_task, is_file, read_source, source_file
 
 LATEST = "latest"
 """Name of the newest run on the command line."""

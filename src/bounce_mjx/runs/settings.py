@@ -44,8 +44,8 @@ from bounce_mjx.runs.config import (
 )
 from bounce_mjx.runs.presets import BASE, SOURCES, preset_files, read_config_file, shown_file
 from bounce_mjx.runs.worlds import robot_and_world
+from bounce_mjx.task.registry import DEFAULT, find_task, is_file, is_same_code
 from bounce_mjx.task.task import Task
-from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file, is_same_code
 from bounce_mjx.world.named import without_idle_curriculum
 
 FLAGS = "flags"

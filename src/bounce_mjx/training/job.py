@@ -29,7 +29,7 @@ from bounce_mjx.runs import checkpoints, folders
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.files import writable
 from bounce_mjx.runs.progress import Progress
-from bounce_mjx.tasks.registry import is_file
+from bounce_mjx.task.registry import is_file
 from bounce_mjx.training import events, faults, hosts
 from bounce_mjx.training.clock import Clock
 from bounce_mjx.training.evaluators import Evaluators

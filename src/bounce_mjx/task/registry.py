@@ -32,7 +32,7 @@ _files: dict[bytes, types.ModuleType] = {}
 _named: dict[str, type[Task]] = {}
 
 _OWN = {
-    name: f"bounce_mjx.tasks.{name}:{name.title()}"
+    name: f"bounce_mjx.task.{name}:{name.title()}"
     for name in ("balance", "bounce", "catch", "juggle", "track")
 }
 
