@@ -6,8 +6,6 @@ import pydantic
 from pydantic import Field
 
 from bounce_mjx.config import settings
-from bounce_mjx.errors import UserError, shorten
-from bounce_mjx.task.registry import class_in_file, is_file
 
 PPO_NAME = "ppo"
 """Name of the algorithm of this package."""
@@ -104,18 +102,3 @@ class PPOConfig(settings.StrictModel):
     def batch_steps(self) -> int:
         """Environment steps in one iteration."""
         return self.num_envs * self.rollout_length
-
-
-def find_algorithm(name: str) -> type:
-    """The algorithm of a name, ppo or FILE.py:CLASS.
-
-    Raises:
-      UserError: there is none.
-    """
-    from bounce_mjx.learning.ppo import PPO
-
-    if is_file(name):
-        return class_in_file(name, PPO)
-    if name != PPO_NAME:
-        raise UserError(f"there is no algorithm {shorten(name)!r}; give ppo or FILE.py:CLASS")
-    return PPO

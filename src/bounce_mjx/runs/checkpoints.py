@@ -24,6 +24,7 @@ import numpy as np
 
 from bounce_mjx.baselines.mirror import MirrorLaw
 from bounce_mjx.config.files import differing_keys
+from bounce_mjx.config.user_code import is_file
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.evaluation.results import Report
@@ -34,7 +35,6 @@ from bounce_mjx.runs import folders
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config, runs_folder
 from bounce_mjx.runs.files import plain_path, seal, to_plain
 from bounce_mjx.runs.records import RECORD, Checkpoint, DamagedCheckpoint, Record, verify
-from bounce_mjx.task.registry import is_file
 
 POLICY, TRAINING, NETWORKS = "policy", "training", "networks"
 """Items of a checkpoint: what acts; what a training continues from; both networks, with which
