@@ -91,7 +91,7 @@ FAULTS = [
     ("a history has the oldest value first", SENSING,
      "with_newest(past, measured[name])", "jnp.concatenate([past[1:], measured[name][None]])", "test_sensors.py -k bounces_are"),
     ("the bootstrap of a time-out is dropped", PPO,
-     "jnp.where(rollout.truncated, timeout_value, values[1:])", "values[1:]", "test_ppo.py -k bootstraps"),
+     "jnp.where(rollout.truncated, timeout_value, next_value)", "next_value", "test_ppo.py -k bootstraps"),
     ("advantages leak across a time-out", PPO,
      "(~(terminated | truncated))", "(~terminated)", "test_ppo.py -k their_definition"),
     ("PPO takes the larger of its two objectives", PPO,

@@ -76,11 +76,11 @@ class PPOConfig(settings.StrictModel):
 
     @pydantic.model_validator(mode="after")
     def _check_batch_and_learning_rates(self):
-        limits = (self.final_max_learning_rate, self.max_learning_rate)
-        if self.min_learning_rate > min(limits):
+        if self.min_learning_rate > min(self.max_learning_rate, self.final_max_learning_rate):
             raise ValueError(
                 f"min_learning_rate {self.min_learning_rate} is above the upper limits "
-                f"max_learning_rate {limits[1]} and final_max_learning_rate {limits[0]}; lower it"
+                f"max_learning_rate {self.max_learning_rate} and final_max_learning_rate "
+                f"{self.final_max_learning_rate}; lower it"
             )
         adapts = self.target_kl > 0.0
         if adapts and not self.min_learning_rate <= self.learning_rate <= self.max_learning_rate:

@@ -255,15 +255,14 @@ class PPO:
         )
         learned, minibatch_metrics = self.update(state, samples, update_key)
 
-        metrics["fault"] = first_fault(
-            metrics["reward"], new_statistics, minibatch_metrics, learned.params
-        )
+        fault = first_fault(metrics["reward"], new_statistics, minibatch_metrics, learned.params)
         metrics |= {name: jnp.mean(values) for name, values in minibatch_metrics.items()}
         if "policy/kl" in minibatch_metrics:
             # How far the whole update has moved the policy: that of the last epoch.
             metrics["policy/kl"] = jnp.mean(minibatch_metrics["policy/kl"][-1])
         metrics["policy/learning_rate"] = self.learning_rate(learned.learning_rate, state.iteration)
         metrics["loss/explained_variance"] = 1.0 - jnp.var(advantage) / jnp.var(value_target)
+        metrics["fault"] = fault
         return learned._replace(
             statistics=new_statistics, env=env_state, key=key, iteration=state.iteration + 1
         ), metrics
@@ -288,6 +287,7 @@ class PPO:
         fresh = vector.first_states(self.env, reset_key, config.num_envs, ranges)
 
         def control_step(carry: tuple, noise: jax.Array) -> tuple:
+            # Packed, because on a GPU each array that a loop carries costs a kernel in each step.
             packed, timeout_inputs = carry
             env_state = unpack(packed)
             inputs = self.network_inputs(vector.observe(env_state), env_state.env.metrics)
@@ -301,7 +301,7 @@ class PPO:
             # An environment times out at most once in a rollout, because no time limit is shorter.
             final_inputs = self.network_inputs(result.final_observation, result.metrics)
             timeout_inputs = jnp.where(result.truncated[:, None], final_inputs, timeout_inputs)
-            taken = Rollout(
+            rollout_step = Rollout(
                 inputs=inputs,
                 action=action,
                 log_prob=policy.log_prob(action),
@@ -310,7 +310,7 @@ class PPO:
                 truncated=result.truncated,
             )
             metrics = step_metrics(result, num_groups(config), self.env.task.curves)
-            return (pack(env_state), timeout_inputs), (taken, pack(metrics))
+            return (pack(env_state), timeout_inputs), (rollout_step, pack(metrics))
 
         no_inputs = jnp.zeros((config.num_envs, state.statistics.mean.size))
         (packed, timeout_inputs), (rollout, metrics) = jax.lax.scan(
@@ -382,11 +382,13 @@ class PPO:
         )
         inputs = normalize(inputs, state.statistics.normalizer)
         values = self.values(state.params, inputs)
-        values, timeout_value = values[:-1], values[-1]
+        num_steps = len(rollout.reward)
+        value = values[:num_steps]
+        next_value = values[1 : num_steps + 1]
+        timeout_value = values[-1]
         # A time-out is bootstrapped: what follows is worth as much as the old episode's last state,
         # and not as the new episode's first one.
-        next_value = jnp.where(rollout.truncated, timeout_value, values[1:])
-        value = values[:-1]
+        next_value = jnp.where(rollout.truncated, timeout_value, next_value)
         advantage = generalized_advantages(
             reward=rollout.reward,
             value=value,
@@ -689,11 +691,17 @@ def first_fault(
       minibatch_metrics: each [epochs, minibatches]; the gradient's norm is one of them.
       params: the parameters after the update.
     """
-    number_of = {"loss/value": 3, "loss/policy": 4, "loss/gradient_norm": 5}
+    number = {quantity: i for i, quantity in enumerate(CHECKED, start=1)}
+    number_of_metric = {
+        "loss/value": number["loss/value"],
+        "loss/policy": number["loss/policy"],
+        "loss/gradient_norm": number["gradient"],
+    }
     # The loss of a subclass may have other parts.
-    names = [name for name in number_of if name in minibatch_metrics]
+    names = [name for name in number_of_metric if name in minibatch_metrics]
     # A row for each minibatch step, in their order.
     steps = jnp.stack([minibatch_metrics[name].ravel() for name in names], axis=-1)
+    numbers_of_steps = len(steps) * [number_of_metric[name] for name in names]
     is_finite = jnp.hstack(
         [
             jnp.isfinite(reward),
@@ -702,7 +710,9 @@ def first_fault(
             all_finite(params),
         ]
     )
-    numbers = jnp.array([1, 2] + len(steps) * [number_of[name] for name in names] + [6])
+    numbers = jnp.array(
+        [number["reward"], number["observation"], *numbers_of_steps, number["parameters"]]
+    )
     first_infinite = jnp.argmin(is_finite)
     return jnp.where(is_finite.all(), 0, numbers[first_infinite])
 
