@@ -231,11 +231,11 @@ class PPO:
         """State and a number of iterations I -> state and metrics, each [I]; the metric "fault" is
         the result of `first_fault`."""
 
-        def iterate(packed: TrainingState, _: None) -> tuple[TrainingState, Metrics]:
+        def iterate_packed(packed: TrainingState, _: None) -> tuple[TrainingState, Metrics]:
             state, metrics = self.iterate(_unpack_env(packed))
             return _pack_env(state), metrics
 
-        packed, metrics = jax.lax.scan(iterate, _pack_env(state), length=num_iterations)
+        packed, metrics = jax.lax.scan(iterate_packed, _pack_env(state), length=num_iterations)
         return _unpack_env(packed), metrics
 
     def iterate(self, state: TrainingState) -> tuple[TrainingState, Metrics]:
