@@ -8,7 +8,7 @@ from collections.abc import Sequence
 ENV_ID = "bounce_mjx/BounceBall-v0"
 """Name of the specification's environment."""
 TASK_ID = "bounce_mjx/Task-v0"
-"""Name of any other one, with the argument `task`."""
+"""Name of any other one, with the argument `task` or `policy`."""
 TASKS = ("balance", "catch", "juggle", "track")
 """The package's other tasks, which have names such as bounce_mjx/Juggle-v0. A constant, because
 finding tasks takes time at each import of Gymnasium."""
@@ -47,7 +47,7 @@ def register() -> None:
     """Adds the environments to Gymnasium's registry; their classes are imported on first use."""
     import gymnasium
 
-    arguments = {ENV_ID: {}, TASK_ID: {}}
+    arguments = {ENV_ID: {"task": "bounce"}, TASK_ID: {}}
     arguments |= {f"bounce_mjx/{task.title()}-v0": {"task": task} for task in TASKS}
     for name, given in arguments.items():
         # Without max_episode_steps, because the environment keeps its config's time limit.
