@@ -8,7 +8,7 @@ import argparse
 
 import gymnasium
 
-import bounce_mjx
+import bounce_mjx.adapters.gymnasium
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("policy", nargs="?", default="pretrained", help="name, file or run")

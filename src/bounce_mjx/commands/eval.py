@@ -5,16 +5,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-from bounce_mjx.commands.run_options import OneActorCommand, WorldCommand, parse_with_commands
+from bounce_mjx.commands.task_commands import parse_with_commands
+from bounce_mjx.commands.which_policy import MirrorRobot, OnePolicy, OtherWorld, WhichPolicy
 from bounce_mjx.config.command_line import Flag, stdout
 from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import config as evaluation
 
 
-class EvalCommand(WorldCommand, OneActorCommand):
+class EvalCommand(WhichPolicy):
     """Measures the results of a trained policy."""
 
+    checkpoint: OnePolicy = None
+    robot: MirrorRobot = None
+    world: OtherWorld = None
     episodes: Count = evaluation.DEFAULT_EPISODES
     """Episodes, each from its own reset."""
     seed: NonNegativeInt = evaluation.DEFAULT_SEED
@@ -47,13 +51,13 @@ def main(args: Sequence[str]) -> None:
 
     check_output(command.json_file, "--json")
     console = stdout()
-    checkpoint = command.choose(command.checkpoint)
+    checkpoint = command.choose(command.checkpoint, command.robot)
     if command.nominal and command.world is not None:
         raise UserError("--nominal and --world cannot be combined; omit one")
-    config = command.config_of(checkpoint)
+    config = command.config_of(checkpoint, command.robot, command.world)
     if command.limits and config.env.robot.limits.velocity is None:
         raise UserError("the policy's arm has no command limits (env.robot.limits); omit --limits")
-    commands = given_commands(config.env)
+    commands = given_commands.checked(config.env)
     set_up_jax(evaluation.on_engine(config.env, command.physics))
     checkpoint, policy, actor = read_actor(checkpoint, config)
     steps = f" ({checkpoint.steps:,} steps)" if checkpoint.steps else ""

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from bounce_mjx.commands.run_options import WorldCommand, parse_with_commands
+from bounce_mjx.commands.task_commands import parse_with_commands
+from bounce_mjx.commands.which_policy import MirrorRobot, OtherWorld, WhichPolicy
 from bounce_mjx.config.command_line import Flag, stdout
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from bounce_mjx.runs.folders import Checkpoint
 
 
-class PlayCommand(WorldCommand):
+class PlayCommand(WhichPolicy):
     """Shows a trained policy, or several side by side."""
 
     checkpoints: Annotated[
@@ -26,6 +27,8 @@ class PlayCommand(WorldCommand):
     policy that comes with the package: pretrained, robust, robust_small, or the name of a task or
     an arm. Several are shown side by side. The default is the newest run, or the task's policy in
     the package if there is no run. mirror stands for the mirror law, a model-based baseline."""
+    robot: MirrorRobot = None
+    world: OtherWorld = None
     randomization: RandomizationConfig = RandomizationConfig()
     """World of the episodes, if a term is given, in place of the world of the training."""
     viewing: ViewerOptions = ViewerOptions()
@@ -43,9 +46,9 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.viewers.show import Shown, show
     from bounce_mjx.viewers.simulation import make_policy_controller
 
-    chosen = [command.choose(path) for path in command.checkpoints or (None,)]
+    chosen = [command.choose(path, command.robot) for path in command.checkpoints or (None,)]
     configs = [_config(checkpoint, command) for checkpoint in chosen]
-    (commands, *_) = [given_commands(config.env) for config in configs]
+    (commands, *_) = [given_commands.checked(config.env) for config in configs]
     set_up_jax(*(config.env for config in configs))
     shown = []
     for checkpoint, config in zip(chosen, configs, strict=True):
@@ -61,7 +64,7 @@ def main(args: Sequence[str]) -> None:
 
 def _config(checkpoint: "Checkpoint", command: PlayCommand) -> TrainConfig:
     """The config of a checkpoint's training, with the world that is to be shown."""
-    config = command.config_of(checkpoint)
+    config = command.config_of(checkpoint, command.robot, command.world)
     if not command.randomization.terms:
         return config
     given = dict(config.env) | {"randomization": command.randomization}
