@@ -35,6 +35,7 @@ from bounce_mjx.tasks.bounce_rewards import BounceReward, RewardInputs
 from bounce_mjx.tasks.registry import find_task
 from bounce_mjx.training import hosts
 from bounce_mjx.training.command import fields_of_command
+from bounce_mjx.training.run import notes_on_starts
 from bounce_mjx.world.randomization import TERMS
 
 CHECKOUT = Path(__file__).resolve().parent.parent
@@ -321,8 +322,10 @@ def short_training(folder: Path) -> Callable:
 
     def train(*given, callbacks=(), **settings):
         calls.append(settings)
-        if len(calls) > 1:
-            return stack(Choice()).config(settings)
+        if len(calls) > 1:  # the page's sweep
+            config = stack(Choice()).config(settings)
+            assert not notes_on_starts(config)
+            return config
         return real(*given, callbacks=callbacks, **settings | short, log_dir=folder)
 
     return train
