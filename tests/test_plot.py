@@ -203,7 +203,8 @@ def check_report(run: Path) -> str:
     assert len(replays) == 1 and b"<title>bounce_mjx</title>" in base64.b64decode(
         replays[0].partition(",")[2]
     )
-    assert len(sources) - len(replays) == 3
+    # Curves, the best checkpoint, and a panel for each reward term.
+    assert len(sources) - len(replays) == 2 + len(TERMS)
     for source in set(sources) - set(replays):
         kind, _, data = source.partition(",")
         assert kind == "data:image/svg+xml;base64"
