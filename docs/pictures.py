@@ -122,7 +122,7 @@ def control_step():
         "", (at(20), 36), (at(20), 30.5), arrowprops={"arrowstyle": "-|>", "color": LINES[2]}
     )
     diagram.axes.barh(37.8, 2.5 * scale, 4, at(20), color=ORANGE, edgecolor=GREY)
-    diagram.text(at(23.2), 37.8, "policy.step: 1 to 2 ms with the filter", size=9, align="left")
+    diagram.text(at(23.2), 37.8, "policy.step: less than 1 ms", size=9, align="left")
     diagram.axes.annotate(
         "", (at(34), 46), (at(22.5), 39.8), arrowprops={"arrowstyle": "-|>", "color": LINES[3]}
     )

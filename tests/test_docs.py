@@ -35,6 +35,7 @@ from bounce_mjx.task.bounce_rewards import BounceReward, RewardInputs
 from bounce_mjx.task.registry import find_task
 from bounce_mjx.training import hosts
 from bounce_mjx.training.command import fields_of_command
+from bounce_mjx.training.run import notes_on_starts
 from bounce_mjx.world.randomization import TERMS
 
 CHECKOUT = Path(__file__).resolve().parent.parent
@@ -190,6 +191,22 @@ def test_config_reference_is_fresh() -> None:
     assert page == REFERENCE, "docs/config.md is stale; it names the command that prints it"
 
 
+def test_api_reference_is_fresh() -> None:
+    pytest.importorskip("griffe")
+    written = runpy.run_path(str(CHECKOUT / "docs/api_reference.py"))["reference"]()
+    assert content("api.md") == written, "docs/api.md is stale; it names the command that prints it"
+
+
+def test_api_reference_has_arguments_shapes_and_errors() -> None:
+    page = content("api.md")
+    entry = page.split("### `bounce_mjx.env.env.Env`\n")[1].split("\n### ")[0]
+    assert "Env.step(state: State, action: jax.Array) -> State" in entry
+    assert "under the action [n], clipped to [-1, 1]" in " ".join(entry.split())
+    assert "- `rng`: key; consumed." in entry and "- `UserError`: " in entry
+    state = page.split("### `bounce_mjx.env.env.State`\n")[1].split("\n### ")[0]
+    assert "- `obs: jax.Array` Observation [observation_size]." in state
+
+
 def test_table_of_libraries_names_every_example_and_existing_tests() -> None:
     page = content("libraries.md")
     rows = re.findall(r"^\| .+ \| .+ \| (`.+`) \| (`.+`) \|$", page, re.MULTILINE)
@@ -319,8 +336,10 @@ def short_training(folder: Path) -> Callable:
 
     def train(*given, callbacks=(), **settings):
         calls.append(settings)
-        if len(calls) > 1:
-            return stack(Choice()).config(settings)
+        if len(calls) > 1:  # the page's sweep
+            config = stack(Choice()).config(settings)
+            assert not notes_on_starts(config)
+            return config
         return real(*given, callbacks=callbacks, **settings | short, log_dir=folder)
 
     return train
@@ -376,6 +395,17 @@ def test_tables_of_figures_are_as_drawn() -> None:
         assert figures["drawn"](text, known) == text, f"python benchmarks/figures.py writes {page}"
         shown |= {name for _, name in figures["TABLE"].findall(text)}
     assert shown == known.keys()
+
+
+def test_verdicts_of_figures_are_by_their_worst_number() -> None:
+    verdict = runpy.run_path(str(CHECKOUT / "benchmarks/figures.py"))["verdict"]
+    assert verdict("at most 45 s", "34 to 45 s") == "reached"
+    assert verdict("at most 45 s", "34 to 46 s") == "missed"
+    assert verdict("at least 11.5 M", "11.4 to 11.6 M") == "missed"
+    assert verdict("at least 1,000", "1,271") == "reached"
+    assert verdict("90 to 99%", "89.9%") == "missed"
+    assert verdict("at most 1e-11", "5.6e-13") == "reached"
+    assert verdict("all five results", "four of them") == "missed"
 
 
 def test_robot_page_has_every_term_of_the_randomisation() -> None:
