@@ -119,6 +119,7 @@ if __name__ == "__main__":
 
             model = rendered_cameras.make_model(str(MJCF), args.ball, args.side_light)
             camera = rendered_cameras.seen_ball(model, robot.metadata, args.ball, args.camera_rate)
+            print(f"cameras calibrated with the arm: {camera.calibration.report()}", flush=True)
         episodes = simulate(robot, camera, args.seconds, args.target_height, recorder, model)
         for count, lasted in episodes:
             print(f"{count} bounces in {lasted:.1f} s of {args.seconds:g} s")
