@@ -221,6 +221,50 @@ class _View:
         return cv2.remap(straight, self._columns, self._rows, cv2.INTER_LINEAR)
 
 
+class Film:
+    """What both cameras see, side by side, with a ring around the ball where the tracker sees it,
+    and its last places."""
+
+    def __init__(self, every: int = 4, seconds_each: float = 0.1):
+        """Args:
+        every: of so many pairs one is shown.
+        seconds_each: how long it is shown, s.
+        """
+        self._every = every
+        self._seconds_each = seconds_each
+        self._count = 0
+        self._places: list[np.ndarray] = []
+        self._frames: list[np.ndarray] = []
+
+    def add(
+        self, pictures: Sequence[np.ndarray], cameras: Sequence[Camera], place: np.ndarray | None
+    ) -> None:
+        """Adds a pair of pictures, and the place of the ball [3] (m), if it was found."""
+        if place is not None:
+            self._places = [*self._places[-30:], place]
+        self._count += 1
+        if (self._count - 1) % self._every:
+            return
+        views = []
+        for picture, camera in zip(pictures, cameras, strict=True):
+            view = picture.copy()
+            if self._places:
+                path = np.round(camera.project(np.array(self._places))).astype(np.int32)
+                cv2.polylines(view, [path], False, (60, 200, 60), 1, cv2.LINE_AA)
+            if place is not None:
+                radius = round(camera.radius_at(place)) + 5
+                cv2.circle(view, path[-1].tolist(), radius, (60, 60, 250), 2, cv2.LINE_AA)
+            views.append(cv2.resize(view, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+        self._frames.append(np.hstack(views))
+
+    def save(self, path: str) -> None:
+        """Writes the film as an animated picture, .webp or .gif."""
+        animation = cv2.Animation()
+        animation.frames = self._frames
+        animation.durations = [round(1e3 * self._seconds_each)] * len(self._frames)
+        cv2.imwriteanimation(path, animation, [cv2.IMWRITE_WEBP_QUALITY, 70])
+
+
 class SeenBall:
     """The ball as a robot's program gets it: pictures, the tracker, and their delays.
 
@@ -252,6 +296,8 @@ class SeenBall:
         """Pairs in which no ball was found."""
         self.pictures: tuple[np.ndarray, np.ndarray] | None = None
         """The newest pair."""
+        self.film: Film | None = None
+        """Where the pairs go, if a film is wanted."""
 
     def look(self, data: mujoco.MjData) -> bool:
         """Sees one instant; call it after each physics step. Tells whether a ball was found."""
@@ -263,6 +309,9 @@ class SeenBall:
         begun = time.process_time()
         fix = self._tracker.update(picture.pictures, picture.taken)
         self.tracking_times.append(time.process_time() - begun)
+        if self.film is not None:
+            place = None if fix is None else fix.position
+            self.film.add(picture.pictures, self.calibration.cameras, place)
         if fix is None:
             self.num_missed += 1
             return False
