@@ -15,7 +15,6 @@ from flax import struct
 from bounce_mjx.adapters.policies import environment_config
 from bounce_mjx.env.env import Env, State
 from bounce_mjx.errors import needed
-from bounce_mjx.task.registry import DEFAULT, task_config
 from bounce_mjx.task.task import Task
 
 

@@ -13,7 +13,6 @@ from gymnasium.spaces import Box
 from bounce_mjx.adapters.gymnasium.programs import Episodes, Programs, shared_programs
 from bounce_mjx.adapters.policies import environment_config, settings_class
 from bounce_mjx.errors import UserError, suggest
-from bounce_mjx.task.registry import task_config
 from bounce_mjx.task.task import Task
 
 Commands = dict[str, float | np.ndarray]

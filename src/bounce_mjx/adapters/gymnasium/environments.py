@@ -27,7 +27,6 @@ from bounce_mjx.adapters.gymnasium.batch import (
 from bounce_mjx.adapters.gymnasium.pictures import Pictures
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
-from bounce_mjx.task.registry import DEFAULT
 from bounce_mjx.task.task import Task
 
 # Of one environment.
