@@ -142,17 +142,19 @@ class Env:
         self._check_seen()
         self._check_num_balls()
         self.mj_model: mujoco.MjModel = world_model(config)
-        self.engine: Engine = make_engine(self.mj_model, config.physics)
-        self.layout = config.layout
         self.addresses = robot_model.find_addresses(self.mj_model)
+        self.engine: Engine = make_engine(self.mj_model, config.physics, self.addresses)
+        self.layout = config.layout
         self._check_joint_angles()
         self._check_heights()
-        self.task.geometry = read_geometry(self.mj_model, config.default_joint_angles)
+        self.task.geometry = read_geometry(
+            self.mj_model, self.addresses, config.default_joint_angles
+        )
         self._check_rest()
-        self._actuators = Actuators(config, self.mj_model)
-        self._sensors = Sensors(config, self.mj_model, self.engine, self.task)
+        self._actuators = Actuators(config, self.mj_model, self.addresses)
+        self._sensors = Sensors(config, self.mj_model, self.addresses, self.engine, self.task)
         self._randomize = randomize
-        self.nominals = nominal_values(self.mj_model, config.randomization.terms)
+        self.nominals = nominal_values(self.mj_model, config.randomization.terms, self.addresses)
         """Values of the terms of the randomisation in an episode that does not sample them."""
         self._fingerprint = robot_model.fingerprint(self.mj_model)
         self.dt = config.control_dt
@@ -198,14 +200,14 @@ class Env:
     def _check_joint_angles(self) -> None:
         """Refuses joint angles of a reset that do not fit the arm."""
         angles = self.config.default_joint_angles
-        joints = robot_model.joint_names(self.mj_model)
+        joints = robot_model.joint_names(self.mj_model, self.addresses)
         if len(angles) != len(joints):
             name = f"the MJCF file {self.config.mjcf}" if self.config.mjcf else "the model"
             raise UserError(
                 f"default_joint_angles has {len(angles)} numbers, but {name} has {len(joints)} "
                 f"joints with an actuator ({', '.join(joints)}); give one number for each"
             )
-        ranges = robot_model.joint_ranges(self.mj_model)
+        ranges = robot_model.joint_ranges(self.mj_model, self.addresses)
         lows, highs = np.nan_to_num(ranges, posinf=_MAX_ANGLE, neginf=-_MAX_ANGLE)
         for joint, angle, low, high in zip(joints, angles, lows, highs, strict=True):
             if not low - _ROUNDING <= angle <= high + _ROUNDING:
@@ -216,7 +218,8 @@ class Env:
 
     def _check_heights(self) -> None:
         """Refuses heights of the config that are not over the paddle of a reset."""
-        data = robot_model.data_at(self.mj_model, self.config.default_joint_angles)
+        angles = self.config.default_joint_angles
+        data = robot_model.data_at(self.mj_model, self.addresses, angles)
         paddle_height = data.geom_xpos[self.addresses.paddle_geom, 2]
         for name, height in self.config.heights.items():
             if height <= paddle_height:
