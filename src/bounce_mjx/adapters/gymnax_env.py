@@ -14,8 +14,8 @@ from flax import struct
 from bounce_mjx.config.validation import validate
 from bounce_mjx.env.env import Env, State
 from bounce_mjx.errors import needed
+from bounce_mjx.task.registry import DEFAULT, task_config
 from bounce_mjx.task.task import Task
-from bounce_mjx.tasks.registry import DEFAULT, task_config
 
 
 @struct.dataclass

@@ -19,7 +19,7 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.statistics import paddle_points
 from bounce_mjx.reports.curves import Group, mean_and_band
-from bounce_mjx.task.shown import Curve, Histogram, Hits, Recording
+from bounce_mjx.task.task import Curve, Histogram, Hits, Recording
 
 RETURN = "episode/return"
 """Tag of the return in a training's log."""

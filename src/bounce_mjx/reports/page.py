@@ -25,7 +25,7 @@ from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.files import write_output
 from bounce_mjx.runs.folders import Checkpoint, best_checkpoint
 from bounce_mjx.runs.progress import load_results
-from bounce_mjx.task.shown import Recording
+from bounce_mjx.task.task import Recording
 from bounce_mjx.viewers.page import replay_first_episode
 
 # Panels side by side in a figure that fits a phone, and its width in inches.

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from bounce_mjx.env.env import Env
-from bounce_mjx.task.shown import Recording
+from bounce_mjx.task.task import Recording
 from bounce_mjx.viewers.guard import open_server
 from bounce_mjx.viewers.scene import Scene
 from bounce_mjx.viewers.simulation import EnvFrame, frame_at, resample

@@ -18,8 +18,8 @@ from flax import struct
 from bounce_mjx.adapters.randomization import randomized_task
 from bounce_mjx.config.validation import validate
 from bounce_mjx.env.env import Env, EnvState, State
+from bounce_mjx.task.registry import DEFAULT, task_config
 from bounce_mjx.task.task import Task
-from bounce_mjx.tasks.registry import DEFAULT, task_config
 from bounce_mjx.viewers.offscreen import choose_opengl
 from bounce_mjx.world.config import WorldConfig
 

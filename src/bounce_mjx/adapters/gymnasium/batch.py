@@ -13,8 +13,8 @@ from gymnasium.spaces import Box
 from bounce_mjx.adapters.gymnasium.programs import Episodes, Programs, shared_programs
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, suggest
+from bounce_mjx.task.registry import task_config
 from bounce_mjx.task.task import Task
-from bounce_mjx.tasks.registry import task_config
 
 Commands = dict[str, float | np.ndarray]
 """Some of the task's commands, each [] or [B]; NaN samples it."""

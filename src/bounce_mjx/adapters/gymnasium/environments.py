@@ -26,8 +26,8 @@ from bounce_mjx.adapters.gymnasium.batch import (
 from bounce_mjx.adapters.gymnasium.pictures import Pictures
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
+from bounce_mjx.task.registry import DEFAULT
 from bounce_mjx.task.task import Task
-from bounce_mjx.tasks.registry import DEFAULT
 
 # Of one environment.
 _CHOSEN = np.ones(1, bool)

@@ -19,8 +19,8 @@ from bounce_mjx.lazy import import_mjx
 from bounce_mjx.physics import PhysicsState
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.arm import locate
+from bounce_mjx.task.registry import DEFAULT, task_config
 from bounce_mjx.task.task import Task
-from bounce_mjx.tasks.registry import DEFAULT, task_config
 from bounce_mjx.viewers.offscreen import choose_opengl
 
 with needed("MuJoCo Playground", "playground<1"):

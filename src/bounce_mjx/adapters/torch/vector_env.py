@@ -16,7 +16,7 @@ from bounce_mjx.env import vector
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.metrics import matching_metrics
-from bounce_mjx.tasks.registry import DEFAULT, task_config
+from bounce_mjx.task.registry import DEFAULT, task_config
 
 
 class StepResult(NamedTuple):
