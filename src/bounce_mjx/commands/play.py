@@ -53,6 +53,8 @@ def main(args: Sequence[str]) -> None:
     command, given_commands = parse_with_commands(PlayCommand, args, prog="bounce-mjx play")
     if len(command.checkpoints) > MAX_ENVS:
         raise UserError(f"{len(command.checkpoints)} policies are given; give at most {MAX_ENVS}")
+    # Before the seconds that imports and the compilation take.
+    print("starting: the simulation is compiled, which takes longer the first time", flush=True)
     from bounce_mjx.reports.tables import count_text
     from bounce_mjx.runs.checkpoints import read_actor
     from bounce_mjx.runs.folders import MIRROR_LAW
