@@ -178,9 +178,9 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
 
 def _environment(env: WorldConfig) -> dict[str, Any]:
     """The settings as plain values; of an own arm's file only the name, as it stays behind."""
-    values = env.model_dump(mode="json")
-    if env.mjcf is not None and not is_packaged(env.mjcf):
-        values["mjcf"] = env.mjcf.name
+    values = env.model_dump()
+    if env.mjcf is not None:
+        values["mjcf"] = str(env.mjcf) if is_packaged(env.mjcf) else env.mjcf.name
     return values
 
 
