@@ -150,7 +150,7 @@ def start_times():
             left += value
         axes.text(left + 0.4, row, f"{end:.0f} s", va="center")
     axes.invert_yaxis()
-    axes.set(xlabel="time until all five results are met, s (2 cores, seed 1, 34c0088)")
+    axes.set(xlabel="time until all five results are met, s (2 cores, seed 1)")
     axes.set(xlim=(0, 46), ylabel="start")
     axes.grid(axis="y", visible=False)
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=1.0)

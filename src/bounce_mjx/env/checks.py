@@ -50,9 +50,7 @@ def _check_num_balls(config: WorldConfig, task: Task) -> None:
     )
 
 
-def check_joint_angles(
-    config: WorldConfig, mj_model: mujoco.MjModel, addresses: Addresses
-) -> None:
+def check_joint_angles(config: WorldConfig, mj_model: mujoco.MjModel, addresses: Addresses) -> None:
     """Refuses joint angles of a reset that do not fit the arm."""
     angles = config.default_joint_angles
     joints = joint_names(mj_model, addresses)
