@@ -104,7 +104,8 @@ def _section(package: griffe.Object, title: str, sentence: str, names: list[str]
         else:
             members = [documented]
         for member in members:
-            parts.append(f"### `{member.path}`")
+            parts.append(f"### {member.name}")
+            parts.append(f"`from {member.parent.path} import {member.name}`")
             parts += _class(member) if member.is_class else _entry(member)
     return "\n" + "\n\n".join(parts) + "\n"
 
@@ -189,7 +190,7 @@ def _signature(name: str, parameters: griffe.Parameters, returns: griffe.Expr | 
         shown.append(f"{stars}{parameter.name}{kind}{default}")
     end = f") -> {returns}" if returns else ")"
     line = f"{name}({', '.join(shown)}{end}"
-    if len(line) > 96:
+    if len(line) > 80:
         line = f"{name}(\n" + "".join(f"    {part},\n" for part in shown) + end
     return f"```py\n{line}\n```"
 
