@@ -30,7 +30,7 @@ from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import Actor, Policy, make_networks, networks_of, untrained_policy
 from bounce_mjx.learning.ppo import Params, names_of_critic_metrics
 from bounce_mjx.learning.statistics import RunningStatistics, init_statistics
-from bounce_mjx.runs import folders
+from bounce_mjx.runs import earlier, folders
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config, runs_folder
 from bounce_mjx.runs.files import plain_path, seal, to_plain
 from bounce_mjx.runs.records import RECORD, Checkpoint, DamagedCheckpoint, Record, verify
@@ -177,7 +177,7 @@ def read_record(checkpoint: Checkpoint) -> Record:
     """Verifies every file of a checkpoint and reads its plain data."""
     run_config, record = load_run_config(checkpoint.run), verify(checkpoint)
     try:
-        config = type(run_config).model_validate(record.config)
+        config = type(run_config).model_validate(earlier.present_settings(record.config))
     # Pydantic's own is one.
     except ValueError as error:
         raise DamagedCheckpoint(checkpoint, error) from error
@@ -195,7 +195,7 @@ def _read_arrays(checkpoint: Checkpoint, item: str, template: Any) -> Any:
     """Reads an item of a checkpoint with exactly the structure, shapes and dtypes of `template`."""
     try:
         with plain_path(checkpoint.folder) as folder:
-            read = _read_old if checkpoint.is_old else _read_item
+            read = earlier.read_arrays if checkpoint.is_old else _read_item
             return read(folder / item, template)
     # Damaged files raise exceptions of many types.
     except Exception as error:
@@ -213,20 +213,6 @@ def _read_item(folder: Path, template: Any) -> Any:
     as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), template)
     arguments = ocp.args.PyTreeRestore(item=template, restore_args=as_numpy)
     return handler.restore(folder, args=arguments)
-
-
-def _read_old(folder: Path, template: Any) -> Any:
-    import tensorstore
-
-    def read(path: tuple, leaf: jax.ShapeDtypeStruct) -> np.ndarray:
-        name = jax.tree_util.keystr(path, simple=True, separator=".")
-        files = {"driver": "file", "path": f"{folder}/"}
-        database = {"driver": "ocdbt", "base": files, "path": f"{name}/"}
-        form = {"shape": leaf.shape, "chunks": leaf.shape, "dtype": leaf.dtype.str}
-        spec = {"driver": "zarr", "kvstore": database, "metadata": form}
-        return tensorstore.open(spec, open=True, read=True).result().read().result()
-
-    return jax.tree_util.tree_map_with_path(read, template)
 
 
 def _forms(tree: Any) -> dict[str, str]:
