@@ -27,7 +27,7 @@ _SECTIONS = (
     (
         "The environment",
         "",
-        "env.env.Env tasks.bounce_ball.BounceBall tasks.bounce.BounceConfig env.env.State "
+        "env.env.Env env.bounce_ball.BounceBall task.bounce.BounceConfig env.env.State "
         "world.observation.ObservationLayout world.observation.Kinematics "
         "physics.parameters.PhysicsParameters",
     ),
@@ -37,7 +37,7 @@ _SECTIONS = (
         "All of these are names of `bounce_mjx.task`. [Write a task](tasks.md#write-a-task) shows "
         "their use.",
         "task.task world.config.WorldConfig world.config.Command world.observation.Quantity "
-        "task.results task.shown task.flight.flight task.flight.closest tasks.registry.find_task",
+        "task.results task.registry.find_task",
     ),
     (
         "Policies on a robot",
@@ -51,7 +51,7 @@ _SECTIONS = (
         "runs.folders.find_checkpoint runs.checkpoints.read_policy learning.policy.Policy "
         "learning.policy.make_networks learning.policy.Networks baselines.mirror.MirrorLaw",
     ),
-    ("Rewards", "", "task.rewards tasks.bounce_rewards.RewardInputs"),
+    ("Rewards", "", "task.rewards task.bounce_rewards.RewardInputs"),
     ("Robots", "", "robot.config.RobotConfig robot.adopt.adopt"),
     (
         "Evaluation",
