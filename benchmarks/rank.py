@@ -37,8 +37,8 @@ from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.checkpoints import read_actor
 from bounce_mjx.runs.folders import Checkpoint, runs_in, runs_of_seeds
 from bounce_mjx.task import Episodes, Task, mean_and_margin
-from bounce_mjx.tasks.bounce import Bounce
-from bounce_mjx.tasks.track import Track
+from bounce_mjx.task.bounce import Bounce
+from bounce_mjx.task.track import Track
 from bounce_mjx.training.setup import set_up_jax
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import RandomizationConfig

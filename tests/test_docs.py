@@ -30,9 +30,9 @@ from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.settings import Choice, read_preset, stack
 from bounce_mjx.task import term_names, weighted_terms
-from bounce_mjx.tasks.bounce import Bounce
-from bounce_mjx.tasks.bounce_rewards import BounceReward, RewardInputs
-from bounce_mjx.tasks.registry import find_task
+from bounce_mjx.task.bounce import Bounce
+from bounce_mjx.task.bounce_rewards import BounceReward, RewardInputs
+from bounce_mjx.task.registry import find_task
 from bounce_mjx.training import hosts
 from bounce_mjx.training.command import fields_of_command
 from bounce_mjx.world.randomization import TERMS

@@ -12,7 +12,7 @@ import pytest
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.resources import resource_path
 from bounce_mjx.task import Kinematics, Step
-from bounce_mjx.tasks.bounce import Bounce, BounceState
+from bounce_mjx.task.bounce import Bounce, BounceState
 from bounce_mjx.world.config import PADDLE_HOME
 from reward_reference import REFERENCE_WEIGHTS, reference_terms
 

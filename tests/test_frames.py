@@ -8,7 +8,7 @@ import numpy as np
 from bounce_mjx import BounceBall
 from bounce_mjx.env.env import State
 from bounce_mjx.task import term_names
-from bounce_mjx.tasks.bounce_rewards import BounceReward
+from bounce_mjx.task.bounce_rewards import BounceReward
 from bounce_mjx.viewers.browser import reward_bars
 from bounce_mjx.viewers.display import Display, body_scenes
 from bounce_mjx.viewers.simulation import EnvFrame, make_random_controller, resample

@@ -19,7 +19,7 @@ from gymnasium.wrappers import RecordEpisodeStatistics
 from bounce_mjx.adapters.gymnasium import batch, environments
 from bounce_mjx.adapters.gymnasium.registration import ENV_ID, TASK_ID, TASKS
 from bounce_mjx.errors import UserError
-from bounce_mjx.tasks.registry import find_task, registered_tasks
+from bounce_mjx.task.registry import find_task, registered_tasks
 
 NUM_ENVS = 3
 # A ball without a paddle reaches the floor after 30 steps.

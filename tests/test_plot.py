@@ -39,8 +39,8 @@ from bounce_mjx.runs.folders import save_config
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.task import Curve, term_names
-from bounce_mjx.task.shown import Hits
-from bounce_mjx.tasks.bounce import Bounce, BounceReward
+from bounce_mjx.task.bounce import Bounce, BounceReward
+from bounce_mjx.task.task import Hits
 from bounce_mjx.training.events import Event
 from bounce_mjx.training.log import TensorBoardLog
 from tiny_runs import TINY

@@ -9,7 +9,7 @@ import pytest
 
 from bounce_mjx import EnvConfig
 from bounce_mjx.task import term_names, weighted_terms
-from bounce_mjx.tasks.bounce_rewards import BounceReward, RewardInputs
+from bounce_mjx.task.bounce_rewards import BounceReward, RewardInputs
 from reward_reference import REFERENCE_WEIGHTS, reference_terms
 
 SPEC_NAMES = tuple(REFERENCE_WEIGHTS)

@@ -28,8 +28,8 @@ from bounce_mjx.learning.metrics import rollout_metrics, step_metrics
 from bounce_mjx.runs.config import CONFIG_FILE, load_run_config
 from bounce_mjx.runs.folders import create_run
 from bounce_mjx.runs.settings import read_preset
-from bounce_mjx.tasks import registry
-from bounce_mjx.tasks.registry import find_task, task_name
+from bounce_mjx.task import registry
+from bounce_mjx.task.registry import find_task, task_name
 from bounce_mjx.training.command import read_command
 from tiny_runs import TINY
 

@@ -13,6 +13,7 @@ import numpy as np
 import pydantic
 
 from bounce_mjx.config.settings import merged
+from bounce_mjx.config.user_code import is_file, is_same_code
 from bounce_mjx.config.validation import validate
 from bounce_mjx.deploy.interface import check_interface, interface_of
 from bounce_mjx.env.env import Env
@@ -22,8 +23,8 @@ from bounce_mjx.robot.config import is_packaged
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import find_run
 from bounce_mjx.runs.worlds import env_in_world
+from bounce_mjx.task.registry import DEFAULT, task_config, task_name
 from bounce_mjx.task.task import Task
-from bounce_mjx.tasks.registry import DEFAULT, is_file, is_same_code, task_config, task_name
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import RandomizationConfig
 

@@ -10,7 +10,7 @@ from bounce_mjx.config.command_line import Flag, flag_names, parse, read_flags, 
 from bounce_mjx.config.files import flat
 from bounce_mjx.config.settings import fields_in
 from bounce_mjx.errors import UserError
-from bounce_mjx.tasks.registry import find_task, registered_tasks
+from bounce_mjx.task.registry import find_task, registered_tasks
 from bounce_mjx.world.config import Command, WorldConfig
 
 CommandT = TypeVar("CommandT", bound=WhichPolicy)

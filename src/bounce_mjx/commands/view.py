@@ -8,7 +8,7 @@ from bounce_mjx.config.command_line import flag_names, parse, read_flags, stdout
 from bounce_mjx.config.files import flat
 from bounce_mjx.config.settings import StrictModel, fields_in
 from bounce_mjx.runs.settings import Choice, stack
-from bounce_mjx.tasks.registry import DEFAULT
+from bounce_mjx.task.registry import DEFAULT
 from bounce_mjx.viewers.options import ViewerOptions
 
 PROG = "bounce-mjx view"

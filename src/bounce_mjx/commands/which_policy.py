@@ -14,7 +14,7 @@ from bounce_mjx.runs import config as run_configs
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.runs.worlds import in_world
-from bounce_mjx.tasks.registry import DEFAULT, find_task
+from bounce_mjx.task.registry import DEFAULT, find_task
 from bounce_mjx.world.randomization import RandomizationConfig
 
 if TYPE_CHECKING:

@@ -10,9 +10,10 @@ import math
 from pathlib import Path
 from typing import NamedTuple
 
+from bounce_mjx.config.user_code import is_file
 from bounce_mjx.deploy.metadata import Metadata
 from bounce_mjx.errors import UserError
-from bounce_mjx.tasks.registry import is_file, task_name
+from bounce_mjx.task.registry import task_name
 from bounce_mjx.world.config import WorldConfig
 
 OWN_ROBOT = "AIR4-560"

@@ -11,7 +11,7 @@ from bounce_mjx.env.env import Env, State
 from bounce_mjx.evaluation import statistics
 from bounce_mjx.evaluation.statistics import Measured
 from bounce_mjx.learning.policy import Actor, Policy
-from bounce_mjx.task.shown import Recording
+from bounce_mjx.task.task import Recording
 from bounce_mjx.world.randomization import Ranges
 
 BLOCK = 64

@@ -13,7 +13,7 @@ from bounce_mjx.evaluation.policy_evaluation import Conditions
 from bounce_mjx.evaluation.statistics import Statistics
 from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.task.results import Episodes
-from bounce_mjx.task.shown import Recording
+from bounce_mjx.task.task import Recording
 
 # Quantile of the normal distribution for 95% intervals.
 _Z = 1.959964

@@ -9,8 +9,7 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.env.env import Env, State
-from bounce_mjx.task.shown import Recording
-from bounce_mjx.task.task import Moment, Tally
+from bounce_mjx.task.task import Moment, Recording, Tally
 
 RECORDED_EPISODES = 32
 

@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bounce_mjx.config.files import flat
+from bounce_mjx.config.user_code import is_file, read_source
 from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.runs.config import ROBOT, load_run_config
 from bounce_mjx.runs.files import MANIFEST_FILE
 from bounce_mjx.runs.progress import load_results
-from bounce_mjx.task.shown import Curve
-from bounce_mjx.tasks.registry import is_file, read_source
+from bounce_mjx.task.task import Curve
 
 # Settings that may differ within a group: the seed, the run's location, its length, its devices.
 _FREE_KEYS = frozenset(("seed", "log_dir", "total_steps", "stop_when_solved", "num_devices"))

@@ -5,7 +5,8 @@ They do not use pyplot, so they need no display and can be drawn in several thre
 
 import functools
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import jax
 import matplotlib
@@ -19,7 +20,7 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.statistics import paddle_points
 from bounce_mjx.reports.curves import Group, mean_and_band
-from bounce_mjx.task.shown import Curve, Histogram, Hits, Recording
+from bounce_mjx.task.task import Curve, Histogram, Hits, Recording
 
 RETURN = "episode/return"
 """Tag of the return in a training's log."""
@@ -49,6 +50,30 @@ style = functools.partial(matplotlib.rc_context, _STYLE)
 """The look of all figures, around what draws them."""
 
 
+class RunPlot(NamedTuple):
+    """A plot of trainings."""
+
+    title: str
+    """Heading in the report."""
+    draw: Callable[..., Figure]
+    """A function of groups of runs (`curves.Group`) and `columns`, the most panels side by side."""
+
+
+RUN_PLOTS: dict[str, RunPlot] = {}
+"""The plots that `bounce-mjx plot` and the report draw, by the names of their files."""
+
+
+def run_plot(name: str, title: str) -> Callable[[Callable[..., Figure]], Callable[..., Figure]]:
+    """Registers a function as a `RunPlot`."""
+
+    def register(draw: Callable[..., Figure]) -> Callable[..., Figure]:
+        RUN_PLOTS[name] = RunPlot(title, style()(draw))
+        return draw
+
+    return register
+
+
+@run_plot("curves", "Learning curves")
 @style()
 def curves_figure(groups: Sequence[Group], columns: int = 3) -> Figure:
     """The return and the curves of the task over the training, with points for evaluations.
@@ -66,6 +91,7 @@ def curves_figure(groups: Sequence[Group], columns: int = 3) -> Figure:
     return figure
 
 
+@run_plot("rewards", "Reward terms")
 @style()
 def rewards_figure(groups: Sequence[Group], columns: int = 5) -> Figure:
     """The weighted reward terms over the training, at most `columns` panels side by side."""

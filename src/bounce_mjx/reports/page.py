@@ -25,7 +25,7 @@ from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.files import write_output
 from bounce_mjx.runs.folders import Checkpoint, best_checkpoint
 from bounce_mjx.runs.progress import load_results
-from bounce_mjx.task.shown import Recording
+from bounce_mjx.task.task import Recording
 from bounce_mjx.viewers.page import replay_first_episode
 
 # Panels side by side in a figure that fits a phone, and its width in inches.
@@ -60,11 +60,9 @@ def write_report(run: Path, recording: Recording | None = None) -> Path:
     env = Env(config.env)
     recording = recording or record_checkpoint(best_checkpoint(run))
     robustness = load_robustness(run)
-    drawn = {
-        "Learning curves": figures.curves_figure(groups, _COLUMNS),
-        "The best checkpoint": figures.evaluation_figure(env, recording, _WIDTH),
-        "Reward terms": figures.rewards_figure(groups, _COLUMNS),
-    }
+    drawn = {"The best checkpoint": figures.evaluation_figure(env, recording, _WIDTH)}
+    for plot in figures.RUN_PLOTS.values():
+        drawn[plot.title] = plot.draw(groups, columns=_COLUMNS)
     if robustness is not None:
         drawn["Perturbed worlds"] = robustness_figure(robustness)
     robot = "Peitian AIR4-560" if config.env.mjcf is None else config.env.mjcf.stem

@@ -24,17 +24,18 @@ import numpy as np
 
 from bounce_mjx.baselines.mirror import MirrorLaw
 from bounce_mjx.config.files import differing_keys
+from bounce_mjx.config.user_code import is_file
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import Actor, Policy, make_networks, networks_of, untrained_policy
-from bounce_mjx.learning.ppo import Params, names_of_critic_metrics
+from bounce_mjx.learning.ppo import PPO, Params, names_of_critic_metrics
+from bounce_mjx.learning.registry import find_algorithm
 from bounce_mjx.learning.statistics import RunningStatistics, init_statistics
 from bounce_mjx.runs import earlier, folders
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config, runs_folder
 from bounce_mjx.runs.files import plain_path, seal, to_plain
 from bounce_mjx.runs.records import RECORD, Checkpoint, DamagedCheckpoint, Record, verify
-from bounce_mjx.tasks.registry import is_file
 
 POLICY, TRAINING, NETWORKS = "policy", "training", "networks"
 """Items of a checkpoint: what acts; what a training continues from; both networks, with which
@@ -46,8 +47,8 @@ NETWORK_KEYS = ("hidden_layers", "critic_layers", "shared_critic", "activation")
 # Keys that may differ between a checkpoint and the training that resumes from it. All other keys
 # shape the training's state.
 RESUMABLE_KEYS = frozenset(
-    "total_steps eval_every eval_episodes screening_episodes eval_seed stop_when_solved log_dir "
-    "num_devices".split()
+    "total_steps eval_every save_every eval_episodes screening_episodes eval_seed "
+    "stop_when_solved log_dir num_devices".split()
 )
 # Room for the metadata of a checkpoint.
 _MARGIN = 2**20
@@ -130,7 +131,15 @@ def read_networks(
         params = Params(*(network.init(jax.random.PRNGKey(0)) for network in networks[:2]))
         return {"params": params, "statistics": init_statistics(size + len(names))}
 
-    stored = _read_arrays(checkpoint, items[0], jax.eval_shape(initial))
+    try:
+        stored = _read_arrays(checkpoint, items[0], jax.eval_shape(initial))
+    except DamagedCheckpoint as error:
+        if not is_file(config.algorithm):
+            raise
+        raise UserError(
+            f"{checkpoint.folder} cannot be read as networks of PPO (its algorithm is "
+            f"{config.algorithm}); --resume it, or give another run"
+        ) from error
     return stored["params"], stored["statistics"], names
 
 
@@ -142,8 +151,14 @@ def read_start(config: TrainConfig, env: Env) -> tuple[Params, RunningStatistics
 
     Raises:
       UserError: the checkpoint is missing, damaged or without a value network, or its observation
-        or hidden layers are not those of the training.
+        or hidden layers are not those of the training, or one of the two makes other networks.
     """
+    algorithm = find_algorithm(config.algorithm)
+    if algorithm.make_networks is not PPO.make_networks:
+        raise UserError(
+            f"{algorithm.__name__} makes networks of its own, which --warm-start cannot fill; "
+            "leave one of them out"
+        )
     checkpoint = folders.choose_checkpoint(config.warm_start, runs_folder(config.env.task))
     own = load_run_config(checkpoint.run)
     networks = [[getattr(ppo, key) for key in NETWORK_KEYS] for ppo in (own.ppo, config.ppo)]

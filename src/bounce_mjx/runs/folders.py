@@ -31,6 +31,7 @@ from typing import Any
 
 import bounce_mjx
 from bounce_mjx.config.files import dump_config
+from bounce_mjx.config.user_code import is_file, read_source, source_file
 from bounce_mjx.errors import UserError, suggest, warn_once
 from bounce_mjx.lazy import mujoco
 from bounce_mjx.resources import POLICIES, PRETRAINED, TASK_POLICIES, resource_path
@@ -40,7 +41,7 @@ from bounce_mjx.runs.files import seal, writable, write_atomically
 from bounce_mjx.runs.presets import BASE
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.records import Checkpoint, DamagedCheckpoint, Record, verify
-from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file, read_source, source_file
+from bounce_mjx.task.registry import DEFAULT, find_task
 
 LATEST = "latest"
 """Name of the newest run on the command line."""

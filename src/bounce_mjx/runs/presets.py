@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from bounce_mjx.config.files import read_mapping
+from bounce_mjx.config.user_code import is_file, source_file
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.lazy import jax
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.config import is_packaged
 from bounce_mjx.runs.earlier import present_settings
-from bounce_mjx.tasks.registry import is_file, source_file
 
 BASE = "base"
 """Key of a config file with the name of the preset on which it lies, or null for none."""

@@ -8,8 +8,8 @@ from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
 from bounce_mjx.runs.config import TrainConfig, task_in
 from bounce_mjx.runs.presets import ROBOTS, WORLDS, named_file, read_config_file, shown_file
+from bounce_mjx.task.registry import DEFAULT
 from bounce_mjx.task.task import Task
-from bounce_mjx.tasks.registry import DEFAULT
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.named import CURRICULUM, NamedWorld, read_world
 

@@ -10,7 +10,7 @@ from bounce_mjx.evaluation.config import EvaluationOptions
 from bounce_mjx.evaluation.failures import Film, film_episode
 from bounce_mjx.evaluation.policy_evaluation import conditions_of
 from bounce_mjx.learning.policy import Actor, Policy
-from bounce_mjx.task.shown import Recording
+from bounce_mjx.task.task import Recording
 from bounce_mjx.viewers.simulation import EnvFrame, Simulation, frame_at
 from bounce_mjx.viewers.world import WorldSlider, sliders_for, with_sliders
 from bounce_mjx.world.config import WorldConfig

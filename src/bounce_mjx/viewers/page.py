@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from bounce_mjx.env.env import Env
-from bounce_mjx.task.shown import Recording
+from bounce_mjx.task.task import Recording
 from bounce_mjx.viewers.film import episode_frames
 from bounce_mjx.viewers.guard import open_server
 from bounce_mjx.viewers.scene import Scene

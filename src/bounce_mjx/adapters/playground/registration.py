@@ -19,7 +19,7 @@ from bounce_mjx.adapters.playground.environment import (
 from bounce_mjx.resources import TASK_POLICIES
 from bounce_mjx.robot.model import load_model
 from bounce_mjx.runs.settings import read_preset
-from bounce_mjx.tasks.registry import DEFAULT, task_config
+from bounce_mjx.task.registry import DEFAULT, task_config
 
 ENVIRONMENTS = {ENV_NAME: DEFAULT} | {f"BounceMjx{task.title()}": task for task in TASK_POLICIES}
 """The package's tasks by their names in the registry."""
