@@ -242,7 +242,7 @@ def reward_terms():
     for name, colour in zip(names, LINES, strict=True):
         axes.plot(time[part], metrics[f"reward/{name}"][part], color=colour, lw=1.6, label=name)
     total = sum(value for name, value in metrics.items() if name.startswith("reward/"))
-    axes.plot(time[part], total[part], color="black", lw=2, label="sum of all fifteen")
+    axes.plot(time[part], total[part], color="black", lw=2, label="sum of all terms")
     for bounce in time[part & (metrics["bounced"] > 0)]:
         axes.axvline(bounce, color=GREY, lw=0.8, ls=":")
     axes.set(xlabel="time, s", ylabel="weighted reward", xlim=(1.0, 2.2))
