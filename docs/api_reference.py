@@ -37,7 +37,7 @@ _SECTIONS = (
         "All of these are names of `bounce_mjx.task`. [Write a task](tasks.md#write-a-task) shows "
         "their use.",
         "task.task world.config.WorldConfig world.config.Command world.observation.Quantity "
-        "task.results task.rewards.flight task.rewards.closest task.registry.find_task",
+        "task.results task.registry.find_task",
     ),
     (
         "Policies on a robot",
@@ -106,7 +106,8 @@ def _section(package: griffe.Object, title: str, sentence: str, names: list[str]
         else:
             members = [documented]
         for member in members:
-            parts.append(f"### `{member.path}`")
+            parts.append(f"### {member.name}")
+            parts.append(f"`from {member.parent.path} import {member.name}`")
             parts += _class(member) if member.is_class else _entry(member)
     return "\n" + "\n\n".join(parts) + "\n"
 
@@ -191,7 +192,7 @@ def _signature(name: str, parameters: griffe.Parameters, returns: griffe.Expr | 
         shown.append(f"{stars}{parameter.name}{kind}{default}")
     end = f") -> {returns}" if returns else ")"
     line = f"{name}({', '.join(shown)}{end}"
-    if len(line) > 96:
+    if len(line) > 80:
         line = f"{name}(\n" + "".join(f"    {part},\n" for part in shown) + end
     return f"```py\n{line}\n```"
 

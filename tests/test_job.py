@@ -64,7 +64,13 @@ class CountingTrainer:
         self.state = np.int32(0) if state is None else state
 
     def run(self):
-        names = "fault", "episode/ended", "episode/return", "episode/bounces", "task/non_finite"
+        names = (
+            "fault",
+            "episode/ended",
+            "episode/return",
+            "episode/bounces_at_end",
+            "task/non_finite",
+        )
         metrics = {name: np.zeros((self.seeds, 1)) for name in names}
         self.state = np.int32(self.state + 1)
         for (seed, iteration), number in self.faults.items():

@@ -171,6 +171,15 @@ def test_live_page_moves_obeys_and_stays_local(watch, served) -> None:
     page.get_by_role("button", name="reset").click()
     still = watched.wait_for_motion(still)
 
+    # A slider's handle covers no label of its ends, and on a phone the panel has the whole width.
+    label = page.locator(".mantine-Slider-markLabel").first.bounding_box()
+    handle = page.locator(".mantine-Slider-thumb").first.bounding_box()
+    assert label["y"] + label["height"] - handle["y"] - handle["height"] > 8.0
+    page.set_viewport_size({"width": 390, "height": 844})
+    panel = page.locator('.mantine-Paper-root[style*="position: fixed"]')
+    panel.wait_for()
+    assert panel.bounding_box()["x"] == 0.0 and panel.bounding_box()["width"] == 390.0
+
     strangers = [
         url
         for url in watched.requests

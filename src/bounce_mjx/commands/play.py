@@ -53,6 +53,11 @@ def main(args: Sequence[str]) -> None:
     command, given_commands = parse_with_commands(PlayCommand, args, prog="bounce-mjx play")
     if len(command.checkpoints) > MAX_ENVS:
         raise UserError(f"{len(command.checkpoints)} policies are given; give at most {MAX_ENVS}")
+    check_one_world(command.nominal, command.world, command.randomization)
+    if command.episode is None and (command.nominal or "episodes" in command.model_fields_set):
+        raise UserError("--nominal and --episodes are of an evaluation, and need --episode")
+    if command.episode is not None:
+        _check_film(command)
     # Before the seconds that imports and the compilation take.
     print("starting: the simulation is compiled, which takes longer the first time", flush=True)
     from bounce_mjx.reports.tables import count_text
@@ -63,11 +68,6 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.viewers.show import Shown, show
     from bounce_mjx.viewers.simulation import make_policy_controller
 
-    check_one_world(command.nominal, command.world, command.randomization)
-    if command.episode is None and (command.nominal or "episodes" in command.model_fields_set):
-        raise UserError("--nominal and --episodes are of an evaluation, and need --episode")
-    if command.episode is not None:
-        _check_film(command)
     chosen = [command.choose(path, command.robot) for path in command.checkpoints or (None,)]
     configs = [_config(checkpoint, command) for checkpoint in chosen]
     (commands, *_) = [given_commands.checked(config.env) for config in configs]

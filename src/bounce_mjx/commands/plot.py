@@ -18,7 +18,8 @@ class PlotCommand(WhichPolicy):
     become one curve with a band, as do the seeds of one run. For a run of one seed, or one
     checkpoint in it, the evaluation is drawn too."""
     out: Path = Path("plots")
-    """Folder for the pictures: curves, rewards and, for one run, evaluation."""
+    """Folder for the pictures: curves, rewards, what your own code registers and, for one run,
+    evaluation."""
     formats: Annotated[tuple[Literal["png", "svg"], ...], Field(min_length=1)] = ("png", "svg")
     """File formats of each picture."""
 
@@ -38,7 +39,7 @@ def main(args: Sequence[str]) -> None:
     groups = curves.group_runs([checkpoint.run for checkpoint in checkpoints])
     with writable(command.out, "choose another folder with --out"):
         command.out.mkdir(parents=True, exist_ok=True)
-    drawn = {"curves": figures.curves_figure(groups), "rewards": figures.rewards_figure(groups)}
+    drawn = {name: plot.draw(groups) for name, plot in figures.RUN_PLOTS.items()}
     if len(checkpoints) == 1:
         recording = page.record_checkpoint(checkpoints[0])
         drawn["evaluation"] = figures.evaluation_figure(Env(configs[0].env), recording)

@@ -25,6 +25,13 @@ _LEARNING_RATE = "ppo.learning_rate"
 _MAX_NAMED = 3
 
 
+_EARLIER_TAGS = {
+    "episode/bounces": "episode/bounces_at_end",
+    "task/n_bounces": "task/bounces_so_far",
+}
+"""Names of curves in the logs of earlier versions, and their present ones."""
+
+
 class LoggedCurve(NamedTuple):
     """N points of one quantity over the training."""
 
@@ -72,10 +79,14 @@ def read_curves(run: Path) -> RunCurves:
         raise UserError(
             f"the TensorBoard log in {run} is damaged ({shorten(reason_of(error))}); remove it"
         ) from error
-    curves = {}
-    for name in log.Tags()["scalars"]:
+    logged: dict[str, dict[int, float]] = {}
+    # Those of an earlier version first, as a run may have been resumed with this one.
+    for tag in sorted(log.Tags()["scalars"], key=lambda tag: tag not in _EARLIER_TAGS):
         # A resumed run may have logged a step twice; the later value belongs to the final policy.
-        values = {e.step: e.value for e in log.Scalars(name) if math.isfinite(e.value)}
+        values = {e.step: e.value for e in log.Scalars(tag) if math.isfinite(e.value)}
+        logged.setdefault(_EARLIER_TAGS.get(tag, tag), {}).update(values)
+    curves = {}
+    for name, values in logged.items():
         if values:
             steps, points = zip(*sorted(values.items()), strict=True)
             curves[name] = LoggedCurve(np.array(steps), np.array(points))

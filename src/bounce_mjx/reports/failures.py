@@ -63,9 +63,9 @@ def failures_figure(associations: Sequence[Association]) -> Figure:
             ends = 100.0 * np.array([t.interval for t in thirds])
             errors = np.abs(ends.T - shares)
             panel.bar(range(len(thirds)), shares, color=_BAR, yerr=errors, capsize=4)
-            labels = [f"{t.low:.3g} to {t.high:.3g}\n{t.episodes} episodes" for t in thirds]
+            labels = [f"{t.low:.2g}\nto {t.high:.2g}\n({t.episodes})" for t in thirds]
             panel.set_xticks(range(len(thirds)), labels, fontsize=7)
-            panel.set_title(one.name, fontsize=9)
+            panel.set_title(f"{one.name} (episodes)", fontsize=9)
             panel.set_ylabel("failures, %")
             panel.set_ylim(bottom=0.0)
     return figure

@@ -5,7 +5,8 @@ They do not use pyplot, so they need no display and can be drawn in several thre
 
 import functools
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import jax
 import matplotlib
@@ -23,6 +24,8 @@ from bounce_mjx.task.task import Curve, Histogram, Hits, Recording
 
 RETURN = "episode/return"
 """Tag of the return in a training's log."""
+REWARDS = "rewards"
+"""Name of the plot of the reward terms."""
 _REWARD = "reward/"
 _GREY = "#777777"
 _STYLE = {
@@ -49,6 +52,30 @@ style = functools.partial(matplotlib.rc_context, _STYLE)
 """The look of all figures, around what draws them."""
 
 
+class RunPlot(NamedTuple):
+    """A plot of trainings."""
+
+    title: str
+    """Heading in the report."""
+    draw: Callable[..., Figure]
+    """A function of groups of runs (`curves.Group`) and `columns`, the most panels side by side."""
+
+
+RUN_PLOTS: dict[str, RunPlot] = {}
+"""The plots that `bounce-mjx plot` and the report draw, by the names of their files."""
+
+
+def run_plot(name: str, title: str) -> Callable[[Callable[..., Figure]], Callable[..., Figure]]:
+    """Registers a function as a `RunPlot`."""
+
+    def register(draw: Callable[..., Figure]) -> Callable[..., Figure]:
+        RUN_PLOTS[name] = RunPlot(title, style()(draw))
+        return draw
+
+    return register
+
+
+@run_plot("curves", "Learning curves")
 @style()
 def curves_figure(groups: Sequence[Group], columns: int = 3) -> Figure:
     """The return and the curves of the task over the training, with points for evaluations.
@@ -66,6 +93,7 @@ def curves_figure(groups: Sequence[Group], columns: int = 3) -> Figure:
     return figure
 
 
+@run_plot(REWARDS, "Reward terms")
 @style()
 def rewards_figure(groups: Sequence[Group], columns: int = 5) -> Figure:
     """The weighted reward terms over the training, at most `columns` panels side by side."""

@@ -60,10 +60,10 @@ def write_report(run: Path, recording: Recording | None = None) -> Path:
     env = Env(config.env)
     recording = recording or record_checkpoint(best_checkpoint(run))
     robustness = load_robustness(run)
-    drawn = {
-        "Learning curves": figures.curves_figure(groups, _COLUMNS),
-        "The best checkpoint": figures.evaluation_figure(env, recording, _WIDTH),
-    }
+    drawn = {"The best checkpoint": figures.evaluation_figure(env, recording, _WIDTH)}
+    for name, plot in figures.RUN_PLOTS.items():
+        if name != figures.REWARDS:  # they are small panels
+            drawn[plot.title] = plot.draw(groups, columns=_COLUMNS)
     if robustness is not None:
         drawn["Perturbed worlds"] = robustness_figure(robustness)
     robot = "Peitian AIR4-560" if config.env.mjcf is None else config.env.mjcf.stem

@@ -47,8 +47,8 @@ NETWORK_KEYS = ("hidden_layers", "critic_layers", "shared_critic", "activation")
 # Keys that may differ between a checkpoint and the training that resumes from it. All other keys
 # shape the training's state.
 RESUMABLE_KEYS = frozenset(
-    "total_steps eval_every eval_episodes screening_episodes eval_seed stop_when_solved log_dir "
-    "num_devices".split()
+    "total_steps eval_every save_every eval_episodes screening_episodes eval_seed "
+    "stop_when_solved log_dir num_devices".split()
 )
 # Room for the metadata of a checkpoint.
 _MARGIN = 2**20

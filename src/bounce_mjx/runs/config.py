@@ -70,6 +70,9 @@ class TrainConfig(StrictModel):
     """Environment steps between two progress reports, rounded to whole iterations."""
     eval_every: Steps = 2_000_000
     """Environment steps between two evaluations, rounded to whole blocks."""
+    save_every: Steps | None = None
+    """Environment steps between two saved states, rounded to whole blocks, in addition to those
+    after each evaluation; null for these alone."""
     eval_episodes: Count = 1024
     """Episodes of an evaluation of the results."""
     screening_episodes: NonNegativeInt = 0

@@ -73,7 +73,7 @@ class Choice(StrictModel):
     resume: Path | None = None
     """Folder of a run, or latest for the newest run, to continue in place from its newest
     checkpoint; or a checkpoint in it, which then counts as the newest. The other flags may then
-    change only total-steps, eval-every, eval-episodes, screening-episodes, eval-seed,
+    change only total-steps, eval-every, save-every, eval-episodes, screening-episodes, eval-seed,
     stop-when-solved, num-devices and log-dir. With total-steps, a run that has met all results
     continues."""
 

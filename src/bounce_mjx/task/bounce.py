@@ -183,10 +183,12 @@ class Bounce(task.Task):
     config: BounceConfig
     folder = "bounce_ball"
     curves = (
-        task.Curve("episode/bounces", "n_bounces", "episodes", "bounces in a row at its end"),
+        task.Curve(
+            "episode/bounces_at_end", "n_bounces", "episodes", "bounces in a row at its end"
+        ),
         task.Curve("task/apex_error", "apex_error", "bounced", "|apex − target height|, cm", 100.0),
         task.Curve("task/ball_xy_error", "ball_xy_error"),
-        task.Curve("task/n_bounces", "n_bounces"),
+        task.Curve("task/bounces_so_far", "n_bounces"),
     )
     critic_metrics = ("n_bounces",)
 

@@ -27,7 +27,7 @@ class Event:
     """Environment steps so far."""
     metrics: dict[str, float]
     """The finite points of the learning curves by name, such as "episode/return" of a block and
-    "results/stable" of an evaluation."""
+    "results/stable" of an evaluation. What a callback adds is in the log too."""
     report: Report | None = None
     """The results of an evaluation; None at the end of a block."""
     policy: Policy | None = None

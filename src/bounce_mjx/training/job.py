@@ -205,13 +205,18 @@ class Job:
     def __post_init__(self) -> None:
         config = self.config
         self.block_steps = steps_per_block(config)
-        self.eval_steps = self.block_steps * max(1, round(config.eval_every / self.block_steps))
+        self.eval_steps = self.whole_blocks(config.eval_every)
+        self.save_steps = config.save_every and self.whole_blocks(config.save_every)
         self.seeds = []
         for seed in range(config.seed, config.seed + config.num_seeds):
             folder = self.run / f"seed_{seed:03d}" if config.num_seeds > 1 else self.run
             alone = config.model_copy(update={"seed": seed, "num_seeds": 1})
             self.seeds.append(SeedRun(folder, alone, self.clock.seconds))
         self.saver = Saver(self.run, config, self.seeds, self.pool, self.say)
+
+    def whole_blocks(self, steps: int) -> int:
+        """A number of steps, rounded to whole blocks, at least one."""
+        return self.block_steps * max(1, round(steps / self.block_steps))
 
     # Opening
 
@@ -290,7 +295,8 @@ class Job:
         """Opens the log, where it is written, and tells the callbacks of each seed, which may
         refuse the run."""
         if hosts.is_leader():
-            self.callbacks.insert(0, TensorBoardLog(None if self.is_new else self.steps))
+            # The last one, so that it has the metrics that other callbacks add.
+            self.callbacks.append(TensorBoardLog(None if self.is_new else self.steps))
         self.stack.callback(events.call_all, self.callbacks, "close")
         for seed in self.seeds:
             events.call_all(self.callbacks, "start", seed.run, seed.config)
@@ -333,8 +339,10 @@ class Job:
             self.clock.restart_estimate(self.steps)
 
     def save_is_due(self) -> bool:
-        """Whether the current state is to be saved: after each evaluation."""
-        return not self.is_saved and self.is_evaluated()
+        """Whether the current state is to be saved: after each evaluation, and where `save_every`
+        asks for it."""
+        is_asked_for = self.save_steps is not None and self.steps % self.save_steps == 0
+        return not self.is_saved and (is_asked_for or self.is_evaluated())
 
     def save(self) -> None:
         """Starts to save the state, and with several seeds the policies that are the best of their

@@ -37,6 +37,13 @@ _HEIGHT_AXIS = {
     "min": {"soft": 0.0, "mode": 1, "pad": 0.05},
     "max": {"soft": 1.05, "mode": 1, "pad": 0.05},
 }
+# What viser has no setting for: a slider's handle would cover the labels of its ends, and on a
+# phone the panel would leave a strip beside it that nothing can be done with.
+_STYLE = """<style>
+.mantine-Slider-markLabel { padding-top: 4px; }
+.mantine-Paper-root[style*="position: fixed"] { left: 0 !important; width: auto !important; }
+.mantine-Paper-root[style*="position: fixed"] [style*="width: 20em"] { width: 100% !important; }
+</style>"""
 _LEVEL_COLOURS = ("#2b8a3e", "#9c36b5", "#0b7285")
 _REWARD = "reward/"
 
@@ -72,7 +79,7 @@ def run_page(
     gui.set_panel_label("bounce_mjx")
     gui.main_panel.dock_right()
     gui.main_panel.set_width(280)
-    gui.add_html(_window_title(f"bounce_mjx: {start.title}"))
+    gui.add_html(_STYLE + _window_title(f"bounce_mjx: {start.title}"))
     controls = Controls(gui, simulation, start)
     scene = Scene(server, simulation.env, start.num_shown, start.names)
     side = side or gui.add_panel()
