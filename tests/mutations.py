@@ -21,7 +21,7 @@ SINGLE = "pyproject.toml", "train_jax.py", "README.md", "CHANGELOG.md", "CONTRIB
 
 REWARDS, BOUNCE = "task/bounce_rewards.py", "task/bounce.py"
 ENV, VECTOR, ACTUATION = "env/env.py", "env/vector.py", "world/actuation.py"
-SENSING, SAMPLING = "world/sensing.py", "world/sampling.py"
+SENSING, CONTACT = "world/sensing.py", "robot/contact.py"
 PPO, STATISTICS = "learning/ppo.py", "learning/statistics.py"
 CONTROL = "physics/control.py"
 BALL, NORMALS = "physics/fused/ball.py", "physics/fused/normals.py"
@@ -76,7 +76,7 @@ FAULTS = [
      "jnp.where(step < control.switch, control.previous, control.ctrl)",
      "jnp.where(step <= control.switch, control.previous, control.ctrl)", "test_randomization.py -k late_and_lagging"),
     ("the air pushes the ball", CONTROL, "tuple(-air_drag * speed", "tuple(air_drag * speed", "test_randomization.py -k brakes"),
-    ("the restitution is clipped", SAMPLING,
+    ("the restitution is clipped", CONTACT,
      "jnp.interp(restitution, restitutions", "jnp.interp(jnp.maximum(restitution, 0.8), restitutions", "test_randomization.py -k drops_bounce"),
     ("the range of a command shrinks", ENV,
      "first + (1.0 - first) * progress", "1.0 - (1.0 - first) * progress", "test_randomization.py -k about_its_middle"),
@@ -91,7 +91,7 @@ FAULTS = [
     ("a history has the oldest value first", SENSING,
      "with_newest(history, measured[name])", "jnp.concatenate([history[1:], measured[name][None]])", "test_sensors.py -k bounces_are"),
     ("the bootstrap of a time-out is dropped", PPO,
-     "jnp.where(rollout.truncated, timeout_values, values[1:])", "values[1:]", "test_ppo.py -k bootstraps"),
+     "jnp.where(rollout.truncated, timeout_value, next_value)", "next_value", "test_ppo.py -k bootstraps"),
     ("advantages leak across a time-out", PPO,
      "(~(terminated | truncated))", "(~terminated)", "test_ppo.py -k their_definition"),
     ("PPO takes the larger of its two objectives", PPO,
@@ -99,7 +99,7 @@ FAULTS = [
     ("a large KL divergence raises the learning rate", PPO,
      "jnp.where(is_large, 1.0 / _LEARNING_RATE_FACTOR, factor)", "jnp.where(is_large, _LEARNING_RATE_FACTOR, factor)", "test_ppo.py -k kl_divergence"),
     ("the variance is measured from the old mean", STATISTICS,
-     "jnp.sum(from_old_mean * (batch - mean)", "jnp.sum(from_old_mean * from_old_mean", "test_policy.py -k statistics_equal"),
+     "jnp.sum(from_old_mean * from_new_mean", "jnp.sum(from_old_mean * from_old_mean", "test_policy.py -k statistics_equal"),
     ("the ball moves with the velocity before the step", BALL,
      "position = ball.position + velocity * dt", "position = ball.position + ball.velocity * dt", "test_physics.py -k random_states"),
     ("a contact pulls", NORMALS, "return [jnp.maximum(first_linear / pivot, 0.0)]", "return [first_linear / pivot]", "test_physics.py -k random_states"),

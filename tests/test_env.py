@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 
 from bounce_mjx import BounceBall, EnvConfig
-from bounce_mjx.config.validation import validate
-from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
 from bounce_mjx.task import Kinematics, Step, term_names
 from bounce_mjx.task.bounce import Bounce, BounceReward, BounceState
@@ -172,14 +170,6 @@ def test_reset_has_a_resting_ball_and_no_history(resets):
 
 
 NO_NOISE = {"joint_angles": 0, "joint_velocities": 0, "ball_position": 0}
-
-
-def test_a_config_of_an_earlier_version_has_no_filter() -> None:
-    former = EnvConfig(estimator={"restitution": 0.8}, observation={"position": "measured"})
-    assert former == EnvConfig()
-    for name in ("position", "velocity"):
-        with pytest.raises(UserError, match=f"a.yaml.*{name}"):
-            validate(EnvConfig, {"observation": {name: "filter"}}, "a.yaml")
 
 
 def test_noise_free_reset_has_the_paddle_at_home():

@@ -19,7 +19,7 @@ from bounce_mjx import load_policy, task
 from bounce_mjx.commands.eval import EvalCommand
 from bounce_mjx.commands.main import main
 from bounce_mjx.commands.play import PlayCommand
-from bounce_mjx.commands.run_options import parse_with_commands
+from bounce_mjx.commands.task_commands import parse_with_commands
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.env.env import Env, EnvState
 from bounce_mjx.env.vector import VectorStep
@@ -350,13 +350,13 @@ def test_a_task_may_name_a_command_or_a_setting_like_a_flag(
     task_flag = ["--task", f"{tmp_path / 'sized.py'}:Sized"]
     env = find_task(task_flag[1]).Config()
     flags = "--commands.size 0.5 --size 64 64 --copy 0.25 --commands.help 1 --depth 1".split()
-    command, values = parse_with_commands(PlayCommand, [*task_flag, *flags], prog="play")
+    command, given = parse_with_commands(PlayCommand, [*task_flag, *flags], prog="play")
     assert command.viewing.size == (64, 64)
-    assert values(env) == {"size": 0.5, "copy": 0.25, "help": 1.0, "depth": 1.0}
+    assert given.checked(env) == {"size": 0.5, "copy": 0.25, "help": 1.0, "depth": 1.0}
     flags = "--episodes 7 --commands.episodes 0.5 --model-config 1 --size 0.1".split()
-    command, values = parse_with_commands(EvalCommand, [*task_flag, *flags], prog="eval")
+    command, given = parse_with_commands(EvalCommand, [*task_flag, *flags], prog="eval")
     assert command.episodes == 7
-    assert values(env) == {"episodes": 0.5, "model_config": 1.0, "size": 0.1}
+    assert given.checked(env) == {"episodes": 0.5, "model_config": 1.0, "size": 0.1}
     flags = "--no-report --env.report 0.25 --seed 8 --env.seed 9".split()
     command = read_command([*task_flag, *flags])
     assert (command.flags.report, command.config.seed) == (False, 8)

@@ -1,9 +1,8 @@
 """A robot arm that learns to bounce a ball: an environment on JAX and MuJoCo, with PPO."""
 
 import importlib
+import sys
 from typing import TYPE_CHECKING, Any
-
-from bounce_mjx.adapters.gymnasium.registration import register_when_imported
 
 if TYPE_CHECKING:
     from bounce_mjx.deploy.loading import load_policy
@@ -23,7 +22,9 @@ _PUBLIC = {
     "train": ("bounce_mjx.training.run", "train"),
 }
 
-register_when_imported()
+if "gymnasium" in sys.modules:
+    # So that Gymnasium's own form, "bounce_mjx:bounce_mjx/BounceBall-v0", finds the environments.
+    importlib.import_module("bounce_mjx.adapters.gymnasium")
 
 
 def __getattr__(name: str) -> Any:

@@ -5,7 +5,7 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.robot.model import joint_names, joint_ranges
+from bounce_mjx.robot.model import Addresses, joint_names, joint_ranges
 from bounce_mjx.task.task import Task
 from bounce_mjx.world.config import WorldConfig
 
@@ -50,17 +50,17 @@ def _check_num_balls(config: WorldConfig, task: Task) -> None:
     )
 
 
-def check_joint_angles(config: WorldConfig, mj_model: mujoco.MjModel) -> None:
+def check_joint_angles(config: WorldConfig, mj_model: mujoco.MjModel, addresses: Addresses) -> None:
     """Refuses joint angles of a reset that do not fit the arm."""
     angles = config.default_joint_angles
-    joints = joint_names(mj_model)
+    joints = joint_names(mj_model, addresses)
     if len(angles) != len(joints):
         model = f"the MJCF file {config.mjcf}" if config.mjcf else "the model"
         raise UserError(
             f"default_joint_angles has {len(angles)} numbers, but {model} has {len(joints)} "
             f"joints with an actuator ({', '.join(joints)}); give one number for each"
         )
-    ranges = joint_ranges(mj_model)
+    ranges = joint_ranges(mj_model, addresses)
     lows, highs = np.nan_to_num(ranges, posinf=_MAX_ANGLE, neginf=-_MAX_ANGLE)
     for joint, angle, low, high in zip(joints, angles, lows, highs, strict=True):
         if not low - _ROUNDING <= angle <= high + _ROUNDING:

@@ -136,16 +136,18 @@ class Env:
         self.task: Task = config.task(config)
         check_task(config, self.task)
         self.mj_model: mujoco.MjModel = world_model(config)
-        self.engine: Engine = make_engine(self.mj_model, config.physics)
-        self.layout = config.layout
         self.addresses = robot_model.find_addresses(self.mj_model)
-        check_joint_angles(config, self.mj_model)
-        self.task.geometry = read_geometry(self.mj_model, config.default_joint_angles)
+        self.engine: Engine = make_engine(self.mj_model, config.physics, self.addresses)
+        self.layout = config.layout
+        check_joint_angles(config, self.mj_model, self.addresses)
+        self.task.geometry = read_geometry(
+            self.mj_model, self.addresses, config.default_joint_angles
+        )
         check_start(config, self.task)
-        self._actuators = Actuators(config, self.mj_model)
-        self._sensors = Sensors(config, self.mj_model, self.engine, self.task)
+        self._actuators = Actuators(config, self.mj_model, self.addresses)
+        self._sensors = Sensors(config, self.mj_model, self.addresses, self.engine, self.task)
         self._randomize = randomize
-        self.nominals = nominal_values(self.mj_model, config.randomization.terms)
+        self.nominals = nominal_values(self.mj_model, config.randomization.terms, self.addresses)
         """Values of the terms of the randomisation in an episode that does not sample them."""
         self._fingerprint = robot_model.fingerprint(self.mj_model)
         self.dt = config.control_dt

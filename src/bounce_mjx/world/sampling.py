@@ -14,16 +14,25 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.physics import PhysicsParameters
 from bounce_mjx.physics.edited import NO_PAIR, own_parameters
 from bounce_mjx.physics.scalars import Quaternion, quaternion_matrix, quaternion_product
+from bounce_mjx.robot.contact import damping_of_restitution, restitution_of_damping
+from bounce_mjx.robot.model import Addresses
 from bounce_mjx.world.randomization import MODEL, TERMS, Operation, Ranges, Term, World
 
 
-def nominal_values(mj_model: mujoco.MjModel, terms: Iterable[str]) -> dict[str, np.ndarray]:
+def nominal_values(
+    mj_model: mujoco.MjModel, terms: Iterable[str], addresses: Addresses | None = None
+) -> dict[str, np.ndarray]:
     """Values without randomisation of the terms that have one, each of the term's shape.
 
     Of a term that replaces a number of the model, it is that number; a model without a contact pair
     has none of the contact.
+
+    Args:
+      mj_model: the model.
+      terms: names of the terms.
+      addresses: of the model's parts, if they are known.
     """
-    model = own_parameters(mj_model)
+    model = own_parameters(mj_model, addresses)
     num_joints = len(model.armature)
     nominals = {}
     for name in terms:
@@ -42,7 +51,7 @@ def _model_nominal(model: PhysicsParameters, term: Term) -> Any:
         return getattr(model, term.parameter)
     if model.contact_damping is None:
         return None
-    return contact_restitution(model.contact_damping, model.contact_stiffness)
+    return restitution_of_damping(model.contact_damping, model.contact_stiffness)
 
 
 def sample_world(
@@ -118,7 +127,7 @@ def apply(
     if operation == "restitution":
         if model.contact_stiffness is None:
             raise UserError(NO_PAIR)
-        return contact_damping(sampled, model.contact_stiffness)
+        return damping_of_restitution(sampled, model.contact_stiffness)
     value = jnp.asarray(getattr(model, parameter), sampled.dtype)
     if operation == "scale":
         return value * sampled
@@ -138,27 +147,3 @@ def _rotation_xy(angles: jax.Array) -> Quaternion:
     cos_x, cos_y = cosines
     sin_x, sin_y = sines
     return cos_x * cos_y, sin_x * cos_y, cos_x * sin_y, sin_x * sin_y
-
-
-# Damping ratios of the contact, and the measured restitution: the mean of the drops on the held
-# paddle of tests/test_randomization.py, at 1, 2, 3 and 4 m/s and eight phases of the physics step.
-_DROPS = (
-    (0.0, 0.993), (0.005, 0.98), (0.01, 0.965), (0.0152, 0.95), (0.032, 0.90), (0.05, 0.85),
-    (0.0697, 0.80), (0.0921, 0.75), (0.116, 0.70), (0.13, 0.674), (0.16, 0.622), (0.2, 0.565),
-    (0.2455, 0.50), (0.2873, 0.45), (0.3352, 0.40),
-)  # fmt: skip
-
-
-def contact_damping(restitution: jax.Array, stiffness: float) -> jax.Array:
-    """Damping [] of the contact, 1/s, that gives a restitution [] at a contact stiffness (1/s^2):
-    2 zeta sqrt(stiffness), with the damping ratio zeta interpolated between drop tests."""
-    ratios, restitutions = np.array(_DROPS[::-1]).T
-    zeta = jnp.interp(restitution, restitutions, ratios)
-    return (2.0 * np.sqrt(stiffness) * zeta).astype(jnp.asarray(restitution).dtype)
-
-
-def contact_restitution(damping: float, stiffness: float) -> np.ndarray:
-    """Restitution [] of a contact with a damping (1/s) at a stiffness (1/s^2): the inverse of
-    `contact_damping`."""
-    ratios, restitutions = np.array(_DROPS).T
-    return np.interp(damping / (2.0 * np.sqrt(stiffness)), ratios, restitutions)
