@@ -30,7 +30,8 @@ from bounce_mjx.robot.model import find_addresses, joint_names
 from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.training.setup import set_up_jax
 from bounce_mjx.world.config import WorldConfig
-from bounce_mjx.world.randomization import RandomizationConfig, physics_parameters, sample_world
+from bounce_mjx.world.randomization import RandomizationConfig
+from bounce_mjx.world.sampling import physics_parameters, sample_world
 
 # Error of the one angle of a log with a spike, rad.
 _SPIKE = 0.5

@@ -44,7 +44,7 @@ from bounce_mjx.robot.model import find_addresses, joint_names
 from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.training.setup import set_up_jax
 from bounce_mjx.world.config import WorldConfig
-from bounce_mjx.world.randomization import physics_parameters
+from bounce_mjx.world.sampling import physics_parameters
 
 # Largest error of a flight that counts as explained, root mean square of an axis, m.
 _EXPLAINED = 3e-3

@@ -21,7 +21,7 @@ SINGLE = "pyproject.toml", "train_jax.py", "README.md", "CHANGELOG.md", "CONTRIB
 
 REWARDS, BOUNCE = "task/bounce_rewards.py", "task/bounce.py"
 ENV, VECTOR, ACTUATION = "env/env.py", "env/vector.py", "world/actuation.py"
-SENSING, RANDOMIZATION = "world/sensing.py", "world/randomization.py"
+SENSING, CONTACT = "world/sensing.py", "robot/contact.py"
 PPO, STATISTICS = "learning/ppo.py", "learning/statistics.py"
 CONTROL = "physics/control.py"
 BALL, NORMALS = "physics/fused/ball.py", "physics/fused/normals.py"
@@ -56,8 +56,8 @@ FAULTS = [
     ("the last action is never remembered", ENV,
      "physics=physics, last_action=action, actuation", "physics=physics, actuation", "test_env.py -k reports_the_terms"),
     ("the joint angles are read in another order", ENV,
-     "joint_angles=jnp.stack([qpos[i] for i in addresses.arm_qpos])",
-     "joint_angles=jnp.stack([qpos[i] for i in addresses.arm_qpos[::-1]])", "test_env.py -k mujocos_state"),
+     "joint_angles=_entries(qpos, addresses.arm_qpos)",
+     "joint_angles=_entries(qpos, addresses.arm_qpos[::-1])", "test_env.py -k mujocos_state"),
     ("the joints' servo targets are swapped", ACTUATION,
      "self._addresses.actuators, gears * values)",
      "self._addresses.actuators, gears * jnp.roll(values, 1))", "test_env.py -k substeps_of_mujoco"),
@@ -76,7 +76,7 @@ FAULTS = [
      "jnp.where(step < control.switch, control.previous, control.ctrl)",
      "jnp.where(step <= control.switch, control.previous, control.ctrl)", "test_randomization.py -k late_and_lagging"),
     ("the air pushes the ball", CONTROL, "tuple(-air_drag * speed", "tuple(air_drag * speed", "test_randomization.py -k brakes"),
-    ("the restitution is clipped", RANDOMIZATION,
+    ("the restitution is clipped", CONTACT,
      "jnp.interp(restitution, restitutions", "jnp.interp(jnp.maximum(restitution, 0.8), restitutions", "test_randomization.py -k drops_bounce"),
     ("the range of a command shrinks", ENV,
      "first + (1.0 - first) * progress", "1.0 - (1.0 - first) * progress", "test_randomization.py -k about_its_middle"),
@@ -89,7 +89,7 @@ FAULTS = [
     ("the encoders' bias has the other sign", SENSING,
      'angles = angles + world["encoder_bias"]', 'angles = angles - world["encoder_bias"]', "test_sensors.py -k measured_angles"),
     ("a history has the oldest value first", SENSING,
-     "with_newest(past, measured[name])", "jnp.concatenate([past[1:], measured[name][None]])", "test_sensors.py -k bounces_are"),
+     "with_newest(history, measured[name])", "jnp.concatenate([history[1:], measured[name][None]])", "test_sensors.py -k bounces_are"),
     ("the bootstrap of a time-out is dropped", PPO,
      "jnp.where(rollout.truncated, timeout_value, next_value)", "next_value", "test_ppo.py -k bootstraps"),
     ("advantages leak across a time-out", PPO,

@@ -25,13 +25,8 @@ from bounce_mjx.robot.config import RobotConfig
 from bounce_mjx.robot.model import load_model
 from bounce_mjx.robot.torques import largest_torques, torque_ranges
 from bounce_mjx.world.actuation import add_delay, start_actuation
-from bounce_mjx.world.randomization import (
-    TERMS,
-    RandomizationConfig,
-    nominal_values,
-    physics_parameters,
-    sample_world,
-)
+from bounce_mjx.world.randomization import TERMS, RandomizationConfig
+from bounce_mjx.world.sampling import nominal_values, physics_parameters, sample_world
 from test_ppo import TwoStates, two_state_config
 
 NOMINALS = model_nominals(EnvConfig())

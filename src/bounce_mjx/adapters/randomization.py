@@ -23,12 +23,8 @@ from bounce_mjx.physics.parameters import MODEL_PARAMETERS, PhysicsParameters
 from bounce_mjx.physics.scalars import scalars_of
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.runs.settings import read_preset
-from bounce_mjx.world.randomization import (
-    TERMS,
-    RandomizationConfig,
-    physics_parameters,
-    sample_world,
-)
+from bounce_mjx.world.randomization import TERMS, RandomizationConfig
+from bounce_mjx.world.sampling import physics_parameters, sample_world
 
 Fields = dict[str, Any]
 """Arrays of a model by their names, such as `body_mass` and `opt.gravity`."""

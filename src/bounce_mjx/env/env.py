@@ -24,14 +24,8 @@ from bounce_mjx.world.actuation import Actuation, Actuators
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.noise import Clock
 from bounce_mjx.world.observation import Kinematics
-from bounce_mjx.world.randomization import (
-    TERMS,
-    Ranges,
-    World,
-    nominal_values,
-    physics_parameters,
-    sample_world,
-)
+from bounce_mjx.world.randomization import TERMS, Ranges, World
+from bounce_mjx.world.sampling import nominal_values, physics_parameters, sample_world
 from bounce_mjx.world.sensing import Instant, Sensing, Sensors
 
 # MuJoCo's mjMAXVAL: a coordinate beyond it has diverged and counts as non-finite.

@@ -18,7 +18,7 @@ from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.task.registry import find_task
 from bounce_mjx.world.actuation import DEFAULT_PUSH_INTERVAL
 from bounce_mjx.world.config import WorldConfig
-from bounce_mjx.world.randomization import TERMS, RandomizationConfig
+from bounce_mjx.world.randomization import MODEL, TERMS, RandomizationConfig
 
 _CONFIG_UNITS = "factor", "s", "Hz", "m", "m/s", "1/m", "rad", "rad/s", "kg", "N m", "N m s/rad"
 UNITS = dict.fromkeys(("", *_CONFIG_UNITS), 1.0) | {
@@ -152,7 +152,7 @@ def load_suite(
 def neutral_range(name: str, env: WorldConfig) -> Bounds | None:
     """Range of a term without effect on the world; None if the term has no such value."""
     value = _INTERVALS.get(name, TERMS[name].nominal)
-    if value is None and TERMS[name].has_nominal:
+    if value == MODEL:
         value = model_nominals(env).get(name)
     return None if value is None else _broadcast(name, env.num_joints, value, value)
 

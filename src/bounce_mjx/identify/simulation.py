@@ -18,7 +18,7 @@ from bounce_mjx.physics import Control, PhysicsState, make_engine
 from bounce_mjx.physics.scalars import quaternion_matrix
 from bounce_mjx.robot.model import find_addresses, link_bodies, scatter
 from bounce_mjx.world.config import WorldConfig
-from bounce_mjx.world.randomization import physics_parameters
+from bounce_mjx.world.sampling import physics_parameters
 
 _LANES = 128
 """Windows that one thread simulates at a time; more would not fit the processor's cache."""

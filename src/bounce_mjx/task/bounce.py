@@ -92,6 +92,7 @@ class BounceConfig(task.WorldConfig):
 
     @pydantic.model_validator(mode="after")
     def _check_start(self):
+        """An episode does not end where it starts."""
         x, y, z = self.ball_init_pos
         lowest_target = self.target_height_range[0]
         is_within = {

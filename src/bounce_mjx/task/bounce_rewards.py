@@ -197,6 +197,7 @@ class ControlledUpwardReward(RewardTerm):
 
     @pydantic.model_validator(mode="after")
     def _check_order(self):
+        """The limits of the ideal velocity have their order."""
         if self.min_ideal_velocity > self.max_ideal_velocity:
             raise ValueError(
                 f"max_ideal_velocity {self.max_ideal_velocity:g} is below min_ideal_velocity "

@@ -77,6 +77,7 @@ class Config(task.WorldConfig):
 
     @pydantic.model_validator(mode="after")
     def _check_throws(self):
+        """A throw starts farther out than its aim."""
         distance = math.hypot(*self.ball_init_pos[:2])
         if distance + AIM_RADIUS > MAX_DISTANCE:
             raise ValueError(

@@ -66,7 +66,14 @@ class Result:
 
 
 def share_of_episodes(name: str, measured: str, met: np.ndarray, least: float) -> Result:
-    """The result for the share of the episodes [E] that meet a condition, at least `least`."""
+    """The result for the share of the episodes that meet a condition.
+
+    Args:
+      name: of the result.
+      measured: description of the measured quantity.
+      met: whether each episode meets the condition [E], bool.
+      least: least share.
+    """
     share = float(met.mean())
     return Result(
         name=name,
@@ -85,8 +92,11 @@ def share_of_events(
     any it fails.
 
     Args:
+      name: of the result.
+      measured: description of the measured quantity.
       met: number that meet the condition in each episode [E].
       events: number of all in each episode [E].
+      least: least share.
     """
     share = mean_of_events(name, f"{measured}, %", met, events, (least, math.inf))
     percentage = None if share.value is None else 100.0 * share.value
@@ -104,8 +114,11 @@ def mean_of_events(
     """The result for a mean over steps or events, between two bounds; without any it fails.
 
     Args:
+      name: of the result.
+      measured: description of the measured quantity, with its unit.
       totals: sum of the quantity in each episode [E].
       events: number of steps or events in each episode [E].
+      bounds: least and greatest mean, of which one may be infinite.
       condition: the condition that the bounds need and that does not hold, in words; "" judges.
     """
     mean, margin = mean_and_margin(totals, events)
@@ -129,8 +142,11 @@ def root_mean_square(
     fails.
 
     Args:
+      name: of the result.
+      measured: description of the measured quantity, with its unit.
       squares: sum of the squared quantity in each episode [E].
       events: number of steps or events in each episode [E].
+      most: greatest root of the mean square.
     """
     mean_square = mean_of_events(name, measured, squares, events, (-math.inf, most**2))
     root = None if mean_square.value is None else math.sqrt(mean_square.value)

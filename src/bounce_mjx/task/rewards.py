@@ -75,47 +75,52 @@ def term_names(reward: type[StrictModel]) -> tuple[str, ...]:
     )
 
 
-def weighted_terms(reward: StrictModel, inputs: Any = None, **own: Any) -> dict[str, jax.Array]:
+def weighted_terms(
+    reward: StrictModel, inputs: Any = None, **term_inputs: Any
+) -> dict[str, jax.Array]:
     """Each term [] times its weight; their sum is the reward.
 
     Args:
       inputs: what the formula of every term takes.
-      own: by a term's name, what its formula takes instead.
+      term_inputs: by a term's name, what its formula takes instead.
 
     Raises:
-      UserError: `own` has a name that is no term, or lacks one although there are no inputs.
+      UserError: a name of `term_inputs` is no term, or a term has no inputs.
     """
     names = term_names(type(reward))
-    # Without `own`, the formulas may take no inputs at all.
-    share_inputs = inputs is not None or not own
-    provided = own.keys() | names if share_inputs else own.keys()
+    provided = set(term_inputs)
+    # Without inputs of single terms, the formulas may take none at all.
+    if inputs is not None or not term_inputs:
+        provided.update(names)
     check_names("weighted_terms", "term of the reward", provided, names)
     weighted = {}
     for name in names:
         term = getattr(reward, name)
-        weighted[name] = term.weight * term.value(own.get(name, inputs))
+        weighted[name] = term.weight * term.value(term_inputs.get(name, inputs))
     return weighted
 
 
-def check_names(what: str, kind: str, given: Collection[str], known: Collection[str]) -> None:
-    """Compares the names that a task's code gives with those that it has.
+def check_names(code: str, kind: str, names: Collection[str], expected: Collection[str]) -> None:
+    """Compares the names in a task's code with those that there are.
 
     Args:
-      what: the code, for the error.
+      code: the code, for the error.
       kind: what the names stand for, for the error.
+      names: the names in the code.
+      expected: the names that there are, each of which it needs.
 
     Raises:
       UserError: a name is unknown or missing.
     """
-    unknown = sorted(set(given) - set(known))
-    missing = sorted(set(known) - set(given))
-    names = ", ".join(sorted(set(known))) or "none"
+    unknown = sorted(set(names) - set(expected))
+    missing = sorted(set(expected) - set(names))
+    listed = ", ".join(sorted(set(expected))) or "none"
     if unknown:
         raise UserError(
-            f"{what} names a {kind} that there is not, {shorten(unknown[0])}; there are: {names}"
+            f"{code} names a {kind} that there is not, {shorten(unknown[0])}; there are: {listed}"
         )
     if missing:
-        raise UserError(f"{what} lacks the {kind} {shorten(missing[0])}; there are: {names}")
+        raise UserError(f"{code} lacks the {kind} {shorten(missing[0])}; there are: {listed}")
 
 
 def gaussian(error: jax.Array, scale: jax.Array | float) -> jax.Array:
@@ -123,14 +128,14 @@ def gaussian(error: jax.Array, scale: jax.Array | float) -> jax.Array:
     return jnp.exp(-jnp.square(error) / (2.0 * jnp.square(scale)))
 
 
-def safe_sqrt(x: jax.Array) -> jax.Array:
-    """Square root of max(0, x), whose derivative is 0 for x <= 0.
+def safe_sqrt(number: jax.Array) -> jax.Array:
+    """Square root of max(0, number), whose derivative is 0 for a number <= 0.
 
     The derivative of `jnp.sqrt` is infinite at 0. Multiplied by the zero of a branch that is not
     taken, it would make the whole gradient NaN.
     """
-    positive = x > 0.0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
+    positive = number > 0.0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, number, 1.0)), 0.0)
 
 
 def length(vector: jax.Array) -> jax.Array:

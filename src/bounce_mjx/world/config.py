@@ -146,21 +146,31 @@ class WorldConfig(RobotSettings):
     """The quantities that the policy sees."""
 
     @pydantic.model_validator(mode="after")
-    def _check_numbers(self):
+    def _check_time_steps(self):
+        """A control step is a whole number of physics steps."""
         substeps = self.control_dt / self.physics_dt
         if round(substeps) < 1 or not math.isclose(substeps, round(substeps), rel_tol=1e-6):
             raise ValueError(
                 f"control_dt {self.control_dt} is not a whole number of physics steps of "
                 f"{self.physics_dt} s; choose a multiple of physics_dt"
             )
+        return self
+
+    @pydantic.model_validator(mode="after")
+    def _check_max_lead(self):
+        """An action of 1 has its full effect."""
         if self.action.base == "target" and self.action.max_lead < self.action_scale:
             raise ValueError(
                 f"action.max_lead is {self.action.max_lead:g}, which is less than the action_scale "
                 f"{self.action_scale:g}, so that no action would have its full effect; give more"
             )
-        limits = self.robot.limits
+        return self
+
+    @pydantic.model_validator(mode="after")
+    def _check_num_joints(self):
+        """What has a number for each acting joint has as many as there are."""
         counts = {}
-        for name, numbers in limits:
+        for name, numbers in self.robot.limits:
             if numbers is not None:
                 counts[f"robot.limits.{name}"] = len(numbers)
         for name in self.randomization.terms:
@@ -173,6 +183,12 @@ class WorldConfig(RobotSettings):
                     f"{key} has {count} numbers, but default_joint_angles has {self.num_joints}; "
                     "give one for each acting joint"
                 )
+        return self
+
+    @pydantic.model_validator(mode="after")
+    def _check_limits(self):
+        """The arm's limits fit the action and the control step."""
+        limits = self.robot.limits
         if limits.velocity is not None and self.action.base == "measured":
             # A command that follows the measured angle, which follows the command, oscillates.
             raise ValueError(

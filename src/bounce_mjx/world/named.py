@@ -35,10 +35,14 @@ class NamedWorld(StrictModel):
 
     @pydantic.model_validator(mode="after")
     def _check_sources(self):
-        given = flat(self.settings)
-        groups = {key[:i] for key in given for i, char in enumerate(key) if char == "."}
-        for key in (*self.sources, *self.assumed):
-            if key not in given and (key in self.assumed or key not in groups):
+        """Each setting has a source, itself or with its group; no source is of another setting."""
+        numbers = flat(self.settings)
+        groups = set()
+        for key in numbers:
+            *parents, _ = key.split(".")
+            groups |= {".".join(parents[:depth]) for depth in range(1, len(parents) + 1)}
+        for key in [*self.sources, *self.assumed]:
+            if key not in numbers and (key in self.assumed or key not in groups):
                 raise ValueError(
                     f"sources or assumed has {shorten(key)}, but env has no such key; give env "
                     "that key, or remove it from them"
@@ -47,9 +51,9 @@ class NamedWorld(StrictModel):
             if not source.strip():
                 raise ValueError(f"{key} has an empty source; write one sentence")
         for key in self.assumed:
-            if not _can_be_doubled(key, given[key]):
+            if not _can_be_doubled(key, numbers[key]):
                 raise ValueError(f"{key} is assumed, but is no number to double; remove it")
-        for key in given:
+        for key in numbers:
             if key.startswith("randomization.") and key.split(".")[1] in CURRICULUM:
                 continue
             if not any(key == source or key.startswith(f"{source}.") for source in self.sources):
@@ -71,9 +75,12 @@ class NamedWorld(StrictModel):
           env: the settings, nested.
           training: whether the curriculum of their randomisation stays unless the world has one.
         """
-        before = env.get("randomization", {}) if training else {}
-        kept = {key: value for key, value in before.items() if key in CURRICULUM}
-        values = merged(env | {"randomization": kept}, self.settings)
+        curriculum = {}
+        if training:
+            for key, value in env.get("randomization", {}).items():
+                if key in CURRICULUM:
+                    curriculum[key] = value
+        values = merged(env | {"randomization": curriculum}, self.settings)
         return values | {"randomization": without_idle_curriculum(values["randomization"])}
 
     def double_assumed(self, nominals: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
@@ -85,8 +92,8 @@ class NamedWorld(StrictModel):
         Args:
           nominals: the values of the terms without randomisation (`Env.nominals`).
         """
-        given = flat(self.settings)
-        return {key: nested(key, _double(key, given[key], nominals)) for key in self.assumed}
+        numbers = flat(self.settings)
+        return {key: nested(key, _double(key, numbers[key], nominals)) for key in self.assumed}
 
 
 def without_idle_curriculum(randomization: dict[str, Any]) -> dict[str, Any]:
@@ -118,8 +125,10 @@ def _can_be_doubled(key: str, value: Any) -> bool:
     group, _, name = key.rpartition(".")
     if group == "randomization" and name not in TERMS:
         return False
-    numbers = np.ravel(np.array(value, object)).tolist()
-    return all(isinstance(x, int | float) and not isinstance(x, bool) for x in numbers)
+    for number in np.ravel(np.array(value, object)).tolist():
+        if isinstance(number, bool) or not isinstance(number, int | float):
+            return False
+    return True
 
 
 def _double(key: str, value: Any, nominals: Mapping[str, Any]) -> Any:

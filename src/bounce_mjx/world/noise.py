@@ -25,7 +25,7 @@ class Clock(NamedTuple):
     """Control steps since the reset [], int32."""
     phases: jax.Array
     """Phases [3] of the camera, of the pushes and of the commands at the reset, as shares of their
-    intervals."""
+    intervals: the three properties, which say from when each counts."""
 
     @property
     def camera_phase(self) -> jax.Array:
@@ -44,7 +44,7 @@ class Clock(NamedTuple):
 
 
 def first_clock(key: jax.Array, dtype: jnp.dtype) -> Clock:
-    """The clock at a reset; consumes the key."""
+    """The clock at a reset: a sampled counter, step 0 and sampled phases; consumes the key."""
     counter = jax.lax.bitcast_convert_type(jax.random.bits(key, dtype=jnp.uint32), jnp.int32)
     phases = uniform(counter, COMMAND, (3,), dtype)
     return Clock(counter, jnp.zeros((), jnp.int32), phases)
@@ -92,8 +92,14 @@ def uniform(counter: jax.Array, stream: int, shape: tuple[int, ...], dtype: jnp.
 
 
 def normal(counter: jax.Array, stream: int, shape: tuple[int, ...], dtype: jnp.dtype) -> jax.Array:
-    """Normally distributed numbers with mean 0 and variance 1 (Box and Muller 1958); the arguments
-    are those of `uniform`."""
+    """Normally distributed numbers with mean 0 and variance 1 (Box and Muller 1958).
+
+    Args:
+      counter: of a `Clock` [], int32.
+      stream: one of the streams above.
+      shape: of the result.
+      dtype: of the result.
+    """
     size = math.prod(shape)
     pairs = (size + 1) // 2
     numbers = uniform(counter, stream, (2, pairs), dtype)
@@ -109,13 +115,13 @@ def joints(counter: jax.Array, num_joints: int, dtype: jnp.dtype) -> tuple[jax.A
     return numbers[:num_joints], numbers[num_joints:]
 
 
-def _mix(x: jax.Array) -> jax.Array:
+def _mix(bits: jax.Array) -> jax.Array:
     """A bijection of int32 in which every output bit depends on every input bit (lowbias32 of
     Wellons, hash-prospector)."""
 
-    def shifted(number: jax.Array, bits: int) -> jax.Array:
-        return jax.lax.shift_right_logical(number, jnp.int32(bits))
+    def shifted(bits: jax.Array, count: int) -> jax.Array:
+        return jax.lax.shift_right_logical(bits, jnp.int32(count))
 
-    x = (x ^ shifted(x, 16)) * jnp.int32(0x7FEB352D)
-    x = (x ^ shifted(x, 15)) * jnp.int32(0x846CA68B - 2**32)
-    return x ^ shifted(x, 16)
+    bits = (bits ^ shifted(bits, 16)) * jnp.int32(0x7FEB352D)
+    bits = (bits ^ shifted(bits, 15)) * jnp.int32(0x846CA68B - 2**32)
+    return bits ^ shifted(bits, 16)

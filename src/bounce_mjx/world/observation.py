@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field
@@ -85,30 +84,31 @@ class ObservationConfig(StrictModel):
     @classmethod
     def quantities(cls) -> dict[str, Quantity]:
         """All quantities by name, in the order of the observation."""
-        found = {
-            name: mark
-            for name, field in cls.model_fields.items()
-            for mark in field.metadata
-            if isinstance(mark, Quantity)
-        }
-        return dict(sorted(found.items(), key=lambda item: _GROUPS.index(item[1].group)))
+        quantities = {}
+        for name, field in cls.model_fields.items():
+            for mark in field.metadata:
+                if isinstance(mark, Quantity):
+                    quantities[name] = mark
+        in_order = sorted(quantities.items(), key=lambda item: _GROUPS.index(item[1].group))
+        return dict(in_order)
 
     def lengths(self, group: str | None = None) -> dict[str, int]:
         """The number of values of each quantity that the policy sees, all or those of a group."""
-        return {
-            name: count
-            for name, quantity in self.quantities().items()
-            if (count := getattr(self, name)) and group in (None, quantity.group)
-        }
+        lengths = {}
+        for name, quantity in self.quantities().items():
+            count = getattr(self, name)
+            if count > 0 and group in (None, quantity.group):
+                lengths[name] = count
+        return lengths
 
     def layout(self, num_joints: int, num_balls: int = 1) -> ObservationLayout:
         """The order of the entries, for an arm with this number of acting joints and for this
         number of balls."""
-        known = self.quantities()
-        parts = (
-            Part(name, known[name].entries(num_joints, num_balls), known[name].unit, count)
-            for name, count in self.lengths().items()
-        )
+        quantities = self.quantities()
+        parts = []
+        for name, count in self.lengths().items():
+            size = quantities[name].entries(num_joints, num_balls)
+            parts.append(Part(name, size, quantities[name].unit, count))
         return ObservationLayout(tuple(parts))
 
     @property
@@ -133,15 +133,21 @@ class ObservationLayout:
 
     def __getitem__(self, name: str) -> slice:
         """Entries of the part `name`, such as `obs[layout["ball_position"]]`."""
-        ends = itertools.accumulate(part.length for part in self.parts)
-        pairs = zip(self.parts, ends, strict=True)
-        return {part.name: slice(end - part.length, end) for part, end in pairs}[name]
+        start = 0
+        for part in self.parts:
+            if part.name == name:
+                return slice(start, start + part.length)
+            start += part.length
+        raise KeyError(name)
 
     def pack(self, values: dict[str, jax.Array]) -> jax.Array:
         """The observation [size] from the values of every part, [part.length]."""
         # One scalar per entry, which XLA fuses with the physics; whole arrays would be copied.
-        entries = [(p.name, i) for p in self.parts for i in range(p.length)]
-        return jnp.stack([values[name][i] for name, i in entries])
+        entries = []
+        for part in self.parts:
+            for i in range(part.length):
+                entries.append(values[part.name][i])
+        return jnp.stack(entries)
 
 
 class Kinematics(NamedTuple):

@@ -2,8 +2,8 @@
 
 `RandomizationConfig` is the table of the terms. A term's row says what it is (its comment, with the
 unit), its shape, its bounds and its nominal value; and, if it is physical, the field of
-`PhysicsParameters` that it changes, and the operation by which it does. `physics.edited.edits` is
-the table of that field's entries in the model.
+`PhysicsParameters` that it changes and the operation by which it does, whose nominal value it has.
+`physics.edited.edits` is the table of that field's entries in the model; `sampling.py` samples.
 
 A term is a key of the config with a range (low, high), from which a reset samples every entry of
 the term uniformly. Each end of a term of several entries may be one number for all, or one for each
@@ -12,26 +12,21 @@ entry. A term that is null is off and costs nothing.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import pydantic
 from pydantic import Field
 
 from bounce_mjx.config.settings import Finite, StrictModel, UnitInterval, whole_number
 from bounce_mjx.config.validation import unit_of
-from bounce_mjx.errors import UserError, shorten
-from bounce_mjx.lazy import jax, jnp, mujoco, np
-
-if TYPE_CHECKING:
-    from bounce_mjx.physics import PhysicsParameters
-    from bounce_mjx.physics.scalars import Quaternion
-    from bounce_mjx.robot.model import Addresses
+from bounce_mjx.errors import shorten
+from bounce_mjx.lazy import jax, jnp, np
 
 
 def _entrywise(end: Any, number: Callable[[Any], float]) -> float | tuple[float, ...]:
+    """An end of a range: one number, or a tuple of them; `number` validates each."""
     return tuple(map(number, end)) if isinstance(end, list | tuple) else number(end)
 
 
@@ -54,89 +49,24 @@ Ranges = dict[str, tuple["jax.Array", "jax.Array"]]
 shape."""
 
 
-class Operation(NamedTuple):
-    """How a sampled value and the model's own parameters make a physical parameter."""
+Operation = Literal["scale", "add", "tilt_frame", "tilt_vector", "replace", "restitution", "limit"]
+"""How a sampled value and the model's own parameter make the episode's parameter
+(`sampling.apply`): times a factor, plus a difference, turned by two angles, in its place, as the
+damping with this restitution, or as a limit of the model's own value, which may have none."""
 
-    apply: Callable[[PhysicsParameters, str, jax.Array], jax.Array]
-    """(the model's own parameters, the parameter's name, sampled value) -> the parameter."""
-    nominal: float | None = None
-    """The sampled value that changes nothing, if it is the same for all models."""
-    model_nominal: Callable[[PhysicsParameters, str], Any] | None = None
-    """(the model's own parameters, the parameter's name) -> the sampled value that changes nothing,
-    if it depends on the model; None for a model that lacks the parameter."""
+MODEL = "model"
+"""Nominal value that is the model's own."""
 
-
-def scale(model: PhysicsParameters, parameter: str, factor: jax.Array) -> jax.Array:
-    """The model's own value times a factor."""
-    return jnp.asarray(getattr(model, parameter), factor.dtype) * factor
-
-
-def shift(model: PhysicsParameters, parameter: str, difference: jax.Array) -> jax.Array:
-    """The model's own value plus a difference."""
-    return jnp.asarray(getattr(model, parameter), difference.dtype) + difference
-
-
-def replace(model: PhysicsParameters, parameter: str, value: jax.Array) -> jax.Array:
-    """The sampled value itself."""
-    return value
-
-
-def tilt_frame(model: PhysicsParameters, parameter: str, angles: jax.Array) -> jax.Array:
-    """The quaternion [4] of a frame that turns by angles [2] about its own x axis, then about its
-    new y axis."""
-    from bounce_mjx.physics.scalars import quaternion_product
-
-    quaternion = jnp.asarray(getattr(model, parameter), angles.dtype)
-    return jnp.stack(quaternion_product(tuple(quaternion), _rotation_xy(angles)))
-
-
-def tilt_vector(model: PhysicsParameters, parameter: str, angles: jax.Array) -> jax.Array:
-    """A vector [3] that turns by angles [2] about the x axis, then about the new y axis."""
-    from bounce_mjx.physics.scalars import quaternion_matrix
-
-    vector = jnp.asarray(getattr(model, parameter), angles.dtype)
-    return jnp.stack(quaternion_matrix(_rotation_xy(angles)) @ tuple(vector))
-
-
-def _rotation_xy(angles: jax.Array) -> Quaternion:
-    """Quaternion [w, x, y, z] of a rotation about x by angles[0], then about the new y."""
-    (cos_a, cos_b), (sin_a, sin_b) = jnp.cos(0.5 * angles), jnp.sin(0.5 * angles)
-    return cos_a * cos_b, sin_a * cos_b, cos_a * sin_b, sin_a * sin_b
-
-
-def restitution_to_damping(
-    model: PhysicsParameters, parameter: str, restitution: jax.Array
-) -> jax.Array:
-    """The damping [] of the contact, 1/s, with a restitution [] at the model's own stiffness.
-
-    Raises:
-      UserError: the model has no contact pair of ball and paddle.
-    """
-    from bounce_mjx.physics.edited import NO_PAIR
-    from bounce_mjx.robot.contact import damping_of_restitution
-
-    if model.contact_stiffness is None:
-        raise UserError(NO_PAIR)
-    return damping_of_restitution(restitution, model.contact_stiffness)
-
-
-def _model_restitution(model: PhysicsParameters, parameter: str) -> Any:
-    """The restitution [] of the model's own contact; None without a contact pair."""
-    from bounce_mjx.robot.contact import restitution_of_damping
-
-    if model.contact_damping is None:
-        return None
-    return restitution_of_damping(model.contact_damping, model.contact_stiffness)
-
-
-SCALE = Operation(scale, nominal=1.0)
-ADD = Operation(shift, nominal=0.0)
-TILT_FRAME = Operation(tilt_frame, nominal=0.0)
-TILT_VECTOR = Operation(tilt_vector, nominal=0.0)
-REPLACE = Operation(replace, model_nominal=getattr)
-RESTITUTION = Operation(restitution_to_damping, model_nominal=_model_restitution)
-LIMIT = Operation(replace)
-"""For a parameter that limits the model's own value, which may have no limit: no nominal value."""
+NOMINALS: dict[Operation, float | Literal["model"] | None] = {
+    "scale": 1.0,
+    "add": 0.0,
+    "tilt_frame": 0.0,
+    "tilt_vector": 0.0,
+    "replace": MODEL,
+    "restitution": MODEL,
+    "limit": None,
+}
+"""The sampled value that changes nothing, by the operation; None where no number does that."""
 
 NUMBER = ()
 """Size of a term with one number."""
@@ -151,10 +81,9 @@ class Term(NamedTuple):
     """Shape of one episode's sample; None (`EACH_JOINT`) for one entry for each acting joint."""
     bounds: tuple[float, float]
     """Smallest and largest sensible value."""
-    nominal: float | None = None
-    """Value without randomisation, from which the range grows during the warm-up, if it is the same
-    for all models; otherwise the operation's `model_nominal`. A term with neither is sampled in
-    every episode, and its range does not grow."""
+    nominal: float | Literal["model"] | None = None
+    """Value without randomisation, from which the range grows during the warm-up; `MODEL` for the
+    model's own. A term without one is sampled in every episode, and its range does not grow."""
     parameter: str | None = None
     """The field of `PhysicsParameters` that it changes."""
     operation: Operation | None = None
@@ -163,9 +92,7 @@ class Term(NamedTuple):
     @property
     def has_nominal(self) -> bool:
         """Whether it has a value without randomisation."""
-        if self.nominal is not None:
-            return True
-        return self.operation is not None and self.operation.model_nominal is not None
+        return self.nominal is not None
 
     def shape(self, num_joints: int) -> tuple[int, ...]:
         """Shape of one episode's sample for an arm with this number of acting joints."""
@@ -186,7 +113,7 @@ def physical(
       size: of one sample, as `Term.size`.
       bounds: smallest and largest sensible value.
     """
-    return Term(size, bounds, operation.nominal, parameter, operation)
+    return Term(size, bounds, NOMINALS[operation], parameter, operation)
 
 
 # Wide, but narrower than the factor between a unit and a thousandth of it.
@@ -198,27 +125,29 @@ class RandomizationConfig(StrictModel):
     of several joints or axes may have a range for each: two lists, of lower and of upper ends."""
 
     restitution: Annotated[
-        Sampled, physical("contact_damping", RESTITUTION, NUMBER, bounds=(0.4, 0.98))
+        Sampled, physical("contact_damping", "restitution", NUMBER, bounds=(0.4, 0.98))
     ] = None
     """Restitution of the ball on the paddle, in place of the model's, which is 0.85 for the
     project's own robot."""
-    ball_mass: Annotated[Sampled, physical("ball_mass", SCALE, NUMBER, bounds=(0.01, 1e3))] = None
+    ball_mass: Annotated[Sampled, physical("ball_mass", "scale", NUMBER, bounds=(0.01, 1e3))] = None
     """Factor of the ball's mass."""
-    ball_radius: Annotated[Sampled, physical("ball_radius", SCALE, NUMBER, bounds=(0.1, 10.0))] = (
-        None
-    )
+    ball_radius: Annotated[
+        Sampled, physical("ball_radius", "scale", NUMBER, bounds=(0.1, 10.0))
+    ] = None
     """Factor of the ball's radius."""
     air_drag: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 10.0), nominal=0.0)] = None
     """Deceleration of the ball by the air divided by its squared speed, 1/m; about 0.11 for a
     table-tennis ball."""
     contact_friction: Annotated[
-        Sampled, physical("contact_friction", REPLACE, NUMBER, bounds=(0.0, 10.0))
+        Sampled, physical("contact_friction", "replace", NUMBER, bounds=(0.0, 10.0))
     ] = None
     """Coefficient of sliding friction between ball and paddle, in place of the model's."""
-    servo_gain: Annotated[Sampled, physical("servo_gain", SCALE, EACH_JOINT, bounds=_FACTOR)] = None
+    servo_gain: Annotated[Sampled, physical("servo_gain", "scale", EACH_JOINT, bounds=_FACTOR)] = (
+        None
+    )
     """Factor of each servo's stiffness."""
     servo_damping: Annotated[
-        Sampled, physical("servo_damping", SCALE, EACH_JOINT, bounds=_FACTOR)
+        Sampled, physical("servo_damping", "scale", EACH_JOINT, bounds=_FACTOR)
     ] = None
     """Factor of each servo's damping."""
     servo_lag: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 1.0), nominal=0.0)] = None
@@ -226,33 +155,33 @@ class RandomizationConfig(StrictModel):
     servo_offset: Annotated[Sampled, Term(EACH_JOINT, bounds=(-0.5, 0.5), nominal=0.0)] = None
     """Constant error of each servo: where it holds its joint, less its target, rad."""
     torque_limit: Annotated[
-        Sampled, physical("force_limit", LIMIT, EACH_JOINT, bounds=(0.01, 1e4))
+        Sampled, physical("force_limit", "limit", EACH_JOINT, bounds=(0.01, 1e4))
     ] = None
     """Largest torque of each servo at its joint, N m; a servo that is weaker keeps its own
     limit."""
-    joint_damping: Annotated[Sampled, physical("damping", ADD, EACH_JOINT, bounds=(0.0, 500.0))] = (
-        None
-    )
+    joint_damping: Annotated[
+        Sampled, physical("damping", "add", EACH_JOINT, bounds=(0.0, 500.0))
+    ] = None
     """Viscous damping added to each joint, N m s/rad."""
     joint_frictionloss: Annotated[
-        Sampled, physical("frictionloss", REPLACE, EACH_JOINT, bounds=(0.0, 500.0))
+        Sampled, physical("frictionloss", "replace", EACH_JOINT, bounds=(0.0, 500.0))
     ] = None
     """Dry friction of each joint, N m, in place of the model's."""
-    armature: Annotated[Sampled, physical("armature", SCALE, EACH_JOINT, bounds=_FACTOR)] = None
+    armature: Annotated[Sampled, physical("armature", "scale", EACH_JOINT, bounds=_FACTOR)] = None
     """Factor of each joint's rotor inertia."""
-    link_mass: Annotated[Sampled, physical("link_mass", SCALE, EACH_JOINT, bounds=_FACTOR)] = None
+    link_mass: Annotated[Sampled, physical("link_mass", "scale", EACH_JOINT, bounds=_FACTOR)] = None
     """Factor of each link's mass."""
     paddle_offset: Annotated[
-        Sampled, physical("paddle_position", ADD, (3,), bounds=(-0.5, 0.5))
+        Sampled, physical("paddle_position", "add", (3,), bounds=(-0.5, 0.5))
     ] = None
     """Displacement of the paddle along each axis of the last link, m."""
     paddle_tilt: Annotated[
-        Sampled, physical("paddle_rotation", TILT_FRAME, (2,), bounds=(-0.5, 0.5))
+        Sampled, physical("paddle_rotation", "tilt_frame", (2,), bounds=(-0.5, 0.5))
     ] = None
     """Rotation of the paddle about its own x and y axis, rad."""
-    gravity_tilt: Annotated[Sampled, physical("gravity", TILT_VECTOR, (2,), bounds=(-0.5, 0.5))] = (
-        None
-    )
+    gravity_tilt: Annotated[
+        Sampled, physical("gravity", "tilt_vector", (2,), bounds=(-0.5, 0.5))
+    ] = None
     """Rotation of gravity about the world's x and y axis, rad."""
     action_latency: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 1.0), nominal=0.0)] = None
     """Time from an action to its servo targets, s."""
@@ -307,6 +236,7 @@ class RandomizationConfig(StrictModel):
 
     @pydantic.model_validator(mode="after")
     def _check_effects(self):
+        """A setting that has no effect is a mistake."""
         for name in sorted(self.shares or {}):
             self._check_share_of(name)
         varies = any(TERMS[name].has_nominal for name in self.terms)
@@ -323,7 +253,7 @@ class RandomizationConfig(StrictModel):
         return self
 
     def _check_share_of(self, name: str) -> None:
-        """Refuses a probability of a term that does not use it."""
+        """Refuses a probability of a term that has none."""
         if name not in TERMS:
             reason = "which is not a term"
         elif getattr(self, name) is None:
@@ -336,6 +266,7 @@ class RandomizationConfig(StrictModel):
 
     @pydantic.model_validator(mode="after")
     def _check_ranges(self):
+        """Each range has the shape and the bounds of its term."""
         for name in self.terms:
             self._check_shape(name)
             self._check_bounds(name)
@@ -409,89 +340,3 @@ TERMS: dict[str, Term] = {
     if isinstance(mark, Term)
 }
 """All terms of `RandomizationConfig`."""
-
-
-def nominal_values(
-    mj_model: mujoco.MjModel, terms: Iterable[str], addresses: Addresses | None = None
-) -> dict[str, np.ndarray]:
-    """Values without randomisation of the terms that have one, each of the term's shape.
-
-    Of a term that replaces a number of the model, it is that number; a model without a contact pair
-    has none of the contact.
-
-    Args:
-      mj_model: the model.
-      terms: names of the terms.
-      addresses: of the model's parts, if they are known.
-    """
-    # The engines are not needed to read a config.
-    from bounce_mjx.physics.edited import own_parameters
-
-    model = own_parameters(mj_model, addresses)
-    num_joints = len(model.armature)
-    nominals = {}
-    for name in terms:
-        term = TERMS[name]
-        value = term.nominal
-        if value is None and term.has_nominal:
-            value = term.operation.model_nominal(model, term.parameter)
-        if value is not None:
-            nominals[name] = np.broadcast_to(np.float64(value), term.shape(num_joints))
-    return nominals
-
-
-def sample_world(
-    ranges: Ranges,
-    key: jax.Array,
-    dtype: jnp.dtype,
-    num_joints: int,
-    nominals: Mapping[str, Any] = MappingProxyType({}),
-    share: float | jax.Array = 1.0,
-    shares: Mapping[str, float] = MappingProxyType({}),
-) -> World:
-    """Samples the world of one episode; consumes the key.
-
-    Args:
-      ranges: of the active terms.
-      key: consumed.
-      dtype: of the values.
-      num_joints: number of acting joints.
-      nominals: `nominal_values`, which the terms have that are not sampled; a term without one is
-        sampled in every episode.
-      share: probability [] that each term is sampled.
-      shares: probabilities of single terms, in place of `share`.
-    """
-    # The order of TERMS, because JAX sorts the keys of a traced dictionary.
-    shapes = {name: TERMS[name].shape(num_joints) for name in TERMS if name in ranges}
-    sizes = {name: math.prod(shape) for name, shape in shapes.items()}
-    # One sample for all numbers, because splitting the key costs more than sampling.
-    uniform = jax.random.uniform(key, (sum(sizes.values()) + len(sizes),), dtype)
-    world = {}
-    # The first numbers decide which terms are sampled.
-    start = len(sizes)
-    for i, (name, size) in enumerate(sizes.items()):
-        low, high = ranges[name]
-        places = uniform[start : start + size].reshape(shapes[name])
-        value = jnp.asarray(low, dtype) + jnp.asarray(high - low, dtype) * places
-        if name in nominals:
-            is_sampled = uniform[i] < shares.get(name, share)
-            value = jnp.where(is_sampled, value, jnp.asarray(nominals[name], dtype))
-        world[name] = value
-        start += size
-    return world
-
-
-def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParameters:
-    """Parameters of the physics for a sampled world."""
-    # The engines are not needed to read a config.
-    from bounce_mjx.physics.edited import own_parameters
-    from bounce_mjx.physics.parameters import PhysicsParameters
-
-    terms = {name: term for name, term in TERMS.items() if name in world and term.parameter}
-    if not terms:
-        return PhysicsParameters()
-    model = own_parameters(mj_model)
-    parameters = {}
-    for name, term in terms.items():
-        parameters[term.parameter] = term.operation.apply(model, term.parameter, world[name])
-    return PhysicsParameters(**parameters)

@@ -19,15 +19,21 @@ from bounce_mjx.world.noise import Clock
 from bounce_mjx.world.observation import Kinematics
 from bounce_mjx.world.randomization import World
 
-_TERMS = frozenset(
-    "ball_latency camera_rate frame_drop ball_position_noise ball_position_bias "
-    "ball_velocity_noise ball_velocity_bias joint_angle_noise encoder_bias joint_velocity_noise "
-    "joint_velocity_bias paddle_offset paddle_tilt".split()
-)
-"""Terms that make measurements differ from the truth."""
-
-_PADDLE_TERMS = frozenset("encoder_bias joint_angle_noise paddle_offset paddle_tilt".split())
+_PADDLE_TERMS = {"encoder_bias", "joint_angle_noise", "paddle_offset", "paddle_tilt"}
 """Terms that make the forward kinematics of the measured joint angles differ from the truth."""
+
+_TERMS = _PADDLE_TERMS | {
+    "ball_latency",
+    "camera_rate",
+    "frame_drop",
+    "ball_position_noise",
+    "ball_position_bias",
+    "ball_velocity_noise",
+    "ball_velocity_bias",
+    "joint_velocity_noise",
+    "joint_velocity_bias",
+}
+"""Terms that make measurements differ from the truth."""
 
 # Older than any picture of an episode, s; its negative is below any picture's number.
 _LONG_AGO = 1e6
@@ -157,14 +163,14 @@ class Sensors:
         picture = take_picture(self._config, now.world, now.clock, balls, before.picture)
         measured = self._measure(now, picture)
         histories = {}
-        of_task = {}
-        for name, past in before.histories.items():
+        task_histories = {}
+        for name, history in before.histories.items():
             if name in measured:
-                histories[name] = with_newest(past, measured[name])
+                histories[name] = with_newest(history, measured[name])
             else:
-                of_task[name] = past
-        task, of_task = self._task.next_quantities(before.task, of_task, measured)
-        return Sensing(balls, picture, histories | of_task, task)
+                task_histories[name] = history
+        task, task_histories = self._task.next_quantities(before.task, task_histories, measured)
+        return Sensing(balls, picture, histories | task_histories, task)
 
     def _measure(self, now: Instant, picture: Picture) -> dict[str, jax.Array]:
         """The measured value [size] of each quantity of the world and of each command."""
@@ -249,8 +255,8 @@ def take_picture(
         arrives = is_new & ((chance >= world["frame_drop"]) | (clock.step == 0))
     new = Picture(position, velocity, age * control_dt, number)
     # A lost picture stays lost.
-    kept = last._replace(age=last_age, number=jnp.where(is_new, number, last.number))
-    return jax.tree.map(lambda new, kept: jnp.where(arrives, new, kept), new, kept)
+    older = last._replace(age=last_age, number=jnp.where(is_new, number, last.number))
+    return jax.tree.map(lambda new, older: jnp.where(arrives, new, older), new, older)
 
 
 def _newest_picture(

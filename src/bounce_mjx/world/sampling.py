@@ -1,0 +1,149 @@
+"""From the ranges of the randomisation to an episode's world, and from that to its physics."""
+
+import math
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from bounce_mjx.errors import UserError
+from bounce_mjx.physics import PhysicsParameters
+from bounce_mjx.physics.edited import NO_PAIR, own_parameters
+from bounce_mjx.physics.scalars import Quaternion, quaternion_matrix, quaternion_product
+from bounce_mjx.robot.contact import damping_of_restitution, restitution_of_damping
+from bounce_mjx.robot.model import Addresses
+from bounce_mjx.world.randomization import MODEL, TERMS, Operation, Ranges, Term, World
+
+
+def nominal_values(
+    mj_model: mujoco.MjModel, terms: Iterable[str], addresses: Addresses | None = None
+) -> dict[str, np.ndarray]:
+    """Values without randomisation of the terms that have one, each of the term's shape.
+
+    Of a term that replaces a number of the model, it is that number; a model without a contact pair
+    has none of the contact.
+
+    Args:
+      mj_model: the model.
+      terms: names of the terms.
+      addresses: of the model's parts, if they are known.
+    """
+    model = own_parameters(mj_model, addresses)
+    num_joints = len(model.armature)
+    nominals = {}
+    for name in terms:
+        term = TERMS[name]
+        value = term.nominal
+        if value == MODEL:
+            value = _model_nominal(model, term)
+        if value is not None:
+            nominals[name] = np.broadcast_to(np.float64(value), term.shape(num_joints))
+    return nominals
+
+
+def _model_nominal(model: PhysicsParameters, term: Term) -> Any:
+    """The model's own value of a term; None if the model lacks the parameter."""
+    if term.operation != "restitution":
+        return getattr(model, term.parameter)
+    if model.contact_damping is None:
+        return None
+    return restitution_of_damping(model.contact_damping, model.contact_stiffness)
+
+
+def sample_world(
+    ranges: Ranges,
+    key: jax.Array,
+    dtype: jnp.dtype,
+    num_joints: int,
+    nominals: Mapping[str, Any] = MappingProxyType({}),
+    share: float | jax.Array = 1.0,
+    shares: Mapping[str, float] = MappingProxyType({}),
+) -> World:
+    """Samples the world of one episode; consumes the key.
+
+    Args:
+      ranges: of the active terms.
+      key: consumed.
+      dtype: of the values.
+      num_joints: number of acting joints.
+      nominals: `nominal_values`, which the terms have that are not sampled; a term without one is
+        sampled in every episode.
+      share: probability [] that each term is sampled.
+      shares: probabilities of single terms, in place of `share`.
+    """
+    # The order of TERMS, because JAX sorts the keys of a traced dictionary.
+    shapes = {name: TERMS[name].shape(num_joints) for name in TERMS if name in ranges}
+    sizes = {name: math.prod(shape) for name, shape in shapes.items()}
+    # One sample for all numbers, because splitting the key costs more than sampling.
+    uniform = jax.random.uniform(key, (sum(sizes.values()) + len(sizes),), dtype)
+    world = {}
+    # The first numbers decide which terms are sampled.
+    start = len(sizes)
+    for i, (name, size) in enumerate(sizes.items()):
+        low, high = ranges[name]
+        places = uniform[start : start + size].reshape(shapes[name])
+        value = jnp.asarray(low, dtype) + jnp.asarray(high - low, dtype) * places
+        if name in nominals:
+            is_sampled = uniform[i] < shares.get(name, share)
+            value = jnp.where(is_sampled, value, jnp.asarray(nominals[name], dtype))
+        world[name] = value
+        start += size
+    return world
+
+
+def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParameters:
+    """Parameters of the physics for a sampled world."""
+    physical_terms = [name for name in TERMS if name in world and TERMS[name].parameter]
+    if not physical_terms:
+        return PhysicsParameters()
+    model = own_parameters(mj_model)
+    parameters = {}
+    for name in physical_terms:
+        term = TERMS[name]
+        parameters[term.parameter] = apply(term.operation, model, term.parameter, world[name])
+    return PhysicsParameters(**parameters)
+
+
+def apply(
+    operation: Operation, model: PhysicsParameters, parameter: str, sampled: jax.Array
+) -> jax.Array:
+    """A physical parameter of an episode.
+
+    Args:
+      operation: how the sampled value changes the model's own.
+      model: the model's own parameters.
+      parameter: name of the field of `PhysicsParameters`.
+      sampled: the term's value, of its shape.
+
+    Raises:
+      UserError: the term is a restitution, and the model has no contact pair of ball and paddle.
+    """
+    if operation in ("replace", "limit"):
+        return sampled
+    if operation == "restitution":
+        if model.contact_stiffness is None:
+            raise UserError(NO_PAIR)
+        return damping_of_restitution(sampled, model.contact_stiffness)
+    value = jnp.asarray(getattr(model, parameter), sampled.dtype)
+    if operation == "scale":
+        return value * sampled
+    if operation == "add":
+        return value + sampled
+    if operation == "tilt_frame":
+        return jnp.stack(quaternion_product(tuple(value), _rotation_xy(sampled)))
+    assert operation == "tilt_vector"
+    return jnp.stack(quaternion_matrix(_rotation_xy(sampled)) @ tuple(value))
+
+
+def _rotation_xy(angles: jax.Array) -> Quaternion:
+    """Quaternion [w, x, y, z] of a rotation about x by angles[0], then about the new y by
+    angles[1]."""
+    cosines = jnp.cos(0.5 * angles)
+    sines = jnp.sin(0.5 * angles)
+    cos_x, cos_y = cosines
+    sin_x, sin_y = sines
+    return cos_x * cos_y, sin_x * cos_y, cos_x * sin_y, sin_x * sin_y
