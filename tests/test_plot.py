@@ -93,6 +93,19 @@ def test_runs_that_differ_in_the_seed_are_one_group(runs: list[Path]) -> None:
     assert [group.label for group in group_runs(runs[:3])] == ["3 runs"]
 
 
+@pytest.mark.parametrize(
+    ("target_kl", "name"), [(0.01, "first learning_rate"), (0.0, "learning_rate")]
+)
+def test_a_learning_rate_that_adapts_is_labelled_as_the_first(target_kl, name, tmp_path) -> None:
+    runs = []
+    for rate in (1e-3, 1e-4):
+        ppo = PPOConfig(learning_rate=rate, target_kl=target_kl)
+        run = tmp_path / str(rate)
+        runs.append(write_run(run, TrainConfig(ppo=ppo), {"episode/return": {1: 1.0}}))
+    labels = [group.label for group in group_runs(runs)]
+    assert labels == [f"{name} 0.001 (one run)", f"{name} 0.0001 (one run)"]
+
+
 def test_a_curve_has_the_values_logged_last(tmp_path: Path) -> None:
     """A run that was resumed from step 2 logs step 3 again."""
     run = write_run(
@@ -206,7 +219,8 @@ def check_report(run: Path) -> str:
     assert len(replays) == 1 and b"<title>bounce_mjx</title>" in base64.b64decode(
         replays[0].partition(",")[2]
     )
-    assert len(sources) - len(replays) == 3
+    # Curves, the best checkpoint, and a panel for each reward term.
+    assert len(sources) - len(replays) == 2 + len(TERMS)
     for source in set(sources) - set(replays):
         kind, _, data = source.partition(",")
         assert kind == "data:image/svg+xml;base64"

@@ -8,12 +8,14 @@ from pydantic import Field
 
 from bounce_mjx.config.command_line import Flag
 from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, suggest
 from bounce_mjx.runs import config as run_configs
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.runs.worlds import in_world
 from bounce_mjx.task.registry import DEFAULT, find_task
+from bounce_mjx.world.randomization import RandomizationConfig
 
 if TYPE_CHECKING:
     from bounce_mjx.runs.folders import Checkpoint
@@ -47,6 +49,38 @@ OtherWorld = Annotated[
     ),
 ]
 """Type of the flag for the world of the episodes."""
+
+
+OtherRandomization = Annotated[
+    RandomizationConfig,
+    Field(description="World of the episodes if a term is given, in place of the training's."),
+]
+"""Type of the flags for a what-if world."""
+
+
+def check_one_world(nominal: bool, world: Path | None, randomization: RandomizationConfig) -> None:
+    """Refuses more than one of the flags that say in which world the episodes are.
+
+    Raises:
+      UserError: several are given.
+    """
+    flags = {"--nominal": nominal, "--world": world, "--randomization": randomization.terms}
+    given = [flag for flag, value in flags.items() if value]
+    if len(given) > 1:
+        raise UserError(f"{' and '.join(given)} cannot be combined; omit one")
+
+
+def in_what_if_world(config: TrainConfig, randomization: RandomizationConfig) -> TrainConfig:
+    """A config with the terms of the world that a user gives, if any, in place of its own.
+
+    Raises:
+      UserError: a term does not fit the arm.
+    """
+    if not randomization.terms:
+        return config
+    given = dict(config.env) | {"randomization": randomization}
+    env = validate(type(config.env), given, "the flags --randomization")
+    return config.model_copy(update={"env": env})
 
 
 class WhichPolicy(StrictModel):
