@@ -11,8 +11,8 @@ import pytest
 
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.resources import resource_path
-from bounce_mjx.task import Kinematics, Step
-from bounce_mjx.task.bounce import Bounce, BounceState
+from bounce_mjx.task import Kinematics, Step, term_names
+from bounce_mjx.task.bounce import Bounce, BounceReward, BounceState
 from bounce_mjx.world.config import PADDLE_HOME
 from reward_reference import REFERENCE_WEIGHTS, reference_terms
 
@@ -266,7 +266,7 @@ def episodes(reset, step):
 
 
 def test_a_step_reports_the_terms_of_its_reward_and_the_metrics(episodes, reset):
-    names = {f"reward/{name}" for name in REFERENCE_WEIGHTS}
+    names = {f"reward/{name}" for name in term_names(BounceReward)}
     others = {"bounced", "n_bounces", "ball_xy_error", "apex_error", "apex_offset"}
     assert set(reset(jax.random.key(0)).metrics) == names | others | {"non_finite", "too_fast"}
     for _, action, after in episodes:

@@ -93,6 +93,19 @@ def test_runs_that_differ_in_the_seed_are_one_group(runs: list[Path]) -> None:
     assert [group.label for group in group_runs(runs[:3])] == ["3 runs"]
 
 
+@pytest.mark.parametrize(
+    ("target_kl", "name"), [(0.01, "first learning_rate"), (0.0, "learning_rate")]
+)
+def test_a_learning_rate_that_adapts_is_labelled_as_the_first(target_kl, name, tmp_path) -> None:
+    runs = []
+    for rate in (1e-3, 1e-4):
+        ppo = PPOConfig(learning_rate=rate, target_kl=target_kl)
+        run = tmp_path / str(rate)
+        runs.append(write_run(run, TrainConfig(ppo=ppo), {"episode/return": {1: 1.0}}))
+    labels = [group.label for group in group_runs(runs)]
+    assert labels == [f"{name} 0.001 (one run)", f"{name} 0.0001 (one run)"]
+
+
 def test_a_curve_has_the_values_logged_last(tmp_path: Path) -> None:
     """A run that was resumed from step 2 logs step 3 again."""
     run = write_run(
@@ -108,7 +121,7 @@ def test_a_curve_has_the_values_logged_last(tmp_path: Path) -> None:
 
 def test_a_run_without_a_log_is_an_error(tmp_path: Path) -> None:
     save_config(tmp_path, TrainConfig())
-    with pytest.raises(UserError, match="no TensorBoard scalars"):
+    with pytest.raises(UserError, match="no learning curves.*start again"):
         read_curves(tmp_path)
 
 
@@ -170,6 +183,22 @@ def test_a_panel_shows_its_whole_curve(first: float, last: float, lowest: float)
     assert top > last and (bottom == 0.0 if lowest == 0.0 else bottom < lowest)
 
 
+def test_a_panel_has_a_point_for_each_evaluation_and_steps_in_millions() -> None:
+    """Beside the line of the training; and where all results were met, a line."""
+    steps = np.array([1e6, 2e6, 4e6])
+    curves = {
+        "episode/return": LoggedCurve(steps, np.array([1.0, 2.0, 3.0])),
+        "results/mean_return": LoggedCurve(steps[1:], np.array([7.0, 9.0])),
+    }
+    axes = curves_figure([Group("one run", [RunCurves(Path("run"), curves, 4_000_000)])]).axes[0]
+    (points,) = [line for line in axes.lines if line.get_label() == "evaluation, without noise"]
+    assert (points.get_marker(), points.get_linestyle()) == ("o", "None")
+    assert points.get_xydata().tolist() == [[2e6, 7.0], [4e6, 9.0]]
+    (met,) = [line for line in axes.lines if line.get_label() == "all results met"]
+    assert set(met.get_xdata()) == {4_000_000}
+    assert [axes.xaxis.get_major_formatter()(x) for x in (0, 5e5, 2e6)] == ["0", "500k", "2M"]
+
+
 def test_hits_beside_the_paddle_are_drawn(env: BounceBall) -> None:
     """A ball bounces off an edge too, up to its radius beside the face."""
     half_x, half_y, _ = env.mj_model.geom_size[env.addresses.paddle_geom]
@@ -200,7 +229,8 @@ def check_report(run: Path) -> str:
     assert len(replays) == 1 and b"<title>bounce_mjx</title>" in base64.b64decode(
         replays[0].partition(",")[2]
     )
-    assert len(sources) - len(replays) == 3
+    # Curves, the best checkpoint, and a panel for each reward term.
+    assert len(sources) - len(replays) == 2 + len(TERMS)
     for source in set(sources) - set(replays):
         kind, _, data = source.partition(",")
         assert kind == "data:image/svg+xml;base64"

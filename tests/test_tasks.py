@@ -21,7 +21,7 @@ from bounce_mjx.commands.main import main
 from bounce_mjx.commands.play import PlayCommand
 from bounce_mjx.commands.task_commands import parse_with_commands
 from bounce_mjx.config.files import dump_config
-from bounce_mjx.env.env import Env
+from bounce_mjx.env.env import Env, EnvState
 from bounce_mjx.env.vector import VectorStep
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.metrics import rollout_metrics, step_metrics
@@ -31,6 +31,8 @@ from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.task import registry
 from bounce_mjx.task.registry import find_task, task_name
 from bounce_mjx.training.command import read_command
+from bounce_mjx.world.observation import ObservationLayout, Part
+from bounce_mjx.world.sensing import Sensing
 from tiny_runs import TINY
 
 CHECKOUT = Path(__file__).parent.parent
@@ -93,6 +95,32 @@ def test_a_command_that_the_policy_does_not_see_is_refused() -> None:
     # A fixed one, or one that a quantity of the task may show.
     Env(bounce(observation=unseen, target_height_range=(0.5, 0.5)))
     Env(bounce(observation=unseen | {"apex_error": 1}))
+
+    class Config(bounce):
+        """A command with the name of a setting that shows nothing."""
+
+        @property
+        def commands(self) -> dict[str, task.Command]:
+            return {"velocity": task.Command(0.0, 1.0)}
+
+    with pytest.raises(UserError, match="not see the command velocity, which varies from 0 to 1"):
+        Env(Config())
+
+
+def test_commands_are_observed_in_one_order() -> None:
+    """Not in that of a set, which differs between processes: each would compile its own program."""
+    values = {f"command_{i}": jnp.zeros(()) for i in range(8)}
+    histories = {name: jnp.zeros((2, 1)) for name in values}
+    env = object.__new__(Env)
+    env.layout = ObservationLayout(tuple(Part(name, 1, "", 2) for name in values))
+
+    def observe(histories: task.Values) -> jax.Array:
+        sensing = Sensing(balls=None, picture=None, histories=histories, task=())
+        return env.observe(EnvState(None, values, last_action=None, sensing=sensing))
+
+    program = jax.make_jaxpr(observe)(histories).jaxpr
+    read = [equation.invars[0] for equation in program.eqns if equation.primitive.name == "slice"]
+    assert [variable for variable in read if variable in program.invars] == program.invars
 
 
 RADIUS, HALF_HEIGHT = 0.03, 0.01

@@ -262,7 +262,8 @@ def _hinges(
         )
         anchor = data.xanchor[joint]
     centre = data.geom_xpos[addresses.paddle_geom] - anchor
-    normal = data.xmat[body].reshape(3, 3) @ upper_face(m, default_joint_angles)[0]
+    normal_in_body, _ = upper_face(m, addresses, default_joint_angles)
+    normal = data.xmat[body].reshape(3, 3) @ normal_in_body
     return tuple(links), tuple(centre.tolist()), tuple(normal.tolist())
 
 

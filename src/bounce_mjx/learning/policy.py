@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from bounce_mjx.env.env import Env
+from bounce_mjx.env.vector import AnyEnv
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.statistics import Normalizer, init_normalizer, normalize
 
@@ -131,10 +131,10 @@ def make_networks(
     )
 
 
-def networks_of(config: PPOConfig) -> Callable[[Env], Networks]:
+def networks_of(config: PPOConfig) -> Callable[[AnyEnv], Networks]:
     """`make_networks` of a config, as a function of the environment."""
 
-    def networks_for(env: Env) -> Networks:
+    def networks_for(env: AnyEnv) -> Networks:
         return make_networks(config, env.observation_size, env.action_size)
 
     return networks_for

@@ -9,6 +9,9 @@ iteration is `PPO.iterate`:
     (statistics)  those of the networks' inputs take in the rollout, and normalise the update
     update        epochs of minibatches: `loss`, its gradient, a step of `learning_rate`
 
+Normalised are the networks' inputs, by the running statistics, and the advantages of each
+minibatch; a reward is only scaled.
+
 Arrays have the axes T (control steps of a rollout), B (environments), N (observation), K (critic
 metrics) and A (action); samples have G groups, and a minibatch has S samples.
 Source: Schulman et al., Proximal Policy Optimization Algorithms (2017).
@@ -151,7 +154,7 @@ class LearnerState(NamedTuple):
     params: jax.Array
     """All parameters in one array: on a GPU, each array costs kernels in every step."""
     optimizer: optax.OptState
-    learning_rate: jax.Array
+    adapted_rate: jax.Array
     """Learning rate that the KL rule has reached []."""
 
 
@@ -403,7 +406,8 @@ class PPO:
     def update(
         self, state: TrainingState, samples: Samples, key: jax.Array
     ) -> tuple[TrainingState, Metrics]:
-        """Several epochs of minibatch steps.
+        """Several epochs of minibatch steps. Samples are shuffled within groups of environments
+        (`num_groups`).
 
         Args:
           state: before the update.
@@ -418,14 +422,14 @@ class PPO:
         grouped = samples.map_arrays(lambda array: group(array, groups))
         params, unravel = ravel_pytree(state.params)
 
+        def learn_epoch(learner: LearnerState, epoch_key: jax.Array) -> tuple:
+            minibatches = self.minibatches(grouped.advantage, epoch_key)
+            return jax.lax.scan(learn_minibatch, learner, minibatches)
+
         def learn_minibatch(learner: LearnerState, minibatch: Minibatch) -> tuple:
             batch = samples_of(minibatch, grouped)
             learner, metrics = self.minibatch_step(learner, batch, unravel, state.iteration)
             return learner, pack(metrics)
-
-        def learn_epoch(learner: LearnerState, epoch_key: jax.Array) -> tuple:
-            minibatches = self.minibatches(grouped.advantage, epoch_key)
-            return jax.lax.scan(learn_minibatch, learner, minibatches)
 
         learner = LearnerState(params, state.optimizer, state.learning_rate)
         epoch_keys = jax.random.split(key, self.config.num_epochs)
@@ -433,7 +437,7 @@ class PPO:
         return state._replace(
             params=unravel(learner.params),
             optimizer=learner.optimizer,
-            learning_rate=learner.learning_rate,
+            learning_rate=learner.adapted_rate,
         ), unpack(metrics)
 
     def minibatches(self, advantage: jax.Array, key: jax.Array) -> Minibatch:
@@ -475,11 +479,11 @@ class PPO:
         gradient, metrics = jax.grad(loss_of, has_aux=True)(learner.params)
         metrics["loss/gradient_norm"] = optax.tree.norm(gradient)
         direction, optimizer = self.optimizer.update(gradient, learner.optimizer)
-        learning_rate = self.learning_rate(learner.learning_rate, iteration)
+        learning_rate = self.learning_rate(learner.adapted_rate, iteration)
         return LearnerState(
             params=learner.params - learning_rate * direction,
             optimizer=optimizer,
-            learning_rate=self.adapt_learning_rate(learner.learning_rate, metrics, iteration),
+            adapted_rate=self.adapt_learning_rate(learner.adapted_rate, metrics, iteration),
         ), metrics
 
     def loss(self, params: Params, samples: Samples) -> tuple[jax.Array, Metrics]:
@@ -517,14 +521,14 @@ class PPO:
         return adapted
 
     def adapt_learning_rate(
-        self, learning_rate: jax.Array, metrics: Metrics, iteration: jax.Array
+        self, adapted: jax.Array, metrics: Metrics, iteration: jax.Array
     ) -> jax.Array:
-        """The learning rate [] after a minibatch step, adapted so that the KL divergence of the
-        policy from that of the rollout approaches target_kl: the adaptive rule of Schulman et al.
-        2017, section 4, applied to the learning rate. If target_kl is 0, it stays.
+        """The rate [] after a minibatch step, adapted so that the KL divergence of the policy from
+        that of the rollout approaches target_kl: the adaptive rule of Schulman et al. 2017, section
+        4, applied to the learning rate. If target_kl is 0, it stays.
 
         Args:
-          learning_rate: that the rule reached before this minibatch step [].
+          adapted: the rate that the rule had reached before [].
           metrics: of this minibatch step, each [].
           iteration: iterations done before this one [], int.
 
@@ -533,7 +537,7 @@ class PPO:
         """
         config = self.config
         if config.target_kl == 0.0:
-            return learning_rate
+            return adapted
         if "policy/kl" not in metrics:
             raise UserError(
                 f"the loss of {type(self).__name__} returns no metric policy/kl, to which the "
@@ -544,7 +548,7 @@ class PPO:
         factor = jnp.where(is_small, _LEARNING_RATE_FACTOR, 1.0)
         factor = jnp.where(is_large, 1.0 / _LEARNING_RATE_FACTOR, factor)
         limit = self.max_learning_rate(iteration)
-        return jnp.clip(learning_rate * factor, config.min_learning_rate, limit)
+        return jnp.clip(adapted * factor, config.min_learning_rate, limit)
 
     def max_learning_rate(self, iteration: jax.Array) -> jax.Array:
         """Upper limit [] of the rate that adapts: an exponential decay from max_learning_rate to

@@ -53,20 +53,22 @@ style = functools.partial(matplotlib.rc_context, _STYLE)
 class RunPlot(NamedTuple):
     """A plot of trainings."""
 
-    title: str
-    """Heading in the report."""
+    title: str | None
+    """Heading in the report; None for a plot that it shows in its own way."""
     draw: Callable[..., Figure]
     """A function of groups of runs (`curves.Group`) and `columns`, the most panels side by side."""
 
+
+Draw = Callable[..., Figure]
 
 RUN_PLOTS: dict[str, RunPlot] = {}
 """The plots that `bounce-mjx plot` and the report draw, by the names of their files."""
 
 
-def run_plot(name: str, title: str) -> Callable[[Callable[..., Figure]], Callable[..., Figure]]:
+def run_plot(name: str, title: str | None) -> Callable[[Draw], Draw]:
     """Registers a function as a `RunPlot`."""
 
-    def register(draw: Callable[..., Figure]) -> Callable[..., Figure]:
+    def register(draw: Draw) -> Draw:
         RUN_PLOTS[name] = RunPlot(title, style()(draw))
         return draw
 
@@ -91,17 +93,32 @@ def curves_figure(groups: Sequence[Group], columns: int = 3) -> Figure:
     return figure
 
 
-@run_plot("rewards", "Reward terms")
+@run_plot("rewards", title=None)
 @style()
 def rewards_figure(groups: Sequence[Group], columns: int = 5) -> Figure:
     """The weighted reward terms over the training, at most `columns` panels side by side."""
-    logged = dict.fromkeys(name for group in groups for run in group.runs for name in run.curves)
-    titles = {x: x.removeprefix(_REWARD).replace("_", " ") for x in logged if x.startswith(_REWARD)}
-    shown = [Curve(name, "", title=title) for name, title in titles.items()]
-    figure = _draw_curves(groups, shown, columns, height=1.6)
+    figure = _draw_curves(groups, _reward_curves(groups), columns, height=1.6)
     title = "weighted reward terms over environment steps,\nmean of a control step"
     figure.suptitle(title, fontsize=10)
     return figure
+
+
+@style()
+def reward_panels(groups: Sequence[Group]) -> dict[str, Figure]:
+    """The panels of `rewards_figure` one by one, without a legend, by the name of the term."""
+    panels = {}
+    for curve in _reward_curves(groups):
+        figure = Figure(figsize=(PANEL_WIDTH, 1.6), layout="constrained")
+        _draw_curve(figure.subplots(), groups, curve)
+        panels[curve.title] = figure
+    return panels
+
+
+def _reward_curves(groups: Sequence[Group]) -> list[Curve]:
+    """The reward terms that any of the runs has logged."""
+    logged = dict.fromkeys(name for group in groups for run in group.runs for name in run.curves)
+    terms = [name for name in logged if name.startswith(_REWARD)]
+    return [Curve(x, "", title=x.removeprefix(_REWARD).replace("_", " ")) for x in terms]
 
 
 @style()

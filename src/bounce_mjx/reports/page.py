@@ -17,7 +17,7 @@ from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
 from bounce_mjx.evaluation.statistics import RECORDED_EPISODES
 from bounce_mjx.reports import figures
 from bounce_mjx.reports.curves import group_runs
-from bounce_mjx.reports.html_page import data_url, figures_html, page, table
+from bounce_mjx.reports.html_page import data_url, figures_html, page, panels_html, table
 from bounce_mjx.reports.robustness import load_robustness, robustness_figure
 from bounce_mjx.reports.tables import details_line, result_cells
 from bounce_mjx.runs.checkpoints import read_actor
@@ -62,7 +62,8 @@ def write_report(run: Path, recording: Recording | None = None) -> Path:
     robustness = load_robustness(run)
     drawn = {"The best checkpoint": figures.evaluation_figure(env, recording, _WIDTH)}
     for plot in figures.RUN_PLOTS.values():
-        drawn[plot.title] = plot.draw(groups, columns=_COLUMNS)
+        if plot.title is not None:
+            drawn[plot.title] = plot.draw(groups, columns=_COLUMNS)
     if robustness is not None:
         drawn["Perturbed worlds"] = robustness_figure(robustness)
     robot = "Peitian AIR4-560" if config.env.mjcf is None else config.env.mjcf.stem
@@ -84,6 +85,10 @@ after {results.best_steps:,} of {results.trained_steps:,} environment steps, on 
 <p>In the learning curves, lines are the training, whose actions are sampled (exploration); points
 are evaluations, whose actions are not. Errors rise first: sampled actions scatter most then.</p>
 {figures_html(drawn)}
+<h2>Reward terms</h2>
+<p>Weighted, the mean of a control step, over environment steps. The dotted line is the first
+evaluation that met all results.</p>
+{panels_html(figures.reward_panels(groups))}
 <h2>Where the time went</h2>
 {table(["phase", "seconds"], phases)}
 <details><summary>Config</summary><pre>{html.escape(dump_config(config))}</pre></details>"""

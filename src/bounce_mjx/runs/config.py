@@ -102,6 +102,12 @@ class TrainConfig(StrictModel):
                 sources[key] = source
         return sources
 
+    @property
+    def starts_with_learning_rate(self) -> bool:
+        """Whether `ppo.learning_rate` is only the start, as `target_kl` adapts it after each
+        minibatch; an algorithm of the user's may have a schedule of its own."""
+        return self.algorithm == PPO_NAME and self.ppo.target_kl > 0.0
+
     def set_sources(self, sources: dict[str, str]) -> None:
         """Notes what set the values, by their dotted keys."""
         self._sources = sources

@@ -205,13 +205,13 @@ class Task:
         a task without one compiles the config's model for them."""
         # The settings alone need no JAX.
         from bounce_mjx.robot.geometry import read_geometry
-        from bounce_mjx.robot.model import load_model
+        from bounce_mjx.robot.model import find_addresses, load_model
 
         config = self.config
         model = load_model(
             config.mjcf, config.physics_dt, False, config.robot, num_balls=config.num_balls
         )
-        return read_geometry(model, config.default_joint_angles)
+        return read_geometry(model, find_addresses(model), config.default_joint_angles)
 
     def throw(self, draws: jax.Array, command: Values) -> tuple[jax.Array, jax.Array] | None:
         """Position [3] (m) and velocity [3] (m/s) of the ball at a reset, before the noise and the

@@ -31,7 +31,7 @@ from bounce_mjx.runs import folders
 from bounce_mjx.runs.checkpoints import read_actor
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.progress import load_results
-from bounce_mjx.runs.settings import PYTHON, Choice, Stack, stack
+from bounce_mjx.runs.settings import FLAGS, PYTHON, Choice, Stack, stack
 from bounce_mjx.training import hosts, job
 from bounce_mjx.training.events import Callback, say
 from bounce_mjx.training.setup import set_up_jax
@@ -207,7 +207,7 @@ def run_training(
     """Trains with a config, which has its settings from layers, and returns the run."""
     if layers.resume is None:
         say(console, f"config: {layers.title}")
-    for note in layers.notes:
+    for note in (*layers.notes, *notes_on_starts(config)):
         say(console, f"note: {note}")
     seeds = job.train(config, console, resume=layers.resume, callbacks=callbacks)
     best = print_results(seeds, console)
@@ -215,6 +215,18 @@ def run_training(
         leave_report(best, console)
     run = best.run if len(seeds) == 1 else best.run.parent
     return Run(run, config.task)
+
+
+def notes_on_starts(config: TrainConfig) -> list[str]:
+    """A sentence where the user sets the learning rate, and it is only the one at the start."""
+    is_said = config.sources["ppo.learning_rate"] in (FLAGS, PYTHON)
+    if not (is_said and config.starts_with_learning_rate):
+        return []
+    return [
+        f"ppo.learning_rate {config.ppo.learning_rate} is only the first one, since ppo.target_kl "
+        f"{config.ppo.target_kl} adapts it after each minibatch; to compare learning rates, set "
+        "target_kl to 0, or change target_kl itself"
+    ]
 
 
 def print_results(seeds: Sequence[job.SeedRun], console: Console) -> job.SeedRun:

@@ -56,7 +56,7 @@ def register() -> None:
 
 
 def domain_randomize(model: Any, rng: Any, task: str = DEFAULT) -> tuple[Any, Any]:
-    """The `randomization_fn` of the shipped robot: `adapters.randomization.DEFAULT`.
+    """The `randomization_fn` of the shipped robot: `adapters.randomization.default_terms`.
 
     Args:
       model: `mjx_model` of the environment.
