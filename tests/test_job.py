@@ -209,6 +209,22 @@ def test_a_failed_screening_is_no_evaluation(tmp_path: Path) -> None:
     assert results_of(run)["screening"] is False
 
 
+def test_a_state_is_saved_between_evaluations_where_save_every_asks_for_it(
+    tmp_path: Path, monkeypatch
+) -> None:
+    saved, save = [], checkpoints.save_checkpoint
+
+    def noted(run: Path, config: TrainConfig, steps: int, *args, **options) -> int:
+        saved.append(steps // BLOCK)
+        return save(run, config, steps, *args, **options)
+
+    monkeypatch.setattr(checkpoints, "save_checkpoint", noted)
+    returns = dict.fromkeys(range(1, 7), 1.0)
+    run = train(tmp_path, returns, eval_every=3 * BLOCK, save_every=2 * BLOCK)
+    assert saved == [2, 3, 4, 6]
+    assert evaluated_steps(run) == [3 * BLOCK, 6 * BLOCK]
+
+
 @pytest.mark.parametrize(("given", "trained"), [(170, 192), (80, 64)])
 def test_a_training_ends_at_the_whole_block_nearest_to_its_steps(
     tmp_path: Path, given: int, trained: int

@@ -121,7 +121,7 @@ def test_a_curve_has_the_values_logged_last(tmp_path: Path) -> None:
 
 def test_a_run_without_a_log_is_an_error(tmp_path: Path) -> None:
     save_config(tmp_path, TrainConfig())
-    with pytest.raises(UserError, match="no TensorBoard scalars"):
+    with pytest.raises(UserError, match="no learning curves.*start again"):
         read_curves(tmp_path)
 
 
@@ -181,6 +181,22 @@ def test_a_panel_shows_its_whole_curve(first: float, last: float, lowest: float)
     figure = curves_figure([Group("one run", [RunCurves(Path("run"), curves, None)])])
     bottom, top = figure.axes[0].get_ylim()
     assert top > last and (bottom == 0.0 if lowest == 0.0 else bottom < lowest)
+
+
+def test_a_panel_has_a_point_for_each_evaluation_and_steps_in_millions() -> None:
+    """Beside the line of the training; and where all results were met, a line."""
+    steps = np.array([1e6, 2e6, 4e6])
+    curves = {
+        "episode/return": LoggedCurve(steps, np.array([1.0, 2.0, 3.0])),
+        "results/mean_return": LoggedCurve(steps[1:], np.array([7.0, 9.0])),
+    }
+    axes = curves_figure([Group("one run", [RunCurves(Path("run"), curves, 4_000_000)])]).axes[0]
+    (points,) = [line for line in axes.lines if line.get_label() == "evaluation, without noise"]
+    assert (points.get_marker(), points.get_linestyle()) == ("o", "None")
+    assert points.get_xydata().tolist() == [[2e6, 7.0], [4e6, 9.0]]
+    (met,) = [line for line in axes.lines if line.get_label() == "all results met"]
+    assert set(met.get_xdata()) == {4_000_000}
+    assert [axes.xaxis.get_major_formatter()(x) for x in (0, 5e5, 2e6)] == ["0", "500k", "2M"]
 
 
 def test_hits_beside_the_paddle_are_drawn(env: BounceBall) -> None:

@@ -10,8 +10,8 @@ import pytest
 
 from bounce_mjx import BounceBall, Run, load_policy
 from bounce_mjx.adapters.gymnasium.registration import ENV_ID, TASK_ID
-from bounce_mjx.adapters.policies import environment_of, policy_environment
 from bounce_mjx.config.files import dump_config
+from bounce_mjx.deploy.environments import environment_of, policy_environment
 from bounce_mjx.deploy.export import policy_metadata
 from bounce_mjx.deploy.interface import interface_in, interface_of
 from bounce_mjx.deploy.metadata import from_entries, to_entries

@@ -40,6 +40,17 @@ def test_a_training_does_not_wait_long_for_a_margin(evaluations, solved: bool) -
     assert progress.solved is solved
 
 
+def test_of_equal_evaluations_the_newest_is_the_best() -> None:
+    """And a screening is never better than a full evaluation."""
+    progress = Progress()
+    result = Result("stable", "episodes, %", 99.5, ">= 99", True, 0.5)
+    full = Report((result,), {"mean_return": 1.0})
+    screened = Report((result,), {"mean_return": 9.0}, screening=True)
+    for steps, report, is_best in ((64, full, True), (128, full, True), (192, screened, False)):
+        assert progress.improves(report, steps, 0.0) is is_best
+    assert progress.best_steps == 128
+
+
 def test_json_has_null_where_there_is_no_finite_number() -> None:
     def refuse(constant: str) -> None:
         raise AssertionError(constant)

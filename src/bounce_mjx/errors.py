@@ -5,6 +5,7 @@ import difflib
 import functools
 import io
 import os
+import re
 import select
 import shlex
 import sys
@@ -138,7 +139,10 @@ def warn_once(sentence: str) -> None:
 
 def reason_of(error: Exception) -> str:
     """An exception's text on one line, for a sentence; its type if it has no text."""
-    return " ".join(str(error).split()) or type(error).__name__
+    text = " ".join(str(error).split())
+    # pydantic's text ends in a link to its own pages.
+    text = re.sub(r" For further information visit \S+", "", text)
+    return text or type(error).__name__
 
 
 def shorten(text: str, length: int = 100) -> str:

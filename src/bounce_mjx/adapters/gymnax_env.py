@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from bounce_mjx.adapters.policies import environment_config
+from bounce_mjx.deploy.environments import environment_config
 from bounce_mjx.env.env import Env, State
 from bounce_mjx.errors import needed
 from bounce_mjx.task.task import Task
@@ -53,7 +53,7 @@ class GymnaxBounceBall:
         Args:
           task: its class, its name, or FILE.py:CLASS; None for the policy's, or the default one.
           policy: a name, a run's folder, a checkpoint in it or an .onnx file, whose environment it
-            is (`adapters.policies`).
+            is (`deploy.environments`).
           world: of the policy: nominal (the default), training for the worlds that its training
             sampled, or a named world.
           settings: fields of the task's config, such as episode_seconds=30.

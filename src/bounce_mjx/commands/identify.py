@@ -69,7 +69,7 @@ def main(args: Sequence[str]) -> None:
     config = read_preset(Path("default"), command.robot).env
     if known is not None:
         # Its ranges are of this robot's joints.
-        ranges = known.applied({})["randomization"]
+        ranges = known.settings.get("randomization", {})
         validate(type(config), config.model_dump() | {"randomization": ranges}, str(command.check))
     model = load_model(config.mjcf, config.physics_dt, visual=False, robot=config.robot)
     names = joint_names(model)

@@ -61,7 +61,7 @@ def _use_environment(policy: DeployedPolicy, name: str, env: Any) -> None:
     Raises:
       UserError: the environment is not the policy's.
     """
-    from bounce_mjx.adapters.policies import environment_of
+    from bounce_mjx.deploy.environments import environment_of
     from bounce_mjx.deploy.interface import check_interface, interface_in, interface_of
 
     config = environment_of(env).config

@@ -91,7 +91,10 @@ def read_curves(run: Path) -> RunCurves:
             steps, points = zip(*sorted(values.items()), strict=True)
             curves[name] = LoggedCurve(np.array(steps), np.array(points))
     if not curves:
-        raise UserError(f"{run} holds no TensorBoard scalars; train longer, or give another run")
+        raise UserError(
+            f"{run} has no learning curves, as its training ended before its first block; "
+            "start again, or give another run"
+        )
     results = load_results(run)
     return RunCurves(run, curves, results.solved_steps if results else None)
 

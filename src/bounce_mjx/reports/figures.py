@@ -55,20 +55,22 @@ style = functools.partial(matplotlib.rc_context, _STYLE)
 class RunPlot(NamedTuple):
     """A plot of trainings."""
 
-    title: str
-    """Heading in the report."""
+    title: str | None
+    """Heading in the report; None for a plot that it shows in its own way."""
     draw: Callable[..., Figure]
     """A function of groups of runs (`curves.Group`) and `columns`, the most panels side by side."""
 
+
+Draw = Callable[..., Figure]
 
 RUN_PLOTS: dict[str, RunPlot] = {}
 """The plots that `bounce-mjx plot` and the report draw, by the names of their files."""
 
 
-def run_plot(name: str, title: str) -> Callable[[Callable[..., Figure]], Callable[..., Figure]]:
+def run_plot(name: str, title: str | None) -> Callable[[Draw], Draw]:
     """Registers a function as a `RunPlot`."""
 
-    def register(draw: Callable[..., Figure]) -> Callable[..., Figure]:
+    def register(draw: Draw) -> Draw:
         RUN_PLOTS[name] = RunPlot(title, style()(draw))
         return draw
 
@@ -93,7 +95,7 @@ def curves_figure(groups: Sequence[Group], columns: int = 3) -> Figure:
     return figure
 
 
-@run_plot(REWARDS, "Reward terms")
+@run_plot("rewards", title=None)
 @style()
 def rewards_figure(groups: Sequence[Group], columns: int = 5) -> Figure:
     """The weighted reward terms over the training, at most `columns` panels side by side."""

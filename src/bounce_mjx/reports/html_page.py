@@ -52,6 +52,7 @@ def figures_html(figures: Mapping[str, Figure]) -> str:
     parts = []
     for title, figure in figures.items():
         source = data_url("image/svg+xml", image(figure, "svg"))
+        title = html.escape(title)
         parts.append(f'<figure><h2>{title}</h2><img alt="{title}" src="{source}"></figure>\n')
     return f'<div class="figures">{"".join(parts)}</div>'
 

@@ -26,7 +26,7 @@ from bounce_mjx.runs.files import write_output
 from bounce_mjx.runs.folders import Checkpoint, best_checkpoint
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.task.task import Recording
-from bounce_mjx.viewers.page import replay_first_episode
+from bounce_mjx.viewers.page import replay_first_and_worst
 
 # Panels side by side in a figure that fits a phone, and its width in inches.
 _COLUMNS = 2
@@ -61,13 +61,14 @@ def write_report(run: Path, recording: Recording | None = None) -> Path:
     recording = recording or record_checkpoint(best_checkpoint(run))
     robustness = load_robustness(run)
     drawn = {"The best checkpoint": figures.evaluation_figure(env, recording, _WIDTH)}
-    for name, plot in figures.RUN_PLOTS.items():
-        if name != figures.REWARDS:  # they are small panels
+    for plot in figures.RUN_PLOTS.values():
+        if plot.title is not None:
             drawn[plot.title] = plot.draw(groups, columns=_COLUMNS)
     if robustness is not None:
         drawn["Perturbed worlds"] = robustness_figure(robustness)
     robot = "Peitian AIR4-560" if config.env.mjcf is None else config.env.mjcf.stem
-    replay, report = replay_first_episode(env, recording), results.best
+    replay, report = replay_first_and_worst(env, recording), results.best
+    num_recorded = recording.running.shape[-1]
     seconds = results.seconds | {"total": sum(results.seconds.values())}
     phases = [[name, f"{value:.1f}"] for name, value in seconds.items()]
     resets = "fresh resets" if results.fresh_resets else "the resets of the selection"
@@ -79,7 +80,7 @@ after {results.best_steps:,} of {results.trained_steps:,} environment steps, on 
 <p>Trained on {html.escape(results.device)} with bounce_mjx {html.escape(results.version or "?")};
 {env.engine.name} physics, MuJoCo {mujoco.__version__}, JAX {jax.__version__}.</p>
 {table(["result", "measured", "value", "bound", ""], map(result_cells, report.results))}
-<h2>The policy in its first recorded episode</h2>
+<h2>The policy in its first recorded episode, and in the worst of {num_recorded}</h2>
 <iframe title="Replay" src="{data_url("text/html", replay.encode())}"></iframe>
 <p>In the learning curves, lines are the training, whose actions are sampled (exploration); points
 are evaluations, whose actions are not. Errors rise first: sampled actions scatter most then.</p>

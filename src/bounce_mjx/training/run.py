@@ -11,14 +11,14 @@ from typing import Any
 import jax
 from rich.console import Console
 
-from bounce_mjx.adapters.policies import (
+from bounce_mjx.config.command_line import stdout
+from bounce_mjx.config.validation import validate
+from bounce_mjx.deploy.environments import (
     environment_config,
     environment_of,
     in_library,
     policy_path,
 )
-from bounce_mjx.config.command_line import stdout
-from bounce_mjx.config.validation import validate
 from bounce_mjx.deploy.interface import check_interface, interface_of
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import reason_of

@@ -2,6 +2,9 @@
 
 from collections.abc import Sequence
 
+import jax
+import numpy as np
+
 from bounce_mjx.env.env import Env
 from bounce_mjx.task.task import Recording
 from bounce_mjx.viewers.film import episode_frames
@@ -15,10 +18,37 @@ _EPISODE_SECONDS = 10.0
 _VISER_TITLE = "<title>Viser</title>"
 
 
-def replay_first_episode(env: Env, recording: Recording) -> str:
-    """A page (HTML) that replays the first recorded episode up to its end, or for 10 s."""
-    frames = episode_frames(env, recording, seconds=_EPISODE_SECONDS)
-    return replay(env, frames)
+def replay_first_and_worst(env: Env, recording: Recording) -> str:
+    """A page (HTML) that replays the first recorded episode from its start, and beside it the worst
+    recorded one up to its end, each up to its end or for 10 s."""
+    worst = worst_episode(recording)
+    first = episode_frames(env, recording, seconds=_EPISODE_SECONDS)
+    if worst == 0:
+        return replay(env, first)
+    whole = episode_frames(env, recording, worst)
+    steps = round(_EPISODE_SECONDS / env.dt)
+    last = jax.tree.map(lambda values: values[-steps:], whole)
+    return replay(env, _beside(first, last), names=["first", f"worst: {worst}"])
+
+
+def worst_episode(recording: Recording) -> int:
+    """Index of the recorded episode that ended first; of those that ended together, of the one with
+    the lowest return."""
+    running = np.asarray(recording.running)
+    terms = [np.asarray(x) for name, x in recording.metrics.items() if name.startswith("reward/")]
+    returns = np.where(running, sum(terms, np.zeros(running.shape)), 0.0).sum(axis=0)
+    return int(np.lexsort((returns, running.sum(axis=0)))[0])
+
+
+def _beside(frames: EnvFrame, others: EnvFrame) -> EnvFrame:
+    """Two recordings [T, 1, ...] in one [T, 2, ...]; the shorter one stays at its last frame."""
+    count = max(len(frames.time), len(others.time))
+
+    def join(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        held = [x[np.minimum(np.arange(count), len(x) - 1)] for x in (first, second)]
+        return np.concatenate(held, axis=1)
+
+    return jax.tree.map(join, frames, others)
 
 
 def replay(

@@ -8,7 +8,7 @@ from typing import Any
 import pydantic
 
 from bounce_mjx.config.files import flat, read_mapping
-from bounce_mjx.config.settings import StrictModel, merged, nested
+from bounce_mjx.config.settings import StrictModel, nested
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import shorten
 from bounce_mjx.lazy import np
@@ -67,21 +67,6 @@ class NamedWorld(StrictModel):
     def settings(self) -> dict[str, Any]:
         """The given settings of `env`, nested."""
         return self.env.model_dump(exclude_unset=True)
-
-    def applied(self, env: dict[str, Any], training: bool = False) -> dict[str, Any]:
-        """The settings of an environment in this world.
-
-        Args:
-          env: the settings, nested.
-          training: whether the curriculum of their randomisation stays unless the world has one.
-        """
-        curriculum = {}
-        if training:
-            for key, value in env.get("randomization", {}).items():
-                if key in CURRICULUM:
-                    curriculum[key] = value
-        values = merged(env | {"randomization": curriculum}, self.settings)
-        return values | {"randomization": without_idle_curriculum(values["randomization"])}
 
     def double_assumed(self, nominals: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         """For each assumed key, the nested settings of `env` in which alone its number is doubled.

@@ -16,9 +16,9 @@ import numpy as np
 from brax.io import image, mjcf
 from flax import struct
 
-from bounce_mjx.adapters.policies import environment_config
 from bounce_mjx.adapters.randomization import randomized_task
 from bounce_mjx.config.validation import validate
+from bounce_mjx.deploy.environments import environment_config
 from bounce_mjx.env.env import Env, EnvState, State
 from bounce_mjx.errors import UserError
 from bounce_mjx.task.task import Task
@@ -83,7 +83,7 @@ class BraxBounceBall(brax.envs.Env):
           task: its class, its name, or FILE.py:CLASS, if there is no config; None for the policy's,
             or the default one.
           policy: a name, a run's folder, a checkpoint in it or an .onnx file, whose environment it
-            is (`adapters.policies`), if there is no config.
+            is (`deploy.environments`), if there is no config.
           world: of the policy: nominal (the default), training for the worlds that its training
             sampled, or a named world.
           settings: fields of the task's config, such as episode_seconds=30, which replace fields of

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from bounce_mjx.adapters.gymnasium.programs import Episodes, Programs, shared_programs
-from bounce_mjx.adapters.policies import environment_config, settings_class
+from bounce_mjx.deploy.environments import environment_config, settings_class
 from bounce_mjx.errors import UserError, suggest
 from bounce_mjx.task.task import Task
 

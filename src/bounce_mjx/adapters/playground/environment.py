@@ -11,8 +11,8 @@ import mujoco
 import numpy as np
 from flax import struct
 
-from bounce_mjx.adapters.policies import environment_config
 from bounce_mjx.adapters.randomization import randomized_task
+from bounce_mjx.deploy.environments import environment_config
 from bounce_mjx.env import env as core
 from bounce_mjx.env.env import Env, EnvState
 from bounce_mjx.errors import needed
@@ -36,7 +36,7 @@ def default_config(
     policy: str | os.PathLike | None = None,
     world: str | os.PathLike | None = None,
 ) -> config_dict.ConfigDict:
-    """The settings of a task's config, or of a policy's environment (`adapters.policies`), some
+    """The settings of a task's config, or of a policy's environment (`deploy.environments`), some
     under Playground's own names."""
     config = environment_config(ENV_NAME, task, policy, world, {})
     return config_dict.create(
@@ -91,7 +91,7 @@ class PlaygroundBounceBall(MjxEnv):
         Args:
           task: its class, its name, or FILE.py:CLASS; None for the policy's, or the default one.
           policy: a name, a run's folder, a checkpoint in it or an .onnx file, whose environment it
-            is (`adapters.policies`).
+            is (`deploy.environments`).
           world: of the policy: nominal (the default), training for the worlds that its training
             sampled, or a named world.
 

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 import torch
 
-from bounce_mjx.adapters.policies import environment_config
 from bounce_mjx.adapters.torch.packing import Layout
+from bounce_mjx.deploy.environments import environment_config
 from bounce_mjx.env import vector
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
@@ -69,7 +69,7 @@ class TorchVectorEnv:
             a pattern such as world/* names many; None for the task's own.
           reward_scale: factor of the rewards.
           policy: a name, a run's folder, a checkpoint in it or an .onnx file, whose environment it
-            is (`adapters.policies`), in place of `env`.
+            is (`deploy.environments`), in place of `env`.
           world: of the policy: nominal (the default), training for the worlds that its training
             sampled, or a named world.
 
