@@ -24,8 +24,6 @@ from bounce_mjx.task.task import Curve, Histogram, Hits, Recording
 
 RETURN = "episode/return"
 """Tag of the return in a training's log."""
-REWARDS = "rewards"
-"""Name of the plot of the reward terms."""
 _REWARD = "reward/"
 _GREY = "#777777"
 _STYLE = {
