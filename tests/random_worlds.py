@@ -5,25 +5,27 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.physics import PhysicsParameters
-from bounce_mjx.physics.edited import EditedModel, direct_solref
-from bounce_mjx.robot.model import find_addresses
+from bounce_mjx.robot.model import find_addresses, link_bodies
 
 
 def own_parameters(mj_model: mujoco.MjModel) -> PhysicsParameters:
     """The model's own numbers, all of them given but for those that it has not: friction and
     force limits."""
     at = find_addresses(mj_model)
-    stiffness, damping = direct_solref(mj_model)
+    links = link_bodies(mj_model, at)
+    # The direct format.
+    stiffness, damping = -mj_model.pair_solref[0]
+    assert stiffness > 0.0
     return PhysicsParameters(
         ball_mass=mj_model.body_mass[at.balls[0].body],
         ball_radius=mj_model.geom_size[at.balls[0].geom, 0],
-        contact_stiffness=np.array(stiffness),
-        contact_damping=np.array(damping),
+        contact_stiffness=stiffness,
+        contact_damping=damping,
         servo_gain=mj_model.actuator_gainprm[at.actuators, 0],
         servo_damping=-mj_model.actuator_biasprm[at.actuators, 2],
         armature=mj_model.dof_armature[at.arm_qvel,],
         damping=mj_model.dof_damping[at.arm_qvel,],
-        link_mass=EditedModel(mj_model).link_masses(),
+        link_mass=np.array([np.sum(mj_model.body_mass[bodies]) for bodies in links]),
         paddle_position=mj_model.geom_pos[at.paddle_geom],
         paddle_rotation=mj_model.geom_quat[at.paddle_geom],
         gravity=mj_model.opt.gravity,

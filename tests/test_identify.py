@@ -40,9 +40,8 @@ from bounce_mjx.physics import (
     edited_model,
     make_engine,
 )
-from bounce_mjx.physics.edited import EditedModel
 from bounce_mjx.reports.identification import identification_page
-from bounce_mjx.robot.model import find_addresses
+from bounce_mjx.robot.model import find_addresses, link_bodies
 from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.world.actuation import Actuators
 from bounce_mjx.world.named import read_world
@@ -402,7 +401,7 @@ def test_a_controller_that_carries_the_arm_lets_no_servo_sag() -> None:
     ball = addresses.balls[0].body
     assert model.body_gravcomp[ball] == 0.0
     engine = make_engine(model, "fused")
-    links = np.concatenate(EditedModel(model).link_bodies()).tolist()
+    links = sum(link_bodies(model, addresses), [])
     start = PhysicsState(jnp.asarray(data.qpos, float), jnp.asarray(data.qvel, float))
     for share in (0.0, 1.0):
         entries = {f"body_gravcomp[{b}]": np.float32(share) for b in links}

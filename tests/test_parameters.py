@@ -1,5 +1,6 @@
 """A given physics parameter acts in each engine as in C with an edited model."""
 
+import re
 from functools import partial
 
 import jax
@@ -25,6 +26,9 @@ from against_c import (
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.c_episodes import full_states, physics_states
 from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, edited_model, make_engine
+from bounce_mjx.physics.fused.model import read_model, variable_entries
+from bounce_mjx.robot.model import find_addresses
+from bounce_mjx.robot.numbers import field_of
 from random_worlds import own_parameters, random_parameters
 
 # Parameters of the shipped model; test_friction.py and test_joint_friction.py cover friction.
@@ -115,6 +119,37 @@ def test_a_parameter_of_another_shape_is_refused(mj_model):
         wrong = PhysicsParameters(**{field: jnp.ones((*np.shape(own), 2))})
         with pytest.raises(UserError, match=field):
             engine.step(wrong, state, Control(jnp.zeros(mj_model.nu)), 1)
+
+
+def test_the_fused_engine_reads_each_entry_that_it_accepts(mj_model):
+    """A change of each of `variable_entries` is one of the fused model; MuJoCo too ignores the last
+    coefficients of friction here."""
+    unchanged = {"opt.gravity[0]": float(mj_model.opt.gravity[0])}
+    base = read_model(mj_model, PhysicsParameters(entries=unchanged))
+    names = set()
+    for field, index in variable_entries(mj_model, find_addresses(mj_model)):
+        array = field_of(mj_model, field)
+        places = np.ravel(np.arange(array.size).reshape(array.shape)[index])
+        for place in zip(*np.unravel_index(places, array.shape), strict=True):
+            if field == "pair_friction" and place[1] > 1:
+                continue
+            name = f"{field}[{', '.join(map(str, place))}]"
+            changed = {name: float(array[place]) + 0.01}
+            assert read_model(mj_model, PhysicsParameters(entries=changed)) != base, name
+            names.add(name)
+    assert len(names) > 100
+
+
+@pytest.mark.parametrize("name", ("pair_dim[0]", "actuator_forcelimited[1]", "jnt_pos[2, 0]"))
+def test_an_entry_that_the_fused_engine_ignores_is_refused(mj_model, name):
+    with pytest.raises(UserError, match=re.escape(f"cannot vary {name}")):
+        read_model(mj_model, PhysicsParameters(entries={name: 3.0}))
+
+
+@pytest.mark.parametrize("name", ("opt.density", "opt.gravity", "opt.gravity[3]", "friction[0]"))
+def test_a_name_of_no_single_entry_is_refused(mj_model, name):
+    with pytest.raises(UserError, match=re.escape(f"{name} is no entry of an MjModel")):
+        edited_model(mj_model, PhysicsParameters(entries={name: np.float64(1.0)}))
 
 
 @pytest.mark.slow

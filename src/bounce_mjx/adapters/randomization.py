@@ -6,7 +6,9 @@ one that it does not read.
 """
 
 import dataclasses
+import functools
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -20,26 +22,31 @@ from bounce_mjx.physics.edited import edited
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS, PhysicsParameters
 from bounce_mjx.physics.scalars import scalars_of
 from bounce_mjx.robot.model import find_addresses
-from bounce_mjx.world.randomization import RandomizationConfig, physics_parameters, sample_world
+from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.world.randomization import (
+    TERMS,
+    RandomizationConfig,
+    physics_parameters,
+    sample_world,
+)
 
 Fields = dict[str, Any]
 """Arrays of a model by their names, such as `body_mass` and `opt.gravity`."""
 
-DEFAULT = RandomizationConfig(
-    restitution=(0.75, 0.95),
-    ball_mass=(0.7, 1.3),
-    ball_radius=(0.9, 1.1),
-    servo_gain=(0.8, 1.2),
-    gravity_tilt=(-0.035, 0.035),
-)
-"""The terms of `configs/randomized.yaml` that change the model."""
+
+@functools.cache
+def default_terms() -> RandomizationConfig:
+    """The terms of `configs/randomized.yaml` that change the model."""
+    preset = read_preset(Path("randomized")).env.randomization
+    ranges = {name: getattr(preset, name) for name in preset.terms if TERMS[name].parameter}
+    return RandomizationConfig(**ranges)
 
 
 def domain_randomize(
     mj_model: mujoco.MjModel,
     model: Any,
     rng: jax.Array,
-    config: RandomizationConfig = DEFAULT,
+    config: RandomizationConfig | None = None,
 ) -> tuple[Any, Any]:
     """A `randomization_fn` of brax and Playground that samples terms of `env.randomization`.
 
@@ -47,19 +54,22 @@ def domain_randomize(
       mj_model: the environment's model.
       model: brax's system or MJX's model, made of it.
       rng: keys [B].
-      config: ranges of the terms; only terms that change the physics act.
+      config: ranges of the terms, of which only those that change the physics act; None for
+        `default_terms`.
 
     Returns:
       The model with a batch axis in the changed fields, and the axes for `jax.vmap`.
     """
-
-    num_joints = len(find_addresses(mj_model).arm_joints)
+    ranges = (config or default_terms()).ranges()
+    addresses = find_addresses(mj_model)
+    num_joints = len(addresses.arm_joints)
 
     def sample(key: jax.Array) -> Fields:
-        world = sample_world(config.ranges(), key, jnp.result_type(float), num_joints)
-        given = scalars_of(physics_parameters(world, mj_model), jnp.result_type(float))
-        m = edited(mj_model, given)
-        return {name: m.array(name) for name in m.fields if m.rows(name)}
+        world = sample_world(ranges, key, jnp.result_type(float), num_joints)
+        parameters = scalars_of(physics_parameters(world, mj_model), jnp.result_type(float))
+        world_model = edited(mj_model, addresses, parameters)
+        fields = world_model.fields
+        return {name: world_model.array(name) for name in fields if world_model.rows(name)}
 
     fields = jax.jit(jax.vmap(sample))(rng)
     axes = jax.tree.map(lambda _: None, model)

@@ -95,7 +95,7 @@ class MirrorLaw:
         self._arm = list(addresses.arm_qpos)
         self._home = np.array(config.default_joint_angles)
         self._gravity = model.opt.gravity.copy()
-        normal, height = upper_face(model, self._home)
+        normal, height = upper_face(model, addresses, self._home)
         # From the paddle's centre to that of a ball that touches it, m.
         self._contact_distance = float(height + model.geom_size[addresses.balls[0].geom, 0])
         # A point over the paddle's centre, whose direction is the paddle's normal.
@@ -109,13 +109,14 @@ class MirrorLaw:
     def _read_servos(self) -> None:
         """How far a servo lags behind a target that moves, s, and sags under the arm's weight."""
         model = self._env.mj_model
-        servos = list(self._env.addresses.actuators)
-        dofs = list(self._env.addresses.arm_qvel)
+        addresses = self._env.addresses
+        servos = list(addresses.actuators)
+        dofs = list(addresses.arm_qvel)
         squared_gear = model.actuator_gear[servos, 0] ** 2
         stiffness = squared_gear * model.actuator_gainprm[servos, 0]
         damping = model.dof_damping[dofs] - squared_gear * model.actuator_biasprm[servos, 2]
         self._lag = damping / stiffness
-        data = data_at(model, self._home)
+        data = data_at(model, addresses, self._home)
         mujoco.mj_forward(model, data)
         weight = data.qfrc_bias - data.qfrc_passive
         self._sag = weight[dofs] / stiffness
@@ -125,6 +126,8 @@ class MirrorLaw:
         return jnp.vectorize(self._action, signature="(n)->(a)")(observation)
 
     def _action(self, observation: jax.Array) -> jax.Array:
+        """The action [A] for an observation [N]: how far the servo targets move towards the joint
+        angles at which the paddle mirrors the ball."""
         config = self._env.config
         layout = self._env.layout
         # The newest value of each quantity comes first.
@@ -164,6 +167,8 @@ class MirrorLaw:
         of its normal.
 
         Args:
+          ball: its position [3], m.
+          velocity: of the ball [3], m/s.
           place: where the ball bounces: the paddle's centre at an impact [3], m.
           target: height of the ball's apex [], m.
         """

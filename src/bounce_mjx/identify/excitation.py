@@ -70,7 +70,7 @@ def excite(
     given = limits.velocity, limits.acceleration, limits.jerk
     bounds = _BELOW_LIMIT * np.array([[np.inf] * n if x is None else x for x in given])
     bounds[0] = np.minimum(bounds[0], max_velocity)
-    low, high = joint_ranges(model)
+    low, high = joint_ranges(model, find_addresses(model))
     centre = _lift_paddle(model, home, low + _FROM_END, high - _FROM_END)
     room = np.minimum(centre - low, high - centre) - _FROM_END
     amplitudes = np.minimum(_LARGEST_AMPLITUDE, room)

@@ -15,9 +15,8 @@ from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.unknowns import CAMERA_ROTATION, Layout
 from bounce_mjx.identify.windows import Windows
 from bounce_mjx.physics import Control, PhysicsState, make_engine
-from bounce_mjx.physics.edited import EditedModel
 from bounce_mjx.physics.scalars import quaternion_matrix
-from bounce_mjx.robot.model import find_addresses, scatter
+from bounce_mjx.robot.model import find_addresses, link_bodies, scatter
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import physics_parameters
 
@@ -118,7 +117,7 @@ def _compile(config: WorldConfig, n: int) -> Callable[..., tuple[jax.Array, jax.
     [A, n, L], rad, and balls [B, 3, L], m."""
     own, model = (world_model(c, visual=False) for c in (config, compensated(config)))
     engine, addresses = make_engine(model, config.physics), find_addresses(model)
-    links = np.concatenate(EditedModel(model).link_bodies()).tolist()
+    links = sum(link_bodies(model, addresses), [])
     ball, dt = addresses.balls[0], config.physics_dt
     gears = model.actuator_gear[list(addresses.actuators), 0]
     shown_q = (*addresses.arm_qpos, *ball.qpos[:3])

@@ -66,6 +66,18 @@ _TERMS = {"delay": "action_latency", "delay_variance": "servo_lag"}
 CAMERA_ROTATION = "camera_rotation"
 """Rotation of the camera's frame about the axes of the base, rad: no term of the world, and 0
 unless its prior deviation is given."""
+MOTIONS = {
+    "bounces in other postures of the arm": "encoder_bias paddle_tilt paddle_offset",
+    "bounces at places far apart": f"ball_position_bias {CAMERA_ROTATION}",
+    "long flights, and a level under the base,": "gravity_tilt",
+    "a known weight on the paddle, or slow motions in other postures,": "link_mass servo_gain",
+    "faster motions (bounce-mjx excite --max-velocity)": "servo_damping servo_lag action_latency",
+    "slow motions there and back (bounce-mjx excite)": "joint_frictionloss servo_offset",
+    "balls with spin, or thrown from the side,": "contact_friction",
+    "higher flights": "air_drag",
+    "more bounces, at several target heights,": "ball_latency restitution",
+}
+"""What shows unknowns that a log does not show or separate."""
 
 
 class Layout:

@@ -9,7 +9,7 @@ import yaml
 
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.stages import Identified
-from bounce_mjx.identify.unknowns import BALL, CAMERA_ROTATION
+from bounce_mjx.identify.unknowns import BALL, CAMERA_ROTATION, MOTIONS
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.world.named import NamedWorld
 from bounce_mjx.world.randomization import TERMS
@@ -32,18 +32,6 @@ _GOOD_SHARE, _GOOD_ANGLE, _GOOD_DISTANCE = 0.02, 1e-3, 3e-3
 # Share of the windows with a ball from which its bounces count.
 _MOST_FLY = 0.5
 
-# What shows unknowns that a log does not show or separate.
-_MOTIONS = {
-    "bounces in other postures of the arm": "encoder_bias paddle_tilt paddle_offset",
-    "bounces at places far apart": f"ball_position_bias {CAMERA_ROTATION}",
-    "long flights, and a level under the base,": "gravity_tilt",
-    "a known weight on the paddle, or slow motions in other postures,": "link_mass servo_gain",
-    "faster motions (bounce-mjx excite --max-velocity)": "servo_damping servo_lag action_latency",
-    "slow motions there and back (bounce-mjx excite)": "joint_frictionloss servo_offset",
-    "balls with spin, or thrown from the side,": "contact_friction",
-    "higher flights": "air_drag",
-    "more bounces, at several target heights,": "ball_latency restitution",
-}
 # Deviations of the prior beyond which an estimate is a mistake, and what is likely to be wrong.
 _SURPRISING = 3.0
 _MISTAKES = (
@@ -241,7 +229,7 @@ def _describe_unseen(found: Identified, joint_names: Sequence[str]) -> list[str]
         names = frozenset(owners[i] for i in main)
         if value > _WEAK or not names or names in said:
             continue
-        motion = next(x for x, shown in _MOTIONS.items() if names & set(shown.split()))
+        motion = next(x for x, shown in MOTIONS.items() if names & set(shown.split()))
         text = f"The log does not show {labels[main[0]]}: its interval is the prior's"
         if len(main) > 1:
             listed = ", ".join(labels[i] for i in main)

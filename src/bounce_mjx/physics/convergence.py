@@ -10,7 +10,8 @@ import numpy as np
 from bounce_mjx.robot.model import find_addresses
 
 _SETTINGS = ("solver", "iterations", "tolerance", "ls_iterations", "ls_tolerance")
-_NUM_BOUNCES, _NUM_STEPS = 8, 30
+_NUM_BOUNCES = 8
+_NUM_STEPS = 30
 # Resolution of the arm's and the ball's speeds in float32, m/s or rad/s.
 _LARGEST_ERROR = 1e-5
 
@@ -30,11 +31,11 @@ def solver_warning(mj_model: mujoco.MjModel) -> str | None:
     error = _largest_error(mj_model, converged)
     if error < _LARGEST_ERROR:
         return None
-    at_fault = [
-        name
-        for name in changed
-        if _largest_error(_with_defaults(mj_model, [name]), converged) < _LARGEST_ERROR
-    ]
+    at_fault = []
+    for name in changed:
+        error_of_others = _largest_error(_with_defaults(mj_model, [name]), converged)
+        if error_of_others < _LARGEST_ERROR:
+            at_fault.append(name)
     words = " and ".join(_as_in_mjcf(mj_model.opt, name) for name in at_fault or changed)
     return (
         f"MuJoCo's C solver stops before it converges with {words} (errors up to {error:.2g} m/s "
@@ -46,17 +47,18 @@ def solver_warning(mj_model: mujoco.MjModel) -> str | None:
 def _with_defaults(mj_model: mujoco.MjModel, settings: Iterable[str]) -> mujoco.MjModel:
     """A copy of the model with MuJoCo's defaults of some settings."""
     default = mujoco.MjOption()
-    changed = copy.copy(mj_model)
+    copied = copy.copy(mj_model)
     for name in settings:
-        setattr(changed.opt, name, getattr(default, name))
-    return changed
+        setattr(copied.opt, name, getattr(default, name))
+    return copied
 
 
 def _largest_error(mj_model: mujoco.MjModel, converged: mujoco.MjModel) -> float:
     """Largest error of a velocity after one step, m/s or rad/s, over several bounces of the first
     ball with a moving arm."""
     addresses = find_addresses(mj_model)
-    arm_qpos, arm_qvel = list(addresses.arm_qpos), list(addresses.arm_qvel)
+    arm_qpos = list(addresses.arm_qpos)
+    arm_qvel = list(addresses.arm_qvel)
     servos = list(addresses.actuators)
     gear = mj_model.actuator_gear[servos, 0]
     ball = addresses.balls[0]

@@ -2,6 +2,7 @@
 
 import contextlib
 import copy
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -15,7 +16,7 @@ from bounce_mjx.physics.control import Control, drag, servo_target
 from bounce_mjx.physics.edited import MIN_FRICTION, edited
 from bounce_mjx.physics.parameters import PhysicsParameters, PhysicsState
 from bounce_mjx.physics.scalars import scalars_of
-from bounce_mjx.robot.model import Addresses, find_addresses
+from bounce_mjx.robot.model import Addresses, BallAddresses, find_addresses
 
 
 class MjxModel(NamedTuple):
@@ -27,9 +28,10 @@ class MjxModel(NamedTuple):
     addresses: Addresses
 
 
-def read_model(mj_model: mujoco.MjModel) -> MjxModel:
-    """Constants of a compiled model that the engine supports (`support.py`)."""
-    return MjxModel(mjx.put_model(mj_model), mj_model, find_addresses(mj_model))
+def read_model(mj_model: mujoco.MjModel, addresses: Addresses | None = None) -> MjxModel:
+    """Constants of a compiled model that the engine supports (`support.py`); `addresses` are those
+    of its parts, if they are known."""
+    return MjxModel(mjx.put_model(mj_model), mj_model, addresses or find_addresses(mj_model))
 
 
 def step(
@@ -53,16 +55,8 @@ def step(
     def substep(i: jax.Array, data: mjx.Data) -> mjx.Data:
         data = data.replace(ctrl=servo_target(control, i.astype(data.qpos.dtype)))
         if control.air_drag is not None:
-            data = with_drag(data)
+            data = _with_drag(model, balls, data, control.air_drag)
         return _step(model, data)
-
-    def with_drag(data: mjx.Data) -> mjx.Data:
-        for ball in balls:
-            velocity = data.qvel[np.array(ball.qvel[:3])]
-            force = model.body_mass[ball.body] * jnp.stack(drag(control.air_drag, velocity))
-            applied = data.xfrc_applied.at[ball.body, :3].set(force)
-            data = data.replace(xfrc_applied=applied)
-        return data
 
     with _full_precision():
         model = world_model(constants, parameters)
@@ -72,6 +66,18 @@ def step(
             data = data.replace(qvel=data.qvel.at[pushed].add(jnp.ravel(control.ball_push)))
         data = jax.lax.fori_loop(0, num_substeps, substep, data)
     return PhysicsState(data.qpos, data.qvel)
+
+
+def _with_drag(
+    model: mjx.Model, balls: Sequence[BallAddresses], data: mjx.Data, air_drag: jax.Array
+) -> mjx.Data:
+    """The data with the force of the air on each ball; `air_drag` is that of `Control`."""
+    for ball in balls:
+        velocity = data.qvel[np.array(ball.qvel[:3])]
+        force = model.body_mass[ball.body] * jnp.stack(drag(air_drag, velocity))
+        forces = data.xfrc_applied.at[ball.body, :3].set(force)
+        data = data.replace(xfrc_applied=forces)
+    return data
 
 
 def _step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -104,8 +110,10 @@ def world_model(constants: MjxModel, parameters: PhysicsParameters) -> mjx.Model
     Raises:
       UserError: they have dry friction of the joints.
     """
-    m = edited(constants.mj_model, scalars_of(parameters, jnp.result_type(float)))
-    if m.rows("dof_frictionloss"):
+    mj_model = constants.mj_model
+    numbers = scalars_of(parameters, jnp.result_type(float))
+    edited_model = edited(mj_model, constants.addresses, numbers)
+    if edited_model.rows("dof_frictionloss"):
         # After one step from 2 of 24 states with a slow arm, MJX differed from C by up to
         # 0.02 rad/s, whatever the solver's tolerance.
         raise UserError(
@@ -113,15 +121,15 @@ def world_model(constants: MjxModel, parameters: PhysicsParameters) -> mjx.Model
             "(frictionloss); use --physics fused"
         )
     # MJX transforms every geom, even one flagged as sharing its body's frame.
-    names = m.fields - {"geom_sameframe", "pair_dim"}
-    fields = {name: m.array(name) for name in names}
+    names = edited_model.fields - {"geom_sameframe", "pair_dim"}
+    fields = {name: edited_model.array(name) for name in names}
     if "pair_friction" in fields:
         fields["pair_friction"] = jnp.maximum(fields["pair_friction"], MIN_FRICTION)
     model = constants.model
-    if "pair_dim" in m.fields:
+    if "pair_dim" in edited_model.fields:
         # MJX cannot change the dimension of a contact pair in a model that it has.
-        frictional = copy.copy(constants.mj_model)
-        frictional.pair_dim[:] = m.array("pair_dim")
+        frictional = copy.copy(mj_model)
+        frictional.pair_dim[:] = edited_model.array("pair_dim")
         with jax.ensure_compile_time_eval():
             model = mjx.put_model(frictional)
     return model.tree_replace(fields)

@@ -148,9 +148,12 @@ def diagonal(v: Vec) -> Mat:
 
 def symmetric(entry: Callable[[int, int], Scalar]) -> Mat:
     """Symmetric matrix, each entry computed once."""
-    xx, xy, xz, yy, yz, zz = (
-        entry(i, j) for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-    )
+    xx = entry(0, 0)
+    xy = entry(0, 1)
+    xz = entry(0, 2)
+    yy = entry(1, 1)
+    yz = entry(1, 2)
+    zz = entry(2, 2)
     return Mat(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
 
 
@@ -198,8 +201,12 @@ def quaternion_matrix(quaternion: Quaternion) -> Mat:
     def off(product: Scalar, turned: Scalar) -> Scalar:
         return mul(2.0, add(product, turned))
 
-    xy, xz, yz = mul(x, y), mul(x, z), mul(y, z)
-    wx, wy, wz = mul(w, x), mul(w, y), mul(w, z)
+    xy = mul(x, y)
+    xz = mul(x, z)
+    yz = mul(y, z)
+    wx = mul(w, x)
+    wy = mul(w, y)
+    wz = mul(w, z)
     return Mat(
         (
             (diagonal(y, z), off(xy, neg(wz)), off(xz, wy)),
@@ -228,6 +235,7 @@ def sine_cosine(angle: jax.Array) -> tuple[jax.Array, jax.Array]:
     if angle.dtype != jnp.float32:
         return jnp.sin(angle), jnp.cos(angle)
     quarters = lax.round(mul(angle, 2.0 / math.pi), lax.RoundingMethod.TO_NEAREST_EVEN)
+    # The rest of the angle, within an eighth of a turn of 0.
     for part in _HALF_PI:
         angle = sub(angle, mul(quarters, part))
     square = mul(angle, angle)
@@ -235,11 +243,16 @@ def sine_cosine(angle: jax.Array) -> tuple[jax.Array, jax.Array]:
     cosine = sub(1.0, mul(0.5, square))
     cosine = add(cosine, mul(mul(square, square), polynomial(_COSINE, square)))
     quadrant = lax.convert_element_type(quarters, jnp.int32)
-    odd = lax.ne(lax.bitwise_and(quadrant, 1), 0)
-    sine, cosine = lax.select(odd, cosine, sine), lax.select(odd, sine, cosine)
-    lower_half = lax.ne(lax.bitwise_and(quadrant, 2), 0)
-    left_half = lax.ne(lax.bitwise_and(lax.add(quadrant, 1), 2), 0)
-    return lax.select(lower_half, neg(sine), sine), lax.select(left_half, neg(cosine), cosine)
+    # A quarter turn exchanges the two; half a turn changes both signs.
+    is_odd = lax.ne(lax.bitwise_and(quadrant, 1), 0)
+    turned_sine = lax.select(is_odd, cosine, sine)
+    turned_cosine = lax.select(is_odd, sine, cosine)
+    in_lower_half = lax.ne(lax.bitwise_and(quadrant, 2), 0)
+    in_left_half = lax.ne(lax.bitwise_and(lax.add(quadrant, 1), 2), 0)
+    return (
+        lax.select(in_lower_half, neg(turned_sine), turned_sine),
+        lax.select(in_left_half, neg(turned_cosine), turned_cosine),
+    )
 
 
 def polynomial(coefficients: tuple[float, ...], x: Scalar) -> Scalar:
@@ -279,10 +292,13 @@ def not_inlined(values: Tree) -> Tree:
     A call that XLA may not inline separates the loops and prevents this.
     """
     leaves, tree = jax.tree.flatten(values)
+    arrays = [leaf for leaf in leaves if not is_constant(leaf)]
     with set_xla_metadata(inlineable="false"):
-        computed = iter(_same(*(x for x in leaves if not is_constant(x))))
-    return tree.unflatten(x if is_constant(x) else next(computed) for x in leaves)
+        computed = iter(_same(*arrays))
+    return tree.unflatten(leaf if is_constant(leaf) else next(computed) for leaf in leaves)
 
 
-# The product with 1 keeps the call: JAX removes a function that only returns its arguments.
-_same = jax.jit(lambda *leaves: tuple(lax.mul(x, jnp.ones_like(x)) for x in leaves))
+@jax.jit
+def _same(*arrays: jax.Array) -> tuple[jax.Array, ...]:
+    # The product with 1 keeps the call: JAX removes a function that only returns its arguments.
+    return tuple(lax.mul(array, jnp.ones_like(array)) for array in arrays)

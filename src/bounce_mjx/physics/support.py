@@ -10,7 +10,9 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.lazy import import_mjx
-from bounce_mjx.robot.model import BallAddresses, find_addresses
+from bounce_mjx.robot.contact import unsupported_constraints
+from bounce_mjx.robot.model import Addresses, BallAddresses, find_addresses
+from bounce_mjx.robot.numbers import field_of
 
 Feature = tuple[str, bool]
 """The name of a feature that an engine lacks, and whether a model has it."""
@@ -35,12 +37,30 @@ _ZERO = {
 }
 
 
-def unsupported_feature(mj_model: mujoco.MjModel, engine: str) -> str | None:
-    """Name of a feature of the model that an engine, "fused" or "mjx", does not support; None if it
-    supports them all."""
-    own = _fused(mj_model) if engine == "fused" else _mjx(mj_model)
-    features = itertools.chain(_common(mj_model, engine), own)
-    return next((name for name, present in features if present), None)
+def unsupported_feature(
+    mj_model: mujoco.MjModel, engine: str, addresses: Addresses | None = None
+) -> str | None:
+    """Name of a feature of the model that an engine does not support; None if it supports them all.
+
+    Args:
+      mj_model: the model.
+      engine: "fused" or "mjx".
+      addresses: of the model's parts, if they are known.
+    """
+    for name, is_present in _features(mj_model, engine, addresses):
+        if is_present:
+            return name
+    return None
+
+
+def _features(
+    mj_model: mujoco.MjModel, engine: str, addresses: Addresses | None
+) -> Iterator[Feature]:
+    yield from _common(mj_model, engine)
+    if engine == "fused":
+        yield from _fused(mj_model, addresses or find_addresses(mj_model))
+    else:
+        yield from _mjx(mj_model)
 
 
 def unsupported_friction(mj_model: mujoco.MjModel, pair_dim: Sequence[int]) -> str | None:
@@ -58,80 +78,102 @@ def unsupported_friction(mj_model: mujoco.MjModel, pair_dim: Sequence[int]) -> s
 
 def _flags(m: mujoco.MjModel) -> set[str]:
     """Names of the flags that are not at their defaults, as the MJCF writes them."""
-    kinds = (m.opt.disableflags, mujoco.mjtDisableBit), (m.opt.enableflags, mujoco.mjtEnableBit)
-    return {
-        name.partition("BL_")[2].lower()  # mjDSBL_GRAVITY, mjENBL_ENERGY; not the count mjNENABLE
-        for bits, kind in kinds
-        for name, flag in kind.__members__.items()
-        if "BL_" in name and bits & int(flag)
-    }
+    names = set()
+    for bits, kind in (
+        (m.opt.disableflags, mujoco.mjtDisableBit),
+        (m.opt.enableflags, mujoco.mjtEnableBit),
+    ):
+        for constant, flag in kind.__members__.items():
+            # mjDSBL_GRAVITY, mjENBL_ENERGY; not the count mjNENABLE
+            _, is_flag, name = constant.partition("BL_")
+            if is_flag and bits & int(flag):
+                names.add(name.lower())
+    return names
 
 
 def _common(m: mujoco.MjModel, engine: str) -> Iterator[Feature]:
     integrator = mujoco.mjtIntegrator(m.opt.integrator).name.removeprefix("mjINT_").lower()
     known = _INTEGRATORS[engine]
     only = f"only {', '.join(known[:-1])} and {known[-1]}"
-    lacking = integrator not in [name.lower() for name in known]
-    yield f"the integrator {integrator} ({only})", lacking
+    is_known = integrator in [name.lower() for name in known]
+    yield f"the integrator {integrator} ({only})", not is_known
     for name in f"{_BOTH_ZERO} {_ZERO[engine]}".split():
-        value = getattr(m.opt if name.startswith("opt.") else m, name.removeprefix("opt."))
-        yield f"{name} (only 0)", bool(np.any(value))
-    for part in "pair_{} geom_{} jnt_{} dof_{} eq_{} tendon_{}_lim tendon_{}_fri".split():
-        solref, solimp = (getattr(m, part.format(kind)) for kind in ("solref", "solimp"))
-        mixed = np.any(np.sum(solref > 0.0, axis=1) == 1)
-        yield f"a {part.format('solref')} with exactly one positive number", bool(mixed)
-        narrow = np.any(solimp[:, 2] <= mujoco.mjMINVAL)
-        yield f"a {part.format('solimp')} without a width", bool(narrow)
+        yield f"{name} (only 0)", bool(np.any(field_of(m, name)))
+    yield from unsupported_constraints(m)
 
 
 def _mjx(m: mujoco.MjModel) -> Iterator[Feature]:
     flags = _flags(m)
     yield "sleeping bodies (sleep)", "sleep" in flags
     # With one of the two disabled, MJX has no passive force at all.
-    one = len(flags & {"spring", "damper"}) == 1
-    yield "the flag spring or damper disabled alone", one
+    alone = len(flags & {"spring", "damper"}) == 1
+    yield "the flag spring or damper disabled alone", alone
     try:
         import_mjx().put_model(m)
     except NotImplementedError as error:
         yield f"a feature of the MJCF ({error})".replace(".)", ")"), True
 
 
-def _fused(m: mujoco.MjModel) -> Iterator[Feature]:
-    at = find_addresses(m)
+def _fused(m: mujoco.MjModel, addresses: Addresses) -> Iterator[Feature]:
+    joints = list(addresses.arm_joints)
+    paddle = addresses.paddle_geom
+    balls = addresses.balls
     lacking = ", ".join(sorted(_flags(m) - _HARMLESS))
     yield f"the flags of the engine ({lacking})", bool(lacking)
-    joints, paddle, balls = list(at.arm_joints), at.paddle_geom, at.balls
-    bodies = m.jnt_bodyid[joints]
-    before, parents = np.array([0, *bodies[:-1]]), m.body_weldid[m.body_parentid[bodies]]
-    yield "joints other than the acting ones and the ball's", m.njnt != len(joints) + len(balls)
-    branches = np.any((bodies != before) & (parents != before))
-    yield "an arm that is not one serial chain", branches
+    has_others = m.njnt != len(joints) + len(balls)
+    yield "joints other than the acting ones and the ball's", has_others
+    yield "an arm that is not one serial chain", _is_branched(m, joints)
     attached = any(np.sum(m.body_weldid == ball.body) != 1 for ball in balls)
     yield "bodies that are attached to the ball", attached
-    behind = m.body_weldid[m.geom_bodyid[paddle]] == bodies[-1]
-    yield "a paddle that is not behind the last joint", not behind
+    holder = m.body_weldid[m.geom_bodyid[paddle]]
+    yield "a paddle that is not behind the last joint", holder != m.jnt_bodyid[joints[-1]]
     yield "a paddle that is not a box", m.geom_type[paddle] != mujoco.mjtGeom.mjGEOM_BOX
-    plain = all(_is_plain(m, ball) for ball in balls)
-    yield "a ball that is not one free homogeneous sphere", not plain
+    are_plain = all(_is_plain(m, ball) for ball in balls)
+    yield "a ball that is not one free homogeneous sphere", not are_plain
     yield "actuators other than one position servo on each joint", m.nu != len(joints)
-    pairs = [frozenset(map(int, pair)) for pair in zip(m.pair_geom1, m.pair_geom2, strict=True)]
-    geoms = [ball.geom for ball in balls]
-    with_paddle = {frozenset((paddle, geom)) for geom in geoms}
-    between = {frozenset(two) for two in itertools.combinations(geoms, 2)}
-    known = len(set(pairs)) == m.npair and with_paddle <= set(pairs) <= with_paddle | between
-    yield "contact pairs other than one of the paddle and each ball, and of two balls", not known
+    yield (
+        "contact pairs other than one of the paddle and each ball, and of two balls",
+        not _has_known_pairs(m, addresses),
+    )
     friction = unsupported_friction(m, m.pair_dim)
     yield str(friction), friction is not None
 
 
+def _is_branched(m: mujoco.MjModel, joints: Sequence[int]) -> bool:
+    """Whether a joint's body hangs neither on the body of the joint before nor is the same."""
+    bodies = m.jnt_bodyid[list(joints)]
+    bodies_before = np.array([0, *bodies[:-1]])
+    parents = m.body_weldid[m.body_parentid[bodies]]
+    return bool(np.any((bodies != bodies_before) & (parents != bodies_before)))
+
+
+def _has_known_pairs(m: mujoco.MjModel, addresses: Addresses) -> bool:
+    """Whether there is one contact pair of the paddle and each ball, and at most one of each two
+    balls."""
+    balls = [ball.geom for ball in addresses.balls]
+    with_paddle = {frozenset((addresses.paddle_geom, ball)) for ball in balls}
+    of_balls = {frozenset(two) for two in itertools.combinations(balls, 2)}
+    pairs = set()
+    for geoms in zip(m.pair_geom1.tolist(), m.pair_geom2.tolist(), strict=True):
+        pairs.add(frozenset(geoms))
+    has_each_once = len(pairs) == m.npair
+    return has_each_once and with_paddle <= pairs <= with_paddle | of_balls
+
+
 def _is_plain(m: mujoco.MjModel, ball: BallAddresses) -> bool:
     """Whether a ball is one free homogeneous sphere."""
-    inertia, dofs = m.body_inertia[ball.body], list(ball.qvel)
-    held = [getattr(m, f"dof_{name}")[dofs] for name in ("damping", "armature", "frictionloss")]
-    held.append(m.jnt_stiffness[m.body_jntadr[ball.body]])
-    moved = m.body_ipos[ball.body], m.geom_pos[ball.geom]
+    inertia = m.body_inertia[ball.body]
+    dofs = list(ball.qvel)
+    must_be_zero = (
+        m.body_ipos[ball.body],
+        m.geom_pos[ball.geom],
+        m.dof_damping[dofs],
+        m.dof_armature[dofs],
+        m.dof_frictionloss[dofs],
+        m.jnt_stiffness[m.body_jntadr[ball.body]],
+    )
     return bool(
         m.geom_type[ball.geom] == mujoco.mjtGeom.mjGEOM_SPHERE
         and np.allclose(inertia, inertia[0], rtol=1e-9, atol=0.0)
-        and not any(map(np.any, (*moved, *held)))
+        and not any(np.any(numbers) for numbers in must_be_zero)
     )

@@ -9,13 +9,16 @@ import numpy as np
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.robot import arm as arms
-from bounce_mjx.robot.config import RobotConfig
-from bounce_mjx.robot.model import find_addresses
+from bounce_mjx.robot.actuators import ServoSettings
+from bounce_mjx.robot.config import PaddleConfig, RobotConfig
+from bounce_mjx.robot.model import Addresses, find_addresses
+from bounce_mjx.robot.names import BALL_BODY_NAME, PADDLE_BODY_NAME
 from bounce_mjx.robot.pose import PaddlePose, clearance, mounts, rank_poses
 
 # Velocity of a joint that the action 1 commands: rad/s of a hinge, m/s of a slide. The Peitian
 # arm's servos give 0.02 rad x 20000 / 200 = 2 rad/s.
-_HINGE_SPEED, _SLIDE_SPEED = 2.0, 0.6
+_HINGE_SPEED = 2.0
+_SLIDE_SPEED = 0.6
 # A kept servo is at least this well damped, and answers within a factor of the others.
 _LEAST_DAMPING_RATIO = 0.5
 _LARGEST_SPREAD = 4.0
@@ -38,7 +41,7 @@ class Adoption(NamedTuple):
     clearance: float
     """Distance of the paddle from the arm's other links in the pose, m; negative inside one."""
     arm: arms.Arm
-    servos: tuple[arms.ServoSettings, ...]
+    servos: tuple[ServoSettings, ...]
     """The servo of each acting joint."""
 
 
@@ -56,9 +59,7 @@ def adopt(mjcf: Path, config: RobotConfig, control_dt: float, is_mount_given: bo
       UserError: the arm cannot do the task.
     """
     path = arms.locate(mjcf)
-    config = config.model_copy(
-        update={f"servo_{name}": None for name in arms.ServoSettings._fields}
-    )
+    config = _with_servos(config, None)
     with arms.naming(path):
         arm = arms.build_arm(path, config)
         # So every body stays: the search turns the paddle's.
@@ -66,33 +67,63 @@ def adopt(mjcf: Path, config: RobotConfig, control_dt: float, is_mount_given: bo
         with_shapes = arms.compile_spec(arm.spec, path)
         arm.spec.compiler.discardvisual = True
         model = arms.compile_spec(arm.spec, path)
+        addresses = find_addresses(model)
         check_as_alone(arm, model)
         choices = [config.paddle] if is_mount_given else mounts(config.paddle)
-        force_limits = [servo.force_limit for servo in arm.servos]
-        try:
-            poses = rank_poses(model, force_limits, choices)
-        except UserError as error:
-            if not arm.narrowed:
-                raise
-            narrowed = ", ".join(arm.narrowed)
-            raise UserError(
-                f"{error}; or widen the ctrlrange of the servos, which narrows {narrowed}"
-            ) from error
+        poses = _ranked_poses(model, addresses, arm, choices)
         pose, distance = _clear_pose(with_shapes, poses)
-        servos, scale = _servos(model, arm, pose, control_dt)
-        update = {"paddle": pose.mount}
-        if servos is not arm.servos:
-            columns = zip(arms.ServoSettings._fields, zip(*servos, strict=True), strict=True)
-            update |= {f"servo_{name}": column for name, column in columns}
-        adopted = RobotConfig.model_validate(config.model_copy(update=update).model_dump())
+        config = config.model_copy(update={"paddle": pose.mount})
+        scale = _scale_of_kept_servos(model, addresses, arm, pose)
+        servos = arm.servos
+        if scale is None:
+            servos, scale = _made_servos(model, addresses, arm, pose, control_dt)
+            config = _with_servos(config, servos)
+        config = RobotConfig.model_validate(config.model_dump())
         return Adoption(
-            config=adopted,
-            action_scale=scale,
+            config=config,
+            action_scale=_four_digits(scale),
             pose=pose,
             clearance=distance,
-            arm=arms.build_arm(path, adopted),
+            arm=arms.build_arm(path, config),
             servos=servos,
         )
+
+
+def _with_servos(config: RobotConfig, servos: Sequence[ServoSettings] | None) -> RobotConfig:
+    """The config with other servos of all joints; None for the MJCF's own."""
+    columns: dict[str, tuple | None] = {
+        "servo_stiffness": None,
+        "servo_damping": None,
+        "servo_force_limit": None,
+    }
+    if servos is not None:
+        columns["servo_stiffness"] = tuple(servo.stiffness for servo in servos)
+        columns["servo_damping"] = tuple(servo.damping for servo in servos)
+        columns["servo_force_limit"] = tuple(servo.force_limit for servo in servos)
+    return config.model_copy(update=columns)
+
+
+def _ranked_poses(
+    model: mujoco.MjModel, addresses: Addresses, arm: arms.Arm, choices: Sequence[PaddleConfig]
+) -> list[PaddlePose]:
+    """`rank_poses`; an error names what narrows the joints' ranges.
+
+    Args:
+      model: the compiled scene.
+      addresses: of its parts.
+      arm: of which it is the scene.
+      choices: mounts of the paddle to try.
+    """
+    force_limits = [servo.force_limit for servo in arm.servos]
+    try:
+        return rank_poses(model, addresses, force_limits, choices)
+    except UserError as error:
+        if not arm.narrowed:
+            raise
+        narrowed = ", ".join(arm.narrowed)
+        raise UserError(
+            f"{error}; or widen the ctrlrange of the servos, which narrows {narrowed}"
+        ) from error
 
 
 def _clear_pose(
@@ -100,63 +131,98 @@ def _clear_pose(
 ) -> tuple[PaddlePose, float]:
     """The first pose in which the paddle keeps clear of the arm, and its distance, m; the best one
     if there is none."""
+    addresses = find_addresses(with_shapes)
     for pose in poses:
-        distance = clearance(with_shapes, pose)
+        distance = clearance(with_shapes, addresses, pose)
         if distance >= _LEAST_CLEARANCE:
             return pose, distance
-    return poses[0], clearance(with_shapes, poses[0])
+    return poses[0], clearance(with_shapes, addresses, poses[0])
 
 
-def _servos(
-    model: mujoco.MjModel, arm: arms.Arm, pose: PaddlePose, control_dt: float
-) -> tuple[tuple[arms.ServoSettings, ...], float]:
-    """The servos, which are the MJCF's own if these suit, and the action scale."""
-    addresses = find_addresses(model)
-    joints = list(addresses.arm_joints)
-    hinge = model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE
-    speed = np.where(hinge, _HINGE_SPEED, _SLIDE_SPEED)
-    passive = model.dof_damping[list(addresses.arm_qvel)]
-    stiffnesses, dampings, limits = zip(*arm.servos, strict=True)
-    if None not in stiffnesses:
-        stiffness, damping = np.array(stiffnesses), np.array(dampings) + passive
-        scales = speed * damping / stiffness
-        scale = float(np.exp(np.mean(np.log(np.maximum(scales, 1e-9)))))
-        ratio = damping / (2.0 * np.sqrt(stiffness * pose.inertia))
-        suits = (
-            np.min(ratio) >= _LEAST_DAMPING_RATIO
-            and np.max(scales) <= _LARGEST_SPREAD * np.min(scales)
-            and np.all(stiffness * scale >= _LEAST_HOLD * np.abs(pose.holding))
-        )
-        if suits:
-            return arm.servos, _four_digits(scale)
-    # Critical damping at the natural frequency 1 / control_dt: within a control step a joint comes
-    # to rest, and physics steps of a fifth of it are stable.
+def _scale_of_kept_servos(
+    model: mujoco.MjModel, addresses: Addresses, arm: arms.Arm, pose: PaddlePose
+) -> float | None:
+    """The action scale (rad, m) with the MJCF's own servos; None if these do not suit.
+
+    Args:
+      model: the compiled scene.
+      addresses: of its parts.
+      arm: with the servos.
+      pose: in which the servos must hold the arm and be damped.
+    """
+    if any(servo.stiffness is None for servo in arm.servos):
+        return None
+    stiffness = np.array([servo.stiffness for servo in arm.servos])
+    servo_damping = np.array([servo.damping for servo in arm.servos])
+    damping = servo_damping + model.dof_damping[list(addresses.arm_qvel)]
+    # A target that is ahead by this much moves the joint at its speed.
+    scales = _speeds(model, addresses) * damping / stiffness
+    mean_scale = float(np.exp(np.mean(np.log(np.maximum(scales, 1e-9)))))
+    damping_ratio = damping / (2.0 * np.sqrt(stiffness * pose.inertia))
+    is_damped = np.min(damping_ratio) >= _LEAST_DAMPING_RATIO
+    is_even = np.max(scales) <= _LARGEST_SPREAD * np.min(scales)
+    holds = np.all(stiffness * mean_scale >= _LEAST_HOLD * np.abs(pose.holding))
+    return mean_scale if is_damped and is_even and holds else None
+
+
+def _made_servos(
+    model: mujoco.MjModel,
+    addresses: Addresses,
+    arm: arms.Arm,
+    pose: PaddlePose,
+    control_dt: float,
+) -> tuple[tuple[ServoSettings, ...], float]:
+    """Servos for the inertias of a pose, and the action scale, rad or m.
+
+    Critical damping at the natural frequency 1 / control_dt: within a control step a joint comes to
+    rest, and physics steps of a fifth of it are stable.
+
+    Args:
+      model: the compiled scene.
+      addresses: of its parts.
+      arm: whose force limits stay.
+      pose: in which the inertias are those of the arm.
+      control_dt: time between two actions, s.
+    """
     frequency = 1.0 / control_dt
     scale = 2.0 * _HINGE_SPEED / frequency
     damping = 2.0 * frequency * pose.inertia
-    stiffness = damping * speed / scale
-    made = zip(stiffness, damping, limits, strict=True)
-    servos = tuple(
-        arms.ServoSettings(_four_digits(k), _four_digits(d), limit) for k, d, limit in made
-    )
-    return servos, _four_digits(scale)
+    stiffness = damping * _speeds(model, addresses) / scale
+    servos = []
+    for i, servo in enumerate(arm.servos):
+        servos.append(
+            ServoSettings(
+                stiffness=_four_digits(stiffness[i]),
+                damping=_four_digits(damping[i]),
+                force_limit=servo.force_limit,
+            )
+        )
+    return tuple(servos), scale
+
+
+def _speeds(model: mujoco.MjModel, addresses: Addresses) -> np.ndarray:
+    """Velocity of each acting joint [n] that the action 1 commands, rad/s or m/s."""
+    kinds = model.jnt_type[list(addresses.arm_joints)]
+    return np.where(kinds == mujoco.mjtJoint.mjJNT_HINGE, _HINGE_SPEED, _SLIDE_SPEED)
 
 
 def check_as_alone(arm: arms.Arm, model: mujoco.MjModel) -> None:
     """Compares the bodies of an arm in the task's scene to those of its file compiled alone.
 
     Args:
+      arm: from the file.
       model: the compiled scene, with all bodies.
 
     Raises:
       UserError: a body's pose, mass or inertia differs, or a joint's axis.
     """
-    added = (arms.BALL_BODY_NAME, arms.PADDLE_BODY_NAME)
-    bodies = [b for b in range(1, model.nbody) if model.body(b).name not in added]
+    added = (BALL_BODY_NAME, PADDLE_BODY_NAME)
+    bodies = [body for body in range(1, model.nbody) if model.body(body).name not in added]
     joints = list(find_addresses(model).arm_joints)
     for field, expected in arm.alone.items():
-        here = getattr(model, field)[bodies if field in arms.BODY_FIELDS else joints]
-        error = np.max(np.abs(here - expected))
+        rows = bodies if field in arms.BODY_FIELDS else joints
+        in_scene = getattr(model, field)[rows]
+        error = np.max(np.abs(in_scene - expected))
         if error > _EQUAL * np.max(np.abs(expected)):
             raise UserError(
                 f"an arm that changes in the task's scene, where its {field} differs by "

@@ -15,39 +15,32 @@ import numpy as np
 
 from bounce_mjx.errors import UserError, install_command, needed, reason_of, shorten
 from bounce_mjx.resources import resource_path
+from bounce_mjx.robot.actuators import (
+    ServoSettings,
+    joint_actuators,
+    servo_range,
+    servo_settings,
+    single_actuators,
+)
 from bounce_mjx.robot.config import PaddleConfig, RobotConfig
-from bounce_mjx.robot.numbers import check_numbers
+from bounce_mjx.robot.names import PADDLE_BODY_NAME, PADDLE_GEOM_NAME, joint_name, listed
+from bounce_mjx.robot.numbers import WORLD_OPTIONS, check_numbers
 
-BALL_BODY_NAME = "ball_link"
-PADDLE_GEOM_NAME = "blocker"
 # Lifting and tilting the paddle about two axes takes three joints.
 MIN_JOINTS = 3
 
-PADDLE_BODY_NAME = "paddle"
 # Ends of the names of a scene's balls.
 _BALL_NUMBERS = ("", "2", "3")
 BODY_FIELDS = ("body_pos", "body_quat", "body_ipos", "body_iquat", "body_mass", "body_inertia")
 JOINT_FIELDS = ("jnt_pos", "jnt_axis")
 # Viewers show the groups 0 to 2.
 HIDDEN_GROUP = 3
-_HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
+_ACTING_KINDS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 # Smallest change of a joint's range that is reported, rad or m.
 _NARROWER = 1e-3
 _HANDLE_RADIUS = 0.011
 # Without what only its simulations need; a later version may move its files.
 _INSTALLED_AS = {"robosuite": ("--no-deps", "robosuite==1.5.2")}
-_JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-
-
-class ServoSettings(NamedTuple):
-    """A position servo of one joint, or another actuator, which has a force limit alone."""
-
-    stiffness: float | None
-    """N m/rad, or N/m."""
-    damping: float | None
-    """N m s/rad, or N s/m."""
-    force_limit: float | None
-    """N m, or N; None for no limit."""
 
 
 class Arm(NamedTuple):
@@ -91,14 +84,14 @@ def locate(mjcf: Path) -> Path:
 
 def _in_package(name: str) -> Path:
     package, _, file = name.partition("/")
-    found = importlib.util.find_spec(package) if package.isidentifier() else None
-    if found is None or not found.submodule_search_locations:
+    spec = importlib.util.find_spec(package) if package.isidentifier() else None
+    if spec is None or not spec.submodule_search_locations:
         words = _INSTALLED_AS.get(package) or (shorten(package.replace("_", "-")),)
         raise UserError(
             f"the package {shorten(package)!r} is not installed, which package:{shorten(name)} "
             f"names; install it with: {install_command(*words)}"
         )
-    return Path(found.submodule_search_locations[0]) / file
+    return Path(spec.submodule_search_locations[0]) / file
 
 
 def _in_menagerie(name: str) -> Path:
@@ -106,8 +99,8 @@ def _in_menagerie(name: str) -> Path:
         import mujoco_menagerie
     robot, _, entry = name.partition("/")
     try:
-        found = mujoco_menagerie.get(robot)
-        return Path(found.xml(entry or found.default_model))
+        model = mujoco_menagerie.get(robot)
+        return Path(model.xml(entry or model.default_model))
     except (mujoco_menagerie.MenagerieError, OSError) as error:
         reason = reason_of(error)
         raise UserError(
@@ -198,7 +191,7 @@ def _other_sites(model: mujoco.MjModel) -> str:
     """The remedy for a wrong site: the sites and bodies of the arm."""
     names = [model.site(i).name for i in range(model.nsite)]
     names += [model.body(i).name for i in range(1, model.nbody)]
-    return f"give --site a site or body beyond {MIN_JOINTS} joints, of {_list(names, 80)}"
+    return f"give --site a site or body beyond {MIN_JOINTS} joints, of {listed(names, 80)}"
 
 
 class _Builder:
@@ -206,31 +199,30 @@ class _Builder:
     spec's elements."""
 
     def __init__(self, arm: mujoco.MjSpec, model: mujoco.MjModel, config: RobotConfig):
-        self._arm, self._model, self._config = arm, model, config
+        self._arm = arm
+        self._model = model
+        self._config = config
         self._changes: list[str] = []
         self._narrowed: list[str] = []
 
     def build(self) -> Arm:
         model = self._model
-        end, position, quaternion = find_site(model, self._config)
-        chain = [end]
-        while parent := int(model.body_parentid[chain[0]]):
-            chain.insert(0, parent)
+        holder, position, quaternion = find_site(model, self._config)
+        chain = _chain_to(model, holder)
         joints = self._acting_joints(chain)
         actuators = self._actuators(joints)
-        servos = tuple(_servo(model, joint, actuators[joint]) for joint in joints)
-        loose = self._loose_bodies(chain, joints, actuators)
+        servos = tuple(servo_settings(model, joint, actuators[joint]) for joint in joints)
+        loose = self._loose_bodies(chain, joints)
+        alone = self._numbers_alone(joints, loose)
         scene = read_spec(resource_path("mjcf/scene.xml"))
-        holder, joint_names = self._rename(scene, end, joints, actuators)
+        self._rename(scene, holder)
+        holder_name, joint_names = self._bind_names(holder, joints, actuators)
         self._freeze_bodies()
         self._freeze_joints(joints, actuators)
         self._strip(joints, loose)
         self._disable_contacts_and_limits(joints)
-        self._attach(scene, holder, position, quaternion)
+        self._attach(scene, holder_name, position, quaternion)
         self._replace_servos(scene, joint_names)
-        kept = [body for body in range(1, model.nbody) if not is_below(model, body, loose)]
-        alone = {name: getattr(model, name)[kept] for name in BODY_FIELDS}
-        alone |= {name: getattr(model, name)[joints] for name in JOINT_FIELDS}
         return Arm(
             spec=scene,
             joint_names=joint_names,
@@ -241,53 +233,72 @@ class _Builder:
         )
 
     def _acting_joints(self, chain: list[int]) -> list[int]:
-        model, given = self._model, self._config.joints
-        on_chain = [j for j in range(model.njnt) if model.jnt_bodyid[j] in chain]
-        balls = [j for j in on_chain if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_BALL]
-        if balls:
-            raise UserError(
-                f"the ball joint {joint_name(model, balls[0])} in the arm; give an arm of hinges "
-                "and slides"
-            )
-        names = {
-            joint_name(model, j): j for j in on_chain if int(model.jnt_type[j]) in (_HINGE, _SLIDE)
-        }
+        """The joints that act: those of the config, or each hinge and slide on the chain.
+
+        Raises:
+          UserError: they are too few or not on the chain, or a ball joint is on it.
+        """
+        joints_by_name = self._joints_on(chain)
+        chosen = self._config.joints
         site = shorten(self._config.site)
-        for name in given or ():
-            if name not in names:
+        for name in chosen or ():
+            if name not in joints_by_name:
                 raise UserError(
                     f"no joint {shorten(name)} on the way to {site}; the joints there are "
-                    f"{_list(names)}"
+                    f"{listed(joints_by_name)}"
                 )
-        acting = [j for name, j in names.items() if given is None or name in given]
+        acting = {}
+        for name, joint in joints_by_name.items():
+            if chosen is None or name in chosen:
+                acting[name] = joint
         if len(acting) < MIN_JOINTS:
-            have = _list(joint_name(model, j) for j in acting)
-            remedy = _other_sites(model) if given is None else "name more with --joints"
+            remedy = "name more with --joints"
+            if chosen is None:
+                remedy = _other_sites(self._model)
             raise UserError(
-                f"too few joints to hold the paddle level and lift it: {len(acting)} ({have}) on "
-                f"the way to {site}, where at least {MIN_JOINTS} must act; {remedy}"
+                f"too few joints to hold the paddle level and lift it: {len(acting)} "
+                f"({listed(acting)}) on the way to {site}, where at least {MIN_JOINTS} must act; "
+                f"{remedy}"
             )
-        return acting
+        return list(acting.values())
+
+    def _joints_on(self, chain: list[int]) -> dict[str, int]:
+        """The hinges and slides of a chain of bodies, by their names.
+
+        Raises:
+          UserError: it has a ball joint.
+        """
+        model = self._model
+        joints = {}
+        for joint in range(model.njnt):
+            if model.jnt_bodyid[joint] not in chain:
+                continue
+            name = joint_name(model, joint)
+            kind = int(model.jnt_type[joint])
+            if kind == mujoco.mjtJoint.mjJNT_BALL:
+                raise UserError(
+                    f"the ball joint {name} in the arm; give an arm of hinges and slides"
+                )
+            if kind in _ACTING_KINDS:
+                joints[name] = joint
+        return joints
 
     def _actuators(self, joints: list[int]) -> dict[int, int]:
-        """The actuator of each joint that has one, and so of each acting joint."""
-        model = self._model
-        drives = joint_actuators(model)
-        for joint in joints:
-            name = joint_name(model, joint)
-            if len(drives.get(joint, ())) > 1:
-                raise UserError(f"several actuators on {name}; give it one")
-        idle = [joint_name(model, joint) for joint in joints if joint not in drives]
+        """The actuator of each acting joint.
+
+        Raises:
+          UserError: a joint has none, or several.
+        """
+        actuators = single_actuators(self._model, joints)
+        idle = [joint_name(self._model, joint) for joint in joints if joint not in actuators]
         if idle:
             raise UserError(
-                f"no actuator on {_list(idle)}; add a <position> or <motor> with a force limit, or "
-                "name the acting joints with --joints"
+                f"no actuator on {listed(idle)}; add a <position> or <motor> with a force limit, "
+                "or name the acting joints with --joints"
             )
-        return {joint: actuators[-1] for joint, actuators in drives.items()}
+        return actuators
 
-    def _loose_bodies(
-        self, chain: list[int], joints: list[int], actuators: dict[int, int]
-    ) -> list[int]:
+    def _loose_bodies(self, chain: list[int], joints: list[int]) -> list[int]:
         """The bodies to remove, each with all below it: a gripper's, which move on the links beyond
         the last acting joint, and objects that move in the world.
 
@@ -295,60 +306,69 @@ class _Builder:
           UserError: the model has driven joints in addition to the arm.
         """
         model = self._model
-        holders = [0, *chain[chain.index(model.jnt_bodyid[joints[-1]]) :]]
-        moving = {*model.jnt_bodyid.tolist(), *np.flatnonzero(model.body_mocapid >= 0).tolist()}
-        loose = [
-            b
-            for b in range(1, model.nbody)
-            if b not in chain
-            and model.body_parentid[b] in holders
-            and any(is_below(model, body, [b]) for body in moving)
-        ]
-        gripper, owners = [b for b in loose if model.body_parentid[b]], model.jnt_bodyid.tolist()
-        beside = [
-            joint_name(model, j)
-            for j in sorted(actuators)
-            if owners[j] not in chain and not is_below(model, owners[j], gripper)
-        ]
-        if beside:
-            raise UserError(
-                f"{len(beside)} driven joints ({_list(beside)}) in addition to the arm "
-                f"{_list(joint_name(model, j) for j in joints)}; give an MJCF with nothing but "
-                "one arm on a fixed base"
-            )
+        last_link = chain.index(model.jnt_bodyid[joints[-1]])
+        holders = [0, *chain[last_link:]]
+        jointed = set(model.jnt_bodyid.tolist())
+        mocap = set(np.flatnonzero(model.body_mocapid >= 0).tolist())
+        moving = jointed | mocap
+        loose = []
+        for body in range(1, model.nbody):
+            is_held = model.body_parentid[body] in holders and body not in chain
+            if is_held and any(is_below(model, other, [body]) for other in moving):
+                loose.append(body)
+        gripper = [body for body in loose if model.body_parentid[body]]
+        self._check_driven(chain, joints, gripper)
         return loose
 
-    def _rename(
-        self, scene: mujoco.MjSpec, end: int, joints: list[int], actuators: dict[int, int]
-    ) -> tuple[str, tuple[str, ...]]:
-        """Gives the arm's parts names that the task's scene does not use.
+    def _check_driven(self, chain: list[int], joints: list[int], gripper: list[int]) -> None:
+        """Refuses driven joints that are neither the arm's nor a gripper's."""
+        model = self._model
+        beside = []
+        for joint in joint_actuators(model):
+            body = int(model.jnt_bodyid[joint])
+            if body not in chain and not is_below(model, body, gripper):
+                beside.append(joint_name(model, joint))
+        if beside:
+            arm_joints = listed(joint_name(model, joint) for joint in joints)
+            raise UserError(
+                f"{len(beside)} driven joints ({listed(beside)}) in addition to the arm "
+                f"{arm_joints}; give an MJCF with nothing but one arm on a fixed base"
+            )
 
-        Returns:
-          The names of the body that holds the paddle, and of the acting joints.
-        """
+    def _numbers_alone(self, joints: list[int], loose: list[int]) -> dict[str, np.ndarray]:
+        """`Arm.alone`."""
+        model = self._model
+        kept = [body for body in range(1, model.nbody) if not is_below(model, body, loose)]
+        numbers = {field: getattr(model, field)[kept] for field in BODY_FIELDS}
+        for field in JOINT_FIELDS:
+            numbers[field] = getattr(model, field)[joints]
+        return numbers
+
+    def _rename(self, scene: mujoco.MjSpec, holder: int) -> None:
+        """Gives the arm's parts names that the task's scene does not use, and the body that holds
+        the paddle a name."""
         arm = self._arm
         # Each access to a list of a spec walks through the whole spec.
-        bodies, parts, drives = list(arm.bodies), list(arm.joints), list(arm.actuators)
-        bodies[end].name = bodies[end].name or _free_name("end_effector", bodies)
-        renamed = []
-        for elements, others, added in (
-            (bodies[1:], scene.bodies, {PADDLE_BODY_NAME}),
-            (parts, scene.joints, set()),
-            (list(arm.geoms), scene.geoms, {PADDLE_GEOM_NAME}),
-        ):
-            names = [other.name for other in others if other.name]
-            reserved = added | {name + number for name in names for number in _BALL_NUMBERS}
-            for element in elements:
-                if element.name in reserved:
-                    free_name = _free_name(element.name, elements, reserved)
-                    renamed.append(f"{element.name} to {free_name}")
-                    element.name = free_name
+        bodies = list(arm.bodies)
+        if not bodies[holder].name:
+            bodies[holder].name = _free_name("end_effector", bodies)
+        renamed = _rename_beside(bodies[1:], scene.bodies, PADDLE_BODY_NAME)
+        renamed += _rename_beside(list(arm.joints), scene.joints)
+        renamed += _rename_beside(list(arm.geoms), scene.geoms, PADDLE_GEOM_NAME)
         if renamed:
-            self._changes.append(f"renamed what the scene has too: {_list(renamed, most=20)}")
+            self._changes.append(f"renamed what the scene has too: {listed(renamed, most=20)}")
+
+    def _bind_names(
+        self, holder: int, joints: list[int], actuators: dict[int, int]
+    ) -> tuple[str, tuple[str, ...]]:
+        """The names of the body that holds the paddle, and of the acting joints, by which their
+        actuators find them."""
+        spec_joints = list(self._arm.joints)
+        spec_actuators = list(self._arm.actuators)
         for joint in joints:
-            # An actuator finds its joint by the name.
-            drives[actuators[joint]].target = parts[joint].name
-        return bodies[end].name, tuple(parts[joint].name for joint in joints)
+            spec_actuators[actuators[joint]].target = spec_joints[joint].name
+        names = tuple(spec_joints[joint].name for joint in joints)
+        return list(self._arm.bodies)[holder].name, names
 
     def _freeze_bodies(self) -> None:
         """Gives the bodies of the spec the numbers of the compiled model.
@@ -356,48 +376,60 @@ class _Builder:
         MuJoCo's compiler computes them from the whole file, with its units and settings. Compiled
         again in another scene, without its limits and with fewer parts, they would be others.
         """
-        arm, model = self._arm, self._model
-        for i, body in enumerate(list(arm.bodies)[1:], start=1):
+        compiler = self._arm.compiler
+        for i, body in enumerate(list(self._arm.bodies)[1:], start=1):
             body.explicitinertial = True
             for field in BODY_FIELDS:
-                setattr(body, field.removeprefix("body_"), getattr(model, field)[i])
+                setattr(body, field.removeprefix("body_"), getattr(self._model, field)[i])
             body.fullinertia[0] = np.nan
             # A body that the scene fuses would be turned by its angles in the scene's units.
-            body.alt.type = body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+            body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+            body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
             if body.frame is not None:
                 body.set_frame(body.parent.add_frame())
-        arm.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
-        arm.compiler.boundmass = arm.compiler.boundinertia = 0.0
+        compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+        compiler.boundmass = 0.0
+        compiler.boundinertia = 0.0
 
     def _freeze_joints(self, joints: list[int], actuators: dict[int, int]) -> None:
         """Gives the acting joints and their actuators the numbers of the compiled model, as
         `_freeze_bodies`, and the joints the ranges that their servos reach."""
-        model = self._model
-        parts, drives = list(self._arm.joints), list(self._arm.actuators)
-        for i in joints:
-            actuator = actuators[i]
-            dof = model.jnt_dofadr[i]
-            gear = model.actuator_gear[actuator, 0]
-            joint, drive = parts[i], drives[actuator]
-            if np.any(joint.range) and not model.jnt_limited[i]:
-                name = joint_name(model, i)
-                self._changes.append(f"ignored the range of {name}, which is not limited")
-            joint.limited = mujoco.mjtLimited.mjLIMITED_FALSE
-            joint.range = self._reached_range(i, actuator)
-            joint.springdamper = np.zeros(2)
-            joint.stiffness[0] = model.jnt_stiffness[i]
-            # The rotor moves with the joint, also where another servo replaces the actuator.
-            joint.damping[0] = model.dof_damping[dof] + gear**2 * model.actuator_damping[actuator]
-            joint.armature = model.dof_armature[dof] + gear**2 * model.actuator_armature[actuator]
-            drive.damping[0] = 0.0
-            drive.armature = 0.0
-            drive.gainprm = model.actuator_gainprm[actuator]
-            drive.biasprm = model.actuator_biasprm[actuator]
-            drive.inheritrange = 0.0
-            drive.ctrlrange = model.actuator_ctrlrange[model.actuator_ctrladr[actuator]]
+        spec_joints = list(self._arm.joints)
+        spec_actuators = list(self._arm.actuators)
+        for joint in joints:
+            actuator = actuators[joint]
+            self._freeze_joint(spec_joints[joint], joint, actuator)
+            self._freeze_actuator(spec_actuators[actuator], actuator)
         if self._narrowed:
-            words = ", ".join(self._narrowed)
-            self._changes.append(f"narrowed the ranges to what the servos reach: {words}")
+            ranges = ", ".join(self._narrowed)
+            self._changes.append(f"narrowed the ranges to what the servos reach: {ranges}")
+
+    def _freeze_joint(self, spec_joint: mujoco.MjsJoint, joint: int, actuator: int) -> None:
+        model = self._model
+        if np.any(spec_joint.range) and not model.jnt_limited[joint]:
+            name = joint_name(model, joint)
+            self._changes.append(f"ignored the range of {name}, which is not limited")
+        spec_joint.limited = mujoco.mjtLimited.mjLIMITED_FALSE
+        spec_joint.range = self._reached_range(joint, actuator)
+        spec_joint.springdamper = np.zeros(2)
+        spec_joint.stiffness[0] = model.jnt_stiffness[joint]
+        dof = model.jnt_dofadr[joint]
+        # The rotor moves with the joint, also where another servo replaces the actuator.
+        squared_gear = model.actuator_gear[actuator, 0] ** 2
+        rotor_damping = squared_gear * model.actuator_damping[actuator]
+        rotor_inertia = squared_gear * model.actuator_armature[actuator]
+        spec_joint.damping[0] = model.dof_damping[dof] + rotor_damping
+        spec_joint.armature = model.dof_armature[dof] + rotor_inertia
+
+    def _freeze_actuator(self, spec_actuator: mujoco.MjsActuator, actuator: int) -> None:
+        model = self._model
+        # The joint has them.
+        spec_actuator.damping[0] = 0.0
+        spec_actuator.armature = 0.0
+        spec_actuator.gainprm = model.actuator_gainprm[actuator]
+        spec_actuator.biasprm = model.actuator_biasprm[actuator]
+        spec_actuator.inheritrange = 0.0
+        spec_actuator.ctrlrange = model.actuator_ctrlrange[model.actuator_ctrladr[actuator]]
 
     def _reached_range(self, joint: int, actuator: int) -> tuple[float, float]:
         """The joint's range, as far as its servo reaches; 0 and 0 without a range.
@@ -405,10 +437,14 @@ class _Builder:
         Raises:
           UserError: the servo reaches nothing of it.
         """
-        model, name = self._model, joint_name(self._model, joint)
-        low, high = model.jnt_range[joint] if model.jnt_limited[joint] else (-np.inf, np.inf)
-        least, greatest = _servo_range(model, actuator)
-        reached_low, reached_high = max(low, least), min(high, greatest)
+        model = self._model
+        name = joint_name(model, joint)
+        low, high = -np.inf, np.inf
+        if model.jnt_limited[joint]:
+            low, high = model.jnt_range[joint]
+        least, greatest = servo_range(model, actuator)
+        reached_low = max(low, least)
+        reached_high = min(high, greatest)
         if not reached_low < reached_high:
             raise UserError(
                 f"the range {low:g} to {high:g} of {name}, but a servo that reaches {least:g} to "
@@ -428,34 +464,42 @@ class _Builder:
         Raises:
           UserError: an equality constraint or a tendon acts on the arm.
         """
-        arm, model = self._arm, self._model
-        bodies, parts = list(arm.bodies), list(arm.joints)
-        acting = [parts[joint].name for joint in joints]
-        still = (j for j in range(model.njnt) if not is_below(model, model.jnt_bodyid[j], loose))
-        fixed = [parts[j] for j in still if j not in joints]
-        tendons = [_tendon_words(model, i) for i in range(model.ntendon)]
+        arm = self._arm
+        model = self._model
+        # Deleted elements change the lists.
+        bodies = list(arm.bodies)
+        spec_joints = list(arm.joints)
+        acting_names = [spec_joints[joint].name for joint in joints]
+        idle = []
+        for joint, spec_joint in enumerate(spec_joints):
+            is_loose = is_below(model, model.jnt_bodyid[joint], loose)
+            if joint not in joints and not is_loose:
+                idle.append(spec_joint)
+        tendons = [_tendon_words(model, tendon) for tendon in range(model.ntendon)]
         # With what acts on them, such as a gripper's tendons.
-        self._remove("removed the grippers and loose objects", [bodies[b] for b in loose])
-        self._remove("fixed the joints that do not act", fixed)
-        couplings = [
-            _constraint_words(equality)
-            for equality in arm.equalities
-            if _moves_with(model, equality.id, joints)
-        ]
-        couplings += [tendons[tendon.id] for tendon in arm.tendons]
+        self._remove("removed the grippers and loose objects", [bodies[body] for body in loose])
+        self._remove("fixed the joints that do not act", idle)
+        self._check_couplings(joints, tendons)
+        elements = [*arm.keys, *arm.sensors, *arm.pairs, *arm.excludes, *arm.lights, *arm.cameras]
+        elements += arm.equalities
+        elements += [drive for drive in arm.actuators if drive.target not in acting_names]
+        floors = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
+        elements += [geom for geom in arm.geoms if geom.type in floors]
+        self._remove("removed what is not the arm", elements)
+
+    def _check_couplings(self, joints: list[int], tendons: list[str]) -> None:
+        """Refuses what still couples the arm's joints; `tendons` are all of the file in words."""
+        couplings = []
+        for equality in self._arm.equalities:
+            if _moves_with(self._model, equality.id, joints):
+                couplings.append(_constraint_words(equality))
+        for tendon in self._arm.tendons:
+            couplings.append(tendons[tendon.id])
         if couplings:
             raise UserError(
                 f"the {couplings[0]} on the arm, so it is not a serial chain; remove it, or give a "
                 "serial arm"
             )
-        floors = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
-        elements = (
-            *(*arm.keys, *arm.sensors, *arm.pairs, *arm.excludes, *arm.lights, *arm.cameras),
-            *arm.equalities,
-            *(actuator for actuator in arm.actuators if actuator.target not in acting),
-            *(geom for geom in arm.geoms if geom.type in floors),
-        )
-        self._remove("removed what is not the arm", elements)
 
     def _remove(self, words: str, elements: Iterable) -> None:
         elements = list(elements)
@@ -463,7 +507,7 @@ class _Builder:
         for element in elements:
             self._arm.delete(element)
         if elements:
-            named = f": {_list(names)}" if any(names) else ""
+            named = f": {listed(names)}" if any(names) else ""
             self._changes.append(f"{words} ({len(elements)}{named})")
 
     def _disable_contacts_and_limits(self, joints: list[int]) -> None:
@@ -477,34 +521,43 @@ class _Builder:
                 # the world, such as a table, is shown as it is.
                 if touches and i > 0 and not all(touching):
                     geom.group = HIDDEN_GROUP
-                geom.contype = geom.conaffinity = 0
+                geom.contype = 0
+                geom.conaffinity = 0
         if np.any(model.jnt_limited[joints]):
             self._changes.append("made the joint limits act by clipping the servo targets")
 
     def _attach(
         self, scene: mujoco.MjSpec, holder: str, position: np.ndarray, quaternion: np.ndarray
     ) -> None:
-        """Puts the arm into the scene, and the paddle on the body `holder`."""
-        config, arm = self._config, self._arm
+        """Puts the arm into the scene, and the paddle on its body `holder`.
+
+        Args:
+          scene: to which the arm is attached, with the task's options in place of the file's.
+          holder: name of the body.
+          position: of the site in the body [3], m.
+          quaternion: of the site in the body [4].
+        """
+        config = self._config
         differing = _differing_options(self._model.opt, scene.option)
         if differing:
             self._changes.append(f"replaced the physics options with the task's: {differing}")
         if np.any(self._model.dof_frictionloss):
             raise_solver_limits(scene.option)
-        arm.option = scene.option
-        scene.attach(arm, frame=scene.worldbody.add_frame(), prefix="")
+        self._arm.option = scene.option
+        scene.attach(self._arm, frame=scene.worldbody.add_frame(), prefix="")
         paddle = scene.body(holder).add_body(name=PADDLE_BODY_NAME, pos=position, quat=quaternion)
-        _add_paddle(paddle, config, scene.default)
+        _add_paddle(paddle, config.paddle, scene.default)
         ball = scene.geom("ball")
-        ball.size[0], ball.mass = config.ball.radius, config.ball.mass
-        size = " x ".join(f"{200 * h:.3g}" for h in config.paddle.half_size)
+        ball.size[0] = config.ball.radius
+        ball.mass = config.ball.mass
+        size = " x ".join(f"{200 * half_size:.3g}" for half_size in config.paddle.half_size)
         self._changes.append(
             f"added a paddle of {size} cm and {config.paddle.mass:g} kg at {config.site}, and a "
             "ball"
         )
 
     def _replace_servos(self, scene: mujoco.MjSpec, names: tuple[str, ...]) -> None:
-        """Replaces the actuators if the config has servos."""
+        """Replaces the actuators of the joints with these names if the config has servos."""
         config = self._config
         settings = (config.servo_stiffness, config.servo_damping, config.servo_force_limit)
         if not any(settings):
@@ -512,24 +565,61 @@ class _Builder:
         counts = [len(numbers or ()) for numbers in settings]
         if set(counts) != {len(names)}:
             raise UserError(
-                f"{len(names)} acting joints ({_list(names)}), but servo_stiffness, servo_damping "
+                f"{len(names)} acting joints ({listed(names)}), but servo_stiffness, servo_damping "
                 f"and servo_force_limit have {counts} numbers; give one of each for each joint"
             )
         for actuator in list(scene.actuators):
             scene.delete(actuator)
         for name, stiffness, damping, limit in zip(names, *settings, strict=True):
-            joint = mujoco.mjtTrn.mjTRN_JOINT
-            actuator = scene.add_actuator(name=f"servo/{name}", target=name, trntype=joint)
-            actuator.set_to_position(kp=stiffness, kv=damping)
-            if limit is not None:
-                actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
-                actuator.forcerange = [-limit, limit]
+            _add_servo(scene, name, ServoSettings(stiffness, damping, limit))
         self._changes.append("replaced the actuators with position servos")
 
 
-def _add_paddle(paddle: mujoco.MjsBody, config: RobotConfig, default: mujoco.MjsDefault) -> None:
+def _chain_to(model: mujoco.MjModel, body: int) -> list[int]:
+    """The bodies from the base to a body."""
+    chain = []
+    while body:
+        chain.insert(0, body)
+        body = int(model.body_parentid[body])
+    return chain
+
+
+def _rename_beside(elements: Iterable, others: Iterable, added: str = "") -> list[str]:
+    """Renames elements of the arm that have a name of the scene, or one that it gets.
+
+    Args:
+      elements: of one kind, such as the arm's bodies.
+      others: the scene's of that kind.
+      added: name of the one that the paddle brings.
+
+    Returns:
+      The changes in words.
+    """
+    reserved = {added}
+    for other in others:
+        if other.name:
+            reserved.update(other.name + number for number in _BALL_NUMBERS)
+    renamed = []
+    for element in elements:
+        if element.name and element.name in reserved:
+            free_name = _free_name(element.name, elements, reserved)
+            renamed.append(f"{element.name} to {free_name}")
+            element.name = free_name
+    return renamed
+
+
+def _add_servo(scene: mujoco.MjSpec, joint: str, servo: ServoSettings) -> None:
+    """Adds a position servo of a joint to the scene."""
+    transmission = mujoco.mjtTrn.mjTRN_JOINT
+    actuator = scene.add_actuator(name=f"servo/{joint}", target=joint, trntype=transmission)
+    actuator.set_to_position(kp=servo.stiffness, kv=servo.damping)
+    if servo.force_limit is not None:
+        actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+        actuator.forcerange = [-servo.force_limit, servo.force_limit]
+
+
+def _add_paddle(paddle: mujoco.MjsBody, blade: PaddleConfig, default: mujoco.MjsDefault) -> None:
     """Adds the blade, with all the mass, and a handle for pictures to the paddle's body."""
-    blade = config.paddle
     common = {"contype": 0, "conaffinity": 0, "friction": [0, 0, 0], "default": default}
     paddle.add_geom(
         name=PADDLE_GEOM_NAME,
@@ -566,85 +656,6 @@ def _handle_length(blade: PaddleConfig) -> float:
     return float(distance - inside - _HANDLE_RADIUS + 0.5 * min(blade.half_size))
 
 
-def _servo(model: mujoco.MjModel, joint: int, actuator: int) -> ServoSettings:
-    """The actuator that drives a joint."""
-    limit = _force_limit(model, joint, actuator)
-    plain = model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_NONE
-    if not (plain and is_position_servo(model, actuator)):
-        return ServoSettings(None, None, limit)
-    gear = float(model.actuator_gear[actuator, 0])
-    return ServoSettings(
-        float(model.actuator_gainprm[actuator, 0] * gear**2),
-        float(-model.actuator_biasprm[actuator, 2] * gear**2) + 0.0,
-        limit,
-    )
-
-
-def is_position_servo(model: mujoco.MjModel, actuator: int) -> bool:
-    """Whether an actuator's control, or its filtered or integrated one, is a target position."""
-    gain, (offset, factor) = (
-        model.actuator_gainprm[actuator, 0],
-        model.actuator_biasprm[actuator, :2],
-    )
-    return bool(
-        model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
-        and model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE
-        and gain > 0.0
-        and offset == 0.0
-        # Otherwise the joint would rest at another position than the control.
-        and np.isclose(factor, -gain)
-    )
-
-
-def _servo_range(model: mujoco.MjModel, actuator: int) -> tuple[float, float]:
-    """Joint positions that the targets of a position servo reach."""
-    control = model.actuator_ctrladr[actuator]
-    # The control of an integrator is a velocity.
-    direct = model.actuator_dyntype[actuator] != mujoco.mjtDyn.mjDYN_INTEGRATOR
-    if not (direct and is_position_servo(model, actuator) and model.actuator_ctrllimited[control]):
-        return -np.inf, np.inf
-    low, high = sorted(model.actuator_ctrlrange[control] / model.actuator_gear[actuator, 0])
-    return float(low), float(high)
-
-
-def _force_limit(model: mujoco.MjModel, joint: int, actuator: int) -> float | None:
-    """Largest force of a joint's actuator, None for no limit: by the force range, by the control
-    range of a plain motor, or by the joint's own limit."""
-    m, a = model, actuator
-    gear, gain = m.actuator_gear[a, 0], m.actuator_gainprm[a, 0]
-    # A <pid> has several controls; the other arrays have one row for each actuator.
-    control = m.actuator_ctrladr[a]
-    is_motor = m.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_NONE
-    clipped = is_motor and m.actuator_ctrllimited[control]
-    limit = np.inf
-    for limited, name, span, factor in (
-        (m.actuator_forcelimited[a], "forcerange", m.actuator_forcerange[a], gear),
-        (clipped, "ctrlrange", m.actuator_ctrlrange[control], gear * gain),
-        (m.jnt_actfrclimited[joint], "actuatorfrcrange", m.jnt_actfrcrange[joint], 1.0),
-    ):
-        low, high = map(float, span)
-        if limited and not low < 0.0 < high:
-            most = max(-low, high)
-            raise UserError(
-                f"the {name} {low:g} to {high:g} on {joint_name(model, joint)}, so its actuator "
-                f"pushes one way only; give a range around 0, such as {-most:g} to {most:g}"
-            )
-        if limited:
-            limit = min(limit, float(min(-low, high) * abs(factor)))
-    return limit if np.isfinite(limit) else None
-
-
-def joint_actuators(model: mujoco.MjModel) -> dict[int, list[int]]:
-    """The actuators of each joint that has some, the joints in the model's order."""
-    drives: dict[int, list[int]] = {}
-    for actuator in range(model.nactuator):
-        # For a hinge or a slide, both kinds of transmission are the same.
-        if int(model.actuator_trntype[actuator]) in _JOINT_TRANSMISSIONS:
-            joint = int(model.actuator_trnid[actuator, 0])
-            drives.setdefault(joint, []).append(actuator)
-    return dict(sorted(drives.items()))
-
-
 def _free_name(name: str, elements: Iterable, reserved: Container[str] = ()) -> str:
     """A name of an arm's part that no other element has, and that is not reserved."""
     taken = {element.name for element in elements}
@@ -658,7 +669,7 @@ def _constraint_words(equality: mujoco.MjsEquality) -> str:
     if equality.name:
         return f"equality constraint {equality.name}"
     kind = mujoco.mjtEq(equality.type).name.removeprefix("mjEQ_").lower()
-    connected = _list((equality.name1, equality.name2))
+    connected = listed((equality.name1, equality.name2))
     return f"unnamed equality constraint ({kind}: {connected})"
 
 
@@ -682,13 +693,13 @@ def _tendon_words(model: mujoco.MjModel, tendon: int) -> str:
     name = model.tendon(tendon).name
     if name:
         return f"tendon {name}"
-    wraps = range(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
-    joints = [
-        joint_name(model, model.wrap_objid[i])
-        for i in wraps
-        if model.wrap_type[i] == mujoco.mjtWrap.mjWRAP_JOINT
-    ]
-    return f"unnamed tendon ({_list(joints) if joints else 'spatial'})"
+    first_wrap = model.tendon_adr[tendon]
+    joints = []
+    for wrap in range(first_wrap, first_wrap + model.tendon_num[tendon]):
+        if model.wrap_type[wrap] == mujoco.mjtWrap.mjWRAP_JOINT:
+            joints.append(joint_name(model, model.wrap_objid[wrap]))
+    path = listed(joints) if joints else "spatial"
+    return f"unnamed tendon ({path})"
 
 
 def _differing_options(option: mujoco.MjOption, task: mujoco.MjOption) -> str:
@@ -697,14 +708,17 @@ def _differing_options(option: mujoco.MjOption, task: mujoco.MjOption) -> str:
     if option.integrator != task.integrator:
         integrator = mujoco.mjtIntegrator(option.integrator).name.removeprefix("mjINT_")
         differing.append(f"the integrator {integrator.lower()}")
-    for name in ("gravity", "wind", "density", "viscosity"):
+    for name in WORLD_OPTIONS:
         value = np.asarray(getattr(option, name))
-        if not np.allclose(value, getattr(task, name), atol=1e-2 if name == "gravity" else 0.0):
+        # 9.8 and 9.81 m/s^2 are the same gravity.
+        tolerance = 1e-2 if name == "gravity" else 0.0
+        if not np.allclose(value, getattr(task, name), atol=tolerance):
             differing.append(f"{name} {np.round(value, 6).tolist()}")
     return ", ".join(differing)
 
 
 def is_below(model: mujoco.MjModel, body: int, ancestors: list[int]) -> bool:
+    """Whether a body is one of some bodies, or below one of them in the tree."""
     while body and body not in ancestors:
         body = int(model.body_parentid[body])
     return body in ancestors
@@ -719,15 +733,3 @@ def raise_solver_limits(option: mujoco.MjOption) -> None:
     default = mujoco.MjOption()
     option.iterations = max(option.iterations, default.iterations)
     option.ls_iterations = max(option.ls_iterations, default.ls_iterations)
-
-
-def joint_name(model: mujoco.MjModel, joint: int) -> str:
-    """Name of a joint; an unnamed joint has its index for a name."""
-    return model.joint(joint).name or f"joint{joint}"
-
-
-def _list(names: Iterable[str], most: int = 8) -> str:
-    """Names with commas; a long list is cut."""
-    names = [name for name in names if name]
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return (", ".join(shorten(name, 40) for name in names[:most]) or "none") + more

@@ -4,18 +4,20 @@ import itertools
 
 import mujoco
 
-from bounce_mjx.robot.arm import BALL_BODY_NAME, PADDLE_GEOM_NAME, raise_solver_limits
+from bounce_mjx.robot.arm import raise_solver_limits
+from bounce_mjx.robot.contact import PAIR_SETTINGS
+from bounce_mjx.robot.names import BALL_BODY_NAME, PADDLE_GEOM_NAME
 
 MAX_BALLS = 3
 BALLS_APART = 0.1
 """Height of each added ball above the last one, m."""
 
-_PAIR_SETTINGS = "condim solref solreffriction solimp margin gap adhesion friction".split()
-
 
 def ball_name(index: int) -> str:
     """Name of the body of a ball, which counts from 0: ball_link, ball_link2, ball_link3."""
-    return BALL_BODY_NAME + (str(index + 1) if index else "")
+    if index == 0:
+        return BALL_BODY_NAME
+    return f"{BALL_BODY_NAME}{index + 1}"
 
 
 def add_balls(spec: mujoco.MjSpec, num_balls: int) -> None:
@@ -34,12 +36,15 @@ def add_balls(spec: mujoco.MjSpec, num_balls: int) -> None:
         if spec.body(ball_name(i)) is None:
             frame = spec.worldbody.add_frame(pos=[0.0, 0.0, BALLS_APART * i])
             frame.attach_body(spec.body(BALL_BODY_NAME), "", str(i + 1))
-    pairs, touching = {frozenset((x.geomname1, x.geomname2)): x for x in spec.pairs}, []
+    pairs = {frozenset((pair.geomname1, pair.geomname2)): pair for pair in spec.pairs}
+    touching = []
     for i in range(num_balls):
         geoms = sorted(geom.name for geom in spec.body(ball_name(i)).geoms)
-        touching += [geom for geom in geoms if frozenset((geom, PADDLE_GEOM_NAME)) in pairs][:1]
+        with_pair = [geom for geom in geoms if frozenset((geom, PADDLE_GEOM_NAME)) in pairs]
+        # A ball without a pair touches nothing.
+        touching += with_pair[:1]
     for first, second in itertools.combinations(touching, 2):
         if frozenset((first, second)) not in pairs:
-            like = pairs[frozenset((second, PADDLE_GEOM_NAME))]
-            settings = {name: getattr(like, name) for name in _PAIR_SETTINGS}
+            with_paddle = pairs[frozenset((second, PADDLE_GEOM_NAME))]
+            settings = {name: getattr(with_paddle, name) for name in PAIR_SETTINGS}
             spec.add_pair(geomname1=first, geomname2=second, **settings)

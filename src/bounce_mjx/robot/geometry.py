@@ -6,7 +6,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from bounce_mjx.robot.model import data_at, find_addresses
+from bounce_mjx.robot.model import Addresses, data_at
 
 
 class Geometry(NamedTuple):
@@ -20,22 +20,29 @@ class Geometry(NamedTuple):
     """Centre of the paddle at a reset without noise, m."""
 
 
-def read_geometry(mj_model: mujoco.MjModel, joint_angles: Sequence[float]) -> Geometry:
+def read_geometry(
+    mj_model: mujoco.MjModel, addresses: Addresses, joint_angles: Sequence[float]
+) -> Geometry:
     """The geometry of a model whose arm starts at joint angles [n], rad."""
-    addresses = find_addresses(mj_model)
-    radius = float(mj_model.geom_size[addresses.balls[0].geom, 0])
-    _, thickness = upper_face(mj_model, joint_angles)
-    home = data_at(mj_model, joint_angles).geom_xpos[addresses.paddle_geom]
-    return Geometry(radius, radius + thickness, tuple(home.tolist()))
+    ball_radius = float(mj_model.geom_size[addresses.balls[0].geom, 0])
+    _, face_height = upper_face(mj_model, addresses, joint_angles)
+    data = data_at(mj_model, addresses, joint_angles)
+    paddle_home = tuple(data.geom_xpos[addresses.paddle_geom].tolist())
+    return Geometry(ball_radius, ball_radius + face_height, paddle_home)
 
 
-def upper_face(mj_model: mujoco.MjModel, joint_angles: Sequence[float]) -> tuple[np.ndarray, float]:
+def upper_face(
+    mj_model: mujoco.MjModel, addresses: Addresses, joint_angles: Sequence[float]
+) -> tuple[np.ndarray, float]:
     """Unit normal [3] of the paddle's face that is the upper one at these joint angles (rad), in
     the frame of the paddle's body, and the face's distance from the paddle's centre, m."""
-    paddle = find_addresses(mj_model).paddle_geom
-    upward = data_at(mj_model, joint_angles).geom_xmat[paddle].reshape(3, 3)[2]
+    paddle = addresses.paddle_geom
+    data = data_at(mj_model, addresses, joint_angles)
+    # The height of each of the geom's axes.
+    upward = data.geom_xmat[paddle].reshape(3, 3)[2]
     axis = int(np.argmax(abs(upward)))
     normal_in_geom = np.sign(upward[axis]) * np.eye(3)[axis]
     normal = np.zeros(3)
     mujoco.mju_rotVecQuat(normal, normal_in_geom, mj_model.geom_quat[paddle])
-    return normal, float(mj_model.geom_aabb[paddle, 3 + axis])
+    half_thickness = float(mj_model.geom_aabb[paddle, 3 + axis])
+    return normal, half_thickness

@@ -1,10 +1,9 @@
 """The simulated robot: its MJCF file, the names in it, and the addresses of its data."""
 
 import hashlib
-import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,13 +13,15 @@ import numpy as np
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot import arm
+from bounce_mjx.robot.actuators import is_direct, is_position_servo, single_actuators
 from bounce_mjx.robot.balls import MAX_BALLS, add_balls, ball_name
 from bounce_mjx.robot.config import RobotConfig
+from bounce_mjx.robot.contact import check_step
+from bounce_mjx.robot.names import BALL_BODY_NAME, PADDLE_GEOM_NAME, joint_name
 from bounce_mjx.robot.numbers import check_numbers, physical_fields
 from bounce_mjx.robot.torques import limit_torques
 
-# With fewer physics steps in half a period of a contact, the ball can gain energy in a rebound.
-_STEPS_OF_A_CONTACT = 4
+_ACTING_KINDS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
 class BallAddresses(NamedTuple):
@@ -89,35 +90,48 @@ def load_model(
         without a position servo, more balls than `num_balls`, or a number that cannot be simulated;
         or half a period of a contact has fewer than four physics steps.
     """
-    spec, path = scene_spec(mjcf, robot or RobotConfig())
+    robot = robot or RobotConfig()
+    spec, path = scene_spec(mjcf, robot)
     add_balls(spec, num_balls)
-    if robot is not None and robot.gravity_compensation > 0.0:
+    if robot.gravity_compensation > 0.0:
         _compensate_gravity(spec, robot.gravity_compensation)
-    # MuJoCo does not drop geoms that make the bodies' inertia.
-    from_geoms = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
-    if not visual and spec.compiler.inertiafromgeom != from_geoms:
-        spec.compiler.discardvisual = True
+    if not visual:
+        _drop_pictures(spec)
     mj_model = arm.compile_spec(spec, path)
     with arm.naming(path):
         check_numbers(mj_model)
         addresses = find_addresses(mj_model)
         check_servos(mj_model, addresses)
-        if (present := len(addresses.balls)) != num_balls:
-            raise UserError(f"{present} balls, but num_balls is {num_balls}; set it to {present}")
-        if robot is not None and robot.limits.torque is not None:
-            # `Env` refuses a config with another number of joints than the model.
-            torques = robot.limits.torque[: len(addresses.actuators)]
-            limit_torques(mj_model, addresses.actuators[: len(torques)], torques)
+        _check_balls(addresses, num_balls)
+    if robot.limits.torque is not None:
+        # `Env` refuses a config with another number of joints than the model.
+        torques = robot.limits.torque[: len(addresses.actuators)]
+        limit_torques(mj_model, addresses.actuators[: len(torques)], torques)
     mj_model.opt.timestep = physics_dt
-    _check_step(mj_model)
+    check_step(mj_model)
     return mj_model
 
 
 def _compensate_gravity(spec: mujoco.MjSpec, share: float) -> None:
     """Lets a controller carry a share of the weight of each body but the balls."""
     for body in spec.bodies:
-        if not any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in body.joints):
+        is_free = any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in body.joints)
+        if not is_free:
             body.gravcomp = share
+
+
+def _drop_pictures(spec: mujoco.MjSpec) -> None:
+    """Leaves out what only pictures need, except where it makes the bodies' inertia: there MuJoCo
+    would not drop it."""
+    from_geoms = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    if spec.compiler.inertiafromgeom != from_geoms:
+        spec.compiler.discardvisual = True
+
+
+def _check_balls(addresses: Addresses, num_balls: int) -> None:
+    present = len(addresses.balls)
+    if present != num_balls:
+        raise UserError(f"{present} balls, but num_balls is {num_balls}; set it to {present}")
 
 
 def paddle_home(
@@ -132,23 +146,51 @@ def paddle_home(
       UserError: as `load_model`.
     """
     mj_model = load_model(mjcf, 0.001, visual=False, robot=robot)
-    paddle = data_at(mj_model, joint_angles).geom(arm.PADDLE_GEOM_NAME).xpos
-    x, y, z = (round(float(c), 4) for c in paddle)
-    return x, y, z
+    addresses = find_addresses(mj_model)
+    data = data_at(mj_model, addresses, joint_angles)
+    x, y, z = data.geom_xpos[addresses.paddle_geom].tolist()
+    return round(x, 4), round(y, 4), round(z, 4)
 
 
-def data_at(mj_model: mujoco.MjModel, joint_angles: Sequence[float]) -> mujoco.MjData:
+def data_at(
+    mj_model: mujoco.MjModel, addresses: Addresses, joint_angles: Sequence[float]
+) -> mujoco.MjData:
     """The kinematics of a model with the arm at joint angles [n], rad."""
     data = mujoco.MjData(mj_model)
-    data.qpos[list(find_addresses(mj_model).arm_qpos)] = joint_angles
+    data.qpos[list(addresses.arm_qpos)] = joint_angles
     mujoco.mj_kinematics(mj_model, data)
     return data
 
 
-def joint_ranges(mj_model: mujoco.MjModel) -> np.ndarray:
+def joint_ranges(mj_model: mujoco.MjModel, addresses: Addresses) -> np.ndarray:
     """Lower and upper ends [2, n] of the acting joints' ranges, rad; infinite without a range."""
-    low, high = mj_model.jnt_range[list(find_addresses(mj_model).arm_joints)].T
-    return np.where(low < high, (low, high), ((-np.inf,), (np.inf,)))
+    low, high = mj_model.jnt_range[list(addresses.arm_joints)].T
+    has_range = low < high
+    return np.stack([np.where(has_range, low, -np.inf), np.where(has_range, high, np.inf)])
+
+
+def link_bodies(mj_model: mujoco.MjModel, addresses: Addresses) -> list[list[int]]:
+    """Bodies of each acting joint's link: the joint's body and the bodies welded to it. A body
+    with several joints belongs to the last one, and the others have no bodies."""
+    last_joint_of_body = mj_model.body_jntadr + mj_model.body_jntnum - 1
+    last_joint = last_joint_of_body[mj_model.body_weldid]
+    return [np.flatnonzero(last_joint == joint).tolist() for joint in addresses.arm_joints]
+
+
+def contact_pairs(mj_model: mujoco.MjModel, addresses: Addresses) -> list[int]:
+    """Indices of the contact pairs of balls and the paddle, the first ball's with the paddle first;
+    none if that one is missing."""
+    paddle = addresses.paddle_geom
+    balls = [ball.geom for ball in addresses.balls]
+    first = None
+    others = []
+    for i in range(mj_model.npair):
+        geoms = {int(mj_model.pair_geom1[i]), int(mj_model.pair_geom2[i])}
+        if geoms == {paddle, balls[0]} and first is None:
+            first = i
+        elif geoms <= {paddle, *balls}:
+            others.append(i)
+    return [] if first is None else [first, *others]
 
 
 def scatter(rest: np.ndarray, places: Sequence[int], values: jax.Array) -> jax.Array:
@@ -158,46 +200,6 @@ def scatter(rest: np.ndarray, places: Sequence[int], values: jax.Array) -> jax.A
     for place, value in zip(places, values, strict=True):
         entries[place] = value
     return jnp.stack([jnp.asarray(entry, values.dtype) for entry in entries])
-
-
-def _check_step(mj_model: mujoco.MjModel) -> None:
-    """Refuses a physics step that is too long for a contact: its ball would gain energy."""
-    step = mj_model.opt.timestep
-    # The engines refuse a solref with one positive number.
-    for solref in mj_model.pair_solref[np.sum(mj_model.pair_solref > 0.0, axis=1) != 1]:
-        stiffness, _ = to_direct_solref(solref, step)
-        half_period = math.pi / math.sqrt(max(stiffness, 1e-9))
-        longest = half_period / _STEPS_OF_A_CONTACT
-        if step > longest * (1.0 + 1e-3):
-            raise UserError(
-                f"physics_dt {step:g} s is too long for a contact whose half period is "
-                f"{half_period:.3g} s, and the ball would gain energy; set physics_dt to "
-                f"{longest:.4g} s or less"
-            )
-
-
-def to_direct_solref(solref: Any, timestep: float) -> tuple[Any, Any]:
-    """k and b of a `solref` [2] in MuJoCo's direct format, `solref="-k -b"`.
-
-    The standard format, a time constant and a damping ratio, converts to the direct one (MuJoCo's
-    documentation, "Modeling", solver parameters).
-
-    Args:
-      solref: two floats, or scalars of JAX.
-      timestep: of the physics, s.
-    """
-    first, second = solref
-    # MuJoCo's lower limit for the time constant is two steps.
-    least = 2.0 * timestep
-    if isinstance(first, float):
-        if first <= 0.0:
-            return -first, -second
-        time_constant = max(first, least)
-        return 1.0 / (time_constant * second) ** 2, 2.0 / time_constant
-    is_standard, time_constant = first > 0.0, jnp.maximum(first, least)
-    damping_ratio = jnp.where(is_standard, second, 1.0)
-    stiffness = jnp.where(is_standard, 1.0 / (time_constant * damping_ratio) ** 2, -first)
-    return stiffness, jnp.where(is_standard, 2.0 / time_constant, -second)
 
 
 def check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
@@ -211,9 +213,8 @@ def check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
     if np.any(mj_model.actuator_ctrlnum != 1):
         raise UserError("an actuator with several controls; drive each joint by a <position>")
     for joint, actuator in zip(addresses.arm_joints, addresses.actuators, strict=True):
-        direct = mj_model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_NONE
-        if not (direct and arm.is_position_servo(mj_model, actuator)):
-            name = arm.joint_name(mj_model, joint)
+        if not (is_direct(mj_model, actuator) and is_position_servo(mj_model, actuator)):
+            name = joint_name(mj_model, joint)
             raise UserError(
                 f"an actuator on {name} that is not a position servo; drive it by "
                 f'<position joint="{name}"/>, without a timeconst (env.randomization.servo_lag '
@@ -227,20 +228,20 @@ def find_addresses(mj_model: mujoco.MjModel) -> Addresses:
     Raises:
       UserError: a needed name is missing; the text starts with the missing part.
     """
-    body = mujoco.mjtObj.mjOBJ_BODY
-    balls = [_find_ball(mj_model, arm.BALL_BODY_NAME)]
-    for name in map(ball_name, range(1, MAX_BALLS)):
-        if mujoco.mj_name2id(mj_model, body, name) < 0:
+    balls = [_find_ball(mj_model, BALL_BODY_NAME)]
+    for i in range(1, MAX_BALLS):
+        name = ball_name(i)
+        if mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_BODY, name) < 0:
             break
         balls.append(_find_ball(mj_model, name))
-    paddle_geom = _find(mj_model, mujoco.mjtObj.mjOBJ_GEOM, arm.PADDLE_GEOM_NAME)
-    servos = _servos(mj_model)
-    joints = tuple(servos)
+    paddle_geom = _find(mj_model, mujoco.mjtObj.mjOBJ_GEOM, PADDLE_GEOM_NAME)
+    actuator_of = _acting_joints(mj_model)
+    joints = tuple(actuator_of)
     return Addresses(
         arm_joints=joints,
         arm_qpos=tuple(int(mj_model.jnt_qposadr[joint]) for joint in joints),
         arm_qvel=tuple(int(mj_model.jnt_dofadr[joint]) for joint in joints),
-        actuators=tuple(servos.values()),
+        actuators=tuple(actuator_of.values()),
         balls=tuple(balls),
         paddle_geom=paddle_geom,
     )
@@ -253,37 +254,36 @@ def _find_ball(mj_model: mujoco.MjModel, name: str) -> BallAddresses:
         raise UserError(f"no free joint on the body {name}; add <freejoint/> to it")
     if mj_model.body_geomnum[body] < 1:
         raise UserError(f"no geom on the body {name}; add the ball's sphere to it")
-    qpos, qvel = int(mj_model.jnt_qposadr[joint]), int(mj_model.jnt_dofadr[joint])
+    first_qpos = int(mj_model.jnt_qposadr[joint])
+    first_dof = int(mj_model.jnt_dofadr[joint])
     # The geom in the contact pair; without a pair, the first one.
     geoms = int(mj_model.body_geomadr[body]) + np.arange(mj_model.body_geomnum[body])
     touching = np.isin(geoms, [mj_model.pair_geom1, mj_model.pair_geom2])
     return BallAddresses(
         body=body,
         geom=int(geoms[np.argmax(touching)]),
-        qpos=tuple(range(qpos, qpos + 7)),
-        qvel=tuple(range(qvel, qvel + 6)),
+        qpos=tuple(range(first_qpos, first_qpos + 7)),
+        qvel=tuple(range(first_dof, first_dof + 6)),
     )
 
 
-def joint_names(mj_model: mujoco.MjModel) -> tuple[str, ...]:
-    """Names of the acting joints."""
-    return tuple(arm.joint_name(mj_model, j) for j in find_addresses(mj_model).arm_joints)
+def joint_names(mj_model: mujoco.MjModel, addresses: Addresses | None = None) -> tuple[str, ...]:
+    """Names of the acting joints; `addresses` are the model's, if they are known."""
+    if addresses is None:
+        addresses = find_addresses(mj_model)
+    return tuple(joint_name(mj_model, joint) for joint in addresses.arm_joints)
 
 
-def _servos(mj_model: mujoco.MjModel) -> dict[int, int]:
+def _acting_joints(mj_model: mujoco.MjModel) -> dict[int, int]:
     """The actuator of each hinge and slide that has one, in the order of the joints."""
-    acting = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-    servos: dict[int, int] = {}
-    for joint, actuators in arm.joint_actuators(mj_model).items():
-        if int(mj_model.jnt_type[joint]) not in acting:
-            continue
-        if len(actuators) > 1:
-            name = arm.joint_name(mj_model, joint)
-            raise UserError(f"several actuators on {name}; give it exactly one position servo")
-        servos[joint] = actuators[0]
-    if not servos:
+    candidates = []
+    for joint in range(mj_model.njnt):
+        if int(mj_model.jnt_type[joint]) in _ACTING_KINDS:
+            candidates.append(joint)
+    actuator_of = single_actuators(mj_model, candidates)
+    if not actuator_of:
         raise UserError("no actuator on a hinge or slide; give each joint of the arm a <position>")
-    return servos
+    return actuator_of
 
 
 def fingerprint(mj_model: mujoco.MjModel) -> bytes:
@@ -314,6 +314,6 @@ def _find(mj_model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:
     index = mujoco.mj_name2id(mj_model, kind, name)
     if index < 0:
         noun = kind.name.removeprefix("mjOBJ_").lower()
-        needed = f"{arm.BALL_BODY_NAME} and {arm.PADDLE_GEOM_NAME}"
+        needed = f"{BALL_BODY_NAME} and {PADDLE_GEOM_NAME}"
         raise UserError(f"no {noun} named {name}; the task needs the names {needed}")
     return index

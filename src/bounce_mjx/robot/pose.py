@@ -15,14 +15,15 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.robot.arm import HIDDEN_GROUP, joint_name
+from bounce_mjx.robot.arm import HIDDEN_GROUP
 from bounce_mjx.robot.config import PaddleConfig
-from bounce_mjx.robot.model import Addresses, find_addresses, joint_ranges
+from bounce_mjx.robot.model import Addresses, data_at, joint_names, joint_ranges
 
 # Length that makes rotations comparable with displacements: about a forearm, m/rad.
 _LENGTH = 0.25
 # Upward acceleration of the paddle that a bounce needs, m/s^2, and one that is plenty.
-_LEAST_ACCELERATION, _AMPLE_ACCELERATION = 3.0, 20.0
+_LEAST_ACCELERATION = 3.0
+_AMPLE_ACCELERATION = 20.0
 # Smallest singular value of a usable pose; 1 would be an arm that moves as a sphere.
 _LEAST_MANIPULABILITY = 0.02
 # Scores within this share of the best one count as equal.
@@ -35,11 +36,13 @@ _SIDE = 0.1
 _TRIES = 8
 # Steps toward the goal with a level paddle, then steps that only level it: not every arm can do
 # both.
-_STEPS_TO_GOAL, _STEPS_TO_LEVEL = 30, 30
+_STEPS_TO_GOAL = 30
+_STEPS_TO_LEVEL = 30
 # Largest change of a joint in a step, rad or m.
 _LARGEST_STEP = 0.4
 # Damping of the least squares, m^2; levelling needs none.
-_DAMPING, _NO_DAMPING = 1e-3, 1e-9
+_DAMPING = 1e-3
+_NO_DAMPING = 1e-9
 _LEVEL_TOLERANCE = 1e-9
 # Number of random postures from which the reach is measured.
 _REACH_SAMPLES = 500
@@ -49,6 +52,7 @@ _REACH_SAMPLES = 500
 _LEAST_MARGIN = 0.1
 # Distance from the joint limits that is plenty, rad.
 _AMPLE_MARGIN = 0.5
+# Radius of the column over the paddle that is the ball's way, m.
 _CLEARANCE = 0.09
 # Least height of the lines between the joints, half the thickness of a link, m; within a radius
 # around the first joint, at the base, they may be lower, but not below the floor.
@@ -58,7 +62,12 @@ _BASE_RADIUS = 0.2
 _LOWEST = 0.1
 # Heights that must be free of the arm around the paddle, m: the ball flies above, and a paddle that
 # lies flat on its site is 0.03 m above it.
-_BELOW, _HEADROOM = 0.02, 1.0
+_BELOW = 0.02
+_HEADROOM = 1.0
+# A height of the paddle at which it does not lie on the floor, m.
+_OFF_FLOOR = 0.03
+# Points of a link that are checked.
+_SAMPLES_OF_A_LINK = 12
 # Largest distance of the paddle from a shape that is measured, m.
 _FAR = 0.5
 
@@ -88,15 +97,20 @@ class PaddlePose(NamedTuple):
 def mounts(paddle: PaddleConfig) -> list[PaddleConfig]:
     """The paddle held by a handle along the site's z, in four turns about it, and flat on the
     site."""
-    turns = [(math.cos(i * math.pi / 4.0), math.sin(i * math.pi / 4.0)) for i in range(4)]
     half = math.sqrt(0.5)
-    choices = [((0.0, 0.0, 0.19), (half * c, half * s, -half * c, half * s)) for c, s in turns]
-    choices.append(((0.0, 0.0, 0.03), (1.0, 0.0, 0.0, 0.0)))
-    return [paddle.model_copy(update={"position": p, "quaternion": q}) for p, q in choices]
+    choices = []
+    for turn in range(4):
+        cosine = math.cos(turn * math.pi / 4.0)
+        sine = math.sin(turn * math.pi / 4.0)
+        quaternion = (half * cosine, half * sine, -half * cosine, half * sine)
+        choices.append({"position": (0.0, 0.0, 0.19), "quaternion": quaternion})
+    choices.append({"position": (0.0, 0.0, 0.03), "quaternion": (1.0, 0.0, 0.0, 0.0)})
+    return [paddle.model_copy(update=choice) for choice in choices]
 
 
 def rank_poses(
     model: mujoco.MjModel,
+    addresses: Addresses,
     force_limits: Sequence[float | None],
     choices: Sequence[PaddleConfig],
 ) -> list[PaddlePose]:
@@ -104,15 +118,18 @@ def rank_poses(
 
     Args:
       model: the compiled scene; its paddle is moved.
+      addresses: of its parts.
       force_limits: largest force of each acting joint, N m or N; None for no limit.
       choices: mounts of the paddle to try.
 
     Raises:
       UserError: the paddle cannot be level, tilted or lifted, or no servo is strong enough.
     """
-    search = _Search(model, force_limits)
-    names = ", ".join(joint_name(model, joint) for joint in find_addresses(model).arm_joints)
-    level = [pose for choice in choices for pose in search.level_poses(choice)]
+    search = _Search(model, addresses, force_limits)
+    names = ", ".join(joint_names(model, addresses))
+    level: list[PaddlePose] = []
+    for mount in choices:
+        level += search.level_poses(mount)
     if not level:
         raise UserError(
             f"no reachable pose with a level paddle in front of the robot, {names} inside their "
@@ -137,26 +154,32 @@ def rank_poses(
 
 
 class _Search:
-    def __init__(self, model: mujoco.MjModel, force_limits: Sequence[float | None]):
+    """Level poses of one arm. `qpos`, `dofs` and `joints` are the acting joints' places in MuJoCo's
+    arrays; all postures are arrays [n] of their positions, rad or m."""
+
+    def __init__(
+        self, model: mujoco.MjModel, addresses: Addresses, force_limits: Sequence[float | None]
+    ):
         self._model = model
+        self._data = mujoco.MjData(model)
         self._rng = np.random.default_rng(0)
         self._limits = np.array([np.inf if limit is None else limit for limit in force_limits])
-        self._data = mujoco.MjData(model)
-        self._at: Addresses = find_addresses(model)
-        self._qpos = np.array(self._at.arm_qpos)
-        self._dofs = np.array(self._at.arm_qvel)
-        self._joints = np.array(self._at.arm_joints)
+        self._qpos = np.array(addresses.arm_qpos)
+        self._dofs = np.array(addresses.arm_qvel)
+        self._joints = np.array(addresses.arm_joints)
         self._is_hinge = model.jnt_type[self._joints] == mujoco.mjtJoint.mjJNT_HINGE
+        self._paddle = addresses.paddle_geom
         # The last link, to which the paddle's own body is welded.
-        self._body = int(model.body_weldid[model.geom_bodyid[self._at.paddle_geom]])
-        self._low, self._high = joint_ranges(model)
+        self._body = int(model.body_weldid[model.geom_bodyid[self._paddle]])
+        self._low, self._high = joint_ranges(model, addresses)
         # A servo whose joint is at its limit could move it one way only.
         margin = np.minimum(_LEAST_MARGIN, 0.1 * (self._high - self._low))
         self._least = self._low + margin
         self._greatest = self._high - margin
         self._centre = self._inside(model.qpos0[self._qpos])
         # The seeds of a hinge lie within half a turn.
-        width = np.where(self._is_hinge, np.pi, np.where(np.isinf(self._low), 0.5, np.inf))
+        slide_width = np.where(np.isinf(self._low), 0.5, np.inf)
+        width = np.where(self._is_hinge, np.pi, slide_width)
         self._least_seed = self._inside(self._centre - width)
         self._greatest_seed = self._inside(self._centre + width)
         mujoco.mj_kinematics(model, self._data)
@@ -171,13 +194,18 @@ class _Search:
         """A random posture [n]."""
         return self._rng.uniform(self._least_seed, self._greatest_seed)
 
+    def _from_base(self, point: np.ndarray) -> float:
+        """Horizontal distance of a point [3] from the first joint, m."""
+        x, y, _ = point - self._base
+        return float(np.hypot(x, y))
+
     def _largest_distance(self) -> float:
         """Largest horizontal distance of the paddle from the first joint, m."""
-        distances = []
+        largest = 0.0
         for _ in range(_REACH_SAMPLES):
             paddle, _ = self._forward(self._seed())
-            distances.append(np.hypot(*(paddle - self._base)[:2]))
-        return float(max(distances))
+            largest = max(largest, self._from_base(paddle))
+        return largest
 
     def rank(self, poses: Sequence[PaddlePose]) -> list[PaddlePose]:
         """The poses by their score; equal ones by their distance to the middle of the ranges.
@@ -186,13 +214,17 @@ class _Search:
         turns it in its plane, and a symmetric arm has each pose twice.
         """
         middle = self._centre + _SIDE
-        left = sorted(poses, key=lambda pose: -pose.score)
+
+        def from_middle(pose: PaddlePose) -> float:
+            return float(np.sum((pose.angles - middle) ** 2))
+
+        remaining = sorted(poses, key=lambda pose: -pose.score)
         ranked: list[PaddlePose] = []
-        while left:
-            least = (1.0 - _EQUAL_SCORES) * left[0].score
-            equal = [pose for pose in left if pose.score >= least]
-            ranked += sorted(equal, key=lambda pose: np.sum((pose.angles - middle) ** 2))
-            left = left[len(equal) :]
+        while remaining:
+            least = (1.0 - _EQUAL_SCORES) * remaining[0].score
+            equal = [pose for pose in remaining if pose.score >= least]
+            ranked += sorted(equal, key=from_middle)
+            remaining = remaining[len(equal) :]
         return ranked
 
     def _forward(self, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -200,8 +232,9 @@ class _Search:
         self._data.qpos[self._qpos] = angles
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_comPos(self._model, self._data)
-        rotation = self._data.geom_xmat[self._at.paddle_geom].reshape(3, 3)
-        return self._data.geom_xpos[self._at.paddle_geom].copy(), rotation[:, 2].copy()
+        position = self._data.geom_xpos[self._paddle].copy()
+        normal = self._data.geom_xmat[self._paddle].reshape(3, 3)[:, 2].copy()
+        return position, normal
 
     def _jacobian(self, paddle: np.ndarray) -> np.ndarray:
         """Jacobian [5, n] of the paddle's displacement, m, and of its scaled tilt about x and y, m;
@@ -211,23 +244,29 @@ class _Search:
         mujoco.mj_jac(self._model, self._data, linear, angular, paddle, self._body)
         return np.vstack([linear, _LENGTH * angular[:2]])[:, self._dofs]
 
-    def level_poses(self, choice: PaddleConfig) -> Iterator[PaddlePose]:
+    def level_poses(self, mount: PaddleConfig) -> Iterator[PaddlePose]:
         """Poses with a level paddle in front of the robot, at many distances and heights, in which
         the arm is neither in the way of the ball nor in the floor."""
-        place_paddle(self._model, choice)
-        distances = self._reach * np.array([0.45, 0.6, 0.75])
-        lowest = max(_LOWEST, self._base[2] - 0.3 * self._reach)
-        heights = lowest + self._reach * np.array([0.0, 0.15, 0.3])
-        for distance, height in itertools.product(distances, heights):
-            goal = np.array([self._base[0] + distance, self._base[1], height])
+        place_paddle(self._model, self._paddle, mount)
+        for goal in self._goals():
             for _ in range(_TRIES):
                 angles = self._solve(self._seed(), goal)
-                if angles is None:
-                    continue
-                paddle, _ = self._forward(angles)
-                in_front = paddle[0] - self._base[0] > 0.3 * np.hypot(*(goal - self._base)[:2])
-                if in_front and paddle[2] > 0.03 and self._is_clear(paddle):
-                    yield self._rate(angles, choice)
+                if angles is not None and self._is_usable(angles, goal):
+                    yield self._rate(angles, mount)
+
+    def _goals(self) -> Iterator[np.ndarray]:
+        """Places of the paddle [3] in front of the robot, m."""
+        lowest = max(_LOWEST, self._base[2] - 0.3 * self._reach)
+        for share_of_reach in (0.45, 0.6, 0.75):
+            x = self._base[0] + share_of_reach * self._reach
+            for rise in (0.0, 0.15, 0.3):
+                yield np.array([x, self._base[1], lowest + rise * self._reach])
+
+    def _is_usable(self, angles: np.ndarray, goal: np.ndarray) -> bool:
+        """Whether the paddle is in front of the robot, over the floor and clear of the links."""
+        paddle, _ = self._forward(angles)
+        in_front = paddle[0] - self._base[0] > 0.3 * self._from_base(goal)
+        return bool(in_front and paddle[2] > _OFF_FLOOR and self._is_clear(paddle))
 
     def _solve(self, angles: np.ndarray, goal: np.ndarray) -> np.ndarray | None:
         """The pose near the goal with a level paddle; None if the search does not level it."""
@@ -261,19 +300,18 @@ class _Search:
         allowed = self._is_hinge & (self._inside(unwound) == unwound)
         return np.where(allowed, unwound, angles)
 
-    def _rate(self, angles: np.ndarray, choice: PaddleConfig) -> PaddlePose:
+    def _rate(self, angles: np.ndarray, mount: PaddleConfig) -> PaddlePose:
         """The pose with its score."""
         paddle, _ = self._forward(angles)
         jacobian = self._jacobian(paddle)
-        lifting_and_tilting = jacobian[2:]
-        task = jacobian if len(angles) >= 5 else lifting_and_tilting
-        manipulability = float(np.linalg.svd(task, compute_uv=False)[-1])
-        if np.linalg.matrix_rank(lifting_and_tilting, tol=1e-3) < 3:
-            manipulability = 0.0
+        # With fewer than five joints, the arm cannot choose where the paddle is.
+        task = jacobian if len(angles) >= 5 else jacobian[2:]
+        manipulability = self._manipulability(task, jacobian[2:])
         mass, holding = self._dynamics()
         acceleration = -np.inf
         can_hold = np.all(np.abs(holding) <= self._limits)
         if manipulability >= _LEAST_MANIPULABILITY and can_hold:
+            # The rows of the task end with z and the two tilts.
             lifting_force = mass @ np.linalg.pinv(task)[:, -3]
             acceleration = self._acceleration(lifting_force, holding)
         to_limit = np.min(np.minimum(angles - self._low, self._high - angles))
@@ -282,7 +320,7 @@ class _Search:
         return PaddlePose(
             angles=angles,
             paddle=paddle,
-            mount=choice,
+            mount=mount,
             manipulability=manipulability,
             acceleration=acceleration,
             inertia=np.diag(mass),
@@ -291,81 +329,108 @@ class _Search:
             score=manipulability * margin * strength,
         )
 
+    def _manipulability(self, task: np.ndarray, lifting_and_tilting: np.ndarray) -> float:
+        """Smallest singular value of the task's Jacobian [k, n]; 0 where the paddle cannot be
+        lifted and tilted about two axes, by its Jacobian [3, n]."""
+        if np.linalg.matrix_rank(lifting_and_tilting, tol=1e-3) < 3:
+            return 0.0
+        return float(np.linalg.svd(task, compute_uv=False)[-1])
+
     def _is_clear(self, paddle: np.ndarray) -> bool:
         """Whether the links, as straight lines between the joints, stay above the floor and out of
-        the ball's way."""
-        data = self._data
-        points = [data.xanchor[joint] for joint in self._joints] + [data.xpos[self._body]]
-        for i, (start, end) in enumerate(itertools.pairwise(points)):
-            samples = start + np.linspace(0.0, 1.0, 12)[:, None] * (end - start)
-            beyond_base = np.linalg.norm(samples - self._base, axis=1) > _BASE_RADIUS
-            # The first joint may be anywhere along its axis.
-            lowest_at_base = -1e-6 if i > 0 else -np.inf
-            lowest = np.where(beyond_base, _FLOOR_CLEARANCE, lowest_at_base)
-            if np.any(samples[:, 2] < lowest):
+        the ball's way; in the pose of the last `_forward`."""
+        ends = [self._data.xanchor[joint] for joint in self._joints]
+        ends.append(self._data.xpos[self._body])
+        for i, (start, end) in enumerate(itertools.pairwise(ends)):
+            shares = np.linspace(0.0, 1.0, _SAMPLES_OF_A_LINK)[:, None]
+            points = start + shares * (end - start)
+            if not self._is_above_floor(points, is_first_link=i == 0):
                 return False
-            near = np.hypot(*(samples[:, :2] - paddle[:2]).T) < _CLEARANCE
-            above_bottom = samples[:, 2] > paddle[2] - _BELOW
-            below_top = samples[:, 2] < paddle[2] + _HEADROOM
-            if np.any(near & above_bottom & below_top):
+            if _is_in_balls_way(points, paddle):
                 return False
         return True
 
+    def _is_above_floor(self, points: np.ndarray, is_first_link: bool) -> bool:
+        """Whether points [k, 3] of a link's line leave room for its half thickness, m."""
+        beyond_base = np.linalg.norm(points - self._base, axis=1) > _BASE_RADIUS
+        # The first joint may be anywhere along its axis.
+        lowest_at_base = -np.inf if is_first_link else -1e-6
+        lowest = np.where(beyond_base, _FLOOR_CLEARANCE, lowest_at_base)
+        return bool(np.all(points[:, 2] >= lowest))
+
     def _dynamics(self) -> tuple[np.ndarray, np.ndarray]:
         """Mass matrix [n, n] of the acting joints, and the forces [n] that hold the arm."""
-        model, data = self._model, self._data
+        model = self._model
+        data = self._data
         data.qvel[:] = 0.0
         mujoco.mj_forward(model, data)
-        full = np.zeros((model.nv, model.nv))
-        mujoco.mj_fullM(model, data, full)
-        hold = (data.qfrc_bias - data.qfrc_passive)[self._dofs]
-        return full[np.ix_(self._dofs, self._dofs)], hold
+        full_matrix = np.zeros((model.nv, model.nv))
+        mujoco.mj_fullM(model, data, full_matrix)
+        mass_matrix = full_matrix[np.ix_(self._dofs, self._dofs)]
+        holding = (data.qfrc_bias - data.qfrc_passive)[self._dofs]
+        return mass_matrix, holding
 
-    def _acceleration(self, force: np.ndarray, hold: np.ndarray) -> float:
-        """Largest upward acceleration of the paddle; each m/s^2 of it needs the forces [n]."""
-        needed = np.abs(force)
-        spare = np.where(force > 0.0, self._limits - hold, self._limits + hold)
-        moved = needed > 1e-9
-        return float(np.min(spare[moved] / needed[moved], initial=np.inf))
+    def _acceleration(self, lifting_force: np.ndarray, holding: np.ndarray) -> float:
+        """Largest upward acceleration of the paddle, m/s^2.
+
+        Args:
+          lifting_force: joint forces [n] for each m/s^2.
+          holding: joint forces [n] that hold the arm.
+        """
+        needed = np.abs(lifting_force)
+        spare = np.where(lifting_force > 0.0, self._limits - holding, self._limits + holding)
+        takes_part = needed > 1e-9
+        return float(np.min(spare[takes_part] / needed[takes_part], initial=np.inf))
 
 
-def clearance(model: mujoco.MjModel, pose: PaddlePose) -> float:
+def _is_in_balls_way(points: np.ndarray, paddle: np.ndarray) -> bool:
+    """Whether one of some points [k, 3] is in the column over the paddle's centre [3], m."""
+    x, y, _ = (points - paddle).T
+    is_near = np.hypot(x, y) < _CLEARANCE
+    above_bottom = points[:, 2] > paddle[2] - _BELOW
+    below_top = points[:, 2] < paddle[2] + _HEADROOM
+    return bool(np.any(is_near & above_bottom & below_top))
+
+
+def clearance(model: mujoco.MjModel, addresses: Addresses, pose: PaddlePose) -> float:
     """Least distance of the paddle in a pose from the shapes of the other links and of the world,
     m; negative if it is inside one, and at most `_FAR`.
 
     Args:
       model: the compiled scene with all its geoms; its paddle is moved.
+      addresses: of its parts.
+      pose: of the arm.
     """
-    addresses = find_addresses(model)
     paddle = addresses.paddle_geom
-    place_paddle(model, pose.mount)
-    data = mujoco.MjData(model)
-    data.qpos[list(addresses.arm_qpos)] = pose.angles
-    mujoco.mj_kinematics(model, data)
-    link = model.body_weldid[model.geom_bodyid[paddle]]
+    place_paddle(model, paddle, pose.mount)
+    data = data_at(model, addresses, pose.angles)
+    last_link = model.body_weldid[model.geom_bodyid[paddle]]
     balls = [ball.geom for ball in addresses.balls]
     least = _FAR
     for geom in range(model.ngeom):
-        body = model.geom_bodyid[geom]
-        own = model.geom_group[model.geom_bodyid == body]
-        # Where a link has shapes that touch, the others are its picture.
-        is_picture = HIDDEN_GROUP in own and model.geom_group[geom] != HIDDEN_GROUP
         is_flat = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE
-        if is_picture or is_flat or geom in balls or model.body_weldid[body] == link:
+        moves_along = model.body_weldid[model.geom_bodyid[geom]] == last_link
+        if is_flat or moves_along or geom in balls or _is_picture(model, geom):
             continue
         distance = mujoco.mj_geomDistance(model, data, paddle, geom, _FAR, None)
         least = min(least, distance)
     return least
 
 
-def place_paddle(model: mujoco.MjModel, mount: PaddleConfig) -> None:
+def _is_picture(model: mujoco.MjModel, geom: int) -> bool:
+    """Whether a geom is only a link's picture: where a link has shapes that touch, the others
+    are."""
+    groups_of_body = model.geom_group[model.geom_bodyid == model.geom_bodyid[geom]]
+    return HIDDEN_GROUP in groups_of_body and model.geom_group[geom] != HIDDEN_GROUP
+
+
+def place_paddle(model: mujoco.MjModel, paddle_geom: int, mount: PaddleConfig) -> None:
     """Moves the paddle of a compiled scene, whose body has the frame of the site."""
-    paddle = find_addresses(model).paddle_geom
     quaternion = np.array(mount.quaternion)
-    model.geom_quat[paddle] = quaternion / np.linalg.norm(quaternion)
-    model.geom_pos[paddle] = mount.position
+    model.geom_quat[paddle_geom] = quaternion / np.linalg.norm(quaternion)
+    model.geom_pos[paddle_geom] = mount.position
     # MuJoCo skips the transformation of a geom flagged as sharing its body's frame.
-    model.geom_sameframe[paddle] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+    model.geom_sameframe[paddle_geom] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
 
 
 def _levelling_turn(normal: np.ndarray) -> np.ndarray:

@@ -94,12 +94,15 @@ def next_setpoint(
     low, high = limits.range
     up = _stopping_velocity(high - position, velocity, limits, duration, xp)
     down = _stopping_velocity(position - low, -velocity, limits, duration, xp)
-    least, most = xp.maximum(-limits.velocity, -down), xp.minimum(limits.velocity, up)
-    change = limits.acceleration * duration
-    after = xp.clip(asked, least, most)
-    after = xp.clip(after, velocity - change, velocity + change)
+    least = xp.maximum(-limits.velocity, -down)
+    most = xp.minimum(limits.velocity, up)
+    largest_change = limits.acceleration * duration
+    new_velocity = xp.clip(asked, least, most)
+    new_velocity = xp.clip(new_velocity, velocity - largest_change, velocity + largest_change)
     return Setpoint(
-        position + 0.5 * (velocity + after) * duration, after, (after - velocity) / duration
+        position=position + 0.5 * (velocity + new_velocity) * duration,
+        velocity=new_velocity,
+        acceleration=(new_velocity - velocity) / duration,
     )
 
 
@@ -135,18 +138,24 @@ def command(
       earlier: duration of a step, and the acceleration two steps before `acceleration`; needed for
         a negative time with a smoothing.
     """
-    half, variance = (0.0, 0.0) if smoothing is None else (0.5 * smoothing, smoothing**2 / 12.0)
+    half = 0.0
+    variance = 0.0
+    if smoothing is not None:
+        half = 0.5 * smoothing
+        variance = smoothing**2 / 12.0
     delay = 0.0 if lag is None else lag
     spread = variance + delay * delay
-    x = time - half - delay
-    result = start.position + start.velocity * x + 0.5 * start.acceleration * (x * x + spread)
-    result = result + (acceleration - start.acceleration) * _kink(time, smoothing, lag, xp)
+    delayed = time - half - delay
+    squared = delayed * delayed + spread
+    position = start.position + start.velocity * delayed + 0.5 * start.acceleration * squared
+    position = position + (acceleration - start.acceleration) * _kink(time, smoothing, lag, xp)
     if earlier is not None:
-        duration, before = earlier
-        x = x + duration
-        kink = 0.5 * (x * x + spread) - _kink(time + duration, smoothing, lag, xp)
-        result = result + (before - start.acceleration) * kink
-    return result
+        duration, earlier_acceleration = earlier
+        delayed = delayed + duration
+        squared = delayed * delayed + spread
+        kink = 0.5 * squared - _kink(time + duration, smoothing, lag, xp)
+        position = position + (earlier_acceleration - start.acceleration) * kink
+    return position
 
 
 def _kink(time: Number, smoothing: Number | None, lag: Number | None, xp: ModuleType) -> Number:
@@ -155,15 +164,18 @@ def _kink(time: Number, smoothing: Number | None, lag: Number | None, xp: Module
     The lag's y solves l y' = t^2 / 2 - y with y(0) = 0; the mean is a difference of integrals.
     """
     if smoothing is None:
-        x = xp.maximum(time, 0.0)
-        square = 0.5 * x * x
-        return square if lag is None else square - lag * (x - lag * (1.0 - xp.exp(-x / lag)))
+        since = xp.maximum(time, 0.0)
+        square = 0.5 * since * since
+        if lag is None:
+            return square
+        return square - lag * (since - lag * (1.0 - xp.exp(-since / lag)))
 
     def integral(time: Number) -> Number:
-        x = xp.maximum(time, 0.0)
-        cube = x * x * x / 6.0
+        since = xp.maximum(time, 0.0)
+        square = 0.5 * since * since
+        cube = since * since * since / 6.0
         if lag is None:
             return cube
-        return cube - lag * (0.5 * x * x - lag * (x - lag * (1.0 - xp.exp(-x / lag))))
+        return cube - lag * (square - lag * (since - lag * (1.0 - xp.exp(-since / lag))))
 
     return (integral(time) - integral(time - smoothing)) / smoothing

@@ -15,7 +15,7 @@ def force_ranges(mj_model: mujoco.MjModel, servos: Sequence[int]) -> np.ndarray:
     limit."""
     low, high = mj_model.actuator_forcerange[list(servos)].T
     is_limited = mj_model.actuator_forcelimited[list(servos)].astype(bool)
-    return np.where(is_limited, (low, high), ((-np.inf,), (np.inf,)))
+    return np.stack([np.where(is_limited, low, -np.inf), np.where(is_limited, high, np.inf)])
 
 
 def torque_ranges(

@@ -11,7 +11,7 @@ import numpy as np
 
 from bounce_mjx.physics import Control
 from bounce_mjx.physics.control import Moving, servo_target
-from bounce_mjx.robot.model import find_addresses, joint_ranges, scatter
+from bounce_mjx.robot.model import Addresses, find_addresses, joint_ranges, scatter
 from bounce_mjx.robot.setpoints import Setpoint, joint_limits, next_setpoint
 from bounce_mjx.world import noise
 from bounce_mjx.world.config import WorldConfig
@@ -42,11 +42,13 @@ class Actuators:
     that, and `physics.control.servo_target` gives its value in each physics step.
     """
 
-    def __init__(self, config: WorldConfig, mj_model: mujoco.MjModel):
+    def __init__(
+        self, config: WorldConfig, mj_model: mujoco.MjModel, addresses: Addresses | None = None
+    ):
         self._config = config
         self._nu = mj_model.nu
-        self._addresses = find_addresses(mj_model)
-        self._range = joint_ranges(mj_model)
+        self._addresses = addresses or find_addresses(mj_model)
+        self._range = joint_ranges(mj_model, self._addresses)
         self._limits = joint_limits(config.robot.limits, *self._range)
         self._gears = mj_model.actuator_gear[list(self._addresses.actuators), 0]
 

@@ -28,6 +28,7 @@ from bounce_mjx.lazy import jax, jnp, mujoco, np
 if TYPE_CHECKING:
     from bounce_mjx.physics import PhysicsParameters
     from bounce_mjx.physics.scalars import Quaternion
+    from bounce_mjx.robot.model import Addresses
 
 
 def _entrywise(end: Any, number: Callable[[Any], float]) -> float | tuple[float, ...]:
@@ -112,16 +113,20 @@ def restitution_to_damping(
       UserError: the model has no contact pair of ball and paddle.
     """
     from bounce_mjx.physics.edited import NO_PAIR
+    from bounce_mjx.robot.contact import damping_of_restitution
 
     if model.contact_stiffness is None:
         raise UserError(NO_PAIR)
-    return contact_damping(restitution, model.contact_stiffness)
+    return damping_of_restitution(restitution, model.contact_stiffness)
 
 
 def _model_restitution(model: PhysicsParameters, parameter: str) -> Any:
+    """The restitution [] of the model's own contact; None without a contact pair."""
+    from bounce_mjx.robot.contact import restitution_of_damping
+
     if model.contact_damping is None:
         return None
-    return contact_restitution(model.contact_damping, model.contact_stiffness)
+    return restitution_of_damping(model.contact_damping, model.contact_stiffness)
 
 
 SCALE = Operation(scale, nominal=1.0)
@@ -191,8 +196,6 @@ _FACTOR = (0.01, 200.0)
 class RandomizationConfig(StrictModel):
     """The world that each episode samples: a range for each term, null for off. In a file, a term
     of several joints or axes may have a range for each: two lists, of lower and of upper ends."""
-
-    former = {"restitution_slope": None, "air_lift": None}
 
     restitution: Annotated[
         Sampled, physical("contact_damping", RESTITUTION, NUMBER, bounds=(0.4, 0.98))
@@ -408,16 +411,23 @@ TERMS: dict[str, Term] = {
 """All terms of `RandomizationConfig`."""
 
 
-def nominal_values(mj_model: mujoco.MjModel, terms: Iterable[str]) -> dict[str, np.ndarray]:
+def nominal_values(
+    mj_model: mujoco.MjModel, terms: Iterable[str], addresses: Addresses | None = None
+) -> dict[str, np.ndarray]:
     """Values without randomisation of the terms that have one, each of the term's shape.
 
     Of a term that replaces a number of the model, it is that number; a model without a contact pair
     has none of the contact.
+
+    Args:
+      mj_model: the model.
+      terms: names of the terms.
+      addresses: of the model's parts, if they are known.
     """
     # The engines are not needed to read a config.
     from bounce_mjx.physics.edited import own_parameters
 
-    model = own_parameters(mj_model)
+    model = own_parameters(mj_model, addresses)
     num_joints = len(model.armature)
     nominals = {}
     for name in terms:
@@ -485,27 +495,3 @@ def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParamet
     for name, term in terms.items():
         parameters[term.parameter] = term.operation.apply(model, term.parameter, world[name])
     return PhysicsParameters(**parameters)
-
-
-# Damping ratios of the contact, and the measured restitution: the mean of the drops on the held
-# paddle of tests/test_randomization.py, at 1, 2, 3 and 4 m/s and eight phases of the physics step.
-_DROPS = (
-    (0.0, 0.993), (0.005, 0.98), (0.01, 0.965), (0.0152, 0.95), (0.032, 0.90), (0.05, 0.85),
-    (0.0697, 0.80), (0.0921, 0.75), (0.116, 0.70), (0.13, 0.674), (0.16, 0.622), (0.2, 0.565),
-    (0.2455, 0.50), (0.2873, 0.45), (0.3352, 0.40),
-)  # fmt: skip
-
-
-def contact_damping(restitution: jax.Array, stiffness: float) -> jax.Array:
-    """Damping [] of the contact, 1/s, that gives a restitution [] at a contact stiffness (1/s^2):
-    2 zeta sqrt(stiffness), with the damping ratio zeta interpolated between drop tests."""
-    ratios, restitutions = np.array(_DROPS[::-1]).T
-    zeta = jnp.interp(restitution, restitutions, ratios)
-    return (2.0 * np.sqrt(stiffness) * zeta).astype(jnp.asarray(restitution).dtype)
-
-
-def contact_restitution(damping: float, stiffness: float) -> np.ndarray:
-    """Restitution [] of a contact with a damping (1/s) at a stiffness (1/s^2): the inverse of
-    `contact_damping`."""
-    ratios, restitutions = np.array(_DROPS).T
-    return np.interp(damping / (2.0 * np.sqrt(stiffness)), ratios, restitutions)

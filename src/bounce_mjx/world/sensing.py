@@ -10,7 +10,7 @@ import mujoco
 
 from bounce_mjx.physics import Engine
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
-from bounce_mjx.robot.model import find_addresses, scatter
+from bounce_mjx.robot.model import Addresses, scatter
 from bounce_mjx.robot.setpoints import Setpoint
 from bounce_mjx.world import noise
 from bounce_mjx.world.actuation import entry_at, with_newest
@@ -91,13 +91,19 @@ class Sensors:
     """The sensors of a world."""
 
     def __init__(
-        self, config: WorldConfig, mj_model: mujoco.MjModel, engine: Engine, task: Remembering
+        self,
+        config: WorldConfig,
+        mj_model: mujoco.MjModel,
+        addresses: Addresses,
+        engine: Engine,
+        task: Remembering,
     ):
         """Chooses what has to be simulated.
 
         Args:
           config: of the world, with its observation and its randomisation.
           mj_model: its model.
+          addresses: of the model's parts.
           engine: computes where the paddle seems to be.
           task: has quantities of its own.
         """
@@ -105,7 +111,7 @@ class Sensors:
         self._engine = engine
         self._task = task
         self._qpos = mj_model.qpos0
-        self._arm_qpos = find_addresses(mj_model).arm_qpos
+        self._arm_qpos = addresses.arm_qpos
         terms = set(config.randomization.terms)
         self.are_needed = bool(_TERMS & terms) or not config.observation.is_momentary
         """Whether the observation differs from the true state of a single instant."""

@@ -7,6 +7,7 @@ physics step is `forward.substep`.
 
 import functools
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -34,28 +35,34 @@ def step(
     Given parameters are inputs of the program; the others fold into it as constants. The loop
     carries the coordinates as scalars. Without friction the contact's force goes through the ball's
     centre and the spin stays constant, so one rotation over the whole interval updates the
-    orientation.
+    orientation; with friction, `constraint._ball_accelerations` changes the spin in each step.
+
+    Args:
+      model: from `read_model`.
+      parameters: of the environment.
+      state: before the steps.
+      control: over the steps.
+      num_substeps: number of physics steps.
     """
     addresses = model.addresses
     qpos = [state.qpos[i] for i in range(len(state.qpos))]
     qvel = [state.qvel[i] for i in range(len(state.qvel))]
-    balls = [
-        read_ball([qpos[i] for i in at.qpos], [qvel[i] for i in at.qvel]) for at in addresses.balls
-    ]
+    balls = []
+    for at in addresses.balls:
+        balls.append(read_ball([qpos[i] for i in at.qpos], [qvel[i] for i in at.qvel]))
     if control.ball_push is not None:
         balls = _pushed(balls, control.ball_push)
     spins_change = _has_sliding_friction(model, parameters)
-    flying = balls if spins_change else [ball._replace(turning=None) for ball in balls]
-    motion = Motion(
+    start = Motion(
         q=Vec(qpos[i] for i in addresses.arm_qpos),
         v=Vec(qvel[i] for i in addresses.arm_qvel),
-        balls=tuple(flying),
+        balls=tuple(ball if spins_change else ball._replace(turning=None) for ball in balls),
     )
-    motion = _run(model, parameters, control, motion, num_substeps)
+    end = _run(model, parameters, control, start, num_substeps)
 
-    _put(qpos, addresses.arm_qpos, motion.q)
-    _put(qvel, addresses.arm_qvel, motion.v)
-    for at, ball, ball_before in zip(addresses.balls, motion.balls, balls, strict=True):
+    _put(qpos, addresses.arm_qpos, end.q)
+    _put(qvel, addresses.arm_qvel, end.v)
+    for at, ball, ball_before in zip(addresses.balls, end.balls, balls, strict=True):
         if spins_change:
             turning = ball.turning
             _put(qvel, at.qvel[3:], spin_in_ball(turning))
@@ -68,8 +75,12 @@ def step(
 
 def paddle_position(model: FusedModel, parameters: PhysicsParameters, qpos: jax.Array) -> jax.Array:
     """World position [3] (m) of the paddle's centre at qpos [nq]."""
+    # The others would only be inputs of the program without use.
     fields = ("body_pos[", "geom_pos[", "qpos0[")
-    entries = {x: y for x, y in (parameters.entries or {}).items() if x.startswith(fields)}
+    entries = {}
+    for name, value in (parameters.entries or {}).items():
+        if name.startswith(fields):
+            entries[name] = value
     relevant = PhysicsParameters(
         paddle_position=parameters.paddle_position, entries=entries or None
     )
@@ -108,11 +119,12 @@ def _run(
     motion: Motion,
     num_substeps: int,
 ) -> Motion:
-    """The motion after some physics steps."""
+    """The motion after some physics steps; the arguments are those of `step`, with the state as a
+    `Motion`."""
     coordinates, motion_structure = jax.tree.flatten(motion)
     inputs = (_arm_control(control, model.addresses.actuators), parameters)
-    dtype = coordinates[0].dtype
-    numbers, input_structure = jax.tree.flatten(scalars_of(inputs, dtype))
+    inputs = scalars_of(inputs, coordinates[0].dtype)
+    numbers, input_structure = jax.tree.flatten(inputs)
     substeps = _substeps(model, motion_structure, input_structure, num_substeps)
     advance = elementwise(substeps, num_results=len(coordinates))
     return motion_structure.unflatten(advance(*coordinates, *numbers))
@@ -121,10 +133,12 @@ def _run(
 def _arm_control(control: Control, actuators: tuple[int, ...]) -> Control:
     """Control of the arm's servos in the order of the joints, without the push."""
 
-    def chosen(x: jax.Array) -> jax.Array:
-        return jnp.stack([x[i] for i in actuators]) if jnp.ndim(x) else x
+    def of_arm(array: jax.Array) -> jax.Array:
+        if jnp.ndim(array) == 0:
+            return array
+        return jnp.stack([array[i] for i in actuators])
 
-    return jax.tree.map(chosen, control._replace(ball_push=None))
+    return jax.tree.map(of_arm, control._replace(ball_push=None))
 
 
 @functools.lru_cache(maxsize=16)
@@ -136,18 +150,24 @@ def _substeps(
 ) -> Callable[..., tuple[Scalar, ...]]:
     """Physics steps as a function of scalars.
 
-    Its arguments are the leaves of a `Motion`, then those of the `Control` and the parameters. The
-    tree structures belong to the cache's key, as they say which inputs there are (whether the balls
-    turn, which disturbances act, which parameters are given), and other inputs are another program.
-    Thanks to the cache and the inline jit, JAX traces this long function once for all programs; a
-    trace takes some tenths of a second.
+    Its arguments are the leaves of a `Motion`, then those of the `Control` and the parameters, as a
+    GPU kernel takes numbers alone. The tree structures are in the cache's key because they say
+    which program it is: a disturbance or a parameter that is None leaves its operations out, and a
+    ball without `turning` does not turn. Thanks to the cache and the inline jit, JAX traces this
+    long function once for all programs; a trace takes some tenths of a second.
+
+    Args:
+      model: of the worlds, which the parameters change.
+      motion_structure: of the first arguments, a `Motion`.
+      input_structure: of the others, a `Control` and the `PhysicsParameters`.
+      num_substeps: number of physics steps.
     """
     num_coordinates = motion_structure.num_leaves
 
     def substeps(*scalars: Scalar) -> tuple[Scalar, ...]:
         motion = motion_structure.unflatten(scalars[:num_coordinates])
         control, parameters = input_structure.unflatten(scalars[num_coordinates:])
-        model_of_world = read_model(model.mj_model, parameters)
+        model_of_world = read_model(model.mj_model, parameters, model.addresses)
 
         def one_step(i: jax.Array, motion: Motion) -> Motion:
             return substep(model_of_world, motion, _targets(control, i), control.air_drag)
@@ -164,12 +184,16 @@ def _targets(control: Control, step: jax.Array) -> tuple[Scalar, ...]:
         return control.ctrl
     step = jax.lax.convert_element_type(step, control.ctrl[0].dtype)
 
-    def servo_control(i: int) -> Control:
+    def is_of_servos(field: Any) -> bool:
+        # Not a NamedTuple such as Control itself.
+        return type(field) is tuple
+
+    def of_servo(i: int) -> Control:
         return jax.tree.map(
-            lambda x: x[i] if type(x) is tuple else x, control, is_leaf=lambda x: type(x) is tuple
+            lambda field: field[i] if is_of_servos(field) else field, control, is_leaf=is_of_servos
         )
 
-    return tuple(servo_target(servo_control(i), step) for i in range(len(control.ctrl)))
+    return tuple(servo_target(of_servo(i), step) for i in range(len(control.ctrl)))
 
 
 @functools.lru_cache(maxsize=16)
@@ -181,7 +205,8 @@ def _paddle_position(
     num_joints = len(model.links)
 
     def position(*scalars: Scalar) -> tuple[Scalar, ...]:
-        model_of_world = read_model(model.mj_model, structure.unflatten(scalars[num_joints:]))
+        parameters = structure.unflatten(scalars[num_joints:])
+        model_of_world = read_model(model.mj_model, parameters, model.addresses)
         pose = chain.forward_kinematics(model_of_world.links, scalars[:num_joints])
         return tuple(paddle_origin(model_of_world, pose))
 

@@ -2,14 +2,14 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import mujoco
 import numpy as np
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.physics.edited import MIN_FRICTION, EditedModel, edited
+from bounce_mjx.physics.edited import MIN_FRICTION, EditedModel, edited, edits
 from bounce_mjx.physics.fused import chain
 from bounce_mjx.physics.fused.contact import ContactModel
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS, PhysicsParameters
@@ -30,7 +30,13 @@ from bounce_mjx.physics.scalars import (
     symmetric,
 )
 from bounce_mjx.physics.support import unsupported_friction
-from bounce_mjx.robot.model import Addresses, fingerprint, to_direct_solref
+from bounce_mjx.robot.model import (
+    Addresses,
+    BallAddresses,
+    find_addresses,
+    fingerprint,
+    link_bodies,
+)
 
 
 class Frame(NamedTuple):
@@ -105,63 +111,101 @@ class FusedModel:
 
 
 def read_model(
-    mj_model: mujoco.MjModel, parameters: PhysicsParameters = MODEL_PARAMETERS
+    mj_model: mujoco.MjModel,
+    parameters: PhysicsParameters = MODEL_PARAMETERS,
+    addresses: Addresses | None = None,
 ) -> FusedModel:
     """Reads a compiled model that the engine supports (`physics/support.py`), in the world of one
     environment.
 
     Args:
+      mj_model: the model.
       parameters: numbers, or tuples of numbers: Python floats or scalars.
+      addresses: of the model's parts, if they are known.
 
     Raises:
       UserError: the engine does not read an entry that the parameters change, or lacks the
         friction that they bring.
     """
-    m = edited(mj_model, parameters)
-    c, addresses = m.model, m.addresses
-    links, frames = _read_links(m)
-    geom, holder = addresses.paddle_geom, int(c.geom_bodyid[addresses.paddle_geom])
-    body, paddle = frames[holder], Frame(m["geom_pos", geom], _rotation(m["geom_quat", geom]))
-    paddle = _apply_flag(m["geom_sameframe", geom], paddle, _inertial_frame(m, holder))
-    implicit = c.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    explicit_damping = c.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
-    model = FusedModel(
-        dt=float(c.opt.timestep),
-        gravity=m["opt.gravity", :],
-        links=tuple(links),
-        servos=tuple(
-            _read_servo(m, actuator, joint)
-            for actuator, joint in zip(addresses.actuators, addresses.arm_joints, strict=True)
-        ),
-        paddle_origin=body.origin + body.rotation @ paddle.origin,
-        paddle_rotation=exact(body.rotation @ paddle.rotation),
-        paddle_half_size=m["geom_size", geom],
-        balls=tuple(
-            BallModel(
-                radius=m["geom_size", ball.geom, 0],
-                mass=m["body_mass", ball.body],
-                # Not recorded: a ball stays homogeneous, so that its inertia is not edited alone.
-                inertia=m.peek("body_inertia", ball.body, 0),
-                weight=1.0 - _gravity_compensation(c)[ball.body].item(),
-            )
-            for ball in addresses.balls
-        ),
-        contacts=_read_contacts(m),
-        addresses=addresses,
-        mj_model=c,
-        fingerprint=b"" if jax.tree.leaves(parameters) else fingerprint(c),
-        implicit_servos=implicit,
-        implicit_damping=implicit or not explicit_damping,
-    )
-    friction = unsupported_friction(c, m.peek("pair_dim", slice(None)))
+    addresses = addresses or find_addresses(mj_model)
+    model = edited(mj_model, addresses, parameters)
+    _check_entries(model)
+    friction = unsupported_friction(mj_model, model["pair_dim", :])
     if friction is not None:
         raise UserError(f"the fused physics does not support {friction}; use --physics mjx")
-    for name in m.unread():
+    links, frames = _read_links(model)
+    paddle = _read_paddle(model, frames)
+    servos = []
+    for actuator, joint in zip(addresses.actuators, addresses.arm_joints, strict=True):
+        servos.append(_read_servo(model, actuator, joint))
+    is_implicit = mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    eulerdamp = _is_on(mj_model, mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+    is_world = bool(jax.tree.leaves(parameters))
+    return FusedModel(
+        dt=float(mj_model.opt.timestep),
+        gravity=model["opt.gravity", :],
+        links=tuple(links),
+        servos=tuple(servos),
+        paddle_origin=paddle.origin,
+        paddle_rotation=paddle.rotation,
+        paddle_half_size=model["geom_size", addresses.paddle_geom],
+        balls=tuple(_read_ball(model, ball) for ball in addresses.balls),
+        contacts=_read_contacts(model),
+        addresses=addresses,
+        mj_model=mj_model,
+        fingerprint=b"" if is_world else fingerprint(mj_model),
+        implicit_servos=is_implicit,
+        implicit_damping=is_implicit or eulerdamp,
+    )
+
+
+def variable_entries(mj_model: mujoco.MjModel, addresses: Addresses) -> tuple[tuple[str, Any], ...]:
+    """What may differ between environments: fields of a model, each with the index of the entries
+    that the functions below read. They read the rest of the model as constants."""
+    balls = [ball.body for ball in addresses.balls]
+    bodies = [body for body in range(1, mj_model.nbody) if mj_model.body_weldid[body] not in balls]
+    links = [body for bodies_of_link in link_bodies(mj_model, addresses) for body in bodies_of_link]
+    joints = list(addresses.arm_joints)
+    paddle = addresses.paddle_geom
+    paddle_body = int(mj_model.geom_bodyid[paddle])
+    positions = list(addresses.arm_qpos)
+    servos = list(addresses.actuators)
+    limited = [servo for servo in servos if mj_model.actuator_ctrllimited[servo]]
+    entries = [(edit.field, edit.index) for edit in edits(mj_model, addresses)]
+    entries += [
+        ("body_pos", bodies),
+        ("body_mass", links),
+        ("body_inertia", links),
+        ("body_invweight0", ([paddle_body, *balls], 0)),
+        ("geom_size", paddle),
+        # Of five coefficients, MuJoCo too uses the first two with condim="3".
+        ("pair_friction", list(range(mj_model.npair))),
+        ("qpos0", positions),
+        ("qpos_spring", positions),
+        ("actuator_biasprm", (servos, 0)),
+        ("actuator_ctrlrange", limited),
+    ]
+    # Where a flag of the MJCF turns a feature off, its numbers act in no engine.
+    if _is_on(mj_model, mujoco.mjtDisableBit.mjDSBL_SPRING):
+        entries.append(("jnt_stiffness", joints))
+    if mj_model.ngravcomp:
+        entries.append(("body_gravcomp", links))
+    return tuple(entries)
+
+
+def _check_entries(model: EditedModel) -> None:
+    """Refuses an edit that the engine would ignore."""
+    ignored = model.edited_beside(variable_entries(model.mj_model, model.addresses))
+    if ignored:
         raise UserError(
-            f"the fused physics cannot vary {name} between environments, so a change of it would "
-            "have no effect; leave it out"
+            f"the fused physics cannot vary {ignored[0]} between environments, so a change of it "
+            "would have no effect; leave it out"
         )
-    return model
+
+
+def _is_on(mj_model: mujoco.MjModel, feature: mujoco.mjtDisableBit) -> bool:
+    """Whether the MJCF's flags do not disable a feature."""
+    return not mj_model.opt.disableflags & feature
 
 
 def exact(rotation: Sequence[Sequence[Scalar]]) -> Mat:
@@ -173,167 +217,221 @@ def exact(rotation: Sequence[Sequence[Scalar]]) -> Mat:
     return Mat(map(entry, row) for row in rotation)
 
 
-def _rotation(quaternion: Sequence[Scalar]) -> Mat:
+def _rotation_matrix(quaternion: Sequence[Scalar]) -> Mat:
     """Rotation matrix of a unit quaternion [w, x, y, z]."""
     return exact(quaternion_matrix(quaternion))
 
 
-def _read_links(m: EditedModel) -> tuple[list[chain.Link], dict[int, Frame]]:
+def _read_links(model: EditedModel) -> tuple[list[chain.Link], dict[int, Frame]]:
     """Links of the chain, and the frame of each body in its link; bodies that do not move are in
     the frame of the world. Welded bodies belong to the link of the last joint above them."""
-    c = m.model
+    mj_model = model.mj_model
+    balls = [ball.body for ball in model.addresses.balls]
     links: list[chain.Link] = []
-    frames, link_of = {0: Frame()}, {0: -1}
-    for body in range(1, c.nbody):  # parents come before their children
-        if c.body_weldid[body] in [ball.body for ball in m.addresses.balls]:
+    frames = {0: Frame()}
+    # -1 stands for the world.
+    link_of_body = {0: -1}
+    for body in range(1, mj_model.nbody):  # parents come before their children
+        if mj_model.body_weldid[body] in balls:
             continue
-        parent, link_of[body] = (x[int(c.body_parentid[body])] for x in (frames, link_of))
-        origin = parent.origin + parent.rotation @ m["body_pos", body]
-        rotation = exact(parent.rotation @ _rotation(c.body_quat[body].tolist()))
-        frame = Frame(origin, rotation)
-        for joint in range(c.body_jntadr[body], c.body_jntadr[body] + c.body_jntnum[body]):
-            slides = c.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
-            anchor = ZERO3 if slides else m.peek("jnt_pos", joint)
+        parent_body = int(mj_model.body_parentid[body])
+        parent = frames[parent_body]
+        link = link_of_body[parent_body]
+        frame = Frame(
+            origin=parent.origin + parent.rotation @ model["body_pos", body],
+            rotation=exact(parent.rotation @ _rotation_matrix(mj_model.body_quat[body].tolist())),
+        )
+        first_joint = mj_model.body_jntadr[body]
+        for joint in range(first_joint, first_joint + mj_model.body_jntnum[body]):
+            anchor = ZERO3 if _slides(mj_model, joint) else model["jnt_pos", joint]
+            link = len(links)
             origin = frame.origin + frame.rotation @ anchor
-            link_of[body] = len(links)
-            links.append(_read_joint(m, joint, Frame(origin, frame.rotation)))
+            links.append(_read_joint(model, joint, Frame(origin, frame.rotation)))
+            # From here on the frame is given in the new link.
             frame = Frame(-anchor)
         frames[body] = frame
-        if link_of[body] >= 0:
-            links[link_of[body]] = _with_body(m, links[link_of[body]], body, frame)
+        link_of_body[body] = link
+        if link >= 0:
+            links[link] = _with_body(model, links[link], body, frame)
     return links, frames
 
 
-def _read_joint(m: EditedModel, joint: int, frame: Frame) -> chain.Link:
+def _slides(mj_model: mujoco.MjModel, joint: int) -> bool:
+    return bool(mj_model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE)
+
+
+def _read_joint(model: EditedModel, joint: int, frame: Frame) -> chain.Link:
     """Link without mass behind a joint, whose frame is given in the parent link."""
-    c = m.model
-    dof, at = c.jnt_dofadr[joint], c.jnt_qposadr[joint]
-    springs = not c.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SPRING
-    dry = not c.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
-    dmin, dmax = _impedance_limits(c.dof_solimp[dof, :2])
-    frictionloss = m["dof_frictionloss", dof]
+    mj_model = model.mj_model
+    dof = mj_model.jnt_dofadr[joint]
+    position = mj_model.jnt_qposadr[joint]
+    springs = _is_on(mj_model, mujoco.mjtDisableBit.mjDSBL_SPRING)
+    dry_friction = _is_on(mj_model, mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS)
+    dmin, dmax = _impedance_limits(mj_model.dof_solimp[dof, :2])
+    _, friction_damping = model.stiffness_and_damping("dof", dof)
     return chain.Link(
         offset=frame.origin,
         rotation=frame.rotation,
-        axis=m.peek("jnt_axis", joint),
-        slides=bool(c.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE),
-        zero_position=m["qpos0", at],
+        axis=model["jnt_axis", joint],
+        slides=_slides(mj_model, joint),
+        zero_position=model["qpos0", position],
         mass=0.0,
         first_moment=ZERO3,
         inertia=Mat((ZERO3,) * 3),
-        armature=m["dof_armature", dof],
-        damping=m["dof_damping", dof],
-        stiffness=m["jnt_stiffness", joint] if springs else 0.0,
-        spring_position=m["qpos_spring", at],
-        frictionloss=frictionloss if dry else 0.0,
-        friction_softness=float((1.0 - dmin) / dmin * c.dof_invweight0[dof]),
-        friction_damping=float(to_direct_solref(c.dof_solref[dof], c.opt.timestep)[1] / dmax),
+        armature=model["dof_armature", dof],
+        damping=model["dof_damping", dof],
+        stiffness=model["jnt_stiffness", joint] if springs else 0.0,
+        spring_position=model["qpos_spring", position],
+        frictionloss=model["dof_frictionloss", dof] if dry_friction else 0.0,
+        friction_softness=float((1.0 - dmin) / dmin * mj_model.dof_invweight0[dof]),
+        friction_damping=float(friction_damping / dmax),
     )
 
 
-def _with_body(m: EditedModel, link: chain.Link, body: int, frame: Frame) -> chain.Link:
+def _with_body(model: EditedModel, link: chain.Link, body: int, frame: Frame) -> chain.Link:
     """Link with the mass of one more body, whose frame is given in the link."""
-    mass, inertial = m["body_mass", body], _inertial_frame(m, body)
+    mass = model["body_mass", body]
+    inertial = _inertial_frame(model, body)
     centre = frame.origin + frame.rotation @ inertial.origin
     principal = frame.rotation @ inertial.rotation
     lever = centre @ centre
-    about_centre = congruence(principal, diagonal(m["body_inertia", body]))
+    about_centre = congruence(principal, diagonal(model["body_inertia", body]))
 
-    def entry(i: int, j: int) -> Scalar:
+    def about_origin(i: int, j: int) -> Scalar:
         shift = sub(lever if i == j else 0.0, mul(centre[i], centre[j]))
         return add(link.inertia[i][j], add(about_centre[i][j], mul(shift, mass)))
 
     moment = centre * mass
-    floating = m["body_gravcomp", body] if m.model.ngravcomp else 0.0
+    carried_share = _carried_share(model, body)
     return dataclasses.replace(
         link,
         mass=add(link.mass, mass),
         first_moment=link.first_moment + moment,
-        inertia=symmetric(entry),
-        floating_mass=add(link.floating_mass, mul(mass, floating)),
-        floating_moment=link.floating_moment + moment * floating,
+        inertia=symmetric(about_origin),
+        floating_mass=add(link.floating_mass, mul(mass, carried_share)),
+        floating_moment=link.floating_moment + moment * carried_share,
     )
 
 
-def _inertial_frame(m: EditedModel, body: int) -> Frame:
+def _carried_share(model: EditedModel, body: int) -> Scalar:
+    """Share of a body's weight that `gravcomp` carries. MuJoCo ignores negative shares if none is
+    positive, which `ngravcomp` counts."""
+    return model["body_gravcomp", body] if model.mj_model.ngravcomp else 0.0
+
+
+def _inertial_frame(model: EditedModel, body: int) -> Frame:
     """Inertial frame of a body in the body's frame."""
-    frame = Frame(m.peek("body_ipos", body), _rotation(m.model.body_iquat[body].tolist()))
-    return _apply_flag(m.model.body_sameframe[body], frame, frame)
+    rotation = _rotation_matrix(model.mj_model.body_iquat[body].tolist())
+    frame = Frame(model["body_ipos", body], rotation)
+    return _apply_flag(model.mj_model.body_sameframe[body], frame, frame)
+
+
+def _read_paddle(model: EditedModel, frames: dict[int, Frame]) -> Frame:
+    """Frame of the paddle in the last link, from the frames of the bodies."""
+    geom = model.addresses.paddle_geom
+    body = int(model.mj_model.geom_bodyid[geom])
+    in_body = Frame(model["geom_pos", geom], _rotation_matrix(model["geom_quat", geom]))
+    same_frame = model["geom_sameframe", geom]
+    in_body = _apply_flag(same_frame, in_body, _inertial_frame(model, body))
+    body_frame = frames[body]
+    return Frame(
+        origin=body_frame.origin + body_frame.rotation @ in_body.origin,
+        rotation=exact(body_frame.rotation @ in_body.rotation),
+    )
+
+
+def _read_ball(model: EditedModel, ball: BallAddresses) -> BallModel:
+    # A ball's own inertia and gravity compensation are no variable entries.
+    return BallModel(
+        radius=model["geom_size", ball.geom, 0],
+        mass=model["body_mass", ball.body],
+        inertia=model["body_inertia", ball.body, 0],
+        weight=1.0 - _carried_share(model, ball.body),
+    )
 
 
 def _apply_flag(same: int, frame: Frame, inertial: Frame) -> Frame:
     """A frame in its body's frame. Where it is almost the same as that one, or as the body's
     inertial one, MuJoCo has a flag and computes as if they were the same."""
-    flags = mujoco.mjtSameFrame
-    return {
-        flags.mjSAMEFRAME_BODY: Frame(),
-        flags.mjSAMEFRAME_BODYROT: Frame(frame.origin),
-        flags.mjSAMEFRAME_INERTIA: inertial,
-        flags.mjSAMEFRAME_INERTIAROT: Frame(frame.origin, inertial.rotation),
-    }.get(flags(int(same)), frame)
+    flag = mujoco.mjtSameFrame(int(same))
+    if flag == mujoco.mjtSameFrame.mjSAMEFRAME_BODY:
+        return Frame()
+    if flag == mujoco.mjtSameFrame.mjSAMEFRAME_BODYROT:
+        return Frame(frame.origin)
+    if flag == mujoco.mjtSameFrame.mjSAMEFRAME_INERTIA:
+        return inertial
+    if flag == mujoco.mjtSameFrame.mjSAMEFRAME_INERTIAROT:
+        return Frame(frame.origin, inertial.rotation)
+    return frame
 
 
-def _gravity_compensation(mj_model: mujoco.MjModel) -> np.ndarray:
-    """Compensated share [nbody] of each body's weight. MuJoCo ignores negative shares if none is
-    positive, which `ngravcomp` counts."""
-    return mj_model.body_gravcomp if mj_model.ngravcomp else np.zeros(mj_model.nbody)
-
-
-def _read_servo(m: EditedModel, actuator: int, joint: int) -> Servo:
-    c = m.model
-    gear = float(c.actuator_gear[actuator, 0])
-    bias, stiffness, damping = m["actuator_biasprm", actuator, :3]
-    forces = tuple(mul(limit, gear) for limit in m["actuator_forcerange", actuator])
-    joint_limited = bool(c.jnt_actfrclimited[joint])
+def _read_servo(model: EditedModel, actuator: int, joint: int) -> Servo:
+    mj_model = model.mj_model
+    gear = float(mj_model.actuator_gear[actuator, 0])
+    bias, stiffness, damping = model["actuator_biasprm", actuator, :3]
+    ctrl_range = None
+    if mj_model.actuator_ctrllimited[actuator]:
+        ctrl_range = model["actuator_ctrlrange", actuator]
+    force_range = None
+    if model["actuator_forcelimited", actuator]:
+        low, high = model["actuator_forcerange", actuator] * gear
+        force_range = (low, high) if gear > 0.0 else (high, low)
+    joint_range = None
+    if mj_model.jnt_actfrclimited[joint]:
+        joint_range = model["jnt_actfrcrange", joint]
     return Servo(
-        gain=mul(m["actuator_gainprm", actuator, 0], gear),
+        gain=mul(model["actuator_gainprm", actuator, 0], gear),
         bias=mul(bias, gear),
         stiffness=mul(stiffness, gear**2),
         damping=mul(damping, gear**2),
-        ctrl_range=m["actuator_ctrlrange", actuator] if c.actuator_ctrllimited[actuator] else None,
-        force_range=forces[:: 1 if gear > 0.0 else -1]
-        if m["actuator_forcelimited", actuator]
-        else None,
-        joint_range=m.peek("jnt_actfrcrange", joint) if joint_limited else None,
-        carries_weight=bool(c.jnt_actgravcomp[joint]),
+        ctrl_range=ctrl_range,
+        force_range=force_range,
+        joint_range=joint_range,
+        carries_weight=bool(mj_model.jnt_actgravcomp[joint]),
     )
 
 
-def _read_contacts(m: EditedModel) -> tuple[ContactModel, ...]:
+def _read_contacts(model: EditedModel) -> tuple[ContactModel, ...]:
     """The contacts in the order of `FusedModel.contacts`."""
-    balls = {ball.geom: i for i, ball in enumerate(m.addresses.balls)}
-    contacts = [
-        _read_contact(m, pair, tuple(sorted(balls[g] for g in map(int, geoms) if g in balls)))
-        for pair, geoms in enumerate(zip(m.model.pair_geom1, m.model.pair_geom2, strict=True))
-    ]
-    return tuple(sorted(contacts, key=lambda contact: (len(contact.balls), contact.balls)))
+    mj_model = model.mj_model
+    ball_of_geom = {ball.geom: i for i, ball in enumerate(model.addresses.balls)}
+    contacts = []
+    for pair in range(mj_model.npair):
+        geoms = (int(mj_model.pair_geom1[pair]), int(mj_model.pair_geom2[pair]))
+        balls = sorted(ball_of_geom[geom] for geom in geoms if geom in ball_of_geom)
+        contacts.append(_read_contact(model, pair, tuple(balls)))
+
+    def paddle_first(contact: ContactModel) -> tuple:
+        return len(contact.balls), contact.balls
+
+    return tuple(sorted(contacts, key=paddle_first))
 
 
-def _read_contact(m: EditedModel, pair: int, balls: tuple[int, ...]) -> ContactModel:
-    c, addresses, solimp = m.model, m.addresses, m.model.pair_solimp[pair]
+def _read_contact(model: EditedModel, pair: int, balls: tuple[int, ...]) -> ContactModel:
+    """The contact of one ball with the paddle, or of two balls."""
+    mj_model = model.mj_model
+    stiffness, damping = model.stiffness_and_damping("pair", pair)
+    solimp = mj_model.pair_solimp[pair]
     dmin, dmax, midpoint = _impedance_limits(solimp[[0, 1, 3]]).tolist()
-    stiffness, damping = to_direct_solref(m["pair_solref", pair], c.opt.timestep)
     power = max(1.0, float(solimp[4]))
-    bodies = [addresses.balls[i].body for i in balls]
-    bodies = [c.geom_bodyid[addresses.paddle_geom], *bodies][-2:]
-    frictional = m["pair_dim", pair] > 1
+    if power.is_integer():
+        power = int(power)
+    bodies = [model.addresses.balls[i].body for i in balls]
+    if len(bodies) == 1:
+        bodies.insert(0, mj_model.geom_bodyid[model.addresses.paddle_geom])
+    friction = None
+    if model["pair_dim", pair] > 1:
+        first, second = model["pair_friction", pair, :2]
+        friction = (maximum(first, MIN_FRICTION), maximum(second, MIN_FRICTION))
     return ContactModel(
         balls=balls,
-        # MuJoCo scales the direct format of solref by the largest impedance.
+        # MuJoCo scales the direct format of a contact's stiffness by the largest impedance.
         stiffness=mul(stiffness, 1.0 / dmax**2),
         damping=mul(damping, 1.0 / dmax),
-        solimp=(
-            dmin,
-            dmax,
-            float(solimp[2]),
-            midpoint,
-            int(power) if power.is_integer() else power,
-        ),
-        inverse_weights=tuple(m["body_invweight0", body, 0] for body in bodies),
-        friction=tuple(maximum(x, MIN_FRICTION) for x in m["pair_friction", pair][:2])
-        if frictional
-        else None,
-        impratio=max(mujoco.mjMINVAL, float(c.opt.impratio)),
+        solimp=(dmin, dmax, float(solimp[2]), midpoint, power),
+        inverse_weights=tuple(model["body_invweight0", body, 0] for body in bodies),
+        friction=friction,
+        impratio=max(mujoco.mjMINVAL, float(mj_model.opt.impratio)),
     )
 
 

@@ -1,0 +1,165 @@
+"""The actuators of a model: which joint each one moves, and whether it is a position servo.
+
+An acting joint of the task has exactly one actuator, a position servo, whose control is the target
+position of the joint. An arm that is adopted may have other ones.
+"""
+
+from collections.abc import Collection
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from bounce_mjx.errors import UserError
+from bounce_mjx.robot.names import joint_name
+
+# For a hinge or a slide, both kinds of transmission are the same.
+_JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+
+
+class ServoSettings(NamedTuple):
+    """A position servo of one joint, or another actuator, which has a force limit alone."""
+
+    stiffness: float | None
+    """N m/rad, or N/m."""
+    damping: float | None
+    """N m s/rad, or N s/m."""
+    force_limit: float | None
+    """N m, or N; None for no limit."""
+
+
+def joint_actuators(model: mujoco.MjModel) -> dict[int, list[int]]:
+    """The actuators of each joint that has some, the joints in the model's order."""
+    actuators_of: dict[int, list[int]] = {}
+    for actuator in range(model.nactuator):
+        if int(model.actuator_trntype[actuator]) in _JOINT_TRANSMISSIONS:
+            joint = int(model.actuator_trnid[actuator, 0])
+            actuators_of.setdefault(joint, []).append(actuator)
+    return dict(sorted(actuators_of.items()))
+
+
+def single_actuators(model: mujoco.MjModel, joints: Collection[int]) -> dict[int, int]:
+    """The actuator of each of some joints that has one, in the model's order.
+
+    Raises:
+      UserError: a joint has several; the text starts with what is wrong.
+    """
+    single = {}
+    for joint, actuators in joint_actuators(model).items():
+        if joint not in joints:
+            continue
+        if len(actuators) > 1:
+            name = joint_name(model, joint)
+            raise UserError(f"several actuators on {name}; give it one")
+        single[joint] = actuators[0]
+    return single
+
+
+def is_position_servo(model: mujoco.MjModel, actuator: int) -> bool:
+    """Whether an actuator's control, or its filtered or integrated one, is a target position.
+
+    MuJoCo's force is gain * control + offset + factor * position + ...; a servo has the gain as its
+    stiffness, and no offset.
+    """
+    gain = model.actuator_gainprm[actuator, 0]
+    offset = model.actuator_biasprm[actuator, 0]
+    factor = model.actuator_biasprm[actuator, 1]
+    return bool(
+        model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
+        and model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE
+        and gain > 0.0
+        and offset == 0.0
+        # Otherwise the joint would rest at another position than the control.
+        and np.isclose(factor, -gain)
+    )
+
+
+def is_direct(model: mujoco.MjModel, actuator: int) -> bool:
+    """Whether the control itself acts, not a filtered or an integrated one."""
+    return bool(model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_NONE)
+
+
+def servo_settings(model: mujoco.MjModel, joint: int, actuator: int) -> ServoSettings:
+    """The actuator that drives a joint.
+
+    Raises:
+      UserError: it pushes one way only.
+    """
+    limit = _force_limit(model, joint, actuator)
+    if not (is_direct(model, actuator) and is_position_servo(model, actuator)):
+        return ServoSettings(None, None, limit)
+    gear = float(model.actuator_gear[actuator, 0])
+    stiffness = float(model.actuator_gainprm[actuator, 0]) * gear**2
+    # Without a damping the bias is -0.0, which would be printed.
+    damping = 0.0 - float(model.actuator_biasprm[actuator, 2]) * gear**2
+    return ServoSettings(stiffness, damping, limit)
+
+
+def servo_range(model: mujoco.MjModel, actuator: int) -> tuple[float, float]:
+    """Joint positions that the targets of a position servo reach, rad or m; infinite for another
+    actuator, and without a range of the control."""
+    control = model.actuator_ctrladr[actuator]
+    # The control of an integrator is a velocity.
+    is_integrator = model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_INTEGRATOR
+    is_servo = not is_integrator and is_position_servo(model, actuator)
+    if not (is_servo and model.actuator_ctrllimited[control]):
+        return -np.inf, np.inf
+    low, high = sorted(model.actuator_ctrlrange[control] / model.actuator_gear[actuator, 0])
+    return float(low), float(high)
+
+
+class _ForceRange(NamedTuple):
+    """One of MuJoCo's limits of an actuator's force."""
+
+    name: str
+    """In the MJCF."""
+    is_limited: bool
+    range: np.ndarray
+    """[2], in its own unit."""
+    factor: float
+    """Force at the joint per unit."""
+
+
+def _force_limit(model: mujoco.MjModel, joint: int, actuator: int) -> float | None:
+    """Largest force of a joint's actuator, N m or N; None for no limit: by the force range, by the
+    control range of a plain motor, or by the joint's own limit."""
+    gear = float(model.actuator_gear[actuator, 0])
+    gain = float(model.actuator_gainprm[actuator, 0])
+    # A <pid> has several controls; the other arrays have one row for each actuator.
+    control = model.actuator_ctrladr[actuator]
+    is_motor = model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_NONE
+    ranges = (
+        _ForceRange(
+            name="forcerange",
+            is_limited=bool(model.actuator_forcelimited[actuator]),
+            range=model.actuator_forcerange[actuator],
+            factor=gear,
+        ),
+        _ForceRange(
+            name="ctrlrange",
+            is_limited=bool(is_motor and model.actuator_ctrllimited[control]),
+            range=model.actuator_ctrlrange[control],
+            factor=gear * gain,
+        ),
+        _ForceRange(
+            name="actuatorfrcrange",
+            is_limited=bool(model.jnt_actfrclimited[joint]),
+            range=model.jnt_actfrcrange[joint],
+            factor=1.0,
+        ),
+    )
+    limits = []
+    for force_range in ranges:
+        if not force_range.is_limited:
+            continue
+        low, high = force_range.range.tolist()
+        if not low < 0.0 < high:
+            most = max(-low, high)
+            raise UserError(
+                f"the {force_range.name} {low:g} to {high:g} on {joint_name(model, joint)}, so its "
+                f"actuator pushes one way only; give a range around 0, such as {-most:g} to "
+                f"{most:g}"
+            )
+        limits.append(min(-low, high) * abs(force_range.factor))
+    limit = min(limits, default=np.inf)
+    return limit if np.isfinite(limit) else None

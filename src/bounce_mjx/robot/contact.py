@@ -1,0 +1,110 @@
+"""The contact of a ball: a spring and a damper, and the restitution that follows from them.
+
+MuJoCo's `solref` holds both numbers in one of two formats. In the direct one, `solref="-k -b"`, k
+is the stiffness, 1/s^2, and b the damping, 1/s; the other one has a time constant and a damping
+ratio.
+"""
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from bounce_mjx.errors import UserError
+
+PAIR_SETTINGS = "condim solref solreffriction solimp margin gap adhesion friction".split()
+"""Attributes of a contact pair in an `MjSpec` that say how its geoms touch."""
+
+# With fewer physics steps in half a period of a contact, the ball can gain energy in a rebound.
+_STEPS_OF_A_CONTACT = 4
+# Fields of an MjModel with such numbers; `{}` is solref or solimp.
+_FIELDS = "pair_{} geom_{} jnt_{} dof_{} eq_{} tendon_{}_lim tendon_{}_fri".split()
+
+# Damping ratios of the contact, and the measured restitution: the mean of the drops on the held
+# paddle of tests/test_randomization.py, at 1, 2, 3 and 4 m/s and eight phases of the physics step.
+_DROPS = (
+    (0.0, 0.993), (0.005, 0.98), (0.01, 0.965), (0.0152, 0.95), (0.032, 0.90), (0.05, 0.85),
+    (0.0697, 0.80), (0.0921, 0.75), (0.116, 0.70), (0.13, 0.674), (0.16, 0.622), (0.2, 0.565),
+    (0.2455, 0.50), (0.2873, 0.45), (0.3352, 0.40),
+)  # fmt: skip
+
+
+def damping_of_restitution(restitution: jax.Array, stiffness: float) -> jax.Array:
+    """Damping [] of a contact, 1/s, that gives a restitution [] at a stiffness (1/s^2):
+    2 zeta sqrt(stiffness), with the damping ratio zeta interpolated between drop tests."""
+    ratios, restitutions = np.array(_DROPS[::-1]).T
+    zeta = jnp.interp(restitution, restitutions, ratios)
+    return (2.0 * np.sqrt(stiffness) * zeta).astype(jnp.asarray(restitution).dtype)
+
+
+def restitution_of_damping(damping: float, stiffness: float) -> np.ndarray:
+    """Restitution [] of a contact with a damping (1/s) at a stiffness (1/s^2): the inverse of
+    `damping_of_restitution`."""
+    ratios, restitutions = np.array(_DROPS).T
+    return np.interp(damping / (2.0 * np.sqrt(stiffness)), ratios, restitutions)
+
+
+def stiffness_and_damping(solref: Any, timestep: float) -> tuple[Any, Any]:
+    """Stiffness k, 1/s^2, and damping b, 1/s, of a `solref` [2] in either format (MuJoCo's
+    documentation, "Modeling", solver parameters).
+
+    Args:
+      solref: two floats, or scalars of JAX.
+      timestep: of the physics, s.
+    """
+    first, second = solref
+    # MuJoCo's lower limit for the time constant is two steps.
+    least_time_constant = 2.0 * timestep
+    if isinstance(first, float):
+        if first <= 0.0:
+            return -first, -second
+        time_constant = max(first, least_time_constant)
+        return 1.0 / (time_constant * second) ** 2, 2.0 / time_constant
+    is_direct = first <= 0.0
+    time_constant = jnp.maximum(first, least_time_constant)
+    # A stand-in for the direct format's damping, by which one must not divide.
+    damping_ratio = jnp.where(is_direct, 1.0, second)
+    stiffness = jnp.where(is_direct, -first, 1.0 / (time_constant * damping_ratio) ** 2)
+    damping = jnp.where(is_direct, -second, 2.0 / time_constant)
+    return stiffness, damping
+
+
+def check_step(mj_model: mujoco.MjModel) -> None:
+    """Refuses a physics step that is too long for a contact: its ball would gain energy.
+
+    Raises:
+      UserError: half a period of a contact has fewer than four physics steps.
+    """
+    step = mj_model.opt.timestep
+    # The engines refuse a mixed format (`unsupported_constraints`).
+    for solref in mj_model.pair_solref[~_is_mixed(mj_model.pair_solref)]:
+        stiffness, _ = stiffness_and_damping(solref, step)
+        half_period = math.pi / math.sqrt(max(stiffness, 1e-9))
+        longest = half_period / _STEPS_OF_A_CONTACT
+        if step > longest * (1.0 + 1e-3):
+            raise UserError(
+                f"physics_dt {step:g} s is too long for a contact whose half period is "
+                f"{half_period:.3g} s, and the ball would gain energy; set physics_dt to "
+                f"{longest:.4g} s or less"
+            )
+
+
+def unsupported_constraints(mj_model: mujoco.MjModel) -> Iterator[tuple[str, bool]]:
+    """Settings of constraints that MuJoCo takes with a warning, which no engine has: the name of
+    each, and whether a model has it."""
+    for field in _FIELDS:
+        solref_field = field.format("solref")
+        solimp_field = field.format("solimp")
+        is_mixed = _is_mixed(getattr(mj_model, solref_field))
+        yield f"a {solref_field} with exactly one positive number", bool(np.any(is_mixed))
+        widths = getattr(mj_model, solimp_field)[:, 2]
+        yield f"a {solimp_field} without a width", bool(np.any(widths <= mujoco.mjMINVAL))
+
+
+def _is_mixed(solrefs: np.ndarray) -> np.ndarray:
+    """Whether each solref [k, 2] has one number of each format [k]."""
+    return np.sum(solrefs > 0.0, axis=1) == 1
