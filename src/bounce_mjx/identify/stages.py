@@ -228,12 +228,16 @@ def identify(
         follower = _stiff_follower(problem, config, log, following)
         is_follower = _explains_better(problem, follower, fit)
     else:
-        problem, fit, is_follower = own, _resting_arm(own), False
+        # Gravity's tilt would explain where an arm rests.
+        problem = own
+        is_follower = False
+        fit = _with_offsets(own, Fit(layout.mean, windows.starts))
     share = float(problem.simulate is carried.simulate)
+    stages, states = ["arm"], windows.arm_state
     if is_follower:
         progress("a delay and offsets explain the arm as well as its servos do")
         fit = follower
-    stages, states = [] if is_follower else ["arm"], windows.arm_state
+        stages = []
     pictures, seen = np.ones_like(windows.picture_weights), _training(problem)
     if with_ball:
         lifted = make_simulator(config, layout, log, windows, share, AIR_LIFT)
@@ -370,7 +374,9 @@ def _fit_ball(problem: Problem, fit: Fit, lifted: Simulate) -> tuple[Problem, Fi
 
 def _guess_spins(problem: Problem, fit: Fit) -> Fit:
     """The fit with the spin and the drag of each flight before a bounce, by a direct fit of it."""
-    windows, starts, vector = problem.windows, fit.starts.copy(), fit.vector.copy()
+    windows = problem.windows
+    starts = fit.starts.copy()
+    vector = fit.vector.copy()
     deviations, _, _ = problem.scale_starts()
     lift_deviation, drag_deviation = AIR_LIFT * deviations[-2], deviations[-1]
     with_ball = np.flatnonzero(windows.has_ball)
@@ -445,14 +451,14 @@ def _search_arm(
     return _residual_noise(problem, fit), fit
 
 
-def _resting_arm(problem: Problem) -> Fit:
-    """A first guess for an arm that rests: each servo's offset, without which gravity's tilt would
-    have to explain why it rests where it does."""
-    fit = Fit(problem.layout.mean.copy(), problem.windows.starts)
+def _with_offsets(problem: Problem, fit: Fit) -> Fit:
+    """The fit with servo offsets, without which an unknown that is no servo's would have to explain
+    where the joints stand."""
+    vector = fit.vector.copy()
     angles = problem.windows.split(problem.predict(fit.vector, fit.starts))[0]
     residuals = (problem.windows.angles - angles)[problem.windows.angle_weights > 0.0]
-    fit.vector[problem.layout.slices["servo_offset"]] = np.median(residuals, axis=0)
-    return fit
+    vector[problem.layout.slices["servo_offset"]] += np.median(residuals, axis=0)
+    return fit._replace(vector=vector)
 
 
 def _own_servos(layout: Layout) -> np.ndarray:
@@ -479,8 +485,9 @@ def _command_delay(log: Log, following: Following) -> float:
 
 def _late_servos(layout: Layout, config: WorldConfig, log: Log, following: Following) -> np.ndarray:
     """Candidates [C, P] whose joints follow their commands as late as measured."""
-    own_delay, vectors = _servo_delays(config), []
+    own_delay = _servo_delays(config)
     total = max(_command_delay(log, following), 2e-3)
+    vectors = []
     for gain, servo_share, lag_share in itertools.product(_GAINS, _SERVO_SHARES, _LAG_SHARES):
         of_servo = servo_share * total
         lag = lag_share * (total - of_servo)
@@ -498,7 +505,9 @@ def _stiff_follower(problem: Problem, config: WorldConfig, log: Log, following: 
     """The arm that follows its commands as the simplest model does: late, with an offset of each
     joint, by servos that are too stiff to matter."""
     layout, windows = problem.layout, problem.windows
-    total, own_delay, vectors = max(_command_delay(log, following), 0.0), _servo_delays(config), []
+    total = max(_command_delay(log, following), 0.0)
+    own_delay = _servo_delays(config)
+    vectors = []
     for gain, longest in itertools.product(_STIFF_GAINS, _STIFF_DELAYS):
         of_servo = max(min(longest, total), _STIFF_DELAYS[0])
         world = {
@@ -516,7 +525,7 @@ def _stiff_follower(problem: Problem, config: WorldConfig, log: Log, following: 
         for vector in vectors
     ]
     best = min(followers, key=lambda fit: np.sum(_joint_errors(windows, fit) ** 2))
-    return best._replace(starts=windows.starts)
+    return _with_offsets(problem, best._replace(starts=windows.starts))
 
 
 def _explains_better(problem: Problem, simple: Fit, fit: Fit) -> bool:

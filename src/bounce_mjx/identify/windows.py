@@ -246,6 +246,7 @@ def _ball_start(log: Log, pictures: np.ndarray, bounce: float, zero: float) -> n
         return np.concatenate([_NO_BALL, np.zeros(7)])
     times = log.picture_times[pictures] - zero
     before = times < bounce - BEFORE_BOUNCE
-    shown, balls = times[before] - BALL["ball_latency"].mean, log.ball_positions[pictures][before]
+    shown = times[before] - BALL["ball_latency"].mean
+    balls = log.ball_positions[pictures][before]
     flight = fit_flight(shown, balls, _GUESSED_NOISE, GUESSED_DRAG)
     return np.concatenate([flight.position, flight.velocity, np.zeros(4)])
