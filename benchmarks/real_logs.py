@@ -322,8 +322,8 @@ def measure_flights(folder: Path, most: int) -> dict[str, Any]:
         counts = windows.picture_weights[s] > 0.0
         early, late = (counts & (side * since > _AT_BOUNCE) for side in (-1.0, 1.0))
         errors["before"].append(np.sqrt(np.mean(residuals[s, early] ** 2)))
-        # A bounce deviates from the mean one, in speed and in spin.
-        design = np.stack([since[late], since[late] ** 2], axis=1)
+        # A bounce deviates from the mean one, in place, speed and spin.
+        design = np.vander(since[late], 3)
         own = np.linalg.lstsq(design, residuals[s, late], rcond=None)[0]
         errors["after"].append(np.sqrt(np.mean((residuals[s, late] - design @ own) ** 2)))
     for side, sizes in errors.items():

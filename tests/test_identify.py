@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.optimize import minimize
 
 from bounce_mjx.env.env import world_model
@@ -23,6 +24,7 @@ from bounce_mjx.identify.fit import (
     certainty,
     minimise,
 )
+from bounce_mjx.identify.flight import acceleration, fit_flight
 from bounce_mjx.identify.following import find_settled, follow
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.reading import read_csv
@@ -327,6 +329,46 @@ def test_whitening_is_the_inverse_root_of_the_covariance(has_lift: bool) -> None
         assert np.sum(white[s, used, axis] ** 2) == pytest.approx(expected, rel=1e-6)
 
 
+def test_a_flight_with_drag_and_spin_is_fitted_directly() -> None:
+    """As an integrator with an error of 1e-9 flies it."""
+    drag, lift = 0.17, np.array([0.6, -0.4, 0.9])
+    start = np.array([0.1, -1.5, 0.4, 0.5, 6.0, 1.5])
+
+    def slope(time: float, state: np.ndarray) -> np.ndarray:
+        return np.concatenate([state[3:], acceleration(state[3:], drag, lift)])
+
+    times = np.arange(0.08, 0.5, 0.006)
+    flown = solve_ivp(slope, (0.0, 0.5), start, t_eval=times, rtol=1e-9, atol=1e-9)
+    flight = fit_flight(times, flown.y[:3].T, np.full(3, 1e-5), 0.1, 10.0, 10.0)
+    np.testing.assert_allclose(flight.position, start[:3], atol=1e-4)
+    np.testing.assert_allclose(flight.velocity, start[3:], atol=2e-3)
+    np.testing.assert_allclose(flight.lift, lift, atol=5e-3)
+    assert 0.1 * (1.0 + flight.drag_deviation) == pytest.approx(drag, rel=5e-3)
+    # Gravity, drag against the motion, and lift across both motion and spin.
+    pull = acceleration(np.array([2.0, 0.0, 0.0]), 0.1, np.array([0.0, 0.0, 3.0]))
+    np.testing.assert_allclose(pull, [-0.4, 6.0, -9.81])
+
+
+@pytest.mark.slow
+def test_an_arm_is_explained_no_worse_than_by_a_delay_and_offsets() -> None:
+    """One that follows its commands more exactly than any servo."""
+    config, random = read_preset(Path("default")).env, np.random.default_rng(3)
+    times = np.arange(0.0, 9.0, 0.008)
+    rates, late = np.array([1.1, 1.7, 2.3, 2.9, 1.3, 0.7]), 0.012
+    home = np.array(config.default_joint_angles)
+    offsets = np.array([0.002, -0.001, 0.0, 0.001, -0.002, 0.0005])
+    angles = home + offsets + 0.3 * np.sin(np.outer(times - late, rates))
+    angles += 1e-4 * random.normal(size=angles.shape)
+    targets = home + 0.3 * np.sin(np.outer(times, rates))
+    nothing = np.zeros(0)
+    log = Log("here", times, angles, times, targets, nothing, np.zeros((0, 3)), nothing)
+    found = identify(config, log)
+    of_model, of_delay = (
+        np.sqrt(np.mean(errors**2)) for errors in (found.joint_errors, found.following_errors)
+    )
+    assert of_model < 1.1 * of_delay
+
+
 def test_following_finds_delay_and_offsets() -> None:
     """Of joints that follow 15.5 ms late; an outlier changes nothing."""
     random = np.random.default_rng(7)
@@ -379,7 +421,9 @@ def test_a_hidden_robot_is_identified(tmp_path: Path) -> None:
     """Of a tuning seed, from a log of 19 s."""
     benchmark = runpy.run_path(str(BENCHMARK))
     config, path = read_preset(Path("default")).env, tmp_path / "log.csv"
-    truth = benchmark["record"](config, 1000, path, excited=10.0, played=9.0).world
+    hidden = benchmark["hidden_robot"](1000)
+    benchmark["record"](config, hidden, 1000, path, excited=10.0, played=9.0)
+    truth = hidden.world
     found = identify(config, read_csv(path, NAMES))
     world = found.layout.world(found.fit.vector)
     late, true = (w["action_latency"] + w["servo_lag"] for w in (world, truth))

@@ -48,6 +48,9 @@ _DISAGREEMENT = 0.1
 _BOUNCE_DEVIATION = (0.02, 0.02, 0.1)
 # The same of a ball with spin, which rubs and rolls in ways that the contact's friction lacks.
 _SPINNING_DEVIATION = (0.5, 0.5, 0.1)
+# Where a real ball leaves the paddle, from where the model's does, m. The model's contact takes
+# 10 ms, in which it falls back by 9 ms * speed; the paddle's height makes good for the mean alone.
+_LEAVING_DEVIATION = (0.005, 0.005, 0.01)
 AIR_LIFT = 0.006
 """Acceleration of a table-tennis ball across its flight, per spin (rad/s) and speed (m/s): a flight
 shows its product with the spin alone."""
@@ -110,8 +113,9 @@ class Problem(NamedTuple):
 
         A bounce that deviates from the model moves each picture after it, along each axis, by the
         columns C = time since the bounce * deviation of the velocity / noise and, with lift, time^2
-        / 2 * deviation of the acceleration / noise. The residuals' covariance is then I + C C'.
-        With C'C = V diag(l) V', its inverse root is I - C V diag((1 - 1 / sqrt(1 + l)) / l) V' C'.
+        / 2 * deviation of the acceleration / noise and deviation of the place / noise. The
+        residuals' covariance is then I + C C'. With C'C = V diag(l) V', its inverse root is
+        I - C V diag((1 - 1 / sqrt(1 + l)) / l) V' C'.
         """
         w, root = self.windows, np.sqrt(weights)
         scaled = (predicted - w.measured) / self.deviations * root
@@ -129,11 +133,13 @@ class Problem(NamedTuple):
         """Shifts [S, B, 3, K] of the pictures, in units of their noise, by each way in which a
         bounce may deviate from the model, by its standard deviation."""
         since = np.nan_to_num(self.windows.picture_times - self.windows.bounces[:, None])
+        has_left = (since > 0.0)[:, :, None]
         since = np.maximum(since, 0.0)[:, :, None]
         columns = [since * _BOUNCE_DEVIATION / self.noise.balls]
         if self.has_lift:
             columns = [since * _SPINNING_DEVIATION / self.noise.balls]
             columns.append(0.5 * since**2 * _LIFT_DEVIATION / self.noise.balls)
+            columns.append(has_left * _LEAVING_DEVIATION / self.noise.balls)
         return np.stack(columns, axis=-1)
 
     def scale_starts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -22,6 +22,7 @@ from bounce_mjx.identify.fit import (
     minimise,
     picture_weights,
 )
+from bounce_mjx.identify.flight import Flight, acceleration, fit_flight
 from bounce_mjx.identify.following import (
     Following,
     does_move,
@@ -34,7 +35,7 @@ from bounce_mjx.identify.following import (
 from bounce_mjx.identify.log import Log, least_age
 from bounce_mjx.identify.simulation import Simulate, make_simulator
 from bounce_mjx.identify.unknowns import Layout
-from bounce_mjx.identify.windows import GRAVITY, Windows, cut
+from bounce_mjx.identify.windows import BEFORE_BOUNCE, GUESSED_DRAG, Windows, cut
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.world.config import WorldConfig
 
@@ -52,14 +53,14 @@ _LAGS = (0.001, 0.008, 0.016, 0.026, 0.038)
 _GAINS = (1.0, 2.0, 4.0, 8.0, 30.0)
 _SERVO_SHARES = (0.1, 0.3, 0.6, 0.9)
 _LAG_SHARES = (0.0, 0.3, 0.6)
+# Gains and longest own delays (s) of servos that are too stiff to matter.
+_STIFF_GAINS, _STIFF_DELAYS = (30.0, 100.0), (5e-4, 1e-3, 3e-3)
 # Candidates from which a search over a few windows begins, and decrease of the cost from which the
 # controller counts as carrying the arm's weight.
 _KEPT = 2
 _CARRIED = 10.0
 # Standard deviation of stamps about regular steps below which the steps count as regular, s.
 _JITTER = 5e-4
-BEFORE_BOUNCE = 0.012
-"""Time before a bounce at which a flight counts as over, s: the camera's jitter, half a contact."""
 _FEWEST_BOUNCES = 3
 # Distance of the bounces from the paddle's height beyond which the search would not find them, m.
 _BESIDE = 0.03
@@ -97,6 +98,9 @@ class Identified(NamedTuple):
     """Those of the identified world [n], rad."""
     gravity_compensation: float = 0.0
     """Share of the arm's weight that its controller carries, if more than the model's own."""
+    is_follower: bool = False
+    """Whether the arm follows its commands late, with an offset and stiff servos, as a fit of the
+    servos explained windows that the search had not seen no better."""
     has_lift: bool = False
     """Whether the flights show lift by spin."""
     stamp_age: float = 0.0
@@ -217,18 +221,28 @@ def identify(
         for share in (0.0, 1.0)
     )
     progress(f"arm: {1e3 * following.delay:.1f} ms behind its commands")
-    problem, fit = own, Fit(layout.mean, windows.starts)
     if does_move(log):
         fits = [_search_arm(problem, config, log, following) for problem in (own, carried)]
         problem, fit = _choose(own, carried, fits)
         problem, fit = _fit_arm(problem, fit)
+        follower = _stiff_follower(problem, config, log, following)
+        is_follower = _explains_better(problem, follower, fit)
+    else:
+        # Gravity's tilt would explain where an arm rests.
+        problem = own
+        is_follower = False
+        fit = _with_offsets(own, Fit(layout.mean, windows.starts))
     share = float(problem.simulate is carried.simulate)
     stages, states = ["arm"], windows.arm_state
+    if is_follower:
+        progress("a delay and offsets explain the arm as well as its servos do")
+        fit = follower
+        stages = []
     pictures, seen = np.ones_like(windows.picture_weights), _training(problem)
     if with_ball:
         lifted = make_simulator(config, layout, log, windows, share, AIR_LIFT)
         problem, fit, pictures = _fit_ball(problem, fit, lifted)
-        stages, states = ["arm", "flight", "bounce"], None
+        stages, states = [*stages, "flight", "bounce"], None
     progress("all")
     angles = angle_weights(problem, problem.predict(fit.vector, fit.starts))
     fit = minimise(problem, fit, stages, problem.weights(pictures, seen, angles), 3, states)
@@ -257,6 +271,7 @@ def identify(
         following_errors=held_out_error(log, following, settled & held_out),
         joint_errors=_joint_errors(windows, unseen),
         gravity_compensation=share,
+        is_follower=is_follower,
         has_lift=problem.has_lift,
         stamp_age=least_age(log),
     )
@@ -334,7 +349,9 @@ def _fit_ball(problem: Problem, fit: Fit, lifted: Simulate) -> tuple[Problem, Fi
         fit = plain
     else:
         spinning = problem._replace(simulate=lifted, has_lift=True)
-        turned = minimise(spinning, fit, ["flight"], problem.weights(flying, seen), 8, states)
+        guess = _guess_spins(spinning, fit)
+        spinning = spinning._replace(noise=_flight_noise(spinning, guess, flying))
+        turned = minimise(spinning, guess, ["flight"], problem.weights(flying, seen), 8, states)
         if _flies(spinning, turned, flying):
             problem, fit = spinning, turned
             problem.progress("the flights show lift by spin")
@@ -353,6 +370,49 @@ def _fit_ball(problem: Problem, fit: Fit, lifted: Simulate) -> tuple[Problem, Fi
     pictures = picture_weights(problem, problem.predict(fit.vector, fit.starts))
     fit = minimise(problem, fit, stages, problem.weights(pictures, seen), 6, states)
     return problem, fit, pictures
+
+
+def _guess_spins(problem: Problem, fit: Fit) -> Fit:
+    """The fit with the spin and the drag of each flight before a bounce, by a direct fit of it."""
+    windows = problem.windows
+    starts = fit.starts.copy()
+    vector = fit.vector.copy()
+    deviations, _, _ = problem.scale_starts()
+    lift_deviation, drag_deviation = AIR_LIFT * deviations[-2], deviations[-1]
+    with_ball = np.flatnonzero(windows.has_ball)
+    latency = vector[problem.layout.slices["ball_latency"]]
+
+    def fit_window(s: int, drag: float, drag_deviation: float) -> Flight:
+        before = windows.picture_times[s] < windows.bounces[s] - BEFORE_BOUNCE
+        counts = before & (windows.picture_weights[s] > 0.0)
+        return fit_flight(
+            windows.picture_times[s, counts] - latency,
+            windows.balls[s, counts],
+            problem.noise.balls,
+            drag,
+            lift_deviation,
+            drag_deviation,
+        )
+
+    # At first, each flight may have any drag; their median is then that of the ball.
+    free = [fit_window(s, GUESSED_DRAG, 1.0).drag_deviation for s in with_ball]
+    drag = GUESSED_DRAG * (1.0 + float(np.median(free)))
+    vector[problem.layout.slices["air_drag"]] = drag
+    for s in with_ball:
+        flight = fit_window(s, drag, drag_deviation)
+        spin = flight.lift / AIR_LIFT
+        starts[s, -10:] = [*flight.position, *flight.velocity, *spin, flight.drag_deviation]
+    return fit._replace(vector=vector, starts=starts)
+
+
+def _flight_noise(problem: Problem, fit: Fit, flying: np.ndarray) -> Noise:
+    """The sensors' noise, or what the flights [S, B] leave where it is larger: a camera's errors
+    that change slowly are not in the differences of neighbouring pictures."""
+    windows = problem.windows
+    residuals = windows.split(problem.predict(fit.vector, fit.starts))[1] - windows.balls
+    counts = flying & (windows.picture_weights > 0.0)
+    errors = error_size(residuals[counts])
+    return problem.noise._replace(balls=np.maximum(problem.sensors.balls, errors))
 
 
 def _flies(problem: Problem, fit: Fit, flying: np.ndarray) -> bool:
@@ -391,6 +451,16 @@ def _search_arm(
     return _residual_noise(problem, fit), fit
 
 
+def _with_offsets(problem: Problem, fit: Fit) -> Fit:
+    """The fit with servo offsets, without which an unknown that is no servo's would have to explain
+    where the joints stand."""
+    vector = fit.vector.copy()
+    angles = problem.windows.split(problem.predict(fit.vector, fit.starts))[0]
+    residuals = (problem.windows.angles - angles)[problem.windows.angle_weights > 0.0]
+    vector[problem.layout.slices["servo_offset"]] += np.median(residuals, axis=0)
+    return fit._replace(vector=vector)
+
+
 def _own_servos(layout: Layout) -> np.ndarray:
     """Candidates [C, P] with the model's own servos."""
     pairs = itertools.product(_LATENCIES, _LAGS)
@@ -399,15 +469,24 @@ def _own_servos(layout: Layout) -> np.ndarray:
     )
 
 
-def _late_servos(layout: Layout, config: WorldConfig, log: Log, following: Following) -> np.ndarray:
-    """Candidates [C, P] whose joints follow their commands as late as measured."""
+def _servo_delays(config: WorldConfig) -> np.ndarray:
+    """Damping divided by stiffness of each servo of the model [n], s."""
     model = world_model(config, visual=False)
     servos = list(find_addresses(model).actuators)
     stiffness, damping = model.actuator_gainprm[servos, 0], -model.actuator_biasprm[servos, 2]
-    own_delay = np.maximum(damping / stiffness, 1e-6)
-    # A command is held until the next: half a step more.
-    held = 0.5 * float(np.median(np.diff(log.target_times)))
-    total = max(following.delay - held, 2e-3)
+    return np.maximum(damping / stiffness, 1e-6)
+
+
+def _command_delay(log: Log, following: Following) -> float:
+    """The delay from a command to the angle, s, without the half step for which a command is held
+    until the next."""
+    return following.delay - 0.5 * float(np.median(np.diff(log.target_times)))
+
+
+def _late_servos(layout: Layout, config: WorldConfig, log: Log, following: Following) -> np.ndarray:
+    """Candidates [C, P] whose joints follow their commands as late as measured."""
+    own_delay = _servo_delays(config)
+    total = max(_command_delay(log, following), 2e-3)
     vectors = []
     for gain, servo_share, lag_share in itertools.product(_GAINS, _SERVO_SHARES, _LAG_SHARES):
         of_servo = servo_share * total
@@ -420,6 +499,42 @@ def _late_servos(layout: Layout, config: WorldConfig, log: Log, following: Follo
         }
         vectors.append(layout.clip(layout.vector(world)))
     return np.stack(vectors)
+
+
+def _stiff_follower(problem: Problem, config: WorldConfig, log: Log, following: Following) -> Fit:
+    """The arm that follows its commands as the simplest model does: late, with an offset of each
+    joint, by servos that are too stiff to matter."""
+    layout, windows = problem.layout, problem.windows
+    total = max(_command_delay(log, following), 0.0)
+    own_delay = _servo_delays(config)
+    vectors = []
+    for gain, longest in itertools.product(_STIFF_GAINS, _STIFF_DELAYS):
+        of_servo = max(min(longest, total), _STIFF_DELAYS[0])
+        world = {
+            "servo_gain": np.full(layout.num_joints, gain),
+            "servo_damping": gain * of_servo / own_delay,
+            "servo_offset": following.offsets,
+            "action_latency": max(total - of_servo, 0.0),
+            "servo_lag": 0.0,
+            "joint_frictionloss": np.zeros(layout.num_joints),
+        }
+        vectors.append(layout.clip(layout.vector(world)))
+    few = problem.weights(0.0, _sample(problem, np.any(windows.angle_weights > 0.0, axis=1)))
+    followers = [
+        minimise(problem, Fit(vector, windows.starts), [], few, 2, windows.arm_state)
+        for vector in vectors
+    ]
+    best = min(followers, key=lambda fit: np.sum(_joint_errors(windows, fit) ** 2))
+    return _with_offsets(problem, best._replace(starts=windows.starts))
+
+
+def _explains_better(problem: Problem, simple: Fit, fit: Fit) -> bool:
+    """Whether the simple arm leaves no more than the fit in windows that no search has seen."""
+    windows = problem.windows
+    unseen = problem.weights(0.0, 1.0 - _training(problem))
+    ends = [minimise(problem, x, [], unseen, 3, windows.arm_state) for x in (simple, fit)]
+    of_simple, of_fit = (float(np.sum(_joint_errors(windows, end) ** 2)) for end in ends)
+    return of_simple <= of_fit
 
 
 def _choose(
@@ -464,9 +579,12 @@ def _shift_flights(problem: Problem, fit: Fit, latency: float, friction: float) 
     vector, starts = fit.vector.copy(), fit.starts.copy()
     later = latency - vector[places["ball_latency"].start]
     vector[places["ball_latency"]], vector[places["contact_friction"]] = latency, friction
-    position, velocity = slice(2 * n, 2 * n + 3), slice(2 * n + 3, 2 * n + 6)
-    starts[:, position] += later * starts[:, velocity] + 0.5 * later**2 * GRAVITY
-    starts[:, velocity] += later * GRAVITY
+    position, velocity, spin = (slice(2 * n + i, 2 * n + i + 3) for i in (0, 3, 6))
+    lift = AIR_LIFT * problem.has_lift * starts[:, spin]
+    drag = vector[places["air_drag"]] * (1.0 + starts[:, -1])
+    pull = acceleration(starts[:, velocity], drag, lift)
+    starts[:, position] += later * starts[:, velocity] + 0.5 * later**2 * pull
+    starts[:, velocity] += later * pull
     return fit._replace(vector=vector, starts=starts)
 
 

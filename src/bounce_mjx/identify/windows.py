@@ -11,8 +11,10 @@ from numpy.polynomial.polynomial import polyfit
 from scipy.ndimage import minimum_filter1d
 
 from bounce_mjx.errors import UserError
+from bounce_mjx.identify.flight import fit_flight
 from bounce_mjx.identify.following import SETTLING, find_settled
 from bounce_mjx.identify.log import JOINT_GAP, Log
+from bounce_mjx.identify.unknowns import BALL
 
 MAX_DELAY = 0.08
 """Time before the first picture of a window at which its simulation starts, s; a picture may be
@@ -31,9 +33,14 @@ _PICTURE_GAP = 0.06
 _BOUNCING = 0.5
 # Time about a bounce at which pictures do not count, s: a flight's kink has no derivative.
 _AT_BOUNCE = 0.01
+BEFORE_BOUNCE = 0.012
+"""Time before a bounce at which a flight counts as over, s: the camera's jitter, half a contact."""
+GUESSED_DRAG = 0.1
+"""Drag of a ball with which the first guess of a flight is made, 1/m."""
+# Noise of a camera, m.
+_GUESSED_NOISE = np.full(3, 2e-3)
 # The ball in windows without one, m: so high above a model's origin it touches nothing.
 _NO_BALL = np.array([0.0, 0.0, 50.0])
-GRAVITY = np.array([0.0, 0.0, -9.81])
 
 
 class Windows(NamedTuple):
@@ -233,12 +240,13 @@ def _joint_start(log: Log, time: float) -> np.ndarray:
 
 
 def _ball_start(log: Log, pictures: np.ndarray, bounce: float, zero: float) -> np.ndarray:
-    """Position, velocity, spin and deviation of the drag [10] of the ball at a time, by a free fall
-    through the pictures before the bounce."""
+    """Position, velocity, spin and deviation of the drag [10] of the ball at a time, by a flight
+    without spin through the pictures before the bounce."""
     if not len(pictures):
         return np.concatenate([_NO_BALL, np.zeros(7)])
-    t = log.picture_times[pictures] - zero
-    before = t < bounce - 0.012
-    t, balls = t[before], log.ball_positions[pictures][before]
-    line = polyfit(t, balls - 0.5 * t[:, None] ** 2 * GRAVITY, 1)
-    return np.append(line.ravel(), np.zeros(4))
+    times = log.picture_times[pictures] - zero
+    before = times < bounce - BEFORE_BOUNCE
+    shown = times[before] - BALL["ball_latency"].mean
+    balls = log.ball_positions[pictures][before]
+    flight = fit_flight(shown, balls, _GUESSED_NOISE, GUESSED_DRAG)
+    return np.concatenate([flight.position, flight.velocity, np.zeros(4)])

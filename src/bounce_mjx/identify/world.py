@@ -126,6 +126,11 @@ def sentences(found: Identified, joint_names: Sequence[str]) -> list[str]:
     said = describe_doubts(found, joint_names)
     if found.gravity_compensation:
         said.append("The log shows that the controller carries the arm's weight.")
+    if found.is_follower:
+        said.append(
+            "A delay and a constant offset of each joint explain the angles in windows that the "
+            "search had not seen no worse than servos do: the world has these, and stiff servos."
+        )
     if found.dropped and found.dropped <= _MOST_FLY * np.sum(found.windows.has_ball):
         said.append(
             f"In {found.dropped} of {int(np.sum(found.windows.has_ball))} windows, the ball was "
@@ -206,11 +211,16 @@ def _describe_mistakes(found: Identified, joint_names: Sequence[str]) -> list[st
     means = layout.decode(layout.mean)
     off = np.abs(vector - layout.mean) / layout.deviation
     at_limit = np.any((layout.limits == vector) & (layout.limits != 0.0), axis=0)
+    is_judged = np.ones(len(vector), bool)
+    if found.is_follower:
+        # Its servos were chosen, not estimated.
+        for name in ("servo_gain", "servo_damping", "joint_frictionloss"):
+            is_judged[layout.terms[name]] = False
     said = [
         f"warning: {entry.label} is {entry.value:.4g} {entry.unit}".rstrip()
         + f", {off[i]:.1f} deviations of the prior from {means[i]:g}."
         for i, entry in enumerate(estimates(found, joint_names))
-        if off[i] > _SURPRISING or at_limit[i]
+        if is_judged[i] and (off[i] > _SURPRISING or at_limit[i])
     ]
     advice = _MISTAKES if np.any(found.windows.has_ball) else _ARM_MISTAKES
     return [*said, advice] if said else []

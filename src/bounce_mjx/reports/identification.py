@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from bounce_mjx.identify.doctor import Checkup
+from bounce_mjx.identify.doctor import Checkup, Joint
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.stages import Identified
 from bounce_mjx.identify.world import estimates, misfit, sentences
@@ -49,12 +49,17 @@ def _describe_logs(logs: Sequence[Log], checkups: Sequence[Checkup]) -> str:
             for joint in checkup.joints
         ]
         header = ["joint", "moves, rad", "slope", "offset, mrad", "delay, ms", "remainder, mrad"]
-        title = "Commanded, later by the delay (lines), and measured (dots)"
+        figures = {
+            "Commanded, later by the delay (wide lines), and measured (thin lines)": (
+                following_figure(log, checkup)
+            ),
+            "Measured less commanded, later by the delay": difference_figure(log, checkup),
+        }
         parts.append(
             f"<h2>{html.escape(log.source)}: angles against their commands</h2>\n<ul>"
             + "".join(f"<li>{html.escape(text)}</li>\n" for text in said)
             + f"</ul>\n{table(header, rows)}\n"
-            + figures_html({title: following_figure(log, checkup)})
+            + figures_html(figures)
         )
     return "\n".join(parts)
 
@@ -148,17 +153,41 @@ def _advise(doubts: Sequence[str], world: Path) -> str:
 
 @style()
 def following_figure(log: Log, checkup: Checkup) -> Figure:
-    """Each joint's command, later by the joint's delay (lines), and its measured angle (dots)."""
+    """Each joint's command, later by the joint's delay (wide lines), and its measured angle (thin
+    ones)."""
     figure, panels = make_panels(len(checkup.joints), 3, height=1.6)
-    rows = slice(None, None, max(len(log.times) // _DRAWN, 1))
-    times = log.times[rows]
+    rows = _drawn_rows(log)
     for j, (axes, joint) in enumerate(zip(panels, checkup.joints, strict=False)):
-        late = np.interp(times - joint.delay, log.target_times, log.servo_targets[:, j])
-        axes.plot(times, log.joint_angles[rows, j], ".", ms=2, color="C0")
-        axes.plot(times, late, lw=1, color="C1")
+        times = log.times[rows]
+        axes.plot(times, _late_command(log, j, joint, rows), lw=4, color="C1", alpha=0.5)
+        axes.plot(times, log.joint_angles[rows, j], lw=1, color="C0")
         axes.set_title(f"{joint.name}, rad")
         axes.set_xlabel("time, s")
     return figure
+
+
+@style()
+def difference_figure(log: Log, checkup: Checkup) -> Figure:
+    """Each joint's measured angle less its command, later by the joint's delay: an offset, a wrong
+    slope or a stretch of rows shows here where both curves look like one."""
+    figure, panels = make_panels(len(checkup.joints), 3, height=1.6)
+    rows = _drawn_rows(log)
+    for j, (axes, joint) in enumerate(zip(panels, checkup.joints, strict=False)):
+        off = log.joint_angles[rows, j] - _late_command(log, j, joint, rows)
+        axes.plot(log.times[rows], 1e3 * off, lw=1, color="C0")
+        axes.set_title(f"{joint.name}, mrad")
+        axes.set_xlabel("time, s")
+    return figure
+
+
+def _drawn_rows(log: Log) -> slice:
+    """The rows of a log that a figure draws."""
+    return slice(None, None, max(len(log.times) // _DRAWN, 1))
+
+
+def _late_command(log: Log, j: int, joint: Joint, rows: slice) -> np.ndarray:
+    """The command of joint j in some rows, later by its delay, rad."""
+    return np.interp(log.times[rows] - joint.delay, log.target_times, log.servo_targets[:, j])
 
 
 @style()
