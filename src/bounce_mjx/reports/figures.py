@@ -65,9 +65,7 @@ RUN_PLOTS: dict[str, RunPlot] = {}
 """The plots that `bounce-mjx plot` and the report draw, by the names of their files."""
 
 
-def run_plot(
-    name: str, title: str | None
-) -> Callable[[Draw], Draw]:
+def run_plot(name: str, title: str | None) -> Callable[[Draw], Draw]:
     """Registers a function as a `RunPlot`."""
 
     def register(draw: Draw) -> Draw:
