@@ -317,6 +317,9 @@ def test_an_arm_that_was_moved_starts_from_where_it_is() -> None:
     moves.until("ready")
     moves.check()
     np.testing.assert_allclose(moves.angles, HOME, atol=2e-3)
+    # At 0.3 rad/s, the speed of every way home.
+    speeds = 1000.0 * np.abs(np.diff(np.asarray(moves.rows[1:]), axis=0))
+    assert 0.29 < speeds.max() < 0.3 + 1e-6
 
 
 def test_joints_have_the_order_of_the_driver() -> None:

@@ -1,6 +1,10 @@
 """The training job: `train` is its loop, and `Job` has what the loop does.
 
 It is the same for every algorithm whose trainer is a `Trainer`.
+
+From a signal to its checkpoint: `StopRequest` notes the signal, the block goes on to its end
+(`train_block`), `is_stopping` ends the loop, and `finish` saves the state, waits until it is
+written, and raises `TrainingStopped` with the command that resumes the run.
 """
 
 import concurrent.futures
