@@ -14,7 +14,7 @@ from bounce_mjx.deploy.metadata import (
 )
 from bounce_mjx.deploy.motion import Motion
 from bounce_mjx.deploy.network import OnnxNetwork
-from bounce_mjx.deploy.samples import Measurements, Samples
+from bounce_mjx.deploy.samples import Measurements, Samples, check_mapping
 from bounce_mjx.deploy.supervisor import Supervisor
 from bounce_mjx.errors import MissingPackage, UserError
 
@@ -292,9 +292,10 @@ class DeployedPolicy:
           needs: as for `read`.
 
         Raises:
-          UserError: one is missing, unknown, of another shape, not finite, or a command in another
-            unit.
+          UserError: they have no names; or one is missing, unknown, of another shape, not finite,
+            or a command in another unit.
         """
+        check_mapping(measurements)
         for name in self.needs if needs is None else needs:
             if name not in measurements:
                 raise UserError(

@@ -5,6 +5,8 @@ raises. Each reason here is a row of the table in docs/real-robot.md.
 """
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -306,6 +308,15 @@ class Samples:
         measured |= {name: self._last[name] for name in names if name in measured}
         if "ball_age" in measured and names == _OF_BALL:
             measured["ball_age"] = np.array([self._now - self._taken])
+
+
+def check_mapping(measurements: Any) -> None:
+    """Raises UserError for measurements without names."""
+    if not isinstance(measurements, Mapping):
+        raise UserError(
+            f"the measurements are {str(measurements)[:100]!r}; give a mapping of their names, "
+            "such as joint_angles"
+        )
 
 
 def _longest(vectors: np.ndarray) -> float:

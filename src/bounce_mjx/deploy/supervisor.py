@@ -8,7 +8,7 @@ import numpy as np
 
 from bounce_mjx.deploy.faults import Fault, Watch, picture_age
 from bounce_mjx.deploy.motion import paddle_position
-from bounce_mjx.deploy.samples import UnconfirmedSample
+from bounce_mjx.deploy.samples import UnconfirmedSample, check_mapping
 from bounce_mjx.errors import UserError
 
 if TYPE_CHECKING:
@@ -142,6 +142,7 @@ class Supervisor:
 
     def _angles(self, measurements: Mapping[str, Any]) -> np.ndarray:
         """The joint angles [J], whatever else is measured."""
+        check_mapping(measurements)
         of_arm = {
             name: value for name, value in measurements.items() if name in ("joint_angles", "time")
         }
