@@ -64,7 +64,8 @@ class World(NamedTuple):
     """What a simulation differs in; the rest is the environment's model."""
 
     restitution: float = 0.85
-    friction: float = 0.0
+    friction: float | None = None
+    """None for that of the environment's model."""
     action_latency: float = 0.0
     ball_latency: float = 0.0
     timestep: float = 0.001
@@ -469,12 +470,20 @@ def maker(
       angles: of the joints [J], where the paddle is level.
     """
     if name != "mujoco":
+        if world.friction is None:
+            world = world._replace(friction=model_friction(model))
         tuning = tune(name, model, world, angles)
         return functools.partial(SIMULATORS[name], make_parts(model), world, tuning)
     delays = {"action_latency": world.action_latency, "ball_latency": world.ball_latency}
     if world != World(**delays):
         raise ValueError("mujoco simulates delays alone; bounce-mjx robustness has other worlds")
     return functools.partial(own_engine, model)
+
+
+def model_friction(model: mujoco.MjModel) -> float:
+    """Coefficient of sliding friction between ball and paddle in a compiled model."""
+    has_friction = model.pair_dim[0] > 1
+    return float(model.pair_friction[0, 0]) if has_friction else 0.0
 
 
 def drop(simulator: Simulator, parts: Parts, angles: np.ndarray, above: np.ndarray) -> float:
@@ -600,8 +609,9 @@ class Episode:
         except ImpossibleMeasurement as error:
             self.alarm = self.alarm or error.fault
         else:
-            last = self._targets[-1]
-            codes = [code for code, _ in self._watch.faults(measured, last) if code != "ball_lost"]
+            last, is_bridged = self._targets[-1], self.policy.samples.is_arm_bridged
+            faults = self._watch.faults(measured, last, is_bridged)
+            codes = [code for code, _ in faults if code != "ball_lost"]
             self.alarm = self.alarm or "".join(codes[:1])
             self.policy.act(measured)
         self.run(self.policy.commands(RATE))

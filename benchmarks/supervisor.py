@@ -125,7 +125,8 @@ def first_alarm(
                 return step, error.fault, bridged
             continue
         bridged += any(np.any(measured[name] != given[name]) for name in MEASURED)
-        found = list(watch.faults(measured, commands[step - 1] if step else angles[0]))
+        command = commands[step - 1] if step else angles[0]
+        found = list(watch.faults(measured, command, samples.is_arm_bridged))
         if found and step >= start:
             return step, found[0][0], bridged
     return len(angles), "", bridged

@@ -398,6 +398,22 @@ def test_zeros_of_a_driver_without_data_are_no_command() -> None:
             policy.step(seen(np.zeros(joints), 0, 0.3))
 
 
+def test_an_arm_without_lag_and_one_wrong_sample_are_no_fault() -> None:
+    for name in ("robust", "robust_small", "pretrained"):
+        arm, home, seen = supervised(name)
+        names = (*load_policy(name).needs, "ball_age", "time")
+        angles = home
+        for step in range(60):
+            given = seen(angles, step, 0.4 + 0.05 * math.sin(0.2 * step))
+            given["ball_velocity"] = [0.0, 0.0, math.cos(0.2 * step)]
+            if arm.state == "ready":
+                arm.start()
+            if step in (30, 40):
+                given["joint_angles"] = angles + [0.0, 0.0, 0.0, 3.0, 0.0, 0.0]
+            angles = arm.commands({key: given[key] for key in names})[-1]
+        assert arm.state == "running", arm.reason
+
+
 def test_a_wrong_first_sample_of_a_joint_is_no_command() -> None:
     for name, joint, size in (("robust", 1, 0.5), ("ur5e", 0, 0.5), ("iiwa", 1, 0.25)):
         arm, home, seen = supervised(name)
@@ -506,3 +522,7 @@ def test_complex_angles_and_hidden_balls_are_no_measurements() -> None:
     ):
         with pytest.raises(UserError, match=words):
             policy.step(measured(**wrong))
+    for wrong in (None, []):
+        for call in (policy.step, policy.supervise(500).commands):
+            with pytest.raises(UserError, match="give a mapping of their names"):
+                call(wrong)

@@ -58,6 +58,43 @@ randomization: {command_interval: [0.01, 0.02]}          # one control step
 action: {base: target, max_lead: 0.001}                  # less than an action moves
 action: {max_lead: 0.3}                                  # does nothing with the base measured
 randomization: {push_interval: [1, 2]}                   # does nothing without push_speed
+robot: {site: s, ball: {mass: 2.7}}                      # g
+robot: {site: s, paddle: {position: [0, 0, 190]}}        # mm
+robot: {site: s, servo_stiffness: [20e+6, 20e+6]}        # N mm/rad
+robot: {site: s, servo_damping: [2e+6, 2e+6]}            # N mm s/rad
+robot: {site: s, servo_force_limit: [150000, 150000]}    # N mm
+robot: {site: s, servo_force_limit: [0.001, 0.001]}      # kN m
+robot: {limits: {velocity: [3], acceleration: [20000]}}  # degrees a second squared
+robot: {limits: {torque: [150000]}}                      # N mm
+robot: {gravity_compensation: 100}                       # %
+physics_dt: 1                                            # ms
+control_dt: 100                                          # Hz
+friction: 30                                             # %
+action_scale: 20                                         # mrad
+reset: {ball_position: 10}                               # mm
+reset: {joint_velocities: 57}                            # degrees a second
+action: {base: target, max_lead: 8.6}                    # degrees
+randomization: {restitution: [75, 90]}                   # %
+randomization: {camera_rate: [0.06, 0.12]}               # kHz
+randomization: {frame_drop: [5, 10]}                     # %
+randomization: {ball_position_noise: [0.3, 0.5]}         # cm
+randomization: {ball_position_bias: [-0.5, 0.5]}         # cm
+randomization: {ball_velocity_noise: [50, 100]}          # mm/s
+randomization: {joint_angle_noise: [0, 0.06]}            # degrees
+randomization: {joint_velocity_noise: [1, 3]}            # degrees a second
+randomization: {joint_velocity_bias: [-3, 3]}            # degrees a second
+randomization: {encoder_bias: [-1, 1]}                   # degrees
+randomization: {servo_offset: [-0.5, 0.5]}               # degrees
+randomization: {servo_lag: [10, 45]}                     # ms
+randomization: {contact_friction: [20, 60]}              # %
+randomization: {paddle_offset: [-0.5, 0.5]}              # cm
+randomization: {link_mass: [90, 110]}                    # %
+randomization: {ball_radius: [95, 105]}                  # %
+randomization: {ball_start: [-30, 30]}                   # mm
+randomization: {joint_start: [-5, 5]}                    # degrees
+randomization: {command_interval: [3000, 4000]}          # ms
+default_joint_angles: [0, 0.111, 0.306, 0, -0.167, 0]    # turns
+target_height_range: [40, 60]                            # cm
 max_joint_velocity: true                                 # a switch is no number
 friction: true                                           # the same, where null is allowed
 target_height_range: [true, 2]                           # and in a list
@@ -112,7 +149,27 @@ def test_a_range_of_a_task_is_refused_by_name(name: str, env: dict, reason: str)
     assert reason in str(caught.value)
 
 
+# What a world can hold as well: a number in a wrong unit that is a sensible one in the right unit.
+ALLOWED = """
+randomization: {ball_mass: [2.7, 3]}                     # g: a factor, of a ball of 7 g
+randomization: {servo_gain: [80, 120]}                   # %: a factor, of very stiff servos
+randomization: {camera_rate: [8, 33]}                    # ms: a slow camera
+randomization: {joint_angle_noise: [0, 0.03]}            # degrees: a coarse encoder
+randomization: {command_interval: [0.05, 0.1]}           # minutes: commands that hardly rest
+reset: {joint_velocities: 0.57}                          # degrees a second: a quick start
+"""
+
 ACCEPTED = """
+# the edges of what was measured: a soft paddle, a table-tennis ball, arms heavier than the model
+bounce: {randomization: {restitution: [0.55, 0.55]}}
+bounce: {robot: {site: s, ball: {mass: 0.0027}}}
+bounce: {randomization: {link_mass: [5, 20], joint_frictionloss: [0, 100]}}
+# an encoder of 512 counts a turn, a camera with 5 cm of noise
+bounce: {randomization: {joint_angle_noise: [0.0, 0.012], ball_position_noise: [0.0, 0.05]}}
+# servos of a small arm and of a gantry
+bounce: {robot: {site: s, servo_stiffness: [5], servo_damping: [0.1], servo_force_limit: [0.3]}}
+bounce: {robot: {site: s, servo_stiffness: [2e+6], servo_damping: [5e+4],
+  servo_force_limit: [1e+4]}}
 # a 3 m gantry
 bounce: {default_joint_angles: [3, -3, 1.5], ball_init_pos: [3, -3, 2], min_ball_height: 1.5,
   target_height_range: [2, 2.5], max_horizontal_distance: 4, action_scale: 0.1}
@@ -135,6 +192,14 @@ bounce: {physics_dt: 0.0005, control_dt: 0.001}
 juggle: {height_range: [1, 3], max_distance: 4}
 track: {home: [1.5, 0.5, 1], path_size: 0.5}
 """
+
+
+def test_a_sensible_number_is_accepted_whatever_unit_was_meant() -> None:
+    """Of 87 wrong units, six cannot be told from a world that someone may want."""
+    lines = ALLOWED.strip().splitlines()
+    for line in lines:
+        config("bounce", **yaml.safe_load(line))
+    assert (len(lines), len(WRONG.strip().splitlines())) == (6, 81)
 
 
 @pytest.mark.parametrize("case", re.findall(r"^\w[^#]+?\n(?=\w|#|$)", ACCEPTED, re.MULTILINE))

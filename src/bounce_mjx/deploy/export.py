@@ -44,16 +44,19 @@ from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import Checkpoint
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.observation import ObservationConfig
-from bounce_mjx.world.randomization import entries
+from bounce_mjx.world.randomization import RandomizationConfig, entries
 
 # Versions of 2022, which onnxruntime reads from 1.14 on.
-_OPSET, _IR_VERSION = 17, 8
+_OPSET = 17
+_IR_VERSION = 8
 
 # An input and the output cannot share a name.
 _INPUT_NAMES = {"action": "past_actions"}
 
 # Episodes and control steps of a policy's own play, and the margin of its largest step.
-_OWN_EPISODES, _OWN_STEPS, _MARGIN = 64, 300, 1.25
+_OWN_EPISODES = 64
+_OWN_STEPS = 300
+_MARGIN = 1.25
 
 _ACTION = (
     "servo target of joint i in rad = clip(base[i] + action_scale * action[i], joint_ranges[i]), "
@@ -115,11 +118,14 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
       UserError: the MJCF file is missing, its paddle hangs on a joint that is not a hinge with a
         servo, or a command has the name of a measurement.
     """
-    env, given = config.env, config.env.robot.limits
-    limits, largest_steps = None, [env.action_scale] * env.num_joints
-    if given.velocity is not None:
-        limits = CommandLimits(given.velocity, given.acceleration, given.jerk)
-        largest_steps = [speed * env.control_dt for speed in given.velocity]
+    env = config.env
+    arm_limits = env.robot.limits
+    if arm_limits.velocity is None:
+        limits = None
+        largest_steps = [env.action_scale] * env.num_joints
+    else:
+        limits = CommandLimits(arm_limits.velocity, arm_limits.acceleration, arm_limits.jerk)
+        largest_steps = [speed * env.control_dt for speed in arm_limits.velocity]
     displacement = env.randomization.joint_start or (0.0, 0.0)
     if taken := env.commands.keys() & UNITS.keys():
         raise UserError(
@@ -163,12 +169,7 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
             name: CommandRange((command.low, command.high), command.unit)
             for name, command in env.commands.items()
         },
-        randomization={
-            f"{name}[{i}]" if len(own) > 1 else name: ends
-            for name in env.randomization.terms
-            for own in [entries(getattr(env.randomization, name))]
-            for i, ends in enumerate(own)
-        },
+        randomization=_ranges(env.randomization),
         chain=chain,
         paddle=paddle,
         paddle_normal=normal,
@@ -182,6 +183,18 @@ def _environment(env: WorldConfig) -> dict[str, Any]:
     if env.mjcf is not None:
         values["mjcf"] = str(env.mjcf) if is_packaged(env.mjcf) else env.mjcf.name
     return values
+
+
+def _ranges(randomization: RandomizationConfig) -> dict[str, tuple[float, float]]:
+    """The ranges of the active terms, each axis or joint with its own under `name[i]`."""
+    ranges = {}
+    for name in randomization.terms:
+        entry_ranges = entries(getattr(randomization, name))
+        if len(entry_ranges) == 1:
+            ranges[name] = entry_ranges[0]
+        else:
+            ranges |= {f"{name}[{i}]": ends for i, ends in enumerate(entry_ranges)}
+    return ranges
 
 
 def largest_step(config: WorldConfig, act: Callable[[jax.Array], jax.Array]) -> float:
@@ -235,15 +248,18 @@ def _hinges(
 
     With the joints at their references, every hinge's frame has the axes of the world.
     """
-    addresses, data = find_addresses(m), mujoco.MjData(m)
+    addresses = find_addresses(m)
+    data = mujoco.MjData(m)
     mujoco.mj_kinematics(m, data)
     body = m.geom_bodyid[addresses.paddle_geom]
     moving = m.body_weldid[body]
-    dof, joints = m.body_dofadr[moving] + m.body_dofnum[moving] - 1, []
+    joints = []
+    dof = m.body_dofadr[moving] + m.body_dofnum[moving] - 1
     while dof >= 0:
         joints.append(int(m.dof_jntid[dof]))
         dof = m.dof_parentid[dof]
-    anchor, links = np.zeros(3), []
+    links = []
+    anchor = np.zeros(3)
     for joint in reversed(joints):
         is_hinge = m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
         if joint not in addresses.arm_joints or not is_hinge:
@@ -276,10 +292,11 @@ def _control_step(
 ) -> tuple[Callable[[dict], dict], dict[str, jax.ShapeDtypeStruct]]:
     """A control step as a function of named arrays, and their shapes: the action, and what the task
     remembers of the measurements, as the environment computes it."""
-    task, own = env.task(env), env.observation.lengths("task")
+    task = env.task(env)
+    of_task = env.observation.lengths("task")
     inputs = {part.name: _floats(part.history, part.size) for part in _inputs(env)}
-    if not own:
-        return lambda given: {"action": network(given)}, inputs
+    if not of_task:
+        return lambda histories: {"action": network(histories)}, inputs
     rows = (env.num_balls,) if env.num_balls > 1 else ()
     measured = {
         name: _floats(*(rows if quantity.per_ball else ()), quantity.entries(env.num_joints, 1))
@@ -293,20 +310,23 @@ def _control_step(
         for path, leaf in leaves
     }
 
-    def control_step(given: dict[str, jax.Array]) -> dict[str, jax.Array]:
-        values = {n: given[f"{MEASURED}{n}"].reshape(x.shape) for n, x in measured.items()}
-        past = {name: given[name] for name in own}
-        before = tree.unflatten([given[name] for name in memory])
+    def control_step(rows: dict[str, jax.Array]) -> dict[str, jax.Array]:
+        values = {
+            name: rows[f"{MEASURED}{name}"].reshape(shaped.shape)
+            for name, shaped in measured.items()
+        }
+        past = {name: rows[name] for name in of_task}
+        before = tree.unflatten([rows[name] for name in memory])
         start, first = task.first_quantities(values)
         after, later = task.next_quantities(before, past, values)
-        first = {name: jnp.broadcast_to(first[name], past[name].shape) for name in own}
+        first = {name: jnp.broadcast_to(first[name], past[name].shape) for name in of_task}
         remembered, seen = jax.tree.map(
-            lambda new, next_one: jnp.where(given[IS_FIRST], new, next_one),
+            lambda new, next_one: jnp.where(rows[IS_FIRST], new, next_one),
             (start, first),
-            (after, {name: later[name] for name in own}),
+            (after, {name: later[name] for name in of_task}),
         )
         kept = seen | dict(zip(memory, jax.tree.leaves(remembered), strict=True))
-        action = {"action": network(given | seen)}
+        action = {"action": network(rows | seen)}
         return action | {f"{NEXT}{name}": value for name, value in kept.items()}
 
     inputs |= {f"{MEASURED}{n}": _floats(x.size) for n, x in measured.items()}

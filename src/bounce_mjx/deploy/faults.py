@@ -12,22 +12,29 @@ from bounce_mjx.deploy.samples import RESOLUTION, Measurements
 
 # Time of a joint's motion that is compared with the training's arms, s.
 _COMPARED = 0.25
-# Latencies of these arms: their distance, and the largest beyond the training's, s.
-_APART, _LATER = 0.01, 0.02
+# Distance of these arms' latencies, and how much later than the training's the last one is, s.
+_APART = 0.01
+_LATER = 0.02
+_NO_LAG = 1e-9
 # Motion beside all these arms that is too much: a share of what the commands moved meanwhile, a
 # share of `action_scale`, the encoders' noise in standard deviations, and a count of the encoder.
 # In 32 episodes of each of four policies, at most 0.65 of it was beside the nearest arm.
-_OF_COMMANDS, _OF_SCALE, _OF_NOISE = 0.25, {"target": 0.2, "measured": 0.05}, 3.0
+_OF_COMMANDS = 0.25
+_OF_SCALE = {"target": 0.2, "measured": 0.05}
+_OF_NOISE = 3.0
 # The same for a joint whose reading repeats to the last digit all the time: what dry friction
 # holds, rad, and counts of the encoder.
-_HELD, _COUNTS = 1e-3, 2.0
+_HELD = 1e-3
+_COUNTS = 2.0
 # Distance from all these arms that is too far, rad.
 _OFFSET = 0.05
 # What a resting joint may be off its command beside the encoder's bias: its load, rad.
 _SAG = 0.01
 # A ball so far below the paddle, or beside it without coming nearer, is lost; one so far above it
 # flies, m.
-_BELOW, _BESIDE, _FLYING = 0.1, 0.9, 0.05
+_BELOW = 0.1
+_BESIDE = 0.9
+_FLYING = 0.05
 # Pictures in which the noise is smaller than the motion of a ball that comes nearer.
 _EARLIER = 5
 # Difference of two clocks, s.
@@ -49,14 +56,15 @@ def arm_responses(metadata: Metadata) -> np.ndarray:
     the newest first, in the next measured angle, for arms of all latencies and lags.
 
     An arm is a servo, a first-order lag of the time constant damping / stiffness, behind the lag
-    and the latency of the randomisation.
+    and the latency of the randomisation; or an ideal servo, without any lag.
     """
-    dt, latency = metadata.control_dt, largest_term(metadata, "action_latency")
+    dt = metadata.control_dt
+    latency = largest_term(metadata, "action_latency")
     lag = float(np.max(np.divide(metadata.servo_damping, metadata.servo_stiffness)))
     slower = largest_term(metadata, "servo_damping", 1.0) / least_term(metadata, "servo_gain", 1.0)
     slowest = lag * slower + largest_term(metadata, "servo_lag")
     latencies = np.arange(0.0, latency + _LATER + 1e-9, _APART) / dt
-    lags = np.linspace(lag, slowest, 3 if slowest > 1.5 * lag else 1)
+    lags = [_NO_LAG, *np.linspace(lag, slowest, 3 if slowest > 1.5 * lag else 1)]
     length = math.ceil(latencies[-1] + 4.0 * slowest / dt) + 1
     steps = np.arange(length)
     responses = []
@@ -78,13 +86,14 @@ class Watch:
         Args:
           max_picture_age: of the ball's picture, s.
         """
-        self._metadata, self._max_age, dt = metadata, max_picture_age, metadata.control_dt
+        self._metadata = metadata
+        self._max_age = max_picture_age
         self.offset = _SAG + largest_term(metadata, "encoder_bias")
         """Distance of a resting joint from its command, rad."""
         noise = largest_term(metadata, "joint_angle_noise")
         self._least = _OF_SCALE[metadata.action_base] * metadata.action_scale + _OF_NOISE * noise
         self._arms = arm_responses(metadata)
-        self._compared = math.ceil(_COMPARED / dt)
+        self._compared = math.ceil(_COMPARED / metadata.control_dt)
 
     def rest(self, angles: np.ndarray, command: np.ndarray) -> None:
         """The arm has rested at these angles [J], commanded to be there [J]."""
@@ -102,14 +111,19 @@ class Watch:
         self._time = 0.0
         self._pictures: list[tuple[np.ndarray, float]] = []
 
-    def arm_faults(self, angles: np.ndarray, command: np.ndarray) -> Iterator[Fault]:
+    def arm_faults(
+        self, angles: np.ndarray, command: np.ndarray, is_bridged: bool = False
+    ) -> Iterator[Fault]:
         """A joint that does not move as any arm of the training would.
 
         Args:
           angles: measured [J], rad.
           command: at the end of the step before [J], rad.
+          is_bridged: whether the angles are those of the step before, which say nothing of this.
         """
         self._commands = np.concatenate([command[None], self._commands[:-1]])
+        if is_bridged:
+            return
         beside = angles - self._arms @ self._commands[: self._arms.shape[1]]
         self._beside = np.concatenate([self._beside[1:], beside[None]])
         self._note_change(angles)
@@ -142,13 +156,16 @@ class Watch:
         of_repeating = np.minimum(allowed, _HELD + _COUNTS * self._count)
         return np.where(self._repeats >= self._compared, of_repeating, allowed)
 
-    def faults(self, measured: Measurements, command: np.ndarray) -> Iterator[Fault]:
+    def faults(
+        self, measured: Measurements, command: np.ndarray, is_bridged: bool = False
+    ) -> Iterator[Fault]:
         """The faults of a control step of an episode.
 
         Args:
           measured: `joint_angles` and what else a policy measures, as for `OnnxNetwork.step`, and
             `time` [1].
-          command: see `arm_faults`.
+          command: as for `arm_faults`.
+          is_bridged: as for `arm_faults`.
         """
         if "time" in measured:
             self._time = float(measured["time"][0])
@@ -158,7 +175,7 @@ class Watch:
             age = float(measured["ball_age"][0]) if "ball_age" in measured else None
             paddle = paddle_position(self._metadata, measured["joint_angles"])
             yield from self._ball_faults(measured["ball_position"].reshape(-1, 3), age, paddle)
-        yield from self.arm_faults(measured["joint_angles"], command)
+        yield from self.arm_faults(measured["joint_angles"], command, is_bridged)
 
     def _ball_faults(
         self, balls: np.ndarray, age: float | None, paddle: np.ndarray

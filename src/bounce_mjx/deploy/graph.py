@@ -116,7 +116,8 @@ def _sources(equation: JaxprEqn, indices: Mapping[int, np.ndarray]) -> tuple[lis
       another; a place outside of them is that of an index out of bounds. And the number of those
       entries.
     """
-    operands, count = [], 0
+    operands = []
+    count = 0
     for i, atom in enumerate(equation.invars):
         if i in indices:
             operands.append(indices[i])
@@ -138,7 +139,9 @@ class _Graph:
     def __init__(self, owner: str):
         from onnx import helper, numpy_helper
 
-        self.helper, self._from_array, self._owner = helper, numpy_helper.from_array, owner
+        self.helper = helper
+        self._from_array = numpy_helper.from_array
+        self._owner = owner
         self.nodes: list[Any] = []
         self.constants: dict[tuple, Any] = {}
 
@@ -159,7 +162,8 @@ class _Graph:
         return [value(atom) for atom in jaxpr.outvars]
 
     def _results(self, equation: JaxprEqn, operands: list[Value]) -> list[Value]:
-        name, atoms = equation.primitive.name, equation.invars
+        name = equation.primitive.name
+        atoms = equation.invars
         if name in _INLINED:
             inner = equation.params[_INLINED[name]]
             return self.run(inner.jaxpr, inner.consts, operands)
@@ -191,7 +195,8 @@ class _Graph:
 
     def _move(self, equation: JaxprEqn, operands: list[Value]) -> list[Value]:
         """Results that hold the operands' numbers at other places."""
-        indices, numbers = {}, []
+        indices = {}
+        numbers = []
         for i, (value, atom) in enumerate(zip(operands, equation.invars, strict=True)):
             if i not in _INDICES.get(equation.primitive.name, ()):
                 size = math.prod(atom.aval.shape)

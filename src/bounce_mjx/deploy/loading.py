@@ -34,7 +34,8 @@ def load_policy(
       UserError: there is no such policy, the file is damaged, the names are not those of the
         policy's robot, or the environment is not the policy's.
     """
-    path, source = Path(policy), str(policy)
+    path = Path(policy)
+    source = str(policy)
     if policy in POLICIES:
         path = resource_path(f"{POLICIES[policy]}/{policy}.onnx")
         source = f"the policy {policy}"
@@ -74,16 +75,21 @@ def _use_environment(policy: DeployedPolicy, name: str, env: Any) -> None:
     policy.use_observations(places, config.layout.size)
 
 
-def check_names(names: Sequence[str], own: Sequence[str], option: str) -> tuple[str, ...]:
-    """A driver's names of a robot's joints, which has its own names for them.
+def check_names(names: Sequence[str], joints: Sequence[str], option: str) -> tuple[str, ...]:
+    """A driver's names of a robot's joints.
+
+    Args:
+      joints: the robot's own names.
+      option: what has the driver's names, for the error.
 
     Raises:
       UserError: their number differs, or a name is given twice.
     """
-    if not len(set(names)) == len(names) == len(own):
+    if not len(set(names)) == len(names) == len(joints):
         raise UserError(
             f"{option} has {len(names)} names, {len(set(names))} of them different, and the robot "
-            f"has the {len(own)} joints {', '.join(own)}; give one name for each, in this order"
+            f"has the {len(joints)} joints {', '.join(joints)}; give one name for each, in this "
+            "order"
         )
     return tuple(names)
 

@@ -4,8 +4,11 @@ Every entry is JSON under the name of its field in `Metadata`.
 """
 
 import json
+import math
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
+
+import numpy as np
 
 FORMAT = 4
 """Version of the entries; readers refuse other versions."""
@@ -32,10 +35,13 @@ PER_BALL = {
 
 Vector = tuple[float, float, float]
 
-IS_FIRST, MEASURED, NEXT = "step/is_first", "measured/", "next/"
-"""Names in the graph of a policy whose task remembers measurements: an input, which is true in the
-first step; what precedes a quantity's newest value; and what precedes an output for the input of
-the same name in the next step."""
+# Names in the graph of a policy whose task remembers measurements.
+IS_FIRST = "step/is_first"
+"""The input that is true in the first step."""
+MEASURED = "measured/"
+"""What precedes the name of a quantity's newest value, an input."""
+NEXT = "next/"
+"""What precedes the name of an output for the input of the same name in the next step."""
 
 
 # Fields with a number for each joint.
@@ -183,16 +189,28 @@ def measurement_sizes(metadata: Metadata) -> dict[str, int]:
     return {name: sizes.get(name, 1) for name in (*UNITS, *metadata.commands)}
 
 
+def joint_ends(metadata: Metadata) -> np.ndarray:
+    """Lower and upper ends [2, J] of the joints' ranges, rad; infinite for a joint without one."""
+    everywhere = (-math.inf, math.inf)
+    ranges = [everywhere if ends is None else ends for ends in metadata.joint_ranges]
+    return np.array(ranges).T
+
+
 def largest_term(metadata: Metadata, term: str, default: float = 0.0) -> float:
     """Largest absolute value of a randomisation term over axes and joints."""
-    ranges = [x for name, x in metadata.randomization.items() if name.split("[")[0] == term]
-    return max((max(map(abs, ends)) for ends in ranges), default=default)
+    ranges = _ranges_of(metadata, term)
+    return max((max(abs(low), abs(high)) for low, high in ranges), default=default)
 
 
 def least_term(metadata: Metadata, term: str, default: float) -> float:
     """Lowest end of a randomisation term over axes and joints."""
-    ranges = [x for name, x in metadata.randomization.items() if name.split("[")[0] == term]
-    return min((low for low, _ in ranges), default=default)
+    return min((low for low, _ in _ranges_of(metadata, term)), default=default)
+
+
+def _ranges_of(metadata: Metadata, term: str) -> list[tuple[float, float]]:
+    """The ranges of a randomisation term, of each axis or joint."""
+    ranges = metadata.randomization.items()
+    return [ends for name, ends in ranges if name.split("[")[0] == term]
 
 
 def to_entries(metadata: Metadata) -> dict[str, str]:
@@ -211,7 +229,8 @@ def from_entries(entries: dict[str, str]) -> Metadata:
         raise ValueError(f"its metadata lacks {missing[0]}")
     stored = [name for name in Metadata._fields if name in entries]
     values = later | {name: _with_tuples(json.loads(entries[name])) for name in stored}
-    limits, commands = values["limits"], values["commands"]
+    limits = values["limits"]
+    commands = values["commands"]
     groups = {
         "ball": BallBounds(**values["ball"]),
         "observation": tuple(Input(**part) for part in values["observation"]),

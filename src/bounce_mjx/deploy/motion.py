@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bounce_mjx.deploy.metadata import Metadata
+from bounce_mjx.deploy.metadata import Metadata, joint_ends
 from bounce_mjx.robot.setpoints import Setpoint, command, joint_limits, next_setpoint
 
 
@@ -15,10 +15,9 @@ class Motion:
     """
 
     def __init__(self, metadata: Metadata):
-        self._duration, self._largest_step = metadata.control_dt, np.array(metadata.largest_step)
-        self.ranges = np.array(
-            [(-np.inf, np.inf) if x is None else x for x in metadata.joint_ranges]
-        ).T
+        self._duration = metadata.control_dt
+        self._largest_step = np.array(metadata.largest_step)
+        self.ranges = joint_ends(metadata)
         """Lower and upper ends [2, J] of the joints' ranges, rad."""
         self._limits = joint_limits(metadata.limits, *self.ranges)
         self._still = np.zeros(len(metadata.joint_names))
@@ -75,8 +74,9 @@ class Motion:
         )
         # An arm beyond its range comes back by its own speed.
         low, high = self.ranges
-        low, high = np.minimum(low, start), np.maximum(high, start)
-        target = np.minimum(np.maximum(target, low), high)
+        lowest = np.minimum(low, start)
+        highest = np.maximum(high, start)
+        target = np.minimum(np.maximum(target, lowest), highest)
         if self._limits is None:
             self.end = self._resting(target)
         else:
@@ -99,8 +99,8 @@ class Motion:
         """Commands [M, J] at times [M] since the start of the control step, s."""
         if self._limits is None or self.start is None:
             return np.tile(self.end.position, (len(times), 1))
-        acceleration, smoothing = self.end.acceleration, self._limits.smoothing
-        return command(self.start, acceleration, np.asarray(times)[:, None], np, smoothing)
+        since_start = np.asarray(times)[:, None]
+        return command(self.start, self.end.acceleration, since_start, np, self._limits.smoothing)
 
 
 def paddle_position(metadata: Metadata, joint_angles: np.ndarray) -> np.ndarray:
@@ -113,8 +113,10 @@ def paddle_position(metadata: Metadata, joint_angles: np.ndarray) -> np.ndarray:
     cosines, sines = (x.tolist() if x.ndim == 1 else x for x in numbers)
     x, y, z = metadata.paddle
     for i in reversed(range(len(joints))):
-        (a, b, c), (left, ahead, up) = metadata.chain[i].axis, metadata.chain[i].position
-        cosine, sine = cosines[i], sines[i]
+        a, b, c = metadata.chain[i].axis
+        left, ahead, up = metadata.chain[i].position
+        cosine = cosines[i]
+        sine = sines[i]
         along = (1.0 - cosine) * (a * x + b * y + c * z)
         x, y, z = (
             left + cosine * x + sine * (b * z - c * y) + along * a,

@@ -45,9 +45,14 @@ class OnnxNetwork:
             if output.name != "action"
         }
         self._outputs = ["action", *(f"{NEXT}{name}" for name in self._remembered)]
-        own = [part for part in self.metadata.observation if part.name not in self._remembered]
-        self._sizes = {part.name: (part.history, part.size) for part in own}
-        self._measured = [n.removeprefix(MEASURED) for n in self._inputs if n.startswith(MEASURED)]
+        self._sizes = {
+            part.name: (part.history, part.size)
+            for part in self.metadata.observation
+            if part.name not in self._remembered
+        }
+        self._measured = [
+            name.removeprefix(MEASURED) for name in self._inputs if name.startswith(MEASURED)
+        ]
         self.reads = {*self._measured, *self._sizes}
         """Names of the quantities that the action depends on."""
         self._order: np.ndarray | None = None
@@ -67,8 +72,8 @@ class OnnxNetwork:
         self._memory = self._remembered
         self._histories = {name: np.zeros(size) for name, size in self._sizes.items()}
         self._rows = {
-            name: np.zeros((1, *given.shape[1:]), _TYPES[given.type])
-            for name, given in self._inputs.items()
+            name: np.zeros((1, *row.shape[1:]), _TYPES[row.type])
+            for name, row in self._inputs.items()
             if name not in self._memory
         }
         balls = np.zeros(3 * self.metadata.num_balls)
@@ -120,7 +125,8 @@ class OnnxNetwork:
                 ordered = np.empty_like(newest[name])
                 ordered[self._order] = newest[name]
                 newest[name] = ordered
-        newest["action"], newest["ball_picture"] = newest["past_actions"], newest["ball_position"]
+        newest["action"] = newest["past_actions"]
+        newest["ball_picture"] = newest["ball_position"]
         if "paddle_position" in self.reads:
             paddle = paddle_position(self.metadata, newest["joint_angles"])
             newest["paddle_position"] = paddle
@@ -140,15 +146,22 @@ class OnnxNetwork:
     def _difference(self, measured: Measurements) -> np.ndarray:
         """Velocity of the ball by the difference of its last two pictures; updates the last one.
         Without a measured age, a picture is new as soon as the position differs."""
-        position, age = measured["ball_position"], measured.get("ball_age")
+        position = measured["ball_position"]
+        age = measured["ball_age"][0] if "ball_age" in measured else None
         if self._picture is None:
-            self._picture = position, self._unknown["ball_velocity"], 0.0 if age is None else age[0]
-            return self._picture[1]
-        ball, velocity, last_age = self._picture
+            velocity = self._unknown["ball_velocity"]
+            self._picture = position, velocity, age or 0.0
+            return velocity
+        last_position, velocity, last_age = self._picture
+        # The age of the last picture now.
         held_age = last_age + self.metadata.control_dt
-        is_new = np.any(position != ball) if age is None else held_age - age[0] > _SAME_PICTURE
-        now = (0.0 if is_new else held_age) if age is None else age[0]
+        if age is None:
+            is_new = np.any(position != last_position)
+            age = 0.0 if is_new else held_age
+        else:
+            is_new = held_age - age > _SAME_PICTURE
         if is_new:
-            velocity, ball = (position - ball) / max(held_age - now, _SHORTEST), position
-        self._picture = ball, velocity, now
+            velocity = (position - last_position) / max(held_age - age, _SHORTEST)
+            last_position = position
+        self._picture = last_position, velocity, age
         return velocity

@@ -20,7 +20,8 @@ from bounce_mjx.errors import MissingPackage, UserError
 
 _MAX_PAUSE = 1.0
 # Measurements and times beyond them are not of a robot.
-_LARGEST, _LARGEST_TIME = 1e6, 1e15
+_LARGEST = 1e6
+_LARGEST_TIME = 1e15
 # A command outside its range that no world can hold, at least.
 _OUTSIDE = 0.5
 # Resolution of a time as a share of a control step.
@@ -94,7 +95,8 @@ class DeployedPolicy:
         order = _joint_order(names, self.metadata)
         self._network.use_order(order)
         self.metadata = in_driver_order(self.metadata, tuple(names), order)
-        self.motion, self.samples = Motion(self.metadata), Samples(self.metadata)
+        self.motion = Motion(self.metadata)
+        self.samples = Samples(self.metadata)
         self.reset()
 
     def use_observations(self, places: Mapping[str, slice], size: int) -> None:
@@ -204,7 +206,8 @@ class DeployedPolicy:
                     for name, value in measured.items()
                 }
             action = self._network.step(between, self._action)
-        self._measured, self._action = measured, action
+        self._measured = measured
+        self._action = action
         self.step_number += steps
         if self._first is None and "time" in measured:
             self._first = float(measured["time"][0]) - self.step_number * self.metadata.control_dt
@@ -279,7 +282,8 @@ class DeployedPolicy:
 
     def _act(self, action: np.ndarray) -> None:
         """Aims the commands of the control step at the targets of an action [J]."""
-        base, lead = self._measured["joint_angles"], self.metadata.max_lead
+        base = self._measured["joint_angles"]
+        lead = self.metadata.max_lead
         if lead is not None:
             base = np.clip(self.motion.start.position, base - lead, base + lead)
         self.motion.aim(base + self.metadata.action_scale * action)
@@ -309,8 +313,8 @@ class DeployedPolicy:
           needs: as for `read`.
 
         Raises:
-          UserError: one is missing, unknown, of another shape, not finite, or a command in another
-            unit.
+          UserError: they have no names; or one is missing, unknown, of another shape, not finite,
+            or a command in another unit.
         """
         if not isinstance(measurements, Mapping):
             measurements = self._in_observation(measurements)
@@ -378,7 +382,8 @@ class DeployedPolicy:
         """
         if "time" not in measured or self._first is None:
             return 1
-        time, dt = float(measured["time"][0]), self.metadata.control_dt
+        time = float(measured["time"][0])
+        dt = self.metadata.control_dt
         elapsed = time - self._first - self.step_number * dt
         if abs(elapsed) > _MAX_PAUSE - 1e-6:
             raise UserError(
@@ -394,26 +399,27 @@ def _joint_order(names: Sequence[str] | Mapping[str, str], metadata: Metadata) -
     Raises:
       UserError: the names are not those of the policy's robot.
     """
-    own = metadata.joint_names
+    joints = metadata.joint_names
     if isinstance(names, Mapping):
-        order = [own.index(name) if name in own else -1 for name in names.values()]
+        order = [joints.index(name) if name in joints else -1 for name in names.values()]
     else:
-        order = [
-            own.index(name) if name in own else _last_of(own, name) for name in dict.fromkeys(names)
-        ]
-    if len(names) != len(own) or sorted(order) != list(range(len(own))):
+        order = [_index_of(joints, name) for name in dict.fromkeys(names)]
+    if len(names) != len(joints) or sorted(order) != list(range(len(joints))):
         raise UserError(
             f"joint_names has {', '.join(names)}, but the policy is for {metadata.robot}, whose "
-            f"joints are {', '.join(own)}; give the names of this robot, each once, or a mapping "
-            "from the driver's names to these"
+            f"joints are {', '.join(joints)}; give the names of this robot, each once, or a "
+            "mapping from the driver's names to these"
         )
     return order
 
 
-def _last_of(own: Sequence[str], name: str) -> int:
-    """Index of the only joint whose name ends a driver's name; -1 if there is none."""
-    found = [i for i, joint in enumerate(own) if name.endswith(joint)]
-    return found[0] if len(found) == 1 else -1
+def _index_of(joints: Sequence[str], name: str) -> int:
+    """Index of the joint of a driver's name: that of this name, else the only one whose name ends
+    it; -1 if there is none."""
+    if name in joints:
+        return joints.index(name)
+    fitting = [i for i, joint in enumerate(joints) if name.endswith(joint)]
+    return fitting[0] if len(fitting) == 1 else -1
 
 
 def _check_command(name: str, value: float, ends: tuple[float, float], unit: str) -> None:
@@ -434,11 +440,11 @@ def _array(label: str, value: Any, size: int, unit: str, limit: float, rows: int
     if isinstance(value, np.ma.MaskedArray):
         value = np.ma.filled(value.astype(float), np.nan)
     try:
-        given = np.asarray(value)
+        array = np.asarray(value)
         # Text, truth values, dates and complex numbers are no measurements.
-        if given.dtype.kind not in "fiuO":
+        if array.dtype.kind not in "fiuO":
             raise TypeError
-        array = given.astype(float)
+        array = array.astype(float)
     except (TypeError, ValueError, OverflowError) as error:
         raise UserError(f"{label} is {str(value)[:100]!r}; give {count} ({unit})") from error
     if array.shape not in ((size,), (rows, size // rows)) and not (size == 1 and not array.shape):

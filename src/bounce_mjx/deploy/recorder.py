@@ -39,7 +39,8 @@ class Recorder(contextlib.AbstractContextManager):
         Raises:
           UserError: the file exists, or cannot be made.
         """
-        joints, columns = tuple(joint_names), {"time": ["time [s]"]}
+        joints = tuple(joint_names)
+        columns = {"time": ["time [s]"]}
         for name, unit in _OF_JOINTS.items():
             columns[name] = [f"{name}.{joint} [{unit}]" for joint in joints]
         columns["ball_position"] = [f"ball_position.{axis} [m]" for axis in "xyz"]
@@ -95,7 +96,8 @@ class Recorder(contextlib.AbstractContextManager):
 
     def _new_picture(self, measurements: Mapping[str, Any]) -> dict[str, Any]:
         """The measured picture; without a position if it is none or the last one."""
-        time, age = float(np.ravel(measurements["time"])[0]), measurements.get("ball_age")
+        time = float(np.ravel(measurements["time"])[0])
+        age = measurements.get("ball_age")
         position = np.array(measurements.get("ball_position"), float)
         taken = time if age is None else time - float(np.ravel(age)[0])
         last, seen = self._last

@@ -5,16 +5,20 @@ raises. Each reason here is a row of the table in docs/real-robot.md.
 """
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
-from bounce_mjx.deploy.metadata import Metadata, largest_term
+from bounce_mjx.deploy.metadata import Metadata, joint_ends, largest_term
 from bounce_mjx.errors import UserError
 
 Measurements = dict[str, np.ndarray]
 
-# An angle outside its range; the first one from where the arm starts, rad.
-_OUTSIDE, _NEAR = 0.5, 0.1
+# Distances that are too far: of an angle from its range, and of the first one from where the arm
+# starts, rad.
+_OUTSIDE = 0.5
+_NEAR = 0.1
 # The start pose in another order or with other signs, beside the noise of a start, rad.
 _SAME = 0.1
 # Share of an arm's own limit of velocity that no joint reaches.
@@ -22,7 +26,8 @@ _OVERSPEED = 1.2
 # Largest noise in standard deviations.
 _LARGEST_NOISE = 8.0
 # Calls at one time, and a pause, s.
-_MOST_STANDING, _PAUSE = 50, 1.0
+_MOST_STANDING = 50
+_PAUSE = 1.0
 
 RESOLUTION = 2e-3
 """Largest count of an encoder, rad; one of 4,096 counts a turn has 1.5e-3."""
@@ -58,15 +63,15 @@ class Samples:
 
     def __init__(self, metadata: Metadata):
         """Bounds of what a policy's worlds can hold."""
-        self._metadata, limits = metadata, metadata.limits
-        self._fastest = np.full(len(metadata.joint_names), metadata.max_joint_velocity)
-        if limits is not None:
-            self._fastest = _OVERSPEED * np.array(limits.velocity)
+        self._metadata = metadata
+        if metadata.limits is None:
+            self._fastest = np.full(len(metadata.joint_names), metadata.max_joint_velocity)
+        else:
+            self._fastest = _OVERSPEED * np.array(metadata.limits.velocity)
         largest = math.sqrt(2.0) * _LARGEST_NOISE
         self._noise = RESOLUTION + largest * largest_term(metadata, "joint_angle_noise")
         self._ball_noise = 1e-3 + largest * largest_term(metadata, "ball_position_noise")
-        ranges = [(-np.inf, np.inf) if x is None else x for x in metadata.joint_ranges]
-        self._low, self._high = np.array(ranges).T
+        self._low, self._high = joint_ends(metadata)
         self._start = np.array(metadata.default_joint_angles)
         self.forget()
 
@@ -97,6 +102,11 @@ class Samples:
         self.forget()
         self._last = {"joint_angles": angles, "joint_velocities": np.zeros(len(angles))}
 
+    @property
+    def is_arm_bridged(self) -> bool:
+        """Whether the joint angles of the last step are those of the step before."""
+        return _OF_ARM[0] in self._bridged
+
     def take(self, measured: Measurements) -> Measurements:
         """The sample, with the last values in place of those that cannot be true.
 
@@ -119,7 +129,8 @@ class Samples:
 
     def _take_time(self, measured: Measurements) -> None:
         """Passes the time, which goes on."""
-        time, last = measured["time"], self._last.get("time")
+        time = measured["time"]
+        last = self._last.get("time")
         if last is None:
             self._last["time"] = time
             return
@@ -147,7 +158,8 @@ class Samples:
 
     def _take_angles(self, measured: Measurements) -> None:
         """Believes the arm's sample, or bridges it."""
-        angles, last = measured["joint_angles"], self._last.get("joint_angles")
+        angles = measured["joint_angles"]
+        last = self._last.get("joint_angles")
         is_outside = self._outside(angles).max() > _OUTSIDE
         if is_outside:
             angles = measured["joint_angles"] = self._unwrapped(angles)
@@ -217,7 +229,8 @@ class Samples:
                 f"those of {', '.join(metadata.joint_names)}, or load_policy the driver's "
                 "joint_names",
             )
-        last, self._unconfirmed = self._unconfirmed, angles
+        last = self._unconfirmed
+        self._unconfirmed = angles
         reach = self._fastest * metadata.control_dt + self._noise
         if last is None or np.any(np.abs(angles - last) > reach):
             raise UnconfirmedSample(
@@ -238,7 +251,8 @@ class Samples:
         taken = self._now - (float(measured["ball_age"][0]) if "ball_age" in measured else 0.0)
         is_new = self._seen is None or (balls != self._seen).any()
         if is_new:
-            self._seen, self._is_held = balls, False
+            self._seen = balls
+            self._is_held = False
             self._doubt = self._doubt_of(balls, measured.get("ball_velocity"), taken)
         if self._doubt is None:
             self._believe(measured, _OF_BALL)
@@ -253,7 +267,8 @@ class Samples:
         self, balls: np.ndarray, velocities: np.ndarray | None, taken: float
     ) -> tuple[str, str] | None:
         """Fault and reason of a new picture of the balls [B, 3] that cannot be true, else None."""
-        bounds, last = self._metadata.ball, self._last.get("ball_position")
+        bounds = self._metadata.ball
+        last = self._last.get("ball_position")
         if (distance := _longest(balls)) > bounds.distance:
             return "ball_place", (
                 f"the distance of ball_position is {distance:.3g}, but the training had 0 to "
@@ -293,6 +308,15 @@ class Samples:
         measured |= {name: self._last[name] for name in names if name in measured}
         if "ball_age" in measured and names == _OF_BALL:
             measured["ball_age"] = np.array([self._now - self._taken])
+
+
+def check_mapping(measurements: Any) -> None:
+    """Raises UserError for measurements without names."""
+    if not isinstance(measurements, Mapping):
+        raise UserError(
+            f"the measurements are {str(measurements)[:100]!r}; give a mapping of their names, "
+            "such as joint_angles"
+        )
 
 
 def _longest(vectors: np.ndarray) -> float:

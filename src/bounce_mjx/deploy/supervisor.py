@@ -8,7 +8,7 @@ import numpy as np
 
 from bounce_mjx.deploy.faults import Fault, Watch, picture_age
 from bounce_mjx.deploy.motion import paddle_position
-from bounce_mjx.deploy.samples import UnconfirmedSample
+from bounce_mjx.deploy.samples import UnconfirmedSample, check_mapping
 from bounce_mjx.errors import UserError
 
 if TYPE_CHECKING:
@@ -46,7 +46,8 @@ class Supervisor:
     ):
         """See `DeployedPolicy.supervise`."""
         policy.commands_per_step(rate)
-        self._policy, self._rate = policy, rate
+        self._policy = policy
+        self._rate = rate
         metadata = policy.metadata
         age = picture_age(metadata) if max_picture_age is None else max_picture_age
         for name, value, most in (
@@ -55,7 +56,8 @@ class Supervisor:
         ):
             if not 0.0 < value <= most:
                 raise UserError(f"{name} is {value}; give a number above 0 and at most {most:g}")
-        self._box, self._most_idle = np.array(box, float), max_steps_late
+        self._box = np.array(box, float)
+        self._most_idle = max_steps_late
         if self._box.shape != (2, 3) or not np.all(self._box[0] < self._box[1]):
             raise UserError(f"the box is {box}; give its lowest and its highest x, y and z, m")
         self._has_box = bool(np.any(np.isfinite(self._box)))
@@ -87,7 +89,9 @@ class Supervisor:
     def stop(self, reason: str, fault: str = "stopped") -> None:
         """Brakes, from any state."""
         if self.state not in ("braking", "stopped"):
-            self.state, self.fault, self.reason = "braking", fault, reason
+            self.state = "braking"
+            self.fault = fault
+            self.reason = reason
 
     def restart(self) -> None:
         """Goes home after a stop, from where the arm then is, for the next `start`.
@@ -97,7 +101,9 @@ class Supervisor:
         """
         if self.state != "stopped":
             raise UserError(f"the arm is {self.state}; restart it when it has stopped")
-        self.state, self.fault, self.reason = "homing", None, None
+        self.state = "homing"
+        self.fault = None
+        self.reason = None
         self._is_moving_home = False
         self._policy.samples.forget(self._policy.targets)
 
@@ -136,8 +142,11 @@ class Supervisor:
 
     def _angles(self, measurements: Mapping[str, Any]) -> np.ndarray:
         """The joint angles [J], whatever else is measured."""
-        given = {k: v for k, v in measurements.items() if k in ("joint_angles", "time")}
-        return self._policy.read(given, ("joint_angles",))["joint_angles"]
+        check_mapping(measurements)
+        of_arm = {
+            name: value for name, value in measurements.items() if name in ("joint_angles", "time")
+        }
+        return self._policy.read(of_arm, ("joint_angles",))["joint_angles"]
 
     def _find_arm(self, measurements: Mapping[str, Any]) -> np.ndarray | None:
         """The joint angles [J] from which the arm goes home, and at which its commands then rest;
@@ -162,7 +171,8 @@ class Supervisor:
 
     def _go_home(self, measurements: Mapping[str, Any]) -> None:
         """A step of the way home."""
-        policy, home = self._policy, np.array(self._policy.metadata.default_joint_angles)
+        policy = self._policy
+        home = np.array(policy.metadata.default_joint_angles)
         if self._is_moving_home:
             angles = self._angles(measurements)
         else:
@@ -172,8 +182,10 @@ class Supervisor:
                     policy.motion.hold()
                 return
             self._watch.rest(angles, policy.targets)
-            self._is_moving_home, self.reason = True, None
-        if self._stop_at(self._watch.arm_faults(angles, policy.targets)):
+            self._is_moving_home = True
+            self.reason = None
+        is_bridged = policy.samples.is_arm_bridged
+        if self._stop_at(self._watch.arm_faults(angles, policy.targets, is_bridged)):
             return
         if np.abs(policy.targets - home).max() > _HOME_TOLERANCE:
             policy.motion.move(home, _HOME_SPEED)
@@ -187,19 +199,20 @@ class Supervisor:
 
     def _follow(self, measurements: Mapping[str, Any]) -> None:
         """A step of the policy."""
-        policy, motion = self._policy, self._policy.motion
+        policy = self._policy
         measured = policy.read(measurements, (*policy.needs, "joint_angles"))
         late = policy.steps_since(measured) - 1
         if late > self._most_idle:
             self.stop(f"a control step came {late} steps late", "late_step")
             return
-        if self._stop_at(self._watch.faults(measured, policy.targets)):
+        is_bridged = policy.samples.is_arm_bridged
+        if self._stop_at(self._watch.faults(measured, policy.targets, is_bridged)):
             return
         last = policy.step_number
         policy.act(measured)
         self._idle = self._idle + 1 if policy.step_number == last else 0
         if self._idle:
-            motion.hold()
+            policy.motion.hold()
         outside = self._outside()
         if self._idle > self._most_idle:
             self.stop(f"{self._idle} calls in a row are no new step", "no_step")
@@ -207,7 +220,7 @@ class Supervisor:
             self.stop(f"the paddle would come to rest {outside:.3g} m outside the box", "box")
         else:
             return
-        motion.withdraw()
+        policy.motion.withdraw()
 
     def _outside(self) -> float:
         """How far the paddle would be outside of the box if the commands braked from the end of

@@ -11,6 +11,10 @@ from bounce_mjx.config import settings
 
 Vector = tuple[settings.Coordinate, settings.Coordinate, settings.Coordinate]
 HalfSize = Annotated[settings.Positive, Field(le=1.0)]
+# Of a watch's motor to a gantry's drives, in N m and rad or in N and m.
+Stiffness = Annotated[settings.Positive, Field(ge=0.1, le=1e7)]
+Damping = Annotated[settings.NonNegative, Field(le=1e6)]
+Force = Annotated[settings.Positive, Field(ge=0.01, le=1e5)]
 Quaternion = tuple[settings.Finite, settings.Finite, settings.Finite, settings.Finite]
 
 
@@ -80,12 +84,12 @@ class RobotConfig(settings.StrictModel):
     """The paddle of an adopted arm."""
     ball: BallConfig = BallConfig()
     """The ball of an adopted arm."""
-    servo_stiffness: tuple[settings.Positive, ...] | None = None
+    servo_stiffness: tuple[Stiffness, ...] | None = None
     """Stiffness of the position servo that replaces the actuator of each acting joint, N m/rad or
     N/m; null keeps the MJCF's servos."""
-    servo_damping: tuple[settings.NonNegative, ...] | None = None
+    servo_damping: tuple[Damping, ...] | None = None
     """Damping of each replaced servo, N m s/rad or N s/m."""
-    servo_force_limit: tuple[settings.Positive | None, ...] | None = None
+    servo_force_limit: tuple[Force | None, ...] | None = None
     """Force limit of each replaced servo, N m or N; null for a servo without one."""
 
     limits: LimitsConfig = LimitsConfig()

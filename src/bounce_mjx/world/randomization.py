@@ -152,7 +152,7 @@ class RandomizationConfig(StrictModel):
     """Factor of each servo's damping."""
     servo_lag: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 1.0), nominal=0.0)] = None
     """Time constant of a first-order lag of the servo targets, s."""
-    servo_offset: Annotated[Sampled, Term(EACH_JOINT, bounds=(-0.5, 0.5), nominal=0.0)] = None
+    servo_offset: Annotated[Sampled, Term(EACH_JOINT, bounds=(-0.3, 0.3), nominal=0.0)] = None
     """Constant error of each servo: where it holds its joint, less its target, rad."""
     torque_limit: Annotated[
         Sampled, physical("force_limit", "limit", EACH_JOINT, bounds=(0.01, 1e4))
@@ -169,10 +169,12 @@ class RandomizationConfig(StrictModel):
     """Dry friction of each joint, N m, in place of the model's."""
     armature: Annotated[Sampled, physical("armature", "scale", EACH_JOINT, bounds=_FACTOR)] = None
     """Factor of each joint's rotor inertia."""
-    link_mass: Annotated[Sampled, physical("link_mass", "scale", EACH_JOINT, bounds=_FACTOR)] = None
+    link_mass: Annotated[
+        Sampled, physical("link_mass", "scale", EACH_JOINT, bounds=(0.01, 50.0))
+    ] = None
     """Factor of each link's mass."""
     paddle_offset: Annotated[
-        Sampled, physical("paddle_position", "add", (3,), bounds=(-0.5, 0.5))
+        Sampled, physical("paddle_position", "add", (3,), bounds=(-0.3, 0.3))
     ] = None
     """Displacement of the paddle along each axis of the last link, m."""
     paddle_tilt: Annotated[
@@ -191,21 +193,21 @@ class RandomizationConfig(StrictModel):
     """Camera pictures of the ball per second, Hz; null for one at every control step."""
     frame_drop: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 0.99), nominal=0.0)] = None
     """Probability that a camera picture is lost."""
-    ball_position_noise: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 0.5), nominal=0.0)] = None
+    ball_position_noise: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 0.2), nominal=0.0)] = None
     """Standard deviation of the noise of each measured ball coordinate, m."""
-    ball_position_bias: Annotated[Sampled, Term((3,), bounds=(-0.5, 0.5), nominal=0.0)] = None
+    ball_position_bias: Annotated[Sampled, Term((3,), bounds=(-0.3, 0.3), nominal=0.0)] = None
     """Error of each measured ball coordinate, constant in an episode, m."""
     ball_velocity_noise: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 10.0), nominal=0.0)] = None
     """Standard deviation of the noise of each component of the measured ball velocity, m/s."""
     ball_velocity_bias: Annotated[Sampled, Term((3,), bounds=(-10.0, 10.0), nominal=0.0)] = None
     """Error of each component of the measured ball velocity, constant in an episode, m/s."""
-    joint_angle_noise: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 0.5), nominal=0.0)] = None
+    joint_angle_noise: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 0.05), nominal=0.0)] = None
     """Standard deviation of the noise of each measured joint angle, rad."""
-    encoder_bias: Annotated[Sampled, Term(EACH_JOINT, bounds=(-0.5, 0.5), nominal=0.0)] = None
+    encoder_bias: Annotated[Sampled, Term(EACH_JOINT, bounds=(-0.3, 0.3), nominal=0.0)] = None
     """Error of each encoder's zero, which the servo shares, rad."""
-    joint_velocity_noise: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 10.0), nominal=0.0)] = None
+    joint_velocity_noise: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 2.0), nominal=0.0)] = None
     """Standard deviation of the noise of each measured joint velocity, rad/s."""
-    joint_velocity_bias: Annotated[Sampled, Term(EACH_JOINT, bounds=(-10.0, 10.0), nominal=0.0)] = (
+    joint_velocity_bias: Annotated[Sampled, Term(EACH_JOINT, bounds=(-2.0, 2.0), nominal=0.0)] = (
         None
     )
     """Error of each measured joint velocity, constant in an episode, rad/s."""
