@@ -134,6 +134,7 @@ ADD = Operation(shift, nominal=0.0)
 TILT_FRAME = Operation(tilt_frame, nominal=0.0)
 TILT_VECTOR = Operation(tilt_vector, nominal=0.0)
 REPLACE = Operation(replace, model_nominal=getattr)
+"""The nominal value is the model's own number, which `nominal_values` reads from the MjModel."""
 RESTITUTION = Operation(restitution_to_damping, model_nominal=_model_restitution)
 LIMIT = Operation(replace)
 """For a parameter that limits the model's own value, which may have no limit: no nominal value."""
