@@ -21,8 +21,8 @@ from tables import device_name, markdown_table, write
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.env import vector
+from bounce_mjx.env.bounce_ball import BounceBall
 from bounce_mjx.errors import exit_on_user_error
-from bounce_mjx.tasks.bounce_ball import BounceBall
 
 
 class Command(StrictModel):

@@ -26,11 +26,11 @@ from trainers import OnBlock, TrainingEnded, block_iterations
 
 from bounce_mjx.adapters.brax import device_put_replicated
 from bounce_mjx.adapters.brax.ppo import ppo_settings
+from bounce_mjx.env.bounce_ball import BounceBall
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import NetworkFunctions, Policy, make_networks
 from bounce_mjx.learning.statistics import MIN_VARIANCE, Normalizer, normalize
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.tasks.bounce_ball import BounceBall
 
 
 class CriticObservation(Wrapper):

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from tables import device_name, markdown_table, write
 
-from bounce_mjx.commands.run_options import ActorCommand
+from bounce_mjx.commands.which_policy import MirrorRobot, WhichPolicy
 from bounce_mjx.config.command_line import Flag, parse
 from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.env.env import Env
@@ -41,11 +41,12 @@ MINUTE = 60.0
 """Time between two looks at whether a ball is left, s."""
 
 
-class EndlessCommand(ActorCommand):
+class EndlessCommand(WhichPolicy):
     """The command line."""
 
     policies: Annotated[tuple[Path, ...], Flag(metavar="POLICY ...", is_positional=True)]
     """Policies of the task bounce."""
+    robot: MirrorRobot = None
     world: Path | None = None
     """Named world in place of the conditions of endless.yaml."""
     minutes: Count = 60
@@ -63,8 +64,8 @@ def main() -> None:
         command = parse(EndlessCommand, sys.argv[1:], prog="benchmarks/endless.py", description=doc)
         records = []
         for name in command.policies:
-            checkpoint = command.choose(name)
-            config = command.config_of(checkpoint)
+            checkpoint = command.choose(name, command.robot)
+            config = command.config_of(checkpoint, command.robot)
             world = None if command.world is None else in_world(config, command.world)[0].env
             suite = Path(__file__).with_name("endless.yaml")
             conditions = load_suite(suite, config.env, world)

@@ -26,8 +26,8 @@ import torch
 from trainers import OnBlock, TrainingEnded
 
 from bounce_mjx.adapters.torch import TorchVectorEnv
+from bounce_mjx.env.bounce_ball import BounceBall
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.tasks.bounce_ball import BounceBall
 
 SOURCE = Path(__file__).with_name("sources") / "FastTD3" / "fast_td3"
 

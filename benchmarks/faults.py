@@ -43,6 +43,10 @@ BOX = 0.5
 """Half of the box around the paddle's home, m."""
 FIRST_COMMAND, OVERSHOOT = 0.02, 0.02
 """What the first command may be off the arm (rad), and the arm off the box (m)."""
+COUNT = 2.0 * math.pi / 4096.0
+"""A coarse encoder's count, rad."""
+DRY_FRICTION = 5e-4
+"""Angle between a servo's target and its joint that dry friction holds, rad."""
 
 
 class Sensors(NamedTuple):
@@ -219,6 +223,11 @@ def _angle(joint: int, change: Callable[[Moment, float], float]) -> Act:
     return act
 
 
+def _first_sample(joint: int, off: float) -> Act:
+    """The first sample is off by an angle (rad)."""
+    return _angle(joint, lambda moment, x: x + off * (moment.robot.data.time < 0.005))
+
+
 def _both(*joints: int, flip: bool = False) -> Act:
     """Two joints swapped, or one with another sign."""
 
@@ -242,6 +251,17 @@ def _weak(torque: float) -> Act:
         model.actuator_forcerange[servos] = np.array([-torque, torque]) / gears
 
     return act
+
+
+def _coarse(moment: Moment) -> None:
+    moment.measured["joint_angles"] = COUNT * np.round(moment.measured["joint_angles"] / COUNT)
+
+
+def _dry_friction(moment: Moment) -> None:
+    model, servos = moment.robot.model, moment.robot.servos
+    stiffness = model.actuator_gainprm[servos, 0] * model.actuator_gear[servos, 0] ** 2
+    model.dof_frictionloss[moment.robot.qvel] = DRY_FRICTION * stiffness
+    _coarse(moment)
 
 
 def _ball(change: Callable[[Moment, np.ndarray], Any]) -> Act:
@@ -310,8 +330,11 @@ def faults(joints: int) -> dict[str, Fault]:
         sign = Fault(_later(_both(joint, flip=True)), JUMP)
         found[f"joint {joint + 1}: sign flips"] = sign
     zeros = _put("joint_angles", lambda m: 0.0 * m.measured["joint_angles"])
-    rubbish = _angle(1, lambda m, x: x + (1.0 if m.robot.data.time < 0.005 else 0.0))
     found |= {
+        "all joints: encoders of 4,096 counts": Fault(_coarse, from_start=True),
+        "all joints: dry friction, 4,096 counts": Fault(
+            _dry_friction, ("", "ball_lost", "box"), math.inf, from_start=True
+        ),
         "joint 1 and 2 swapped": Fault(_later(_both(0, 1)), (*JUMP, *ARM)),
         "joint 2 and 3 swapped": Fault(_later(_both(1, 2)), (*JUMP, *ARM)),
         "joint 2 and 3 swapped from the start": Fault(
@@ -328,7 +351,9 @@ def faults(joints: int) -> dict[str, Fault]:
         "all joints: first samples are zeros": Fault(
             lambda m: zeros(m) if m.robot.data.time < 0.1 else None, from_start=True
         ),
-        "all joints: first sample is off by 1 rad": Fault(rubbish, from_start=True),
+        "joint 1: first sample is off by 0.5 rad": Fault(_first_sample(0, 0.5), from_start=True),
+        "joint 2: first sample is off by 0.25 rad": Fault(_first_sample(1, 0.25), from_start=True),
+        "joint 2: first sample is off by 1 rad": Fault(_first_sample(1, 1.0), from_start=True),
         "all joints: frozen": Fault(_later(_frozen("joint_angles")), ARM),
         "all joints: wrapped by a turn": Fault(
             _later(_put("joint_angles", lambda m: m.measured["joint_angles"] + 2.0 * math.pi)),

@@ -5,6 +5,7 @@ python benchmarks/figures.py
 A table stands in a page after a line <!-- figures: NAME -->, and ends before the next empty line.
 """
 
+import math
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,18 +19,60 @@ COLUMNS = {
     name if name != "value" else "figure": name
     for name in ("claim", "value", "target", "command", "device", "date", "commit")
 }
+_NUMBER = r"\d[\d,]*(?:\.\d+)?(?:e-?\d+)?"
+_RANGE = re.compile(rf"({_NUMBER})(?: to ({_NUMBER}))?")
 TABLE = re.compile(r"(<!-- figures: (\w+) -->\n)(?:.+\n)*")
 
 
 def tables() -> dict[str, str]:
     """The tables of figures.yaml by name, as Markdown."""
     source = yaml.safe_load((CHECKOUT / "benchmarks/figures.yaml").read_text(encoding="utf-8"))
-    return {name: _table(table, source["figures"]) for name, table in source["tables"].items()}
+    figures = {
+        name: figure | _judged_shares(figure, source["criteria"]) | _judged_target(figure)
+        for name, figure in source["figures"].items()
+    }
+    return {name: _table(table, figures) for name, table in source["tables"].items()}
 
 
 def drawn(text: str, known: dict[str, str]) -> str:
     """A page's text with its tables as they are in figures.yaml."""
     return TABLE.sub(lambda found: found[1] + known[found[2]], text)
+
+
+def verdict(target: str, measured: str) -> str:
+    """Whether a figure, by the worst of its numbers, reaches a target: see figures.yaml."""
+    is_upper, is_lower = target.startswith("at most "), target.startswith("at least ")
+    bounds = _numbers(target.removeprefix("at most ").removeprefix("at least "))
+    if not bounds:
+        return "reached" if measured == target else "missed"
+    low = -math.inf if is_upper else bounds[0]
+    high = math.inf if is_lower else bounds[-1]
+    is_reached = all(low <= number <= high for number in _numbers(measured))
+    return "reached" if is_reached else "missed"
+
+
+def _judged_target(figure: dict[str, Any]) -> dict[str, str]:
+    """The target with its verdict and its note, where there is one."""
+    if "target" not in figure:
+        return {}
+    measured = figure.get("measured", figure.get(figure.get("judged", "value")))
+    note = f": {figure['note']}" if "note" in figure else ""
+    return {"target": f"{figure['target']}, {verdict(figure['target'], str(measured))}{note}"}
+
+
+def _judged_shares(figure: dict[str, Any], criteria: dict[str, float]) -> dict[str, str]:
+    """The shares of a run in another simulator that miss their criterion, with that word."""
+    if not {"simulator", "world"} <= figure.keys():
+        return {}
+    missed = [name for name, bound in criteria.items() if float(figure[name]) < bound]
+    return {name: f"{figure[name]}, missed" for name in missed}
+
+
+def _numbers(text: str) -> list[float]:
+    """The number with which a text begins, or both of a range; none of another text."""
+    found = _RANGE.match(text)
+    numbers = found.groups() if found else ()
+    return [float(number.replace(",", "")) for number in numbers if number is not None]
 
 
 def _table(table: str | dict[str, Any], figures: dict[str, dict[str, Any]]) -> str:

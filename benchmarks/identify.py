@@ -1,16 +1,17 @@
 """Identification of hidden robots, which MuJoCo's C engine simulates: errors, and coverage of the
 intervals.
 
-`python benchmarks/identify.py --seeds 1000-1004 --out FILE.json`. Seeds below 20 are for the final
-report alone; tune on seeds from 1000.
+`python benchmarks/identify.py --seeds 1000-1004 --robot-step 5e-4 --spike --out FILE.json`. Seeds
+below 20 are for the final report alone; tune on seeds from 1000.
 """
 
 import argparse
+import csv
 import json
 import tempfile
 import time
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import mujoco
@@ -31,6 +32,8 @@ from bounce_mjx.training.setup import set_up_jax
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import RandomizationConfig, physics_parameters, sample_world
 
+# Error of the one angle of a log with a spike, rad.
+_SPIKE = 0.5
 # Terms of the sensors, which are the same for all robots, and disturbances.
 _FIXED = (
     "camera_rate frame_drop ball_position_noise joint_velocity_noise push_speed push_interval "
@@ -53,9 +56,13 @@ class Hidden(NamedTuple):
     """What the model lacks: nothing, backlash or friction that differs by direction."""
 
 
-def hidden_robot(seed: int) -> Hidden:
+def hidden_robot(seed: int, flawless: bool = False) -> Hidden:
     """Draws a robot: about 30% of the terms of configs/transfer.yaml, and all that a servo differs
-    in."""
+    in.
+
+    Args:
+      flawless: whether the model lacks nothing of it.
+    """
     wide = read_preset(resource_path("configs/transfer.yaml")).env
     ranges = {k: v for k, v in wide.randomization.ranges().items() if k not in _FIXED}
     key, rare, always = jax.random.split(jax.random.PRNGKey(seed), 3)
@@ -71,7 +78,7 @@ def hidden_robot(seed: int) -> Hidden:
     world |= sample_world(servos.ranges(), always, np.dtype("float32"), 6)
     world = {name: np.asarray(value, np.float32) for name, value in world.items()}
     flaw = ("nothing", "backlash", "nothing", "asymmetric friction")[seed % 4]
-    return Hidden(world, flaw)
+    return Hidden(world, "nothing" if flawless else flaw)
 
 
 def sensor_terms() -> dict[str, float]:
@@ -86,7 +93,7 @@ def sensor_terms() -> dict[str, float]:
 
 
 class _Robot:
-    """The robot with its clocks, servos and camera, on MuJoCo's C engine at 1 ms."""
+    """The robot with its clocks, servos and camera, on MuJoCo's C engine at the config's step."""
 
     def __init__(self, config: WorldConfig, hidden: Hidden, seed: int):
         plain = world_model(config, visual=False)
@@ -168,10 +175,11 @@ class _Robot:
             self.due += 1.0 / _CAMERA_RATE
 
 
-def record(config: WorldConfig, seed: int, path: Path, excited=20.0, played=40.0) -> Hidden:
+def record(
+    config: WorldConfig, hidden: Hidden, seed: int, path: Path, excited=20.0, played=40.0
+) -> None:
     """Writes the log of a hidden robot: an excitation, then the robust policy with the ball, at
     several heights; the ball is dropped again after each loss."""
-    hidden = hidden_robot(seed)
     robot, policy = _Robot(config, hidden, seed), load_policy("robust")
     motion = excite(config, excited, 1.5)
     steps = round(config.control_dt / config.physics_dt)
@@ -221,7 +229,6 @@ def record(config: WorldConfig, seed: int, path: Path, excited=20.0, played=40.0
             robot.sent.append((now, np.array(target)))
             for _ in range(steps):
                 robot.step()
-    return hidden
 
 
 def errors(found: Identified, hidden: Hidden, model: mujoco.MjModel, home) -> dict[str, float]:
@@ -277,54 +284,50 @@ def _paddle_normal(model: mujoco.MjModel, world, home) -> np.ndarray:
     return data.geom_xmat[addresses.paddle_geom].reshape(3, 3)[:, 2]
 
 
-def _seeds(text: str) -> list[int]:
-    first, _, last = text.partition("-")
-    return list(range(int(first), int(last or first) + 1))
+def add_spike(path: Path, spiked: Path, seed: int) -> None:
+    """Copies a log with one wrong number: an angle in the middle half is off by `_SPIKE`."""
+    with path.open(newline="") as file:
+        header, *rows = csv.reader(file)
+    columns = [i for i, name in enumerate(header) if name.startswith("joint_angles.")]
+    random = np.random.default_rng([seed, 2])
+    column = int(random.choice(columns))
+    # Rows of pictures have no angles.
+    measured = [row for row in rows if row[column]]
+    row = measured[int(random.uniform(0.25, 0.75) * len(measured))]
+    row[column] = repr(float(row[column]) + _SPIKE)
+    with spiked.open("w", newline="") as file:
+        csv.writer(file).writerows([header, *rows])
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=_seeds, default=_seeds("1000-1003"))
-    parser.add_argument("--logs", type=Path, default=None, help="folder for the logs and worlds")
-    parser.add_argument("--out", type=Path, default=None, help="JSON file")
-    given = parser.parse_args()
-    folder = given.logs or Path(tempfile.mkdtemp())
-    folder.mkdir(parents=True, exist_ok=True)
-    config = read_preset(resource_path("configs/default.yaml")).env
-    set_up_jax(config)
+def measure(config: WorldConfig, hidden: Hidden, path: Path) -> dict[str, Any]:
+    """The identification of one log: its errors, and whether the intervals hold the truth."""
     model = world_model(config, visual=False)
-    home, names = np.array(config.default_joint_angles), joint_names(model)
-    rows = []
-    for seed in given.seeds:
-        path = folder / f"{seed}.csv"
-        if not path.exists():
-            record(config, seed, path)
-        hidden, begin = hidden_robot(seed), time.perf_counter()
-        begin_processor = time.process_time()
-        log = read_csv(path, names)
-        found = identify(config, log)
-        seconds = time.perf_counter() - begin
-        processor = time.process_time() - begin_processor
-        path.with_suffix(".yaml").write_text(to_yaml(found, log, names, None))
-        inside = covered(found, hidden)
-        rows.append(
-            {
-                "seed": seed,
-                "flaw": hidden.flaw,
-                "seconds": seconds,
-                "processor seconds": processor,
-                "errors": errors(found, hidden, model, home),
-                "held out": found.held_out,
-                "covered": sum(inside.values()),
-                "shown": len(inside),
-                "outside": [label for label, holds in inside.items() if not holds],
-                "widths": widths(found),
-                "dropped": found.dropped,
-            }
-        )
-        print(json.dumps(rows[-1]), flush=True)
-        if given.out is not None:
-            given.out.write_text(json.dumps(rows, indent=1))
+    names, home = joint_names(model), np.array(config.default_joint_angles)
+    begin, begin_processor = time.perf_counter(), time.process_time()
+    log = read_csv(path, names)
+    found = identify(config, log)
+    seconds = time.perf_counter() - begin
+    processor = time.process_time() - begin_processor
+    path.with_suffix(".yaml").write_text(to_yaml(found, log, names, None))
+    inside = covered(found, hidden)
+    return {
+        "log": path.stem,
+        "flaw": hidden.flaw,
+        "seconds": seconds,
+        "processor seconds": processor,
+        "errors": errors(found, hidden, model, home),
+        "held out": found.held_out,
+        "covered": sum(inside.values()),
+        "shown": len(inside),
+        "outside": [label for label, holds in inside.items() if not holds],
+        "widths": widths(found),
+        "dropped": found.dropped,
+        "notes": list(log.notes),
+    }
+
+
+def print_summary(rows: list[dict[str, Any]]) -> None:
+    """Medians of the errors, and the share of the intervals that hold the truth."""
     print(f"{'error':32}{'median':>10}{'worst':>10}")
     for name in rows[0]["errors"]:
         values = [row["errors"][name] for row in rows]
@@ -333,6 +336,46 @@ def main() -> None:
     if right:
         share = sum(r["covered"] for r in right) / sum(r["shown"] for r in right)
         print(f"95% intervals that hold the truth, where the model is right: {100 * share:.0f}%")
+
+
+def _seeds(text: str) -> list[int]:
+    first, _, last = text.partition("-")
+    return list(range(int(first), int(last or first) + 1))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=_seeds, default=_seeds("1000-1003"))
+    parser.add_argument("--robot-step", type=float, default=1e-3, help="physics step of a robot, s")
+    parser.add_argument("--flawless", action="store_true", help="robots that the model can be")
+    parser.add_argument("--spike", action="store_true", help="each log also with a wrong angle")
+    parser.add_argument("--logs", type=Path, default=None, help="folder for the logs and worlds")
+    parser.add_argument("--out", type=Path, default=None, help="JSON file")
+    given = parser.parse_args()
+    folder = given.logs or Path(tempfile.mkdtemp())
+    folder.mkdir(parents=True, exist_ok=True)
+    config = read_preset(resource_path("configs/default.yaml")).env
+    finer = config.model_copy(update={"physics_dt": given.robot_step})
+    set_up_jax(config)
+    rows = []
+    for seed in given.seeds:
+        hidden, path = hidden_robot(seed, given.flawless), folder / f"{seed}.csv"
+        if not path.exists():
+            record(finer, hidden, seed, path)
+        paths = [path]
+        if given.spike:
+            spiked = folder / f"{seed}_spike.csv"
+            add_spike(path, spiked, seed)
+            paths.append(spiked)
+        for log in paths:
+            rows.append(measure(config, hidden, log))
+            print(json.dumps(rows[-1]), flush=True)
+            if given.out is not None:
+                given.out.write_text(json.dumps(rows, indent=1))
+    print_summary([row for row in rows if not row["log"].endswith("_spike")])
+    if given.spike:
+        print("with one angle that is off by 0.5 rad:")
+        print_summary([row for row in rows if row["log"].endswith("_spike")])
 
 
 if __name__ == "__main__":

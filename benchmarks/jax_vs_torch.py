@@ -39,6 +39,7 @@ from trainers import TRAINERS, Method
 
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.env.bounce_ball import BounceBall
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import judge
@@ -46,8 +47,7 @@ from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Actor, make_networks, untrained_policy
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.settings import read_preset
-from bounce_mjx.tasks.bounce import BounceConfig as EnvConfig
-from bounce_mjx.tasks.bounce_ball import BounceBall
+from bounce_mjx.task.bounce import BounceConfig as EnvConfig
 from bounce_mjx.training.setup import compiler_options
 
 METHODS: tuple[Method, ...] = typing.get_args(Method)

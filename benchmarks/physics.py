@@ -27,7 +27,7 @@ from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.physics import Control, PhysicsParameters
-from bounce_mjx.tasks.registry import task_config
+from bounce_mjx.task.registry import task_config
 
 EngineName = Literal["fused", "mjx", "c"]
 

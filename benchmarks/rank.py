@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from tables import device_name, markdown_table, write
 
-from bounce_mjx.commands.run_options import ActorCommand
+from bounce_mjx.commands.which_policy import MirrorRobot, WhichPolicy
 from bounce_mjx.config.command_line import Flag, parse
 from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.env.env import Env
@@ -37,8 +37,8 @@ from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.checkpoints import read_actor
 from bounce_mjx.runs.folders import Checkpoint, runs_in, runs_of_seeds
 from bounce_mjx.task import Episodes, Task, mean_and_margin
-from bounce_mjx.tasks.bounce import Bounce
-from bounce_mjx.tasks.track import Track
+from bounce_mjx.task.bounce import Bounce
+from bounce_mjx.task.track import Track
 from bounce_mjx.training.setup import set_up_jax
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import RandomizationConfig
@@ -60,12 +60,13 @@ Figures = dict[str, float | None]
 """Figures by their titles; None if there was nothing to measure."""
 
 
-class RankCommand(ActorCommand):
+class RankCommand(WhichPolicy):
     """The command line."""
 
     policies: Annotated[tuple[Path, ...], Flag(metavar="POLICY ...", is_positional=True)]
     """Rows: a run, a checkpoint, a policy that comes with the package, mirror for the mirror law,
     or a folder whose runs are the seeds of one training run."""
+    robot: MirrorRobot = None
     episodes: Count = DEFAULT_CONDITION_EPISODES
     """Episodes in each condition."""
     seed: NonNegativeInt = DEFAULT_SEED
@@ -84,10 +85,10 @@ def main() -> None:
         if not command.policies:
             raise UserError("no policy is given; give one, such as pretrained")
         chosen = {
-            str(path): [command.choose(run) for run in runs_of_row(path)]
+            str(path): [command.choose(run, command.robot) for run in runs_of_row(path)]
             for path in command.policies
         }
-        configs = [command.config_of(one) for row in chosen.values() for one in row]
+        configs = [command.config_of(one, command.robot) for row in chosen.values() for one in row]
         set_up_jax(*(on_engine(config.env, command.physics) for config in configs))
         rows: dict[str, list[Figures]] = {}
         for name, checkpoints in chosen.items():
@@ -110,7 +111,7 @@ def runs_of_row(path: Path) -> list[Path]:
 
 def measure(command: RankCommand, checkpoint: Checkpoint) -> Figures:
     """The figures of one policy, in the nominal world where no condition changes it."""
-    config = command.config_of(checkpoint)
+    config = command.config_of(checkpoint, command.robot)
     _, policy, actor = read_actor(checkpoint, config)
     suite = load_suite(resource_path("configs/robustness.yaml"), config.env)
     limits = load_suite(Path(__file__).with_name("limits.yaml"), config.env)

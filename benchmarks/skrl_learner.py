@@ -13,6 +13,7 @@ normalisation.
 from typing import Any
 
 import numpy as np
+import optax
 import torch
 from skrl.agents.torch.ppo import PPO, PPO_CFG
 from skrl.memories.torch import RandomMemory
@@ -25,7 +26,6 @@ from bounce_mjx.adapters.torch.skrl_env import SkrlEnv
 from bounce_mjx.env.env import Env
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy
-from bounce_mjx.learning.ppo import max_learning_rate
 
 
 class SkrlLearner:
@@ -51,11 +51,18 @@ class SkrlLearner:
         self.agent.init()
         self.agent.enable_training_mode(True)
         self._iteration = 0
+        # The limit of our rule, `PPO.max_learning_rate`.
+        self._max_learning_rate = optax.exponential_decay(
+            config.max_learning_rate,
+            transition_steps=config.decay_steps / config.batch_steps,
+            decay_rate=config.final_max_learning_rate / config.max_learning_rate,
+            end_value=config.final_max_learning_rate,
+        )
 
     def learn(self) -> None:
         """Trains for an iteration."""
         if self.agent.scheduler is not None:
-            self.agent.scheduler.max_lr = float(max_learning_rate(self.config, self._iteration))
+            self.agent.scheduler.max_lr = float(self._max_learning_rate(self._iteration))
         self._iteration += 1
         self.agent.tracking_data.clear()
         for _ in range(self.config.rollout_length):

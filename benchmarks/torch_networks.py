@@ -72,7 +72,7 @@ def make_mlp(
 
 
 def init_weights(mlp: nn.Sequential, output_gain: float) -> None:
-    """Sets orthogonal weights as in `learning/networks.py`: gain sqrt(2), and `output_gain` in the
+    """Sets orthogonal weights as in `learning/policy.py`: gain sqrt(2), and `output_gain` in the
     last layer."""
     linears = [module for module in mlp if isinstance(module, nn.Linear)]
     for linear in linears:

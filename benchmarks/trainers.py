@@ -18,10 +18,10 @@ from typing import Any, Literal, Protocol
 import jax
 import jax.numpy as jnp
 
+from bounce_mjx.env.bounce_ball import BounceBall
 from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.learning.ppo import PPO, policy_of
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.tasks.bounce_ball import BounceBall
 from bounce_mjx.training.setup import compiler_options
 
 Method = Literal["ours", "brax", "brax_mjx", "rsl_rl", "skrl", "fast_td3", "flash_sac"]

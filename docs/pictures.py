@@ -122,7 +122,7 @@ def control_step():
         "", (at(20), 36), (at(20), 30.5), arrowprops={"arrowstyle": "-|>", "color": LINES[2]}
     )
     diagram.axes.barh(37.8, 2.5 * scale, 4, at(20), color=ORANGE, edgecolor=GREY)
-    diagram.text(at(23.2), 37.8, "policy.step: 1 to 2 ms with the filter", size=9, align="left")
+    diagram.text(at(23.2), 37.8, "policy.step: less than 1 ms", size=9, align="left")
     diagram.axes.annotate(
         "", (at(34), 46), (at(22.5), 39.8), arrowprops={"arrowstyle": "-|>", "color": LINES[3]}
     )
@@ -150,7 +150,7 @@ def start_times():
             left += value
         axes.text(left + 0.4, row, f"{end:.0f} s", va="center")
     axes.invert_yaxis()
-    axes.set(xlabel="time until all five results are met, s (2 cores, seed 1, 34c0088)")
+    axes.set(xlabel="time until all five results are met, s (2 cores, seed 1)")
     axes.set(xlim=(0, 46), ylabel="start")
     axes.grid(axis="y", visible=False)
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=1.0)
@@ -186,7 +186,7 @@ def rollout(observation=None, randomization=None, seconds=3.0, target=0.5):
     from bounce_mjx.runs.checkpoints import read_policy
     from bounce_mjx.runs.config import load_run_config
     from bounce_mjx.runs.folders import pretrained_checkpoint
-    from bounce_mjx.tasks.bounce import BounceConfig as EnvConfig
+    from bounce_mjx.task.bounce import BounceConfig as EnvConfig
 
     checkpoint = pretrained_checkpoint()
     config = load_run_config(checkpoint.run)
@@ -242,7 +242,7 @@ def reward_terms():
     for name, colour in zip(names, LINES, strict=True):
         axes.plot(time[part], metrics[f"reward/{name}"][part], color=colour, lw=1.6, label=name)
     total = sum(value for name, value in metrics.items() if name.startswith("reward/"))
-    axes.plot(time[part], total[part], color="black", lw=2, label="sum of all fifteen")
+    axes.plot(time[part], total[part], color="black", lw=2, label="sum of all terms")
     for bounce in time[part & (metrics["bounced"] > 0)]:
         axes.axvline(bounce, color=GREY, lw=0.8, ls=":")
     axes.set(xlabel="time, s", ylabel="weighted reward", xlim=(1.0, 2.2))

@@ -10,7 +10,6 @@ from mkdocs.structure.pages import Page
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 _OUTSIDE = re.compile(r"\]\(\.\./(?!src/)([^)#]+)")
-_DOCUMENTED = re.compile(r"^- \[`(\S+)`\]\(\.\./src/.*$", re.MULTILINE)
 
 
 @event_priority(100)  # before the redirects, whose targets must exist
@@ -27,9 +26,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Links between pages of this folder and files outside it, from the places on the site. The API
-    page's names, which GitHub shows as links, are what mkdocstrings documents."""
-    markdown = _DOCUMENTED.sub(r"\n::: \1\n", markdown)
+    """Links between pages of this folder and files outside it, from the places on the site."""
     if page.file.generated_by:
         return re.sub(r"\]\((\.\./)?docs/", r"](\1", markdown)
     return markdown.replace("](../", "](")

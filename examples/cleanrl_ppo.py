@@ -9,7 +9,7 @@ import gymnasium
 import torch
 from torch.distributions import Normal
 
-import bounce_mjx  # noqa: F401  registers the environment
+import bounce_mjx.adapters.gymnasium  # noqa: F401  registers the environment
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--num-envs", type=int, default=256)

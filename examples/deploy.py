@@ -105,7 +105,9 @@ if __name__ == "__main__":
     parser.add_argument("--cameras", action="store_true", help="see the ball in rendered pictures")
     parser.add_argument("--camera-rate", type=float, default=120.0, help="of --cameras, Hz")
     parser.add_argument("--ball", choices=["white", "orange"], default="white", help="of --cameras")
+    parser.add_argument("--film", help="of --cameras: what they see, a .webp or .gif file")
     parser.add_argument("--side-light", action="store_true", help="light --cameras from one side")
+    parser.add_argument("--quick", action="store_true", help="render --cameras without shadows")
     args = parser.parse_args()
     with exit_on_user_error(), contextlib.ExitStack() as files:
         robot, recorder = load_policy(args.policy), None
@@ -117,10 +119,14 @@ if __name__ == "__main__":
             # Before MuJoCo renders; a second import of it changes nothing.
             import rendered_cameras
 
-            model = rendered_cameras.make_model(str(MJCF), args.ball, args.side_light)
+            model = rendered_cameras.make_model(str(MJCF), args.ball, args.side_light, args.quick)
             camera = rendered_cameras.seen_ball(model, robot.metadata, args.ball, args.camera_rate)
+            print(f"cameras calibrated with the arm: {camera.calibration.report()}", flush=True)
+            camera.film = rendered_cameras.Film() if args.film else None
         episodes = simulate(robot, camera, args.seconds, args.target_height, recorder, model)
         for count, lasted in episodes:
             print(f"{count} bounces in {lasted:.1f} s of {args.seconds:g} s")
         if args.cameras:
             print(camera.report())
+            if args.film:
+                camera.film.save(args.film)

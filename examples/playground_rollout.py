@@ -1,7 +1,7 @@
-"""MuJoCo Playground: a policy in randomised worlds of the environment from its registry, filmed.
+"""MuJoCo Playground: a policy in randomised worlds of its environment, filmed.
 
 `python examples/playground_rollout.py [pretrained | robust | RUN]` needs
-`pip install 'playground<1'` and the extra `deploy`.
+`pip install 'playground<1'`.
 Training is `python -m bounce_mjx.adapters.playground --env_name=BounceBall`, Playground's own
 program.
 """
@@ -11,12 +11,11 @@ import sys
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import mediapy
-import numpy as np
 from mujoco_playground import registry, wrapper
 
-import bounce_mjx.adapters.playground
+from bounce_mjx import Run
+from bounce_mjx.adapters.playground import PlaygroundBounceBall
 from bounce_mjx.viewers.video import find_ffmpeg
 
 
@@ -27,21 +26,17 @@ def main(
     num_envs: int = 4,
 ) -> jax.Array:
     """Bounces the ball in several worlds and films the first; the final heights [B], m."""
-    env = registry.load("BounceBall", config_overrides={"task.target_height_range": [0.5, 0.5]})
+    overrides = {"task.target_height_range": [0.5, 0.5]}
+    env = PlaygroundBounceBall(policy=policy, config_overrides=overrides)
     randomizer = functools.partial(
         registry.get_domain_randomizer("BounceBall"),
         rng=jax.random.split(jax.random.PRNGKey(0), num_envs),
     )
     worlds = wrapper.wrap_for_brax_training(env, randomization_fn=randomizer)
     state = jax.jit(worlds.reset)(jax.random.split(jax.random.PRNGKey(1), num_envs))
-    policies = [bounce_mjx.load_policy(policy) for _ in range(num_envs)]
-    layout, step, states = env.task.layout, jax.jit(worlds.step), []
+    act, step, states = Run(policy).policy_in(env), jax.jit(worlds.step), []
     for _ in range(steps):
-        actions = [
-            one.step({name: observation[layout[name]] for name in one.needs})
-            for one, observation in zip(policies, np.asarray(state.obs), strict=True)
-        ]
-        state = step(state, jnp.asarray(actions, jnp.float32))
+        state = step(state, act(state.obs))
         states.append(jax.tree.map(lambda x: x[0], state))
     mediapy.set_ffmpeg(find_ffmpeg())
     mediapy.write_video(video, env.render(states, 240, 320, camera="overview"), fps=1.0 / env.dt)

@@ -15,7 +15,7 @@ from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-import bounce_mjx  # noqa: F401  registers the environment
+import bounce_mjx.adapters.gymnasium  # noqa: F401  registers the environment
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--num-envs", type=int, default=256)

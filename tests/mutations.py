@@ -19,7 +19,7 @@ CHECKOUT = Path(__file__).parent.parent
 COPIED = "src", "tests", "mjcf", "configs", "pretrained", "examples", "benchmarks", "docs"
 SINGLE = "pyproject.toml", "train_jax.py", "README.md", "CHANGELOG.md", "CONTRIBUTING.md"
 
-REWARDS, BOUNCE = "tasks/bounce_rewards.py", "tasks/bounce.py"
+REWARDS, BOUNCE = "task/bounce_rewards.py", "task/bounce.py"
 ENV, VECTOR, ACTUATION = "env/env.py", "env/vector.py", "world/actuation.py"
 SENSING, RANDOMIZATION = "world/sensing.py", "world/randomization.py"
 PPO, STATISTICS = "learning/ppo.py", "learning/statistics.py"
@@ -91,7 +91,7 @@ FAULTS = [
     ("a history has the oldest value first", SENSING,
      "with_newest(past, measured[name])", "jnp.concatenate([past[1:], measured[name][None]])", "test_sensors.py -k bounces_are"),
     ("the bootstrap of a time-out is dropped", PPO,
-     "jnp.where(rollout.truncated, timeout_values, values[1:])", "values[1:]", "test_ppo.py -k bootstraps"),
+     "jnp.where(rollout.truncated, timeout_value, next_value)", "next_value", "test_ppo.py -k bootstraps"),
     ("advantages leak across a time-out", PPO,
      "(~(terminated | truncated))", "(~terminated)", "test_ppo.py -k their_definition"),
     ("PPO takes the larger of its two objectives", PPO,
@@ -99,7 +99,7 @@ FAULTS = [
     ("a large KL divergence raises the learning rate", PPO,
      "jnp.where(is_large, 1.0 / _LEARNING_RATE_FACTOR, factor)", "jnp.where(is_large, _LEARNING_RATE_FACTOR, factor)", "test_ppo.py -k kl_divergence"),
     ("the variance is measured from the old mean", STATISTICS,
-     "jnp.sum(from_old_mean * (batch - mean)", "jnp.sum(from_old_mean * from_old_mean", "test_policy.py -k statistics_equal"),
+     "jnp.sum(from_old_mean * from_new_mean", "jnp.sum(from_old_mean * from_old_mean", "test_policy.py -k statistics_equal"),
     ("the ball moves with the velocity before the step", BALL,
      "position = ball.position + velocity * dt", "position = ball.position + ball.velocity * dt", "test_physics.py -k random_states"),
     ("a contact pulls", NORMALS, "return [jnp.maximum(first_linear / pivot, 0.0)]", "return [first_linear / pivot]", "test_physics.py -k random_states"),

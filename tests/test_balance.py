@@ -9,7 +9,7 @@ from bounce_mjx import task
 from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.c_episodes import episode_models
 from bounce_mjx.physics import PhysicsParameters
-from bounce_mjx.tasks.balance import Balance, Config
+from bounce_mjx.task.balance import Balance, Config
 from bounce_mjx.world.randomization import RandomizationConfig
 
 REACH, SPEED, FRICTION, HALF_SIZE, RADIUS = 0.03, 0.05, 0.3, 0.0035, 0.019

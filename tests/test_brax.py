@@ -26,7 +26,7 @@ from bounce_mjx.adapters.brax import (
 )
 from bounce_mjx.errors import UserError
 from bounce_mjx.task import term_names
-from bounce_mjx.tasks.bounce_rewards import BounceReward
+from bounce_mjx.task.bounce_rewards import BounceReward
 
 
 def all_finite(tree) -> bool:

@@ -4,17 +4,21 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
+import mujoco
 import numpy as np
 import pytest
 
 from bounce_mjx import load_policy
+from bounce_mjx.resources import resource_path
 
 cv2 = pytest.importorskip("cv2")
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 sys.path.insert(0, str(EXAMPLES))
 
+import rendered_cameras  # noqa: E402
 import two_cameras as cameras  # noqa: E402
 
 SIZE = 640, 480
@@ -173,3 +177,147 @@ def test_a_policy_plays_from_rendered_pictures(tmp_path) -> None:
     assert "20 poses" in done.stdout and "36 pairs of pictures, 0 without a ball" in done.stdout
     error = float(done.stdout.split("off by ")[1].split(" mm")[0])
     assert error < 4.0
+
+
+class DrawnCameras:
+    """Stands in for `RenderedCameras`: a grey wall, and the ball as a disc. It needs no OpenGL."""
+
+    exposure = 0.004
+
+    def __init__(self, pair: tuple[cameras.Camera, ...], rate: float = 120.0):
+        self._pair = pair
+        self._rate = rate
+        self._count = 0
+        noise = 3.0 * np.random.default_rng(0).standard_normal((SIZE[1], SIZE[0], 3))
+        self.wall = np.clip(110.0 + noise, 0, 255).astype(np.uint8)
+        self.covered: set[int] = set()
+        """Cameras before which somebody holds a hand."""
+
+    def look(self, data: mujoco.MjData) -> rendered_cameras.Picture | None:
+        if data.time < self._count / self._rate - 1e-9:
+            return None
+        self._count += 1
+        place = data.joint("ball_link").qpos[:3].copy()
+        pictures = []
+        for number, camera in enumerate(self._pair):
+            picture = self.wall.copy()
+            if number not in self.covered:
+                x, y = camera.project(place[None])[0]
+                centre = (round(16 * x), round(16 * y))
+                radius = round(16 * camera.radius_at(place))
+                cv2.circle(picture, centre, radius, (250, 250, 250), -1, cv2.LINE_AA, 4)
+            pictures.append(picture)
+        return rendered_cameras.Picture(data.time, data.time + 0.006, tuple(pictures), place)
+
+
+class Play(NamedTuple):
+    """What happened while a policy played from drawn pictures."""
+
+    bounces: int
+    fault: str
+    """Code of the first fault; empty for none."""
+    braking_after: float
+    """Time from the covering of a camera to the braking, s."""
+    largest_step: float
+    """Largest change of a command in a control step, rad."""
+
+
+def play_from_drawn_pictures(
+    believed: tuple[cameras.Camera, ...], cover: int | None = None, seconds: float = 2.0
+) -> Play:
+    """The robust policy plays until its supervisor stops it. One camera is covered after 1 s.
+
+    Args:
+      believed: the cameras as a calibration gives them.
+      cover: number of the camera that is covered.
+    """
+    policy = load_policy("robust")
+    model = mujoco.MjModel.from_xml_path(str(resource_path("mjcf/bounce_ball.xml")))
+    data = mujoco.MjData(model)
+    drawn = DrawnCameras(true_cameras())
+    tracker = cameras.Tracker(believed, cameras.COLOURS["white"], exposure=1e-4)
+    tracker.learn_background([(drawn.wall, drawn.wall)])
+    camera = rendered_cameras.SeenBall(drawn, tracker, calibration=None)
+    arm = policy.supervise(rate=1.0 / model.opt.timestep)
+    joints = [data.joint(name) for name in policy.metadata.joint_names]
+    for joint, angle in zip(joints, policy.metadata.default_joint_angles, strict=True):
+        joint.qpos = angle
+    ball = data.joint("ball_link")
+    held = ball.qpos.copy()
+    camera.look(data)
+    bounces, was_falling, largest_step, last = 0, False, 0.0, None
+    begun, covered_at, braking_at, fault = None, None, None, ""
+    while data.time < seconds:
+        measured = {
+            "joint_angles": [joint.qpos[0] for joint in joints],
+            "joint_velocities": [joint.qvel[0] for joint in joints],
+            "target_height": 0.5,
+            "time": data.time,
+            **camera.measure(data.time),
+        }
+        commands = arm.commands(measured)
+        if last is not None:
+            largest_step = max(largest_step, np.max(np.abs(commands[-1] - last)))
+        last = commands[-1]
+        if arm.state == "ready" and "ball_position" in measured and begun is None:
+            arm.start()
+            begun = data.time
+        if begun is not None and cover is not None and data.time > begun + 1.0:
+            if covered_at is None:
+                covered_at = data.time
+            drawn.covered = {cover}
+        if arm.state in ("braking", "stopped") and braking_at is None:
+            braking_at, fault = data.time, arm.fault
+        if arm.state == "stopped":
+            break
+        for command in commands:
+            data.ctrl[:] = command
+            mujoco.mj_step(model, data)
+            if arm.state not in ("running", "braking"):
+                ball.qpos[:], ball.qvel[:] = held, 0.0
+            bounces += bool(was_falling and ball.qvel[2] > 0.0)
+            was_falling = ball.qvel[2] < 0.0
+            camera.look(data)
+    braking_after = np.nan
+    if braking_at is not None and covered_at is not None:
+        braking_after = braking_at - covered_at
+    return Play(bounces, fault, braking_after, largest_step)
+
+
+def test_a_policy_plays_from_pictures_alone() -> None:
+    play = play_from_drawn_pictures(true_cameras())
+    assert play.fault == "" and play.bounces >= 2
+
+
+def test_a_covered_camera_brakes_the_arm() -> None:
+    play = play_from_drawn_pictures(true_cameras(), cover=1, seconds=3.0)
+    assert play.fault == "old_picture"
+    assert 0.05 < play.braking_after < 0.3
+    assert play.largest_step <= max(load_policy("robust").metadata.largest_step) + 1e-9
+
+
+def moved(camera: cameras.Camera, shift: np.ndarray, turn: np.ndarray) -> cameras.Camera:
+    """A camera as somebody believes it to stand: moved (m) and turned (rad) from where it is."""
+    rotation = camera.rotation @ cv2.Rodrigues(np.array(turn))[0].T
+    return camera._replace(rotation=rotation, translation=-rotation @ (camera.centre + shift))
+
+
+@pytest.mark.parametrize(
+    ("shift", "turn"),
+    [((0.0, 0.0, 0.10), (0.0, 0.0, 0.0)), ((0.0, 0.0, 0.0), (0.0, 0.0, 0.05))],
+)
+def test_one_camera_that_was_moved_gives_no_place(shift, turn) -> None:
+    """The rays do not meet, so the arm never starts."""
+    first, second = true_cameras()
+    believed = (first, moved(second, np.array(shift), np.array(turn)))
+    play = play_from_drawn_pictures(believed, seconds=0.5)
+    assert play.bounces == 0
+
+
+def test_cameras_in_a_wrong_frame_end_with_the_supervisor() -> None:
+    """Both are off together by 10 cm: the places fit each other, and the arm misses the ball."""
+    shift = np.array([0.0, 0.10, 0.0])
+    believed = tuple(moved(camera, shift, np.zeros(3)) for camera in true_cameras())
+    play = play_from_drawn_pictures(believed, seconds=3.0)
+    assert play.fault == "ball_lost" and play.bounces == 0
+    assert play.largest_step <= max(load_policy("robust").metadata.largest_step) + 1e-9

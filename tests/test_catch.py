@@ -9,7 +9,7 @@ import pytest
 from bounce_mjx import task
 from bounce_mjx.env.env import Env
 from bounce_mjx.robot.model import find_addresses
-from bounce_mjx.tasks.catch import Catch, Config
+from bounce_mjx.task.catch import Catch, Config
 
 DT, REST_HEIGHT = 0.01, 0.0225
 

@@ -15,6 +15,7 @@ import pytest
 
 import bounce_mjx
 from bounce_mjx.deploy.export import export_onnx
+from bounce_mjx.env.bounce_ball import BounceBall
 from bounce_mjx.errors import UserError, warn_once
 from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.learning.config import PPOConfig
@@ -32,8 +33,7 @@ from bounce_mjx.runs.folders import (
 )
 from bounce_mjx.runs.records import verify
 from bounce_mjx.runs.settings import read_preset
-from bounce_mjx.tasks.bounce import BounceConfig
-from bounce_mjx.tasks.bounce_ball import BounceBall
+from bounce_mjx.task.bounce import BounceConfig
 
 OBSERVATION = BounceConfig().layout
 

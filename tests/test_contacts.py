@@ -13,7 +13,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.contacts import ContactChecker, arm_contacts
 from bounce_mjx.identify.excitation import excite
 from bounce_mjx.robot.model import find_addresses, load_model
-from bounce_mjx.task.shown import Recording
+from bounce_mjx.task.task import Recording
 
 HOME = np.radians([0.0, 40.0, 110.0, 0.0, -60.0, 0.0])
 

@@ -11,7 +11,9 @@ import pkgutil
 import re
 import runpy
 import shlex
+import subprocess
 import sys
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -29,13 +31,15 @@ from bounce_mjx.config.settings import StrictModel, fields_in
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.settings import Choice, read_preset, stack
-from bounce_mjx.task import term_names, weighted_terms
-from bounce_mjx.tasks.bounce import Bounce
-from bounce_mjx.tasks.bounce_rewards import BounceReward, RewardInputs
-from bounce_mjx.tasks.registry import find_task
+from bounce_mjx.task import registry, term_names, weighted_terms
+from bounce_mjx.task.bounce import Bounce
+from bounce_mjx.task.bounce_rewards import BounceReward, RewardInputs
+from bounce_mjx.task.registry import find_task
 from bounce_mjx.training import hosts
 from bounce_mjx.training.command import fields_of_command
+from bounce_mjx.training.run import Run, notes_on_starts
 from bounce_mjx.world.randomization import TERMS
+from tiny_runs import shared_run
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 REFERENCE = runpy.run_path(str(CHECKOUT / "docs/config_reference.py"))["reference"]()
@@ -52,6 +56,12 @@ def page_id(page: Path) -> str:
 
 def content(page: str) -> str:
     return (CHECKOUT / "docs" / page).read_text(encoding="utf-8")
+
+
+def examples(page: str, language: str) -> list[str]:
+    """The code blocks of a page in a language; of a page outside docs/, none."""
+    text = content(page) if (CHECKOUT / "docs" / page).is_file() else ""
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
 
 
 def code(page: Path) -> list[str]:
@@ -190,6 +200,22 @@ def test_config_reference_is_fresh() -> None:
     assert page == REFERENCE, "docs/config.md is stale; it names the command that prints it"
 
 
+def test_api_reference_is_fresh() -> None:
+    pytest.importorskip("griffe")
+    written = runpy.run_path(str(CHECKOUT / "docs/api_reference.py"))["reference"]()
+    assert content("api.md") == written, "docs/api.md is stale; it names the command that prints it"
+
+
+def test_api_reference_has_arguments_shapes_and_errors() -> None:
+    page = content("api.md")
+    entry = page.split("### `bounce_mjx.env.env.Env`\n")[1].split("\n### ")[0]
+    assert "Env.step(state: State, action: jax.Array) -> State" in entry
+    assert "under the action [n], clipped to [-1, 1]" in " ".join(entry.split())
+    assert "- `rng`: key; consumed." in entry and "- `UserError`: " in entry
+    state = page.split("### `bounce_mjx.env.env.State`\n")[1].split("\n### ")[0]
+    assert "- `obs: jax.Array` Observation [observation_size]." in state
+
+
 def test_table_of_libraries_names_every_example_and_existing_tests() -> None:
     page = content("libraries.md")
     rows = re.findall(r"^\| .+ \| .+ \| (`.+`) \| (`.+`) \|$", page, re.MULTILINE)
@@ -210,13 +236,11 @@ def test_table_of_libraries_names_every_example_and_existing_tests() -> None:
             assert not name or f"\ndef {name}(" in text, test
 
 
-def test_task_page_has_the_weights() -> None:
+def test_task_page_has_the_table_of_the_terms() -> None:
     page = content("task.md")
-    rows = re.findall(r"^\| `(\w+)` \| ([\d.]+) \| `", page, re.MULTILINE)
-    defaults = BounceReward()
-    assert {name: float(weight) for name, weight in rows} == {
-        name: getattr(defaults, name).weight for name in term_names(BounceReward)
-    }
+    assert page.count("\n<!-- reward terms -->\n| term |") == 1
+    script = runpy.run_path(str(CHECKOUT / "docs/reward_table.py"))
+    assert page == script["with_table"](page), "stale; python docs/reward_table.py writes it"
 
 
 TROUBLES = re.findall(
@@ -282,18 +306,35 @@ def test_the_site_has_the_files_that_its_pages_link_to(need) -> None:
     assert not [path for path in linked if config.exclude_docs.match_file(path)]
 
 
-def examples(page: str, language: str) -> list[str]:
-    """The code blocks of a page in a language."""
-    return re.findall(rf"^```{language}\n(.*?)^```", content(page), re.MULTILINE | re.DOTALL)
+@pytest.mark.parametrize("page", [path.name for path in PAGES if examples(path.name, "yaml")])
+def test_files_on_pages_are_configs_or_worlds(page: str, tmp_path: Path) -> None:
+    path = tmp_path / "my.yaml"
+    for file in examples(page, "yaml"):
+        path.write_text(file, encoding="utf-8")
+        is_world = "sources:" in file
+        read_preset(None, world=path) if is_world else read_preset(path)
 
 
-@pytest.mark.parametrize("page", ["task.md", "other-robots.md", "training.md"])
-def test_files_on_pages_are_configs(page: str, tmp_path: Path) -> None:
-    files = examples(page, "yaml")
-    assert files
-    for file in files:
-        (tmp_path / "my.yaml").write_text(file, encoding="utf-8")
-        read_preset(tmp_path / "my.yaml")
+def test_other_blocks_of_pages_are_what_they_say() -> None:
+    """Shell scripts, a package's metadata, and Python that would train for minutes, whose names
+    exist; test_sb3.py does what it says."""
+    languages = {
+        x for path in PAGES for x in re.findall(r"^```(\w+)$", path.read_text("utf-8"), re.M)
+    }
+    assert languages == {"python", "py", "yaml", "bash", "toml"}
+    for page in ("libraries.md", "runs.md"):
+        for script in examples(page, "bash"):
+            subprocess.run(["bash", "-n"], input=script, text=True, check=True)
+    (package,) = examples("tasks.md", "toml")
+    assert tomllib.loads(package)["project"]["entry-points"].keys() == {registry.GROUP}
+    for program in examples("libraries.md", "py"):
+        for line in ast.walk(ast.parse(program)):
+            if isinstance(line, ast.ImportFrom) and line.module.startswith("bounce_mjx"):
+                source = CHECKOUT / "src" / f"{line.module.replace('.', '/')}.py"
+                defined = {
+                    getattr(x, "name", "") for x in ast.parse(source.read_text("utf-8")).body
+                }
+                assert {name.name for name in line.names} <= defined
 
 
 def test_new_term_of_the_rewards_page_is_a_term(tmp_path: Path) -> None:
@@ -321,8 +362,10 @@ def short_training(folder: Path) -> Callable:
 
     def train(*given, callbacks=(), **settings):
         calls.append(settings)
-        if len(calls) > 1:
-            return stack(Choice()).config(settings)
+        if len(calls) > 1:  # the page's sweep
+            config = stack(Choice()).config(settings)
+            assert not notes_on_starts(config)
+            return config
         return real(*given, callbacks=callbacks, **settings | short, log_dir=folder)
 
     return train
@@ -349,6 +392,8 @@ def test_python_of_a_page_runs(page: str, capsys, tmp_path: Path, monkeypatch, r
         shapes = functools.partial(jax.eval_shape, function)
         return lambda *args: jax.tree.map(lambda x: jnp.ones(x.shape, x.dtype), shapes(*args))
 
+    if page == "../README.md":
+        monkeypatch.setattr(bounce_mjx, "train", lambda *_, **settings: Run(shared_run()))
     if page == "libraries.md":
         for fixture in ("opengl", "torch_libraries"):
             request.getfixturevalue(fixture)
@@ -378,6 +423,39 @@ def test_tables_of_figures_are_as_drawn() -> None:
         assert figures["drawn"](text, known) == text, f"python benchmarks/figures.py writes {page}"
         shown |= {name for _, name in figures["TABLE"].findall(text)}
     assert shown == known.keys()
+
+
+def test_verdicts_of_figures_are_by_their_worst_number() -> None:
+    verdict = runpy.run_path(str(CHECKOUT / "benchmarks/figures.py"))["verdict"]
+    assert verdict("at most 45 s", "34 to 45 s") == "reached"
+    assert verdict("at most 45 s", "34 to 46 s") == "missed"
+    assert verdict("at least 11.5 M", "11.4 to 11.6 M") == "missed"
+    assert verdict("at least 1,000", "1,271") == "reached"
+    assert verdict("90 to 99%", "89.9%") == "missed"
+    assert verdict("at most 1e-11", "5.6e-13") == "reached"
+    assert verdict("all five results", "four of them") == "missed"
+
+
+HAND_WRITTEN = [page for page in PAGES if page.name not in ("api.md", "config.md")]
+
+
+def test_pages_have_at_most_the_words_that_contributing_allows() -> None:
+    bound = re.search(
+        r"README and docs/ have ([\d,]+) words", PAGES[1].read_text(encoding="utf-8")
+    )[1]
+    words = {}
+    for page in HAND_WRITTEN:
+        text = page.read_text(encoding="utf-8")
+        text = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
+        words[page_id(page)] = len(re.sub(r"^ {4}.*$", "", text, flags=re.MULTILINE).split())
+    del words["CONTRIBUTING.md"]
+    assert sum(words.values()) <= int(bound.replace(",", "")), words
+
+
+def test_users_pages_name_no_commit() -> None:
+    for page in PAGES:
+        found = re.findall(r"\b(?=[0-9a-f]*\d)(?=\d*[a-f])[0-9a-f]{7,8}\b", page.read_text("utf-8"))
+        assert not found, f"{page_id(page)}: {found}"
 
 
 def test_robot_page_has_every_term_of_the_randomisation() -> None:

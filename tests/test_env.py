@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 
 from bounce_mjx import BounceBall, EnvConfig
-from bounce_mjx.config.validation import validate
-from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
-from bounce_mjx.task import Kinematics, Step
-from bounce_mjx.tasks.bounce import Bounce, BounceState
+from bounce_mjx.task import Kinematics, Step, term_names
+from bounce_mjx.task.bounce import Bounce, BounceReward, BounceState
 from bounce_mjx.world.config import PADDLE_HOME
 from reward_reference import REFERENCE_WEIGHTS, reference_terms
 
@@ -174,14 +172,6 @@ def test_reset_has_a_resting_ball_and_no_history(resets):
 NO_NOISE = {"joint_angles": 0, "joint_velocities": 0, "ball_position": 0}
 
 
-def test_a_config_of_an_earlier_version_has_no_filter() -> None:
-    former = EnvConfig(estimator={"restitution": 0.8}, observation={"position": "measured"})
-    assert former == EnvConfig()
-    for name in ("position", "velocity"):
-        with pytest.raises(UserError, match=f"a.yaml.*{name}"):
-            validate(EnvConfig, {"observation": {name: "filter"}}, "a.yaml")
-
-
 def test_noise_free_reset_has_the_paddle_at_home():
     config = EnvConfig(reset=NO_NOISE, target_height_range=(0.8, 0.8))
     obs = jax.jit(BounceBall(config).reset)(jax.random.key(0)).obs
@@ -276,7 +266,7 @@ def episodes(reset, step):
 
 
 def test_a_step_reports_the_terms_of_its_reward_and_the_metrics(episodes, reset):
-    names = {f"reward/{name}" for name in REFERENCE_WEIGHTS}
+    names = {f"reward/{name}" for name in term_names(BounceReward)}
     others = {"bounced", "n_bounces", "ball_xy_error", "apex_error", "apex_offset"}
     assert set(reset(jax.random.key(0)).metrics) == names | others | {"non_finite", "too_fast"}
     for _, action, after in episodes:

@@ -30,7 +30,7 @@ from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.physics import PhysicsParameters
 from bounce_mjx.reports.tables import details_line, seeds_table
 from bounce_mjx.task import Tally, share_of_episodes
-from bounce_mjx.tasks.registry import find_task
+from bounce_mjx.task.registry import find_task
 
 BOUNCES, HORIZONTAL, HEIGHT, SPEED, STABLE = range(5)
 TARGET_X = 0.58856

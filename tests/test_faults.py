@@ -15,6 +15,8 @@ CASES = [
     ("ur5e", "joint 1: encoder drifts by 0.5 rad/s"),
     ("ur5e", "ball: thrown away"),
     ("pretrained", "joint 6: encoder is frozen"),
+    ("pretrained", "all joints: dry friction, 4,096 counts"),
+    ("balance", "joint 1: encoder is frozen"),
 ]
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from bounce_mjx import BounceBall
 from bounce_mjx.env.env import State
 from bounce_mjx.task import term_names
-from bounce_mjx.tasks.bounce_rewards import BounceReward
+from bounce_mjx.task.bounce_rewards import BounceReward
 from bounce_mjx.viewers.browser import reward_bars
 from bounce_mjx.viewers.display import Display, body_scenes
 from bounce_mjx.viewers.simulation import EnvFrame, make_random_controller, resample
@@ -83,7 +83,7 @@ def test_random_actions_are_uniform(env: BounceBall) -> None:
 
 def test_reward_bars_show_every_term() -> None:
     terms = dict.fromkeys(term_names(BounceReward), 0.0) | {"position": 2.0, "alignment": -1.25}
-    terms["sixteenth_term"] = 0.5
+    terms["my_term"] = 0.5
     text = reward_bars(terms)
     for name in terms:
         assert text.count(f">{name.replace('_', ' ')}<") == 1

@@ -19,7 +19,7 @@ from gymnasium.wrappers import RecordEpisodeStatistics
 from bounce_mjx.adapters.gymnasium import batch, environments
 from bounce_mjx.adapters.gymnasium.registration import ENV_ID, TASK_ID, TASKS
 from bounce_mjx.errors import UserError
-from bounce_mjx.tasks.registry import find_task, registered_tasks
+from bounce_mjx.task.registry import find_task, registered_tasks
 
 NUM_ENVS = 3
 # A ball without a paddle reaches the floor after 30 steps.
@@ -93,19 +93,27 @@ def assert_same(left, right, tolerance: float) -> None:
         assert left is right is None
 
 
-def test_import_registers_whichever_comes_first():
-    # Other libraries, such as TorchRL, look for Gymnasium before they import it.
-    looks = "import bounce_mjx; __import__('importlib.util').util.find_spec('gymnasium')"
-    for order in (
-        "import bounce_mjx, gymnasium",
-        "import gymnasium, bounce_mjx",
-        f"{looks}; import gymnasium",
-    ):
-        script = (
-            f"{order}\nprint(gymnasium.spec({ENV_ID!r}).id, 'torch' in __import__('sys').modules)"
-        )
-        done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-        assert done.stdout.split() == [ENV_ID, "False"], done.stderr
+def test_one_import_registers_the_environments_and_no_import_is_hooked() -> None:
+    """Also Gymnasium's own form, with the name of the module before the environment's."""
+    script = f"""
+import sys
+finders = list(sys.meta_path)
+import bounce_mjx
+assert sys.meta_path == finders and "gymnasium" not in sys.modules
+import bounce_mjx.adapters.gymnasium, gymnasium
+print(gymnasium.spec({ENV_ID!r}).id, "torch" in sys.modules, "jax" in sys.modules)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.stdout.split() == [ENV_ID, "False", "False"], done.stderr
+    script = f"""
+import gymnasium
+try:
+    gymnasium.make("bounce_mjx:" + {ENV_ID!r}, frameskip=2)
+except TypeError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert "frameskip" in done.stdout, done.stderr
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import pytest
 from bounce_mjx import task
 from bounce_mjx.errors import UserError
 from bounce_mjx.robot.model import find_addresses, load_model
-from bounce_mjx.tasks.juggle import Config, Juggle, Rewards
+from bounce_mjx.task.juggle import Config, Juggle, Rewards
 
 JUGGLE = Juggle(Config())
 HOME = np.array(JUGGLE.config.home)

@@ -24,7 +24,7 @@ from bounce_mjx.learning.ppo import PPO
 from bounce_mjx.physics import Control
 from bounce_mjx.robot.model import fingerprint
 from bounce_mjx.runs.config import TrainConfig, fields_of
-from bounce_mjx.tasks.registry import find_task
+from bounce_mjx.task.registry import find_task
 from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.job import open_job
 from bounce_mjx.training.ppo_trainer import episode_steps

@@ -14,7 +14,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.limits import limit_shares
 from bounce_mjx.physics import servo_targets
 from bounce_mjx.robot.setpoints import JointLimits, Setpoint, command, next_setpoint
-from bounce_mjx.task.shown import Recording
+from bounce_mjx.task.task import Recording
 
 VELOCITY, ACCELERATION, JERK = 2.0, 15.0, 7500.0
 LIMITS = {

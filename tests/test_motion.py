@@ -395,6 +395,29 @@ def test_zeros_of_a_driver_without_data_are_no_command() -> None:
             policy.step(seen(np.zeros(joints), 0, 0.3))
 
 
+def test_a_wrong_first_sample_of_a_joint_is_no_command() -> None:
+    for name, joint, size in (("robust", 1, 0.5), ("ur5e", 0, 0.5), ("iiwa", 1, 0.25)):
+        arm, home, seen = supervised(name)
+        wrong = home + size * (np.arange(len(home)) == joint)
+        # Far from the start pose, it waits for a second one that agrees.
+        assert not len(arm.commands(seen(wrong, 0, 0.3)))
+        assert arm.fault is None and "the next sample confirms them" in arm.reason
+        for step in range(1, 20):
+            commands = arm.commands(seen(home, step, 0.3))
+            assert len(commands) == 5 and np.max(np.abs(commands - home)) < 1e-9
+        with pytest.raises(UserError, match="the next sample confirms them"):
+            load_policy(name).step(seen(wrong, 0, 0.3))
+        # Near the start pose it is believed, and the right ones are a jump; nothing else moves.
+        arm, home, seen = supervised(name)
+        wrong = home + 0.15 * (np.arange(len(home)) == joint)
+        rows = [arm.commands(seen(wrong, 0, 0.3))[-1]]
+        rows += [arm.commands(seen(home, step, 0.3))[-1] for step in range(1, 20)]
+        assert arm.fault == "joint_jump"
+        largest_step = np.array(load_policy(name).metadata.largest_step)
+        assert np.all(np.abs(np.diff(rows, axis=0)) <= largest_step + 1e-12)
+        assert np.max(np.abs(rows - home)) < 0.15 + 1e-9
+
+
 def test_another_order_of_the_joints_is_refused_at_the_start_pose() -> None:
     arm, home, seen = supervised("ur5e")
     alphabetical = home[[2, 1, 0, 3, 4, 5]]

@@ -24,7 +24,7 @@ from mujoco_playground.config import manipulation_params
 
 from bounce_mjx.adapters.gymnasium.registration import TASKS
 from bounce_mjx.adapters.playground import PlaygroundBounceBall
-from bounce_mjx.tasks.registry import find_task
+from bounce_mjx.task.registry import find_task
 
 ENV_NAME = "BounceBall"
 

@@ -39,8 +39,8 @@ from bounce_mjx.runs.folders import save_config
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.task import Curve, term_names
-from bounce_mjx.task.shown import Hits
-from bounce_mjx.tasks.bounce import Bounce, BounceReward
+from bounce_mjx.task.bounce import Bounce, BounceReward
+from bounce_mjx.task.task import Hits
 from bounce_mjx.training.events import Event
 from bounce_mjx.training.log import TensorBoardLog
 from tiny_runs import TINY
@@ -91,6 +91,19 @@ def test_runs_that_differ_in_the_seed_are_one_group(runs: list[Path]) -> None:
         "num_envs 2048 (one run)",
     ]
     assert [group.label for group in group_runs(runs[:3])] == ["3 runs"]
+
+
+@pytest.mark.parametrize(
+    ("target_kl", "name"), [(0.01, "first learning_rate"), (0.0, "learning_rate")]
+)
+def test_a_learning_rate_that_adapts_is_labelled_as_the_first(target_kl, name, tmp_path) -> None:
+    runs = []
+    for rate in (1e-3, 1e-4):
+        ppo = PPOConfig(learning_rate=rate, target_kl=target_kl)
+        run = tmp_path / str(rate)
+        runs.append(write_run(run, TrainConfig(ppo=ppo), {"episode/return": {1: 1.0}}))
+    labels = [group.label for group in group_runs(runs)]
+    assert labels == [f"{name} 0.001 (one run)", f"{name} 0.0001 (one run)"]
 
 
 def test_a_curve_has_the_values_logged_last(tmp_path: Path) -> None:
@@ -190,7 +203,8 @@ def check_report(run: Path) -> str:
     assert len(replays) == 1 and b"<title>bounce_mjx</title>" in base64.b64decode(
         replays[0].partition(",")[2]
     )
-    assert len(sources) - len(replays) == 3
+    # Curves, the best checkpoint, and a panel for each reward term.
+    assert len(sources) - len(replays) == 2 + len(TERMS)
     for source in set(sources) - set(replays):
         kind, _, data = source.partition(",")
         assert kind == "data:image/svg+xml;base64"

@@ -12,17 +12,17 @@ from brax.training.agents.ppo.networks import make_ppo_networks
 from brax.training.distribution import NormalDistribution
 
 from bounce_mjx.learning.config import PPOConfig
-from bounce_mjx.learning.networks import Gaussian
-from bounce_mjx.learning.policy import Policy, make_networks
+from bounce_mjx.learning.policy import ActionDistribution, Policy, make_networks
 from bounce_mjx.learning.statistics import (
     MAX_NORMALIZED,
     MIN_VARIANCE,
+    denormalize,
     init_normalizer,
     init_statistics,
     normalize,
     update,
 )
-from bounce_mjx.tasks.bounce import BounceConfig
+from bounce_mjx.task.bounce import BounceConfig
 
 OBSERVATION = BounceConfig().layout
 
@@ -48,6 +48,15 @@ def normalizer(seen):
 def test_far_observations_are_clipped(normalizer):
     far = normalize(jnp.full(N, 1e6), normalizer)
     np.testing.assert_array_equal(np.delete(far, CONSTANT), 10.0)
+
+
+def test_denormalised_inputs_have_their_units(seen, normalizer):
+    """Up to rounding, also the constant ones; one that was clipped is at 10 standard deviations."""
+    units = denormalize(normalize(jnp.asarray(seen), normalizer), normalizer)
+    np.testing.assert_allclose(units, seen, rtol=1e-5, atol=1e-5)
+    far = denormalize(normalize(jnp.full(N, -1e6), normalizer), normalizer)
+    limit = seen.mean(axis=0) - 10.0 * seen.std(axis=0)
+    np.testing.assert_allclose(far, limit, rtol=1e-3, atol=1e-3)
 
 
 def test_before_any_data_observations_are_unchanged():
@@ -122,10 +131,10 @@ def test_networks_equal_brax(which, config, brax_networks, seen):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
 
 
-def test_gaussian_equals_brax(seen):
+def test_distribution_of_the_action_equals_brax(seen):
     rng = np.random.default_rng(1)
     mean, std = rng.normal(size=(50, 6)), np.exp(rng.normal(size=(50, 6)))
-    ours, theirs = Gaussian(mean, std), NormalDistribution(6)
+    ours, theirs = ActionDistribution(mean, std), NormalDistribution(6)
     value = mean + 3.0 * std * rng.normal(size=(50, 6))
     expected = theirs.log_prob((mean, std), jnp.asarray(value))
     np.testing.assert_allclose(ours.log_prob(value), expected, rtol=1e-4)

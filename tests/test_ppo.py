@@ -1,11 +1,15 @@
 """PPO: advantages, learning rate, bootstrapping at time-outs, purity, and that it learns."""
 
+import re
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
+import optax
 import pytest
+from jax.flatten_util import ravel_pytree
 
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.env.env import State
@@ -13,15 +17,38 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import judge
 from bounce_mjx.learning import policy, ppo
-from bounce_mjx.learning.config import PPOConfig, find_algorithm
+from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.ppo import generalized_advantages
-from bounce_mjx.learning.statistics import normalize
+from bounce_mjx.learning.registry import find_algorithm
+from bounce_mjx.learning.statistics import Normalizer, init_normalizer, normalize
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import create_run
 from bounce_mjx.task import Task
 from bounce_mjx.training.command import read_command
 
 OBSERVATION = EnvConfig().layout
+
+# Each block of Python on the page about changing PPO is a file of a user's.
+PAGE = (Path(__file__).parents[1] / "docs/algorithms.md").read_text(encoding="utf-8")
+RECIPES = re.findall(r"^```python\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
+
+
+def recipe(name: str, folder: Path) -> type[ppo.PPO]:
+    """The algorithm of that name on the page, found as `--algorithm` finds it."""
+    (block,) = (block for block in RECIPES if f"class {name}(" in block)
+    (folder / f"{name}.py").write_text(block)
+    return find_algorithm(f"{folder}/{name}.py:{name}")
+
+
+def point_of_the_page() -> type:
+    """The environment on the page, which has no more than `AnyEnv` asks for."""
+    (block,) = (block for block in RECIPES if "class Point:" in block)
+    names: dict = {}
+    exec(block.split("\n\n\ntrainer =")[0], names)
+    return names["Point"]
+
+
+Point = point_of_the_page()
 
 
 def plain(tree):
@@ -75,40 +102,42 @@ def test_advantages_equal_their_definition(discount, lam):
 
 
 @pytest.fixture(scope="module")
-def rate_config():
+def rate() -> ppo.PPO:
     """The limit falls over ten iterations of 100 steps each."""
-    return PPOConfig(
+    config = PPOConfig(
         num_envs=10, rollout_length=10, num_minibatches=2, decay_steps=1000,
         max_learning_rate=1e-2, final_max_learning_rate=1e-4, min_learning_rate=1e-5,
         target_kl=0.01,
     )  # fmt: skip
+    return ppo.PPO(config, Point(), episode_steps=10)
 
 
-def test_max_learning_rate_decays_exponentially(rate_config):
+def test_max_learning_rate_decays_exponentially(rate):
     for iteration, expected in ((0, 1e-2), (5, 1e-3), (10, 1e-4), (11, 1e-4), (10**6, 1e-4)):
-        actual = ppo.max_learning_rate(rate_config, jnp.int32(iteration))
+        actual = rate.max_learning_rate(jnp.int32(iteration))
         np.testing.assert_allclose(actual, expected, rtol=1e-5)
 
 
-def adapted(config, kl, learning_rate=1e-3, limit=1e-2):
-    return float(ppo.adapt_learning_rate(config, learning_rate, jnp.float32(kl), limit))
+def adapted(trainer, kl, learning_rate=1e-3, iteration=0):
+    metrics = {"policy/kl": jnp.float32(kl)}
+    return float(trainer.adapt_learning_rate(learning_rate, metrics, jnp.int32(iteration)))
 
 
-def test_learning_rate_follows_the_kl_divergence(rate_config):
-    slower, faster = adapted(rate_config, 0.0201), adapted(rate_config, 0.0049)
+def test_learning_rate_follows_the_kl_divergence(rate):
+    slower, faster = adapted(rate, 0.0201), adapted(rate, 0.0049)
     assert slower < 1e-3 < faster
     np.testing.assert_allclose(slower * faster, 1e-6, rtol=1e-5)
     for kl in (0.0051, 0.01, 0.0199):
-        np.testing.assert_allclose(adapted(rate_config, kl), 1e-3, rtol=1e-6)
+        np.testing.assert_allclose(adapted(rate, kl), 1e-3, rtol=1e-6)
 
 
-def test_learning_rate_stays_in_its_limits(rate_config):
-    np.testing.assert_allclose(adapted(rate_config, 0.0, 9.9e-3), 1e-2, rtol=1e-6)
-    np.testing.assert_allclose(adapted(rate_config, 0.01, 5e-3, limit=2e-3), 2e-3, rtol=1e-6)
-    np.testing.assert_allclose(adapted(rate_config, 1.0, 1.01e-5), 1e-5, rtol=1e-6)
+def test_learning_rate_stays_in_its_limits(rate):
+    np.testing.assert_allclose(adapted(rate, 0.0, 9.9e-3), 1e-2, rtol=1e-6)
+    np.testing.assert_allclose(adapted(rate, 0.01, 5e-3, iteration=5), 1e-3, rtol=1e-5)
+    np.testing.assert_allclose(adapted(rate, 1.0, 1.01e-5), 1e-5, rtol=1e-6)
     # Without a target it is fixed, whatever its limits.
-    fixed = rate_config.model_copy(update={"target_kl": 0.0})
-    kept = [adapted(fixed, kl, limit=limit) for kl in (0.0, 1.0) for limit in (1e-2, 1e-4)]
+    fixed = ppo.PPO(rate.config.model_copy(update={"target_kl": 0.0}), Point(), episode_steps=10)
+    kept = [adapted(fixed, kl, iteration=i) for kl in (0.0, 1.0) for i in (0, 10)]
     np.testing.assert_allclose(kept, 1e-3, rtol=1e-6)
 
 
@@ -215,51 +244,50 @@ def test_settings_that_no_training_can_have_are_refused():
         assert two_state_config(learning_rate=rate).learning_rate == rate
 
 
-class Point:
-    """A point in the plane that an action moves: no more than `AnyEnv` asks for."""
-
-    class task:  # noqa: N801
-        curves = ()
-        critic_metrics = ()
-
-    observation_size = 2
-    action_size = 2
-
-    def reset(self, rng):
-        start = jax.random.normal(rng, (2,))
-        return State(start, start, jnp.zeros(()), jnp.zeros(()))
-
-    def step(self, state, action):
-        point = state.pipeline_state + 0.1 * action
-        return state.replace(pipeline_state=point, obs=point, reward=-jnp.sum(point**2))
-
-
-class Scheduled(ppo.PPO):
-    """A loss of its own, which tells no KL divergence, and a schedule of its own."""
+class Silent(ppo.PPO):
+    """A loss of its own, which tells no KL divergence."""
 
     def loss(self, params, samples):
         total, _ = super().loss(params, samples)
         return total, {"loss/own": total}
 
-    def next_learning_rate(self, learning_rate, metrics, iteration):
-        return 1e-3 * 0.5**iteration
 
-
-def test_any_environment_and_any_loss_train() -> None:
-    config = two_state_config(num_envs=64, target_kl=0.01)
-    trainer = Scheduled(config, Point(), episode_steps=8)
-    _, metrics = jax.jit(lambda key: trainer.run(trainer.init(key), 3))(jax.random.key(0))
-    # Nothing adapts what a schedule says.
-    np.testing.assert_allclose(metrics["policy/learning_rate"], [1e-3, 5e-4, 2.5e-4], rtol=1e-6)
+def test_any_environment_and_any_loss_train(tmp_path) -> None:
+    config = two_state_config(num_envs=64, decay_steps=512, learning_rate=1e-3)
+    scheduled = type("Scheduled", (Silent, recipe("Linear", tmp_path)), {})
+    trainer = scheduled(config, Point(), episode_steps=8)
+    _, metrics = jax.jit(lambda key: trainer.run(trainer.init(key), 5))(jax.random.key(0))
+    expected = [1e-3, 7.5e-4, 5e-4, 2.5e-4, 0.0]
+    np.testing.assert_allclose(metrics["policy/learning_rate"], expected, rtol=1e-6, atol=1e-12)
     assert np.all(np.isfinite(metrics["loss/own"])) and not np.any(metrics["fault"])
     assert np.all(metrics["reward"] < 0.0)
 
-    class Silent(Scheduled):
-        next_learning_rate = ppo.PPO.next_learning_rate
-
-    silent = Silent(config, Point(), episode_steps=8)
+    silent = Silent(config.model_copy(update={"target_kl": 0.01}), Point(), episode_steps=8)
     with pytest.raises(UserError, match="the loss of Silent returns no metric policy/kl"):
         jax.eval_shape(lambda key: silent.run(silent.init(key), 1), jax.random.key(0))
+
+
+class Descent(ppo.PPO):
+    """Plain gradient descent with a schedule of its own, beside the KL rule."""
+
+    def make_optimizer(self):
+        return optax.identity()
+
+    def learning_rate(self, adapted, iteration):
+        return 0.01 * 0.5**iteration
+
+
+def test_a_schedule_decides_each_minibatch_step(trainer, params):
+    """The first of an iteration too, and the KL rule, which has the rate 0.1 here, none."""
+    config = trainer.config.model_copy(update={"target_kl": 0.01})
+    descent, samples = Descent(config, trainer.env, 100), some_samples(trainer, params)
+    flat, unravel = ravel_pytree(params)
+    before = ppo.LearnerState(flat, optax.EmptyState(), jnp.float32(0.1))
+    step = jax.jit(lambda iteration: descent.minibatch_step(before, samples, unravel, iteration)[0])
+    gradient, _ = ravel_pytree(jax.grad(lambda p: trainer.loss(p, samples)[0])(params))
+    for iteration, rate in ((0, 0.01), (3, 0.00125)):
+        moved = step(jnp.int32(iteration)).params - flat
+        np.testing.assert_allclose(moved, -rate * gradient, rtol=1e-4, atol=1e-7)
 
 
 def test_episodes_do_not_all_time_out_together():
@@ -357,7 +385,9 @@ def test_the_objective_is_the_smaller_of_the_two(trainer, params):
     inputs, action, bound = jnp.ones((4, 3)), jnp.full((4, 1), 0.3), jnp.zeros((4, 1))
     ratio, advantage = np.array([0.5, 0.5, 1.5, 1.5]), np.array([1.0, -1.0, 2.0, -3.0])
     new = trainer.distribution(params, inputs, bound).log_prob(action)
-    samples = ppo.Samples(inputs, action, new - np.log(ratio), advantage, jnp.zeros(4), bound)
+    samples = ppo.Samples(
+        inputs, action, new - np.log(ratio), advantage, jnp.zeros(4), bound, init_normalizer(3)
+    )
     epsilon = trainer.config.clip_epsilon
     expected = -np.mean([0.5, -(1.0 - epsilon), 2.0 * (1.0 + epsilon), -4.5])
     _, parts = trainer.loss(params, samples)
@@ -370,7 +400,8 @@ def some_samples(trainer, params) -> ppo.Samples:
     inputs, action = (jnp.float32(rng.normal(size=(64, n))) for n in (3, 1))
     bound, target = jnp.zeros((64, 1)), jnp.float32(rng.normal(size=64))
     log_prob = trainer.distribution(params, inputs, bound).log_prob(action)
-    return ppo.Samples(inputs, action, log_prob + 0.3 * target, target, target, bound)
+    log_prob += 0.3 * target
+    return ppo.Samples(inputs, action, log_prob, target, target, bound, init_normalizer(3))
 
 
 def test_the_examples_term_weighs_the_change_of_the_action(trainer, params):
@@ -382,6 +413,93 @@ def test_the_examples_term_weighs_the_change_of_the_action(trainer, params):
     assert metrics["loss/smoothness"] > 0.0
     expected = 1e5 * float(metrics["loss/smoothness"])
     assert float(after - before) == pytest.approx(expected, rel=1e-3)
+
+
+def signs_of_the_mirror_image(env: BounceBall) -> tuple[np.ndarray, np.ndarray]:
+    """Signs of the observation [29] and of the action [6] in a mirror along y, from geometry."""
+    model, arm = env.mj_model, list(env.addresses.arm_qpos)
+    data = mujoco.MjData(model)
+    data.qpos[arm] = env.config.default_joint_angles
+    mujoco.mj_kinematics(model, data)
+    # A rotation about an axis along y stays, one about an axis in the mirror's plane turns back.
+    along_y = np.abs(data.xaxis[: len(arm), 1])
+    np.testing.assert_allclose(along_y, np.round(along_y), atol=1e-9)
+    joints = np.where(along_y > 0.5, 1.0, -1.0)
+    vector = np.array([1.0, -1.0, 1.0])
+    first, second = np.random.default_rng(0).normal(size=(2, 3))
+    spin = np.cross(vector * first, vector * second) / np.cross(first, second)
+    signs = {
+        "joint_angles": joints, "joint_velocities": joints, "ball_position": vector,
+        "ball_velocity": vector, "ball_quaternion": np.concatenate([[1.0], spin]),
+        "ball_angular_velocity": spin, "paddle_position": vector, "target_height": np.ones(1),
+    }  # fmt: skip
+    return np.concatenate([signs[part.name] for part in env.layout.parts]), joints
+
+
+def test_the_pages_symmetry_is_that_of_the_arm(tmp_path):
+    """The term is the difference between the actions that the policy, as it is evaluated, takes in
+    a state and in its mirror image, in their units."""
+    env = BounceBall()
+    of_observation, of_action = signs_of_the_mirror_image(env)
+    symmetric = recipe("Symmetric", tmp_path)
+    settings = two_state_config(critic_metrics=("n_bounces",)).model_dump()
+    free = symmetric(symmetric.Config(**settings, symmetry_cost=0.0), env, 100)
+    costly = symmetric(symmetric.Config(**settings, symmetry_cost=3.0), env, 100)
+    params = ppo.Params(
+        policy=costly.networks.policy_network.init(jax.random.key(0)),
+        value=costly.networks.value_network.init(jax.random.key(1)),
+    )
+    rng = np.random.default_rng(0)
+    size = env.observation_size + 1
+    mean, std = np.float32(rng.normal(size=size)), np.float32(rng.uniform(0.5, 2.0, size))
+    raw = np.float32(mean + std * rng.uniform(-1.0, 1.0, (32, size)))
+    normalizer = Normalizer(mean, std)
+    action, number, bound = np.zeros((32, 6)), np.zeros(32), np.zeros((32, 1))
+    inputs = normalize(raw, normalizer)
+    samples = ppo.Samples(inputs, action, number, number, number, bound, normalizer)
+
+    observation = raw[:, : env.observation_size]
+    evaluated = policy.Policy(Normalizer(mean[:-1], std[:-1]), params.policy)
+    here = costly.networks.act(evaluated, observation)
+    there = costly.networks.act(evaluated, of_observation * observation)
+    expected = np.mean(np.square(there - of_action * here))
+    without, _ = free.loss(params, samples)
+    total, metrics = costly.loss(params, samples)
+    assert expected > 1e-6
+    assert float(metrics["loss/asymmetry"]) == pytest.approx(expected, rel=1e-3)
+    assert float(total - without) == pytest.approx(3.0 * expected, rel=1e-2)
+
+
+def test_an_arm_has_a_mirror_image():
+    """The paddle of the mirrored joint angles is the mirrored paddle, in MuJoCo."""
+    env = BounceBall()
+    _, of_action = signs_of_the_mirror_image(env)
+    angles = np.random.default_rng(1).uniform(-1.0, 1.0, 6)
+    paddles = []
+    for pose in (angles, of_action * angles):
+        data = mujoco.MjData(env.mj_model)
+        data.qpos[list(env.addresses.arm_qpos)] = pose
+        mujoco.mj_kinematics(env.mj_model, data)
+        paddles.append(data.geom_xpos[env.addresses.paddle_geom].copy())
+    np.testing.assert_allclose(paddles[1], paddles[0] * [1.0, -1.0, 1.0], atol=1e-9)
+
+
+@pytest.mark.slow
+def test_the_pages_a2c_with_the_pages_network_learns(tmp_path):
+    """The reward is the negative square of a distance, at first 0.3^2."""
+    a2c, normed = recipe("A2C", tmp_path), recipe("NormedCritic", tmp_path)
+    kind = type("Both", (a2c, normed), {})
+    config = two_state_config(
+        num_envs=64, reward_scale=10.0, discount=0.0, learning_rate=1e-2, num_minibatches=1
+    )
+    trainer = kind(a2c.Config(**config.model_dump(exclude={"num_epochs"})), Precise(1.0), 2)
+    assert trainer.config.num_epochs == 1
+    state, metrics = jax.jit(lambda key: trainer.run(trainer.init(key), 400))(jax.random.key(0))
+    assert state.params.value["params"]["layers_1"]["scale"].shape == (128,)
+    action = trainer.networks.act(ppo.policy_of(state, 2), jnp.eye(2))
+    np.testing.assert_allclose(action, 0.3, atol=0.05)
+    assert metrics["reward"][-1] > metrics["reward"][0] / 4
+    assert not np.any(metrics["fault"])
 
 
 def test_a_shared_critic_continues_the_policys_layers(trainer):

@@ -23,7 +23,7 @@ from bounce_mjx.runs.folders import best_checkpoint, choose_checkpoint, pretrain
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.runs.worlds import in_world
-from bounce_mjx.tasks.registry import find_task
+from bounce_mjx.task.registry import find_task
 
 FOLDER = resource_path("pretrained")
 LOG_DIR = TrainConfig().log_dir

@@ -460,7 +460,7 @@ def run(moves: bool) -> Run:
         config = EnvConfig(
             randomization=terms,
             target_height_range=(0.3, 0.8),
-            joint_angle_noise=0.0,
+            reset={"joint_angles": 0.0},
             ball_init_pos=(0.59, 0, 0.2),
         )
         env = BounceBall(config)

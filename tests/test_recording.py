@@ -15,7 +15,7 @@ from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.task import Histogram, Hits, Recording
-from bounce_mjx.tasks.bounce import Bounce
+from bounce_mjx.task.bounce import Bounce
 
 EPISODES, RECORDED = 6, 4
 LAYOUT = EnvConfig().layout

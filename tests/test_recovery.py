@@ -25,6 +25,7 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from bounce_mjx.commands import train as train_command
+from bounce_mjx.env.bounce_ball import BounceBall
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import judge
 from bounce_mjx.learning.policy import make_networks
@@ -36,7 +37,6 @@ from bounce_mjx.runs.folders import (
     latest_checkpoint,
     stored_checkpoints,
 )
-from bounce_mjx.tasks.bounce_ball import BounceBall
 from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.ppo_trainer import PPOTrainer, make_mesh
 from tiny_runs import STEPS, TIMEOUT, TINY, arrays, job, shared_run

@@ -22,7 +22,7 @@ from bounce_mjx.learning.policy import networks_of
 from bounce_mjx.reports.robustness import load_robustness, robustness_table
 from bounce_mjx.resources import resource_path
 from bounce_mjx.task import Tally
-from bounce_mjx.tasks.registry import find_task
+from bounce_mjx.task.registry import find_task
 from bounce_mjx.world.randomization import TERMS
 
 DRIBBLE = f"{Path(__file__).parent.parent / 'examples' / 'dribble_task.py'}:Dribble"

@@ -92,6 +92,23 @@ def runs(tmp_path: Path, progress: Progress) -> Path:
     return tmp_path
 
 
+def test_a_config_of_0_1_0_has_settings_that_ended_or_moved(tmp_path: Path) -> None:
+    """Those that change nothing are left out, and others are refused, as no filter runs today."""
+    path = tmp_path / "config.yaml"
+    path.write_text(
+        "env: {estimator: {restitution: 0.8}, observation: {position: measured}, "
+        "randomization: {air_lift: null}, joint_angle_noise: 0.25}"
+    )
+    env = load_run_config(tmp_path).env
+    assert env.reset.joint_angles == 0.25
+    changed = env.reset.model_copy(update={"joint_angles": TrainConfig().env.reset.joint_angles})
+    assert env.model_copy(update={"reset": changed}) == TrainConfig().env
+    for setting in ("observation: {position: filter}", "randomization: {air_lift: [0, 1]}"):
+        path.write_text(f"env: {{{setting}}}")
+        with pytest.raises(UserError, match=f"unknown key env.{setting.partition(':')[0]}"):
+            load_run_config(tmp_path)
+
+
 @pytest.mark.parametrize("name", [None, Path("latest")])
 def test_the_newest_run_is_introduced(runs: Path, name: Path | None, capsys) -> None:
     """A result that is not judged counts neither as met nor as missed."""

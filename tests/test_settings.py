@@ -22,6 +22,7 @@ from bounce_mjx.runs.folders import create_run, pretrained_checkpoint
 from bounce_mjx.runs.settings import Choice, read_preset, stack
 from bounce_mjx.training import job
 from bounce_mjx.training.command import read_command
+from bounce_mjx.training.run import notes_on_starts
 from test_keys import KEYS, NEEDED, WITH, other, settings
 
 OWN = """
@@ -213,6 +214,16 @@ def test_a_file_has_the_same_defaults_wherever_it_lies(folder: Path, monkeypatch
     for path in (folder / "my.yaml", folder / "configs/my.yaml"):
         path.write_text("seed: 3")
         assert read_preset(path) == expected
+
+
+def test_a_learning_rate_that_adapts_is_said_to_be_the_first_one() -> None:
+    adapts = stack(Choice()).config({"learning_rate": 1e-3, "target_kl": 0.01})
+    (note,) = notes_on_starts(adapts)
+    assert note.startswith(
+        "ppo.learning_rate 0.001 is only the first one, since ppo.target_kl 0.01"
+    )
+    for said in ({"learning_rate": 1e-3, "target_kl": 0.0}, {"target_kl": 0.01}):
+        assert not notes_on_starts(stack(Choice()).config(said))
 
 
 def test_a_mistake_names_the_layer_that_has_it(folder: Path, refused) -> None:

@@ -17,8 +17,8 @@ from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.checkpoints import read_policy
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import pretrained_checkpoint
-from bounce_mjx.tasks.bounce import BounceConfig
-from bounce_mjx.tasks.bounce_rewards import BounceReward
+from bounce_mjx.task.bounce import BounceConfig
+from bounce_mjx.task.bounce_rewards import BounceReward
 from bounce_mjx.viewers import show
 from bounce_mjx.viewers.controls import direction
 from bounce_mjx.viewers.display import Display, camera_pose, marker_body

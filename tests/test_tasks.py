@@ -19,18 +19,20 @@ from bounce_mjx import load_policy, task
 from bounce_mjx.commands.eval import EvalCommand
 from bounce_mjx.commands.main import main
 from bounce_mjx.commands.play import PlayCommand
-from bounce_mjx.commands.run_options import parse_with_commands
+from bounce_mjx.commands.task_commands import parse_with_commands
 from bounce_mjx.config.files import dump_config
-from bounce_mjx.env.env import Env
+from bounce_mjx.env.env import Env, EnvState
 from bounce_mjx.env.vector import VectorStep
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.metrics import rollout_metrics, step_metrics
 from bounce_mjx.runs.config import CONFIG_FILE, load_run_config
 from bounce_mjx.runs.folders import create_run
 from bounce_mjx.runs.settings import read_preset
-from bounce_mjx.tasks import registry
-from bounce_mjx.tasks.registry import find_task, task_name
+from bounce_mjx.task import registry
+from bounce_mjx.task.registry import find_task, task_name
 from bounce_mjx.training.command import read_command
+from bounce_mjx.world.observation import ObservationLayout, Part
+from bounce_mjx.world.sensing import Sensing
 from tiny_runs import TINY
 
 CHECKOUT = Path(__file__).parent.parent
@@ -93,6 +95,32 @@ def test_a_command_that_the_policy_does_not_see_is_refused() -> None:
     # A fixed one, or one that a quantity of the task may show.
     Env(bounce(observation=unseen, target_height_range=(0.5, 0.5)))
     Env(bounce(observation=unseen | {"apex_error": 1}))
+
+    class Config(bounce):
+        """A command with the name of a setting that shows nothing."""
+
+        @property
+        def commands(self) -> dict[str, task.Command]:
+            return {"velocity": task.Command(0.0, 1.0)}
+
+    with pytest.raises(UserError, match="not see the command velocity, which varies from 0 to 1"):
+        Env(Config())
+
+
+def test_commands_are_observed_in_one_order() -> None:
+    """Not in that of a set, which differs between processes: each would compile its own program."""
+    values = {f"command_{i}": jnp.zeros(()) for i in range(8)}
+    histories = {name: jnp.zeros((2, 1)) for name in values}
+    env = object.__new__(Env)
+    env.layout = ObservationLayout(tuple(Part(name, 1, "", 2) for name in values))
+
+    def observe(histories: task.Values) -> jax.Array:
+        sensing = Sensing(balls=None, picture=None, histories=histories, task=())
+        return env.observe(EnvState(None, values, last_action=None, sensing=sensing))
+
+    program = jax.make_jaxpr(observe)(histories).jaxpr
+    read = [equation.invars[0] for equation in program.eqns if equation.primitive.name == "slice"]
+    assert [variable for variable in read if variable in program.invars] == program.invars
 
 
 RADIUS, HALF_HEIGHT = 0.03, 0.01
@@ -322,13 +350,13 @@ def test_a_task_may_name_a_command_or_a_setting_like_a_flag(
     task_flag = ["--task", f"{tmp_path / 'sized.py'}:Sized"]
     env = find_task(task_flag[1]).Config()
     flags = "--commands.size 0.5 --size 64 64 --copy 0.25 --commands.help 1 --depth 1".split()
-    command, values = parse_with_commands(PlayCommand, [*task_flag, *flags], prog="play")
+    command, given = parse_with_commands(PlayCommand, [*task_flag, *flags], prog="play")
     assert command.viewing.size == (64, 64)
-    assert values(env) == {"size": 0.5, "copy": 0.25, "help": 1.0, "depth": 1.0}
+    assert given.checked(env) == {"size": 0.5, "copy": 0.25, "help": 1.0, "depth": 1.0}
     flags = "--episodes 7 --commands.episodes 0.5 --model-config 1 --size 0.1".split()
-    command, values = parse_with_commands(EvalCommand, [*task_flag, *flags], prog="eval")
+    command, given = parse_with_commands(EvalCommand, [*task_flag, *flags], prog="eval")
     assert command.episodes == 7
-    assert values(env) == {"episodes": 0.5, "model_config": 1.0, "size": 0.1}
+    assert given.checked(env) == {"episodes": 0.5, "model_config": 1.0, "size": 0.1}
     flags = "--no-report --env.report 0.25 --seed 8 --env.seed 9".split()
     command = read_command([*task_flag, *flags])
     assert (command.flags.report, command.config.seed) == (False, 8)

@@ -9,8 +9,8 @@ import pytest
 
 from bounce_mjx import task
 from bounce_mjx.env.env import Env
-from bounce_mjx.tasks import paths
-from bounce_mjx.tasks.track import Config, Track
+from bounce_mjx.task import paths
+from bounce_mjx.task.track import Config, Track
 from bounce_mjx.world.randomization import RandomizationConfig
 
 CONFIG = Config()

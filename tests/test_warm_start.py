@@ -11,12 +11,20 @@ import yaml
 
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.env.env import Env
-from bounce_mjx.learning.policy import make_networks
+from bounce_mjx.errors import UserError
+from bounce_mjx.learning.policy import make_networks, untrained_policy
 from bounce_mjx.learning.ppo import names_of_critic_metrics
 from bounce_mjx.learning.statistics import normalize
-from bounce_mjx.runs.checkpoints import read_networks, read_policy, read_start
+from bounce_mjx.runs.checkpoints import (
+    NETWORKS,
+    POLICY,
+    read_networks,
+    read_policy,
+    read_start,
+    save_checkpoint,
+)
 from bounce_mjx.runs.config import load_run_config
-from bounce_mjx.runs.folders import best_checkpoint, pretrained_checkpoint
+from bounce_mjx.runs.folders import best_checkpoint, create_run, pretrained_checkpoint
 from tiny_runs import STEPS, TINY
 
 CRITIC = {"n_bounces", "world/restitution", "world/air_drag"}
@@ -104,6 +112,34 @@ def test_the_small_robust_policy_can_be_trained_further() -> None:
     checkpoint = pretrained_checkpoint("robust_small")
     own = read_policy(checkpoint, load_run_config(checkpoint.run))
     jax.tree.map(np.testing.assert_array_equal, params.policy, own.params)
+
+
+OWN_NETWORKS = """
+from bounce_mjx.learning.ppo import PPO
+class Own(PPO):
+    def make_networks(self):
+        return super().make_networks()
+"""
+
+
+def test_networks_of_an_own_algorithm_are_no_warm_start(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(OWN_NETWORKS)
+    name = f"{tmp_path}/own.py:Own"
+    flags = [*TINY, "--log-dir", str(tmp_path / "runs"), "--algorithm", name]
+    config = train_command.read_command(flags).config
+    with pytest.raises(UserError, match="Own makes networks of its own, which --warm-start cannot"):
+        read_start(config.model_copy(update={"warm_start": Path("robust_small")}), Env(config.env))
+    # A run whose networks are others.
+    run = create_run(config)
+    size = config.env.layout.size
+    networks = make_networks(config.ppo, size, config.env.num_joints)
+    items = {
+        POLICY: untrained_policy(networks, size, jax.random.PRNGKey(0)),
+        NETWORKS: {"params": np.zeros(3), "statistics": np.zeros(3)},
+    }
+    save_checkpoint(run, config, STEPS, items)
+    with pytest.raises(UserError, match="cannot be read as networks of PPO .its algorithm is /.+"):
+        read_networks(best_checkpoint(run), config)
 
 
 def test_the_latest_run_is_that_beside_the_new_one_or_else_of_the_task(

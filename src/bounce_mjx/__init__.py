@@ -1,14 +1,13 @@
 """A robot arm that learns to bounce a ball: an environment on JAX and MuJoCo, with PPO."""
 
 import importlib
+import sys
 from typing import TYPE_CHECKING, Any
-
-from bounce_mjx.adapters.gymnasium.registration import register_when_imported
 
 if TYPE_CHECKING:
     from bounce_mjx.deploy.loading import load_policy
-    from bounce_mjx.tasks.bounce import BounceConfig as EnvConfig
-    from bounce_mjx.tasks.bounce_ball import BounceBall
+    from bounce_mjx.env.bounce_ball import BounceBall
+    from bounce_mjx.task.bounce import BounceConfig as EnvConfig
     from bounce_mjx.training.run import Run, train
 
 __version__ = "0.1.0"
@@ -16,14 +15,16 @@ __version__ = "0.1.0"
 __all__ = ["BounceBall", "EnvConfig", "Run", "__version__", "load_policy", "train"]
 
 _PUBLIC = {
-    "BounceBall": ("bounce_mjx.tasks.bounce_ball", "BounceBall"),
-    "EnvConfig": ("bounce_mjx.tasks.bounce", "BounceConfig"),
+    "BounceBall": ("bounce_mjx.env.bounce_ball", "BounceBall"),
+    "EnvConfig": ("bounce_mjx.task.bounce", "BounceConfig"),
     "Run": ("bounce_mjx.training.run", "Run"),
     "load_policy": ("bounce_mjx.deploy.loading", "load_policy"),
     "train": ("bounce_mjx.training.run", "train"),
 }
 
-register_when_imported()
+if "gymnasium" in sys.modules:
+    # So that Gymnasium's own form, "bounce_mjx:bounce_mjx/BounceBall-v0", finds the environments.
+    importlib.import_module("bounce_mjx.adapters.gymnasium")
 
 
 def __getattr__(name: str) -> Any:

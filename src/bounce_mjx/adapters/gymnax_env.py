@@ -5,17 +5,17 @@ The functions are pure and take one environment: apply `jax.vmap` to batch them.
 """
 
 import functools
+import os
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from bounce_mjx.config.validation import validate
+from bounce_mjx.adapters.policies import environment_config
 from bounce_mjx.env.env import Env, State
 from bounce_mjx.errors import needed
 from bounce_mjx.task.task import Task
-from bounce_mjx.tasks.registry import DEFAULT, task_config
 
 
 @struct.dataclass
@@ -41,17 +41,27 @@ class GymnaxBounceBall:
     name = "BounceBall"
     """Name of the environment."""
 
-    def __init__(self, task: str | type[Task] = DEFAULT, **settings: Any):
+    def __init__(
+        self,
+        task: str | type[Task] | None = None,
+        policy: str | os.PathLike | None = None,
+        world: str | os.PathLike | None = None,
+        **settings: Any,
+    ):
         """Makes the environment.
 
         Args:
-          task: its class, its name, or FILE.py:CLASS.
+          task: its class, its name, or FILE.py:CLASS; None for the policy's, or the default one.
+          policy: a name, a run's folder, a checkpoint in it or an .onnx file, whose environment it
+            is (`adapters.policies`).
+          world: of the policy: nominal (the default), training for the worlds that its training
+            sampled, or a named world.
           settings: fields of the task's config, such as episode_seconds=30.
 
         Raises:
-          UserError: a setting is wrong.
+          UserError: a setting is wrong, or the policy's environment has another value.
         """
-        self.task = Env(validate(task_config(task), settings, self.name))
+        self.task = Env(environment_config(self.name, task, policy, world, settings))
         self.default_params = EnvParams(self.task.config.episode_steps)
         """The time limit of the settings."""
         self.num_actions = self.task.action_size

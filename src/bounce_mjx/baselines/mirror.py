@@ -126,6 +126,8 @@ class MirrorLaw:
         return jnp.vectorize(self._action, signature="(n)->(a)")(observation)
 
     def _action(self, observation: jax.Array) -> jax.Array:
+        """The action [A] for an observation [N]: how far the servo targets move towards the joint
+        angles at which the paddle mirrors the ball."""
         config = self._env.config
         layout = self._env.layout
         # The newest value of each quantity comes first.
@@ -165,6 +167,8 @@ class MirrorLaw:
         of its normal.
 
         Args:
+          ball: its position [3], m.
+          velocity: of the ball [3], m/s.
           place: where the ball bounces: the paddle's centre at an impact [3], m.
           target: height of the ball's apex [], m.
         """

@@ -13,8 +13,8 @@ from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.robot.config import PaddleConfig, RobotConfig
 from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.task.registry import DEFAULT, find_task
 from bounce_mjx.task.task import Task
-from bounce_mjx.tasks.registry import DEFAULT, find_task
 from bounce_mjx.world.config import WorldConfig
 
 if TYPE_CHECKING:

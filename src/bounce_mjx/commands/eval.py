@@ -1,20 +1,36 @@
 """Measures the results of a trained policy: `bounce-mjx eval [CHECKPOINT]`."""
 
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-from bounce_mjx.commands.run_options import OneActorCommand, WorldCommand, parse_with_commands
+from bounce_mjx.commands.task_commands import parse_with_commands
+from bounce_mjx.commands.which_policy import (
+    MirrorRobot,
+    OnePolicy,
+    OtherRandomization,
+    OtherWorld,
+    WhichPolicy,
+    check_one_world,
+    in_what_if_world,
+)
 from bounce_mjx.config.command_line import Flag, stdout
 from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import config as evaluation
+from bounce_mjx.resources import POLICIES, resource_path
+from bounce_mjx.world.randomization import RandomizationConfig
 
 
-class EvalCommand(WorldCommand, OneActorCommand):
+class EvalCommand(WhichPolicy):
     """Measures the results of a trained policy."""
 
+    checkpoint: OnePolicy = None
+    robot: MirrorRobot = None
+    world: OtherWorld = None
+    randomization: OtherRandomization = RandomizationConfig()
     episodes: Count = evaluation.DEFAULT_EPISODES
     """Episodes, each from its own reset."""
     seed: NonNegativeInt = evaluation.DEFAULT_SEED
@@ -27,6 +43,10 @@ class EvalCommand(WorldCommand, OneActorCommand):
     limits: bool = False
     """Also show how much of the arm's own limits of velocity, acceleration and jerk its commands at
     1 kHz use, in the first 32 episodes."""
+    failures: bool = False
+    """Also list the failed episodes with their worlds, and the terms of the world that go with
+    failure, with a picture, failures.png, in the run's folder or, for a policy that comes with the
+    package, here."""
     physics: evaluation.Physics = "config"
     """Physics engine: mujoco is MuJoCo's C engine; config is the engine used in training."""
     json_file: Annotated[Path | None, Flag(name="json")] = None
@@ -37,25 +57,31 @@ def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 0 if all results pass, 1 if one fails, 2 on a mistake."""
     command, given_commands = parse_with_commands(EvalCommand, args, prog="bounce-mjx eval")
     from bounce_mjx.evaluation.contacts import arm_contacts, describe_contacts
+    from bounce_mjx.evaluation.failures import associations, failures_of
     from bounce_mjx.evaluation.limits import describe_limits, limit_shares
     from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
     from bounce_mjx.evaluation.statistics import RECORDED_EPISODES
+    from bounce_mjx.reports.failures import association_lines, failures_figure, failures_table
+    from bounce_mjx.reports.figures import image
     from bounce_mjx.reports.tables import details_line, results_table
     from bounce_mjx.runs.checkpoints import read_actor
     from bounce_mjx.runs.files import check_output, to_json, write_output
+    from bounce_mjx.runs.folders import MIRROR_LAW
     from bounce_mjx.training.setup import set_up_jax
 
     check_output(command.json_file, "--json")
+    no_run = {MIRROR_LAW.run, *map(resource_path, POLICIES.values())}
     console = stdout()
-    checkpoint = command.choose(command.checkpoint)
-    if command.nominal and command.world is not None:
-        raise UserError("--nominal and --world cannot be combined; omit one")
-    config = command.config_of(checkpoint)
+    checkpoint = command.choose(command.checkpoint, command.robot)
+    check_one_world(command.nominal, command.world, command.randomization)
+    config = command.config_of(checkpoint, command.robot, command.world)
+    config = in_what_if_world(config, command.randomization)
     if command.limits and config.env.robot.limits.velocity is None:
         raise UserError("the policy's arm has no command limits (env.robot.limits); omit --limits")
-    commands = given_commands(config.env)
+    commands = given_commands.checked(config.env)
     set_up_jax(evaluation.on_engine(config.env, command.physics))
     checkpoint, policy, actor = read_actor(checkpoint, config)
+    picture = Path("." if checkpoint.run in no_run else checkpoint.run) / "failures.png"
     steps = f" ({checkpoint.steps:,} steps)" if checkpoint.steps else ""
     print(f"checkpoint: {checkpoint.folder}{steps}")
     options = evaluation.EvaluationOptions(
@@ -65,7 +91,8 @@ def main(args: Sequence[str]) -> None:
     checks += [("limits", limit_shares, describe_limits)] * command.limits
     recorded = RECORDED_EPISODES if checks else 0
     with console.status("evaluating"):
-        report, engine, warning = evaluate_policy(policy, config.env, actor, options, recorded)
+        evaluated = evaluate_policy(policy, config.env, actor, options, recorded)
+    report, engine, warning = evaluated.report, evaluated.engine, evaluated.warning
     length = f"{command.episodes:,} episodes of {config.env.episode_seconds:g} s"
     print(f"physics: {engine}  {length}")
     if warning is not None:
@@ -77,8 +104,33 @@ def main(args: Sequence[str]) -> None:
         entries = measure(config.env, report.recording)
         print(describe(entries, report.recording.running.shape[-1]))
         found[name] = [entry._asdict() for entry in entries]
+    if command.failures:
+        failures = failures_of(evaluated.conditions, evaluated.statistics)
+        found["failures"] = [failure._asdict() for failure in failures]
+        terms = associations(evaluated.statistics, failures)
+        console.print(failures_table(failures, terms, command.episodes))
+        if failures:
+            print(*association_lines(terms), sep="\n")
+        if failures and terms:
+            write_output(picture, image(failures_figure(terms), "png"))
+            print(f"picture: {picture}")
+        if failures and command.physics == "config":
+            first_to_end = min(failures, key=lambda failure: failure.seconds)
+            print(f"film of one: {_film_command(args, first_to_end.episode)}")
     if command.json_file is not None:
         plain = {"checkpoint": str(checkpoint.folder), "physics": engine, **report.to_dict()}
         plain |= {"seed": command.seed, "commands": commands, "nominal": command.nominal, **found}
         write_output(command.json_file, to_json(plain))
     sys.exit(0 if report.passed else 1)
+
+
+def _film_command(args: Sequence[str], episode: int) -> str:
+    """The command that shows an episode of this evaluation."""
+    switches = ("--failures", "--contacts", "--limits")
+    kept = [word for word in args if word not in switches]
+    for flag in ("--json", "--physics"):
+        if flag in kept:
+            place = kept.index(flag)
+            del kept[place : place + 2]
+    kept = [word for word in kept if not word.startswith(("--json=", "--physics="))]
+    return shlex.join(["bounce-mjx", "play", *kept, "--episode", str(episode)])

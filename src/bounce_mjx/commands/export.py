@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-from bounce_mjx.commands.run_options import RunCommand
+from bounce_mjx.commands.which_policy import WhichPolicy
 from bounce_mjx.config.command_line import Flag, parse
 
 
-class ExportCommand(RunCommand):
+class ExportCommand(WhichPolicy):
     """Exports a trained policy as an ONNX file."""
 
     checkpoint: Annotated[Path | None, Flag(metavar="[CHECKPOINT]", is_positional=True)] = None
@@ -32,7 +32,7 @@ def main(args: Sequence[str]) -> None:
     set_up_jax()
     checkpoint = choose_checkpoint(command.checkpoint, command.folder)
     print(f"checkpoint: {checkpoint.folder} ({checkpoint.steps:,} steps)")
-    command.config(checkpoint.run)
+    command.config_of_run(checkpoint.run)
     content = export_onnx(checkpoint)
     write_output(command.onnx, content)
     print(f"written: {command.onnx} ({len(content) / 1000:.0f} kB)")

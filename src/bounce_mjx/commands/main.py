@@ -46,6 +46,9 @@ def main(args: Sequence[str] | None = None) -> None:
     # Python looks for garbage after so many new objects. Those of imports and of JAX's programs are
     # hardly ever garbage.
     gc.set_threshold(10_000)
+    # XLA would print a banner about a compilation that takes minutes on a busy machine. What fails
+    # in it is an exception too.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     with exit_on_user_error():
         name, *rest = (sys.argv[1:] if args is None else args) or ["--help"]
         if name in ("--help", "-h"):

@@ -4,10 +4,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from bounce_mjx.commands.run_options import WorldCommand, parse_with_commands
+from bounce_mjx.commands.task_commands import parse_with_commands
+from bounce_mjx.commands.which_policy import (
+    MirrorRobot,
+    OtherRandomization,
+    OtherWorld,
+    WhichPolicy,
+    check_one_world,
+    in_what_if_world,
+)
 from bounce_mjx.config.command_line import Flag, stdout
-from bounce_mjx.config.validation import validate
+from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation.config import DEFAULT_EPISODES, DEFAULT_SEED, EvaluationOptions
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.viewers.options import MAX_ENVS, ViewerOptions
 from bounce_mjx.world.randomization import RandomizationConfig
@@ -16,7 +25,7 @@ if TYPE_CHECKING:
     from bounce_mjx.runs.folders import Checkpoint
 
 
-class PlayCommand(WorldCommand):
+class PlayCommand(WhichPolicy):
     """Shows a trained policy, or several side by side."""
 
     checkpoints: Annotated[
@@ -26,8 +35,16 @@ class PlayCommand(WorldCommand):
     policy that comes with the package: pretrained, robust, robust_small, or the name of a task or
     an arm. Several are shown side by side. The default is the newest run, or the task's policy in
     the package if there is no run. mirror stands for the mirror law, a model-based baseline."""
-    randomization: RandomizationConfig = RandomizationConfig()
-    """World of the episodes, if a term is given, in place of the world of the training."""
+    robot: MirrorRobot = None
+    world: OtherWorld = None
+    randomization: OtherRandomization = RandomizationConfig()
+    episode: NonNegativeInt | None = None
+    """Episode of an evaluation to show again, as it was: its number in the list of bounce-mjx eval
+    --failures, from 0. --seed, --episodes, --nominal and the world are then those of eval."""
+    episodes: Count = DEFAULT_EPISODES
+    """Episodes of that evaluation."""
+    nominal: bool = False
+    """Whether that evaluation was without domain randomisation."""
     viewing: ViewerOptions = ViewerOptions()
 
 
@@ -36,16 +53,24 @@ def main(args: Sequence[str]) -> None:
     command, given_commands = parse_with_commands(PlayCommand, args, prog="bounce-mjx play")
     if len(command.checkpoints) > MAX_ENVS:
         raise UserError(f"{len(command.checkpoints)} policies are given; give at most {MAX_ENVS}")
+    # Before the seconds that imports and the compilation take.
+    print("starting: the simulation is compiled, which takes longer the first time", flush=True)
     from bounce_mjx.reports.tables import count_text
     from bounce_mjx.runs.checkpoints import read_actor
     from bounce_mjx.runs.folders import MIRROR_LAW
     from bounce_mjx.training.setup import set_up_jax
+    from bounce_mjx.viewers.film import film_player
     from bounce_mjx.viewers.show import Shown, show
     from bounce_mjx.viewers.simulation import make_policy_controller
 
-    chosen = [command.choose(path) for path in command.checkpoints or (None,)]
+    check_one_world(command.nominal, command.world, command.randomization)
+    if command.episode is None and (command.nominal or "episodes" in command.model_fields_set):
+        raise UserError("--nominal and --episodes are of an evaluation, and need --episode")
+    if command.episode is not None:
+        _check_film(command)
+    chosen = [command.choose(path, command.robot) for path in command.checkpoints or (None,)]
     configs = [_config(checkpoint, command) for checkpoint in chosen]
-    (commands, *_) = [given_commands(config.env) for config in configs]
+    (commands, *_) = [given_commands.checked(config.env) for config in configs]
     set_up_jax(*(config.env for config in configs))
     shown = []
     for checkpoint, config in zip(chosen, configs, strict=True):
@@ -55,14 +80,33 @@ def main(args: Sequence[str]) -> None:
         if checkpoint is not MIRROR_LAW:
             title += f", {count_text(checkpoint.steps)} steps"
         make_controller = lambda env, actor=actor: make_policy_controller(actor(env))  # noqa: E731
-        shown.append(Shown(config.env, make_controller, title, policy))
+        film = None
+        if command.episode is not None:
+            options = _evaluation(command, commands)
+            title += f", episode {command.episode}"
+            film = film_player(config.env, actor, policy, options, command.episode)
+        shown.append(Shown(config.env, make_controller, title, policy, film))
     show(shown, command.viewing, commands=commands, console=stdout())
 
 
 def _config(checkpoint: "Checkpoint", command: PlayCommand) -> TrainConfig:
     """The config of a checkpoint's training, with the world that is to be shown."""
-    config = command.config_of(checkpoint)
-    if not command.randomization.terms:
-        return config
-    given = dict(config.env) | {"randomization": command.randomization}
-    return config.model_copy(update={"env": validate(type(config.env), given, "play")})
+    config = command.config_of(checkpoint, command.robot, command.world)
+    return in_what_if_world(config, command.randomization)
+
+
+def _evaluation(command: PlayCommand, commands: dict[str, float]) -> EvaluationOptions:
+    """The evaluation of which an episode is shown."""
+    seed = command.viewing.seed if "seed" in command.viewing.model_fields_set else DEFAULT_SEED
+    return EvaluationOptions(command.episodes, seed, "config", command.nominal, commands)
+
+
+def _check_film(command: PlayCommand) -> None:
+    """Raises UserError for what an episode cannot be shown with."""
+    if len(command.checkpoints) > 1 or command.viewing.num_envs > 1:
+        raise UserError("--episode shows one episode of one policy; give one policy, one robot")
+    if command.episode >= command.episodes:
+        raise UserError(
+            f"--episode is {command.episode}, but the evaluation has the {command.episodes:,} "
+            f"episodes 0 to {command.episodes - 1:,}; give one of them, or its --episodes"
+        )

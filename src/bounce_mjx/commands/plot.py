@@ -6,11 +6,11 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from bounce_mjx.commands.run_options import RunCommand
+from bounce_mjx.commands.which_policy import WhichPolicy
 from bounce_mjx.config.command_line import Flag, parse
 
 
-class PlotCommand(RunCommand):
+class PlotCommand(WhichPolicy):
     """Draws the learning curves of runs, and the evaluation of a checkpoint."""
 
     runs: Annotated[tuple[Path, ...], Flag(metavar="[RUN ...]", is_positional=True)] = ()
@@ -34,7 +34,7 @@ def main(args: Sequence[str]) -> None:
     runs = [named_run(run, command.folder) for run in command.runs or (None,)]
     seeds = [seed for run in runs for seed in runs_of_seeds(run)]
     checkpoints = [find_checkpoint(seed) for seed in seeds]
-    configs = [command.config(checkpoint.run) for checkpoint in checkpoints]
+    configs = [command.config_of_run(checkpoint.run) for checkpoint in checkpoints]
     groups = curves.group_runs([checkpoint.run for checkpoint in checkpoints])
     with writable(command.out, "choose another folder with --out"):
         command.out.mkdir(parents=True, exist_ok=True)

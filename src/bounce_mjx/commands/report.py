@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-from bounce_mjx.commands.run_options import RunCommand
+from bounce_mjx.commands.which_policy import WhichPolicy
 from bounce_mjx.config.command_line import Flag, parse
 
 
-class ReportCommand(RunCommand):
+class ReportCommand(WhichPolicy):
     """Writes the report of a run, report.html in its folder."""
 
     run: Annotated[Path | None, Flag(metavar="[RUN]", is_positional=True)] = None
@@ -23,5 +23,5 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.training.setup import set_up_jax
 
     checkpoint = find_checkpoint(named_run(command.run, command.folder))
-    set_up_jax(command.config(checkpoint.run).env)
+    set_up_jax(command.config_of_run(checkpoint.run).env)
     print(write_report(checkpoint.run))

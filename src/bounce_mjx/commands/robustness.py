@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rich.progress import Progress
 
-from bounce_mjx.commands.run_options import OneActorCommand
+from bounce_mjx.commands.which_policy import MirrorRobot, OnePolicy, WhichPolicy
 from bounce_mjx.config.command_line import parse, stdout
 from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.errors import UserError
@@ -16,9 +16,11 @@ from bounce_mjx.runs.presets import named_file
 from bounce_mjx.runs.worlds import in_world
 
 
-class RobustnessCommand(OneActorCommand):
+class RobustnessCommand(WhichPolicy):
     """Measures the results of a trained policy in perturbed worlds."""
 
+    checkpoint: OnePolicy = None
+    robot: MirrorRobot = None
     world: Path | None = None
     """World that each condition changes, in place of the model's own: a YAML file, or the name of
     one in configs/worlds/ (ur5e_rtde, panda_fci, iiwa_fri or fast_servo). Twice each of its assumed
@@ -56,8 +58,8 @@ def main(args: Sequence[str]) -> None:
     if command.assumed and command.world is None:
         raise UserError("--assumed needs a named world; give one with --world, or leave it out")
     console = stdout()
-    checkpoint = command.choose(command.checkpoint)
-    config = command.config_of(checkpoint)
+    checkpoint = command.choose(command.checkpoint, command.robot)
+    config = command.config_of(checkpoint, command.robot)
     path = named_file(command.suite, "configs")
     suite, version, world, assumed = str(path), read_suite(path).version, None, {}
     if command.world is not None:

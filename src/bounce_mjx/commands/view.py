@@ -4,12 +4,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from bounce_mjx.commands.run_options import ActorCommand
-from bounce_mjx.config.command_line import flag_names, parse, read_flags, stdout, typed
+from bounce_mjx.config.command_line import flag_names, parse, read_flags, stdout
 from bounce_mjx.config.files import flat
 from bounce_mjx.config.settings import StrictModel, fields_in
 from bounce_mjx.runs.settings import Choice, stack
-from bounce_mjx.tasks.registry import DEFAULT
+from bounce_mjx.task.registry import DEFAULT
 from bounce_mjx.viewers.options import ViewerOptions
 
 PROG = "bounce-mjx view"
@@ -32,8 +31,8 @@ class ViewCommand(StrictModel):
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 2 on a mistake."""
     # The task and the robot decide the other flags, which are those of the environment.
-    first = parse(ActorCommand, args, prog=PROG, is_first=True)
-    preset = Choice(config=(Path("default"),), robot=first.robot, task=first.task)
+    command = parse(ViewCommand, args, prog=PROG, is_first=True)
+    preset = Choice(config=(Path("default"),), robot=command.robot, task=command.task)
     layers = stack(preset)
     of_env = {key: field for key, field in layers.fields.items() if key.startswith("env.")}
     fields = fields_in(ViewCommand) | of_env
@@ -41,7 +40,6 @@ def main(args: Sequence[str]) -> None:
     defaults = flat(ViewCommand().model_dump()) | flat(layers.config().model_dump())
     about = ViewCommand.__doc__ or ""
     given = read_flags(fields, args, prog=PROG, description=about, defaults=defaults)
-    command = typed(ViewCommand, given, names, PROG)
     said = {key: value for key, value in given.items() if key in of_env}
     env = layers.config(said, names, PROG).env
     from bounce_mjx.baselines.mirror import MirrorLaw, observing

@@ -8,7 +8,7 @@ are wide, and refuse the same quantity in another unit: millimetres, degrees or 
 import re
 import typing
 from collections.abc import Iterator
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import pydantic
 from pydantic import Field
@@ -80,9 +80,6 @@ class StrictModel(pydantic.BaseModel):
         frozen=True, extra="forbid", use_attribute_docstrings=True, validate_default=True
     )
 
-    former: ClassVar[dict[str, Any]] = {}
-    """Keys of earlier versions that are gone, each with the value that it may have; ... for any."""
-
     @pydantic.field_validator("*", mode="before")
     @classmethod
     def _refuse_switch(cls, value: Any, info: pydantic.ValidationInfo) -> Any:
@@ -100,8 +97,6 @@ class StrictModel(pydantic.BaseModel):
         those of its class."""
         if not isinstance(values, dict):
             return values
-        gone = {key for key, x in cls.former.items() if key in values and x in (..., values[key])}
-        values = {key: value for key, value in values.items() if key not in gone}
         groups = {
             name: field.default.model_dump(exclude_unset=True)
             for name, field in cls.model_fields.items()

@@ -7,6 +7,7 @@ the inputs; a single vector would hide a wrong order.
 import functools
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.deploy.graph import onnx_graph
+from bounce_mjx.deploy.interface import robot_name
 from bounce_mjx.deploy.metadata import (
     FORMAT,
     IS_FIRST,
@@ -33,9 +35,9 @@ from bounce_mjx.errors import UserError, needed
 from bounce_mjx.evaluation.episodes import reset_episodes
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.robot.arm import joint_name
-from bounce_mjx.robot.config import RobotConfig
+from bounce_mjx.robot.config import is_packaged
 from bounce_mjx.robot.geometry import upper_face
-from bounce_mjx.robot.model import find_addresses, joint_names, load_model, scene_spec
+from bounce_mjx.robot.model import find_addresses, joint_names, load_model
 from bounce_mjx.robot.torques import largest_torques
 from bounce_mjx.runs.checkpoints import read_actor
 from bounce_mjx.runs.config import TrainConfig, load_run_config
@@ -50,7 +52,6 @@ _OPSET, _IR_VERSION = 17, 8
 # An input and the output cannot share a name.
 _INPUT_NAMES = {"action": "past_actions"}
 
-_OWN_ROBOT = "AIR4-560"
 # Episodes and control steps of a policy's own play, and the margin of its largest step.
 _OWN_EPISODES, _OWN_STEPS, _MARGIN = 64, 300, 1.25
 
@@ -135,7 +136,7 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         format=FORMAT,
         task=config.task,
         steps=steps,
-        robot=_OWN_ROBOT if env.mjcf is None else scene_spec(env.mjcf, RobotConfig())[0].modelname,
+        robot=robot_name(env.mjcf),
         joint_names=joint_names(m),
         num_balls=env.num_balls,
         ball=BallBounds(*env.ball_bounds),
@@ -171,7 +172,16 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         chain=chain,
         paddle=paddle,
         paddle_normal=normal,
+        environment=_environment(env),
     )
+
+
+def _environment(env: WorldConfig) -> dict[str, Any]:
+    """The settings as plain values; of an own arm's file only the name, as it stays behind."""
+    values = env.model_dump()
+    if env.mjcf is not None:
+        values["mjcf"] = str(env.mjcf) if is_packaged(env.mjcf) else env.mjcf.name
+    return values
 
 
 def largest_step(config: WorldConfig, act: Callable[[jax.Array], jax.Array]) -> float:

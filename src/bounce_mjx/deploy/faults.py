@@ -8,16 +8,19 @@ import numpy as np
 
 from bounce_mjx.deploy.metadata import Metadata, largest_term, least_term
 from bounce_mjx.deploy.motion import paddle_position
-from bounce_mjx.deploy.samples import Measurements
+from bounce_mjx.deploy.samples import RESOLUTION, Measurements
 
 # Time of a joint's motion that is compared with the training's arms, s.
 _COMPARED = 0.25
 # Latencies of these arms: their distance, and the largest beyond the training's, s.
 _APART, _LATER = 0.01, 0.02
 # Motion beside all these arms that is too much: a share of what the commands moved meanwhile, a
-# share of `action_scale`, and the encoders' noise in standard deviations. In 32 episodes of each of
-# four policies, at most 0.65 of it was beside the nearest arm.
-_OF_COMMANDS, _OF_SCALE, _OF_NOISE = 0.25, {"target": 0.2, "measured": 0.1}, 3.0
+# share of `action_scale`, the encoders' noise in standard deviations, and a count of the encoder.
+# In 32 episodes of each of four policies, at most 0.65 of it was beside the nearest arm.
+_OF_COMMANDS, _OF_SCALE, _OF_NOISE = 0.25, {"target": 0.2, "measured": 0.05}, 3.0
+# The same for a joint whose reading repeats to the last digit all the time: what dry friction
+# holds, rad, and counts of the encoder.
+_HELD, _COUNTS = 1e-3, 2.0
 # Distance from all these arms that is too far, rad.
 _OFFSET = 0.05
 # What a resting joint may be off its command beside the encoder's bias: its load, rad.
@@ -88,6 +91,11 @@ class Watch:
         arms, length = self._arms.shape
         self._commands = np.tile(command, (length + self._compared, 1))
         self._beside = np.tile(angles - command, (self._compared, arms, 1))
+        self._angles = angles
+        # Steps in which each reading has repeated, and its smallest change, which is a count of the
+        # encoder or more.
+        self._repeats = np.zeros(len(angles), int)
+        self._count = np.full(len(angles), np.inf)
 
     def begin(self) -> None:
         """An episode begins."""
@@ -104,18 +112,35 @@ class Watch:
         self._commands = np.concatenate([command[None], self._commands[:-1]])
         beside = angles - self._arms @ self._commands[: self._arms.shape[1]]
         self._beside = np.concatenate([self._beside[1:], beside[None]])
-        high, low = np.max(self._beside, axis=0), np.min(self._beside, axis=0)
-        allowed = self._least + _OF_COMMANDS * np.ptp(self._commands, axis=0)
-        unlike = np.maximum((high - low) / allowed, np.maximum(high, -low) / _OFFSET)
-        least = np.min(unlike, axis=0)
-        if np.max(least) > 1.0:
-            joint = int(np.argmax(least))
-            away = np.min(np.abs(beside[:, joint]))
+        self._note_change(angles)
+        high = np.max(self._beside, axis=0)
+        low = np.min(self._beside, axis=0)
+        by_motion = (high - low) / self._allowed_motion()
+        by_place = np.maximum(high, -low) / _OFFSET
+        unlike = np.min(np.maximum(by_motion, by_place), axis=0)
+        joint = int(np.argmax(unlike))
+        if unlike[joint] > 1.0:
+            name = self._metadata.joint_names[joint]
+            distance = np.min(np.abs(beside[:, joint]))
             yield (
                 "joint_astray",
-                f"{self._metadata.joint_names[joint]} does not follow its commands, and is "
-                f"{away:.2g} rad beside them",
+                f"{name} does not follow its commands, and is {distance:.2g} rad beside them",
             )
+
+    def _note_change(self, angles: np.ndarray) -> None:
+        change = np.abs(angles - self._angles)
+        has_changed = change > 0.0
+        self._repeats = np.where(has_changed, 0, self._repeats + 1)
+        self._count = np.where(has_changed, np.minimum(self._count, change), self._count)
+        self._angles = angles
+
+    def _allowed_motion(self) -> np.ndarray:
+        """Motion of each joint beside the training's arms [J] that is no fault, rad."""
+        allowed = self._least + np.minimum(self._count, RESOLUTION)
+        allowed += _OF_COMMANDS * np.ptp(self._commands, axis=0)
+        # A moving joint's reading changes by a count, and one with noise in every step.
+        of_repeating = np.minimum(allowed, _HELD + _COUNTS * self._count)
+        return np.where(self._repeats >= self._compared, of_repeating, allowed)
 
     def faults(self, measured: Measurements, command: np.ndarray) -> Iterator[Fault]:
         """The faults of a control step of an episode.

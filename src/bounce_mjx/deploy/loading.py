@@ -3,6 +3,7 @@
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from bounce_mjx.deploy.policy import DeployedPolicy
 from bounce_mjx.errors import UserError
@@ -13,6 +14,7 @@ def load_policy(
     policy: str | os.PathLike,
     task: str | None = None,
     joint_names: Sequence[str] | Mapping[str, str] | None = None,
+    env: Any = None,
 ) -> DeployedPolicy:
     """Loads a policy that runs without JAX.
 
@@ -25,10 +27,12 @@ def load_policy(
       joint_names: the driver's names of the joints in the driver's order, such as `fr3_joint1`;
         angles, velocities, actions and commands then have this order. A name belongs to the joint
         whose name it ends with; for others, a mapping from the driver's names to the policy's.
+      env: an environment of this package, such as one of `gymnasium.make`, in place of a robot;
+        then `step` takes its observations.
 
     Raises:
-      UserError: there is no such policy, the file is damaged, or the names are not those of the
-        policy's robot.
+      UserError: there is no such policy, the file is damaged, the names are not those of the
+        policy's robot, or the environment is not the policy's.
     """
     path, source = Path(policy), str(policy)
     if policy in POLICIES:
@@ -42,9 +46,32 @@ def load_policy(
             "a .onnx file or a run's folder"
         ) from error
     loaded = DeployedPolicy(model, source)
+    if env is not None:
+        if joint_names is not None:
+            raise UserError("joint_names are of a robot's driver, and env is given; leave one out")
+        _use_environment(loaded, str(policy), env)
     if joint_names is not None:
         loaded.use_joints(joint_names)
     return loaded
+
+
+def _use_environment(policy: DeployedPolicy, name: str, env: Any) -> None:
+    """Lets a policy take the observations of an environment.
+
+    Raises:
+      UserError: the environment is not the policy's.
+    """
+    from bounce_mjx.adapters.policies import environment_of
+    from bounce_mjx.deploy.interface import check_interface, interface_in, interface_of
+
+    config = environment_of(env).config
+    own, there = interface_in(policy.metadata), interface_of(config)
+    check_interface(own, there, name, f"make the environment with policy={name!r}")
+    places = {}
+    for part in config.layout.parts:
+        first = config.layout[part.name].start
+        places[part.name] = slice(first, first + part.size)
+    policy.use_observations(places, config.layout.size)
 
 
 def check_names(names: Sequence[str], own: Sequence[str], option: str) -> tuple[str, ...]:

@@ -169,6 +169,9 @@ class Metadata(NamedTuple):
     """Centre of the paddle in the frame of the last hinge, m."""
     paddle_normal: Vector
     """Unit normal of the paddle's upper face in the frame of the last hinge."""
+    environment: dict[str, Any] | None = None
+    """Settings of the environment of the training, the `env` of its config; None in a file of an
+    earlier version."""
 
 
 def measurement_sizes(metadata: Metadata) -> dict[str, int]:
@@ -202,10 +205,12 @@ def from_entries(entries: dict[str, str]) -> Metadata:
     # A file of another format lacks entries too, but the format is the reason.
     if "format" in entries and (given := json.loads(entries["format"])) != FORMAT:
         raise ValueError(f"its format is {given}, not {FORMAT}; export the policy again")
-    missing = [name for name in Metadata._fields if name not in entries]
+    later = Metadata._field_defaults
+    missing = [name for name in Metadata._fields if name not in entries and name not in later]
     if missing:
         raise ValueError(f"its metadata lacks {missing[0]}")
-    values = {name: _with_tuples(json.loads(entries[name])) for name in Metadata._fields}
+    stored = [name for name in Metadata._fields if name in entries]
+    values = later | {name: _with_tuples(json.loads(entries[name])) for name in stored}
     limits, commands = values["limits"], values["commands"]
     groups = {
         "ball": BallBounds(**values["ball"]),

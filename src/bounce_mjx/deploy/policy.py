@@ -60,6 +60,8 @@ class DeployedPolicy:
                 "ball_quaternion": np.tile([1.0, 0.0, 0.0, 0.0], balls),
                 "ball_angular_velocity": np.zeros(3 * balls),
             }
+            self._places: dict[str, slice] = {}
+            self._observation_size = 0
             self.needs = self._needs()
             """Measurements required in every step."""
             # A network that fails or gives no numbers fails here, and not on the robot.
@@ -95,6 +97,23 @@ class DeployedPolicy:
         self.motion, self.samples = Motion(self.metadata), Samples(self.metadata)
         self.reset()
 
+    def use_observations(self, places: Mapping[str, slice], size: int) -> None:
+        """Lets a step take observations of an environment in place of measurements.
+
+        Args:
+          places: entries of each quantity's newest value in an observation.
+          size: length of an observation.
+
+        Raises:
+          UserError: an observation lacks a measurement that the policy needs.
+        """
+        if missing := [name for name in self.needs if name not in places]:
+            raise UserError(
+                f"an observation has no {', '.join(missing)}, which this policy measures; use "
+                "Run(...).policy_in(env)"
+            )
+        self._places, self._observation_size = dict(places), size
+
     def reset(self, targets: np.ndarray | None = None) -> None:
         """Forgets the past. The next step fills the whole history with its measurements.
 
@@ -120,7 +139,7 @@ class DeployedPolicy:
         self._action = np.zeros(count)
         self.motion.rest(targets)
 
-    def step(self, measurements: Mapping[str, Any]) -> np.ndarray:
+    def step(self, measurements: Mapping[str, Any] | np.ndarray) -> np.ndarray:
         """Action of a control step.
 
         Args:
@@ -139,6 +158,8 @@ class DeployedPolicy:
             measurements and the last action.
 
             One sample that cannot be true is bridged (`Samples`): the last one holds.
+
+            With an environment (`load_policy(..., env=env)`), its observation [N].
 
         Returns:
           Action [J], from -1 to 1; `servo_targets` converts it.
@@ -291,6 +312,8 @@ class DeployedPolicy:
           UserError: one is missing, unknown, of another shape, not finite, or a command in another
             unit.
         """
+        if not isinstance(measurements, Mapping):
+            measurements = self._in_observation(measurements)
         for name in self.needs if needs is None else needs:
             if name not in measurements:
                 raise UserError(
@@ -315,6 +338,25 @@ class DeployedPolicy:
         if "time" in measurements:
             self._check_resolution(measurements["time"])
         return checked
+
+    def _in_observation(self, observation: Any) -> dict[str, Any]:
+        """The newest measurements in an observation.
+
+        Raises:
+          UserError: the policy was loaded without the environment; or there is not one observation.
+        """
+        if not self._places:
+            raise UserError(
+                f"a step got {type(observation).__name__}, and takes measurements by name; for an "
+                "environment's observations, load_policy(..., env=env)"
+            )
+        array = np.asarray(observation)
+        if array.shape != (self._observation_size,):
+            raise UserError(
+                f"the observation has the shape {list(array.shape)}, but must have "
+                f"{[self._observation_size]}; for many at once, use Run(...).policy_in(env)"
+            )
+        return {name: array[self._places[name]] for name in self.needs}
 
     def _check_resolution(self, time: Any) -> None:
         """Raises UserError for a time whose type cannot tell one control step from the next."""

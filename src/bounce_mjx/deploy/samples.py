@@ -13,16 +13,19 @@ from bounce_mjx.errors import UserError
 
 Measurements = dict[str, np.ndarray]
 
-# An angle outside its range; the first one from the start pose, and from commands at rest, rad.
-_OUTSIDE, _NEAR, _AT_REST = 0.5, 0.5, 0.1
+# An angle outside its range; the first one from where the arm starts, rad.
+_OUTSIDE, _NEAR = 0.5, 0.1
 # The start pose in another order or with other signs, beside the noise of a start, rad.
 _SAME = 0.1
 # Share of an arm's own limit of velocity that no joint reaches.
 _OVERSPEED = 1.2
-# Largest noise in standard deviations, and the resolution of an encoder, rad.
-_LARGEST_NOISE, _RESOLUTION = 8.0, 2e-3
+# Largest noise in standard deviations.
+_LARGEST_NOISE = 8.0
 # Calls at one time, and a pause, s.
 _MOST_STANDING, _PAUSE = 50, 1.0
+
+RESOLUTION = 2e-3
+"""Largest count of an encoder, rad; one of 4,096 counts a turn has 1.5e-3."""
 
 _OF_ARM = ("joint_angles", "joint_velocities")
 _OF_BALL = (
@@ -60,7 +63,7 @@ class Samples:
         if limits is not None:
             self._fastest = _OVERSPEED * np.array(limits.velocity)
         largest = math.sqrt(2.0) * _LARGEST_NOISE
-        self._noise = _RESOLUTION + largest * largest_term(metadata, "joint_angle_noise")
+        self._noise = RESOLUTION + largest * largest_term(metadata, "joint_angle_noise")
         self._ball_noise = 1e-3 + largest * largest_term(metadata, "ball_position_noise")
         ranges = [(-np.inf, np.inf) if x is None else x for x in metadata.joint_ranges]
         self._low, self._high = np.array(ranges).T
@@ -73,9 +76,12 @@ class Samples:
         Args:
           near: commands [J] (rad) at which the arm has rested; by default, the start pose.
         """
-        self._place, self._room = self._start, _NEAR + self._metadata.start_noise
-        if near is not None:
-            self._place, self._room = near, _AT_REST
+        if near is None:
+            self._place = self._start
+            self._room = _NEAR + self._metadata.start_noise
+        else:
+            self._place = near
+            self._room = _NEAR
         self._last: Measurements = {}
         self._bridged: set[str] = set()
         self._unconfirmed: np.ndarray | None = None
@@ -202,8 +208,9 @@ class Samples:
         far = float(np.max(np.abs(angles - self._place)))
         if far <= self._room:
             return
-        reordered = np.abs(np.sort(np.abs(angles)) - np.sort(np.abs(self._start)))
-        if np.max(reordered) <= _SAME + metadata.start_noise:
+        in_order = np.max(np.abs(angles - self._start))
+        reordered = np.max(np.abs(np.sort(np.abs(angles)) - np.sort(np.abs(self._start))))
+        if reordered <= min(_SAME + metadata.start_noise, 0.5 * in_order):
             raise ImpossibleMeasurement(
                 "joint_order",
                 "the joint angles fit the start pose in another order or with other signs; give "

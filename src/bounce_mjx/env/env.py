@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from bounce_mjx.errors import UserError
+from bounce_mjx.env.checks import check_joint_angles, check_start, check_task
 from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, edited_model
 from bounce_mjx.physics.engine import Engine, make_engine
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
@@ -36,10 +36,15 @@ from bounce_mjx.world.sensing import Instant, Sensing, Sensors
 
 # MuJoCo's mjMAXVAL: a coordinate beyond it has diverged and counts as non-finite.
 _MAX_COORDINATE = 1e10
-# Two turns of a joint without a range, rad; or m.
-_MAX_ANGLE = 4.0 * np.pi
-# Poses in files are rounded, rad or m.
-_ROUNDING = 1e-3
+# What a critic may see beside noisy measurements; the ball's quaternion tells nothing of a sphere.
+_TRUE_QUANTITIES = (
+    "joint_angles",
+    "ball_position",
+    "joint_velocities",
+    "ball_velocity",
+    "ball_angular_velocity",
+    "paddle_position",
+)
 
 
 class Redraw(NamedTuple):
@@ -89,10 +94,6 @@ class EnvState(NamedTuple):
     """For an observation that differs from the true state of one instant."""
 
 
-# A ball that starts farther beside the paddle falls before the paddle is under it, m.
-_FARTHEST_BESIDE = 0.3
-
-
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class State:
@@ -139,18 +140,16 @@ class Env:
         """
         self.config = config
         self.task: Task = config.task(config)
-        self._check_seen()
-        self._check_num_balls()
+        check_task(config, self.task)
         self.mj_model: mujoco.MjModel = world_model(config)
         self.addresses = robot_model.find_addresses(self.mj_model)
         self.engine: Engine = make_engine(self.mj_model, config.physics, self.addresses)
         self.layout = config.layout
-        self._check_joint_angles()
-        self._check_heights()
+        check_joint_angles(config, self.mj_model, self.addresses)
         self.task.geometry = read_geometry(
             self.mj_model, self.addresses, config.default_joint_angles
         )
-        self._check_rest()
+        check_start(config, self.task)
         self._actuators = Actuators(config, self.mj_model, self.addresses)
         self._sensors = Sensors(config, self.mj_model, self.addresses, self.engine, self.task)
         self._randomize = randomize
@@ -171,82 +170,6 @@ class Env:
     def __reduce__(self) -> tuple:
         """Pickled as its settings; a copy is built again."""
         return type(self), (self.config, self._randomize)
-
-    def _check_seen(self) -> None:
-        """Refuses a command that varies and that the policy does not see."""
-        observation = self.config.observation
-        if observation.lengths("task"):
-            # The task's own quantities may show any command.
-            return
-        for name, command in self.config.commands.items():
-            varies = command.low < command.high
-            if varies and not command.hidden and not getattr(observation, name, 0):
-                raise UserError(
-                    f"the policy does not see the command {name}, which varies from "
-                    f"{command.low:g} to {command.high:g}; give the observation a quantity {name}, "
-                    "fix the command, or mark it as hidden if it acts through others"
-                )
-
-    def _check_num_balls(self) -> None:
-        """Refuses a number of balls that the task does not take."""
-        num_balls = self.config.num_balls
-        if num_balls not in self.task.num_balls:
-            takes = " or ".join(map(str, self.task.num_balls))
-            raise UserError(
-                f"num_balls is {num_balls}, but the task {type(self.task).__name__} takes "
-                f"{takes}; set num_balls to {takes}"
-            )
-
-    def _check_joint_angles(self) -> None:
-        """Refuses joint angles of a reset that do not fit the arm."""
-        angles = self.config.default_joint_angles
-        joints = robot_model.joint_names(self.mj_model, self.addresses)
-        if len(angles) != len(joints):
-            name = f"the MJCF file {self.config.mjcf}" if self.config.mjcf else "the model"
-            raise UserError(
-                f"default_joint_angles has {len(angles)} numbers, but {name} has {len(joints)} "
-                f"joints with an actuator ({', '.join(joints)}); give one number for each"
-            )
-        ranges = robot_model.joint_ranges(self.mj_model, self.addresses)
-        lows, highs = np.nan_to_num(ranges, posinf=_MAX_ANGLE, neginf=-_MAX_ANGLE)
-        for joint, angle, low, high in zip(joints, angles, lows, highs, strict=True):
-            if not low - _ROUNDING <= angle <= high + _ROUNDING:
-                raise UserError(
-                    f"default_joint_angles has {angle:g} for {joint}, whose range is {low:.4g} to "
-                    f"{high:.4g}; give radians, or metres for a slide, within the range"
-                )
-
-    def _check_heights(self) -> None:
-        """Refuses heights of the config that are not over the paddle of a reset."""
-        angles = self.config.default_joint_angles
-        data = robot_model.data_at(self.mj_model, self.addresses, angles)
-        paddle_height = data.geom_xpos[self.addresses.paddle_geom, 2]
-        for name, height in self.config.heights.items():
-            if height <= paddle_height:
-                raise UserError(
-                    f"{name} has the height {height:g} m, which is not over the paddle at "
-                    f"{paddle_height:.4g} m, where default_joint_angles hold it; change one of the "
-                    "two"
-                )
-
-    def _check_rest(self) -> None:
-        """Refuses a start within or beside the paddle for the ball of a task that throws none."""
-        geometry = self.task.geometry
-        start_height = self.config.ball_init_pos[2]
-        rest_height = geometry.paddle_home[2] + geometry.rest_height
-        throws = type(self.task).throw is not Task.throw
-        x, y, _ = geometry.paddle_home
-        beside = np.linalg.norm(np.array(self.config.ball_init_pos)[:2] - (x, y))
-        if not throws and beside > _FARTHEST_BESIDE:
-            raise UserError(
-                f"ball_init_pos is {beside:.3g} m beside the paddle at ({x:.3g}, {y:.3g}) m, where "
-                "default_joint_angles hold it; start it over the paddle"
-            )
-        if not throws and start_height < rest_height - _ROUNDING:
-            raise UserError(
-                f"ball_init_pos has the height {start_height:g} m, but a ball of the radius "
-                f"{geometry.ball_radius:g} m rests on the paddle at {rest_height:.4g} m; raise it"
-            )
 
     @property
     def unwrapped(self) -> "Env":
@@ -272,7 +195,7 @@ class Env:
     def reset(
         self, rng: jax.Array, ranges: Ranges | None = None, share: float | None = None
     ) -> State:
-        """Starts an episode.
+        """Starts an episode, with its own world, clock (`noise.first_clock`), commands and start.
 
         Args:
           rng: key; consumed.
@@ -319,7 +242,12 @@ class Env:
 
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one control step under the action [n], clipped to [-1, 1]. A NaN action ends the
-        episode and acts as 0."""
+        episode and acts as 0.
+
+        The action becomes the servos' targets, which latency and lag delay (`Actuators.next`); the
+        physics takes its steps; the task judges the true state under the command that the policy
+        has seen; then commands change, the clock moves on, and the sensors measure.
+        """
         robot_model.check_unedited(self.mj_model, self._fingerprint)
         before = state.pipeline_state
         control, actuation = self.control(before, action)
@@ -328,8 +256,8 @@ class Env:
         return self.finish_step(state, action, actuation, physics)
 
     def control(self, before: EnvState, action: jax.Array) -> tuple[Control, Actuation]:
-        """The part of a step before the physics: its inputs under the action [n] of `step`, and
-        the memory of the actuation after the step."""
+        """The part of a step before the physics: its inputs under the action [n] of `step`, late
+        by the world's latency and lag, and the memory of the actuation after the step."""
         action, _ = _clip_action(action)
         return self._actuators.next(
             before.actuation, before.physics.qpos, action, before.world, before.clock
@@ -353,8 +281,8 @@ class Env:
         physics, finite = _keep_finite(physics, before.physics)
         action, is_number = _clip_action(action)
         action = jnp.where(finite, action, before.last_action)
-        now = before._replace(physics=physics, last_action=action, actuation=actuation)
-        truth = self.kinematics(now)
+        after = before._replace(physics=physics, last_action=action, actuation=actuation)
+        truth = self.kinematics(after)
 
         task_step = Step(
             truth=truth,
@@ -369,23 +297,23 @@ class Env:
             "too_fast": jnp.any(jnp.abs(truth.joint_velocities) > self.config.max_joint_velocity),
         }
 
-        now = self._redraw_commands(now)
-        command = self.task.next_command(result.state, now.command)
-        now = now._replace(task=result.state, command=command)
-        if now.clock is not None:
-            now = now._replace(clock=noise.next_clock(now.clock))
-        if now.sensing is not None:
-            sensing = self._sensors.next(now.sensing, _instant(now, truth))
-            now = now._replace(sensing=sensing)
+        after = self._redraw_commands(after)
+        command = self.task.next_command(result.state, after.command)
+        after = after._replace(task=result.state, command=command)
+        if after.clock is not None:
+            after = after._replace(clock=noise.next_clock(after.clock))
+        if after.sensing is not None:
+            sensing = self._sensors.next(after.sensing, _instant(after, truth))
+            after = after._replace(sensing=sensing)
 
         dtype = truth.ball_position.dtype
         metrics = _metrics(result, dtype)
         metrics |= {name: end.astype(dtype) for name, end in ends.items()}
-        metrics |= self._privileged_metrics(now.world, truth)
+        metrics |= self._privileged_metrics(after.world, truth)
         ended = result.ended | ends["non_finite"] | ends["too_fast"]
         return state.replace(
-            pipeline_state=now,
-            obs=self.observe(now, truth),
+            pipeline_state=after,
+            obs=self.observe(after, truth),
             reward=sum(result.reward.values()),
             done=ended.astype(dtype),
             # Wrappers add their own metrics, which a step must keep.
@@ -450,17 +378,19 @@ class Env:
         noise_widths = self.config.reset
         scatter = robot_model.scatter
 
-        angles = jnp.asarray(self.config.default_joint_angles, dtype)
-        angles = angles + noise_widths.joint_angles * draws.joint_angles
-        angles = angles + world.get("joint_start", 0.0)
+        joint_angles = jnp.asarray(self.config.default_joint_angles, dtype)
+        joint_angles = joint_angles + noise_widths.joint_angles * draws.joint_angles
+        joint_angles = joint_angles + world.get("joint_start", 0.0)
         joint_velocities = noise_widths.joint_velocities * draws.joint_velocities
-        qpos = scatter(self.mj_model.qpos0, self.addresses.arm_qpos, angles)
+        qpos = scatter(self.mj_model.qpos0, self.addresses.arm_qpos, joint_angles)
         qvel = scatter(np.zeros(self.mj_model.nv), self.addresses.arm_qvel, joint_velocities)
 
         if thrown is None:
             heights = np.array([[0.0, 0.0, BALLS_APART * i] for i in range(num_balls)])
-            thrown = np.array(self.config.ball_init_pos) + heights, np.zeros((num_balls, 3))
-        positions, velocities = (jnp.asarray(x, dtype).reshape(num_balls, 3) for x in thrown)
+            thrown = (np.array(self.config.ball_init_pos) + heights, np.zeros((num_balls, 3)))
+        thrown_positions, thrown_velocities = thrown
+        positions = jnp.asarray(thrown_positions, dtype).reshape(num_balls, 3)
+        velocities = jnp.asarray(thrown_velocities, dtype).reshape(num_balls, 3)
         positions = positions + noise_widths.ball_position * draws.ball_positions
         positions = positions + world.get("ball_start", 0.0)
         level = jnp.array([1.0, 0.0, 0.0, 0.0], dtype)
@@ -494,10 +424,10 @@ class Env:
         """What later samples of the commands need; None if they stay for the whole episode."""
         if "command_interval" not in world:
             return None
-        kept = {}
+        command_ranges = {}
         for name, (low, high) in ranges.items():
-            kept[name] = (jnp.asarray(low, dtype), jnp.asarray(high, dtype))
-        return Redraw(age=jnp.zeros((), dtype), ranges=kept)
+            command_ranges[name] = (jnp.asarray(low, dtype), jnp.asarray(high, dtype))
+        return Redraw(age=jnp.zeros((), dtype), ranges=command_ranges)
 
     def _redraw_commands(self, state: EnvState) -> EnvState:
         """The state with new commands after a control step in which their interval passes; its
@@ -514,10 +444,9 @@ class Env:
         draws = noise.uniform(counter, noise.COMMAND, (len(ranges),), age.dtype)
         in_order = {name: ranges[name] for name in self.config.commands}
         new_command = self._first_command(sample_commands(in_order, draws))
-        command = {
-            name: jnp.where(is_due, new_command[name], value)
-            for name, value in state.command.items()
-        }
+        command = {}
+        for name, last_value in state.command.items():
+            command[name] = jnp.where(is_due, new_command[name], last_value)
         redraw = Redraw(age=jnp.where(is_due, 0.0, age + self.dt), ranges=ranges)
         return state._replace(command=command, redraw=redraw)
 
@@ -535,8 +464,10 @@ class Env:
         metrics = dict.fromkeys([*names, "non_finite", "too_fast"], zero)
         metrics |= self._privileged_metrics(state.world, truth)
         for curve in self.task.curves:
-            shown = {curve.metric, *({curve.over} - {"steps", "episodes"})}
-            check_names(f"the curve {curve.tag}", "metric", {*metrics} | shown, metrics)
+            named = {curve.metric}
+            if curve.over not in ("steps", "episodes"):
+                named.add(curve.over)
+            check_names(f"the curve {curve.tag}", "metric", metrics.keys() | named, metrics)
         return metrics
 
     def kinematics(self, state: EnvState) -> Kinematics:
@@ -544,21 +475,24 @@ class Env:
         return self._kinematics(state.physics, state.parameters)
 
     def _kinematics(self, physics: PhysicsState, parameters: PhysicsParameters) -> Kinematics:
+        """The `kinematics` of a state with this physics."""
         addresses = self.addresses
         qpos = physics.qpos
         qvel = physics.qvel
 
-        def ball_rows(coordinates: jax.Array, entries: list[tuple[int, ...]]) -> jax.Array:
-            rows = [jnp.stack([coordinates[i] for i in row]) for row in entries]
-            return rows[0] if len(rows) == 1 else jnp.stack(rows)
+        ball_qpos = []
+        ball_qvel = []
+        for ball in addresses.balls:
+            ball_qpos.append(ball.qpos)
+            ball_qvel.append(ball.qvel)
 
         return Kinematics(
-            joint_angles=jnp.stack([qpos[i] for i in addresses.arm_qpos]),
-            ball_position=ball_rows(qpos, [ball.qpos[:3] for ball in addresses.balls]),
-            ball_quaternion=ball_rows(qpos, [ball.qpos[3:] for ball in addresses.balls]),
-            joint_velocities=jnp.stack([qvel[i] for i in addresses.arm_qvel]),
-            ball_velocity=ball_rows(qvel, [ball.qvel[:3] for ball in addresses.balls]),
-            ball_angular_velocity=ball_rows(qvel, [ball.qvel[3:] for ball in addresses.balls]),
+            joint_angles=_entries(qpos, addresses.arm_qpos),
+            ball_position=_ball_rows(qpos, ball_qpos, slice(0, 3)),
+            ball_quaternion=_ball_rows(qpos, ball_qpos, slice(3, 7)),
+            joint_velocities=_entries(qvel, addresses.arm_qvel),
+            ball_velocity=_ball_rows(qvel, ball_qvel, slice(0, 3)),
+            ball_angular_velocity=_ball_rows(qvel, ball_qvel, slice(3, 6)),
             paddle_position=self.engine.paddle_position(parameters, qpos),
         )
 
@@ -568,46 +502,46 @@ class Env:
         Args:
           truth: `kinematics(state)`, if it has already been computed.
         """
-        command = {name: value[None] for name, value in state.command.items()}
+        commands = {name: value[None] for name, value in state.command.items()}
         if state.sensing is None:
             truth = self.kinematics(state) if truth is None else truth
-            values = truth._asdict() | command
+            values = truth._asdict() | commands
         else:
             values = dict(state.sensing.histories)
-            # A command may have been set since the last step.
-            for name in command.keys() & values.keys():
-                values[name] = jnp.concatenate([command[name][None], values[name][1:]])
+            # A command may have been set since the last step. The order is that of the state, so
+            # that each process compiles the same program.
+            for name, command in commands.items():
+                if name in values:
+                    values[name] = jnp.concatenate([command[None], values[name][1:]])
         return self.layout.pack({name: jnp.ravel(value) for name, value in values.items()})
 
     def with_world(self, state: EnvState, world: World) -> EnvState:
         """The state with other values of the terms of its world."""
         randomized = MODEL_PARAMETERS
         if self._randomize is not None:
-            forms = jax.eval_shape(self._randomize, jax.random.PRNGKey(0))
-            names = [name for name, form in forms._asdict().items() if form is not None]
-            randomized = PhysicsParameters(**{n: getattr(state.parameters, n) for n in names})
+            sampled = jax.eval_shape(self._randomize, jax.random.PRNGKey(0))
+            randomized = PhysicsParameters(**_fields_of(sampled, state.parameters))
         return state._replace(world=world, parameters=self._parameters(world, randomized))
 
     def _parameters(self, world: World, randomized: PhysicsParameters) -> PhysicsParameters:
         """The physics of a world, in which the parameters of `randomize` replace those of the
         world's terms."""
-        given = {name: value for name, value in randomized._asdict().items() if value is not None}
-        return physics_parameters(world, self.mj_model)._replace(**given)
+        replaced = _fields_of(randomized, randomized)
+        return physics_parameters(world, self.mj_model)._replace(**replaced)
 
     def _privileged_metrics(self, world: World, truth: Kinematics) -> dict[str, jax.Array]:
         """Quantities that only a critic may see: `world/<term>` and, where the sensors differ from
         the truth, `true/<quantity>`. Each entry of an array has its own name with an index."""
-        named = {f"world/{name}": value for name, value in world.items()}
+        quantities = {f"world/{name}": value for name, value in world.items()}
         if self._sensors.are_needed:
-            hidden = ("joint_angles", "ball_position", "joint_velocities", "ball_velocity")
-            hidden += ("ball_angular_velocity", "paddle_position")
-            named |= {f"true/{name}": getattr(truth, name) for name in hidden}
+            quantities |= {f"true/{name}": getattr(truth, name) for name in _TRUE_QUANTITIES}
         metrics = {}
-        for name, value in named.items():
+        for name, value in quantities.items():
             if value.ndim == 0:
                 metrics[name] = value
-            else:
-                metrics |= {f"{name}_{i}": entry for i, entry in enumerate(jnp.ravel(value))}
+                continue
+            for i, entry in enumerate(jnp.ravel(value)):
+                metrics[f"{name}_{i}"] = entry
         return metrics
 
 
@@ -636,6 +570,34 @@ def sample_commands(ranges: Ranges, draws: jax.Array) -> dict[str, jax.Array]:
     return sampled
 
 
+def _entries(coordinates: jax.Array, places: Sequence[int]) -> jax.Array:
+    """The coordinates [len(places)] at some places."""
+    return jnp.stack([coordinates[place] for place in places])
+
+
+def _ball_rows(coordinates: jax.Array, places: list[tuple[int, ...]], part: slice) -> jax.Array:
+    """The coordinates of one ball [size], or a row for each of several [B, size].
+
+    Args:
+      coordinates: qpos [nq] or qvel [nv].
+      places: of each ball's coordinates.
+      part: which of them.
+    """
+    rows = []
+    for ball_places in places:
+        rows.append(_entries(coordinates, ball_places[part]))
+    return rows[0] if len(rows) == 1 else jnp.stack(rows)
+
+
+def _fields_of(names: PhysicsParameters, parameters: PhysicsParameters) -> dict[str, Any]:
+    """The fields of `parameters` that `names` has, which are those that are not None."""
+    fields = {}
+    for name, value in names._asdict().items():
+        if value is not None:
+            fields[name] = getattr(parameters, name)
+    return fields
+
+
 def _instant(state: EnvState, truth: Kinematics) -> Instant:
     """What the sensors depend on in a state."""
     return Instant(
@@ -654,12 +616,12 @@ def _keep_finite(physics: PhysicsState, before: PhysicsState) -> tuple[PhysicsSt
     for coordinates in jax.tree.leaves(physics):
         finite &= jnp.all(jnp.abs(coordinates) < _MAX_COORDINATE)
 
-    def kept(new: jax.Array, old: jax.Array) -> jax.Array:
+    def newest_finite(new: jax.Array, old: jax.Array) -> jax.Array:
         # The previous state is checked too, in case memory was corrupted.
         old = jnp.where(jnp.abs(old) < _MAX_COORDINATE, old, 0.0)
         return jnp.where(finite, new, old)
 
-    return jax.tree.map(kept, physics, before), finite
+    return jax.tree.map(newest_finite, physics, before), finite
 
 
 def _clip_action(action: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -38,7 +38,8 @@ class VectorState(NamedTuple):
     env: State
     """Environment states, the batch last in every array."""
     clock: jax.Array
-    """Steps that count towards the time limit [B], int."""
+    """Steps that count towards the time limit [B], int: from 0 at a reset, or from any number, so
+    that the episodes of a training do not all end at once. No `noise.Clock`."""
     length: jax.Array
     """Steps since the reset [B], int."""
     episode_return: jax.Array

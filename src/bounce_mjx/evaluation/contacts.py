@@ -11,7 +11,7 @@ import numpy as np
 
 from bounce_mjx.robot.arm import HIDDEN_GROUP, compile_spec
 from bounce_mjx.robot.model import find_addresses, scene_spec
-from bounce_mjx.task.shown import Recording
+from bounce_mjx.task.task import Recording
 from bounce_mjx.world.config import WorldConfig
 
 # Distance that counts as a contact, m.

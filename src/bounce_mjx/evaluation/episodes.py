@@ -5,13 +5,18 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from bounce_mjx.env.env import Env, State
 from bounce_mjx.evaluation import statistics
 from bounce_mjx.evaluation.statistics import Measured
 from bounce_mjx.learning.policy import Actor, Policy
-from bounce_mjx.task.shown import Recording
+from bounce_mjx.task.task import Recording
 from bounce_mjx.world.randomization import Ranges
+
+BLOCK = 64
+"""Episodes of a film's batch. From this number on, an episode is the same bit for bit in a batch of
+any multiple of it on a CPU, whose vector instructions then have no remainder."""
 
 Evaluator = Callable[..., Measured]
 """Measures E deterministic episodes from a policy, a key and optional ranges."""
@@ -30,13 +35,50 @@ class Batch(NamedTuple):
 def make_evaluator(env: Env, actor: Actor, episodes: int, recorded: int = 0) -> Evaluator:
     """A jitted evaluation of `episodes` episodes, each from its own reset (`reset_episodes`), with
     a recording of the first `recorded`. It stops when all episodes have ended or their time limit
-    is reached."""
+    is reached. More than `BLOCK` are simulated with copies of the last one, up to whole blocks, so
+    that a film shows each of them as it was."""
 
     def evaluate(policy: Policy, key: jax.Array, ranges: Ranges | None = None) -> Measured:
         states = reset_episodes(env, key, episodes, ranges)
-        return run_episodes(env, actor, policy, states, recorded)
+        states = jax.tree.map(lambda x: x[..., _whole_blocks(episodes)], states)
+        statistics, recording = run_episodes(env, actor, policy, states, recorded)
+        return jax.tree.map(lambda x: x[:episodes], statistics), recording
 
     return jax.jit(evaluate)
+
+
+def make_filmer(env: Env, actor: Actor, episodes: int, episode: int) -> Evaluator:
+    """A jitted evaluation of the block in which one of `episodes` episodes is, as `make_evaluator`
+    simulates it, with a recording of this episode alone [T, ..., 1].
+
+    On a CPU it is the same bit for bit. On other devices the batch is the evaluation's own, but the
+    episode has another place in it, which may change the last bits of its actions.
+    """
+    lanes = _whole_blocks(episodes)
+    if jax.default_backend() != "cpu":
+        lanes = np.roll(lanes, -episode)
+        place = 0
+    else:
+        first = episode // BLOCK * BLOCK
+        lanes = lanes[first : first + BLOCK]
+        place = episode - first
+    recorded = place + 1
+
+    def evaluate(policy: Policy, key: jax.Array, ranges: Ranges | None = None) -> Measured:
+        states = reset_episodes(env, key, episodes, ranges)
+        states = jax.tree.map(lambda x: x[..., lanes], states)
+        statistics, recording = run_episodes(env, actor, policy, states, recorded)
+        its_statistics = jax.tree.map(lambda x: x[place : place + 1], statistics)
+        return its_statistics, jax.tree.map(lambda x: x[..., place : place + 1], recording)
+
+    return jax.jit(evaluate)
+
+
+def _whole_blocks(episodes: int) -> np.ndarray:
+    """Indices of the episodes, the last one repeated up to whole blocks; of one block, no more than
+    there are."""
+    total = episodes if episodes <= BLOCK else -(-episodes // BLOCK) * BLOCK
+    return np.minimum(np.arange(total), episodes - 1)
 
 
 def run_episodes(env: Env, actor: Actor, policy: Policy, states: State, recorded: int) -> Measured:

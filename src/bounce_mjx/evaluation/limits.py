@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bounce_mjx.robot.setpoints import Setpoint, command, joint_limits
-from bounce_mjx.task.shown import Recording
+from bounce_mjx.task.task import Recording
 from bounce_mjx.world.config import WorldConfig
 
 

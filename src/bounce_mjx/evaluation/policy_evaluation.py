@@ -11,11 +11,22 @@ from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
 from bounce_mjx.evaluation.config import DEFAULT_OPTIONS, EvaluationOptions, on_engine
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import Report, judge
+from bounce_mjx.evaluation.statistics import Statistics
 from bounce_mjx.evaluation.suite import neutral_commands
 from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.physics.convergence import solver_warning
 from bounce_mjx.world.config import WorldConfig
-from bounce_mjx.world.randomization import RandomizationConfig
+from bounce_mjx.world.randomization import RandomizationConfig, Ranges
+
+
+class Conditions(NamedTuple):
+    """What an evaluation simulates."""
+
+    env: Env
+    commands: dict[str, tuple[float, float]]
+    """Ranges of commands, where they are not the config's."""
+    ranges: Ranges | None
+    """Of one condition, as for `reset_episodes`; None for the config's."""
 
 
 class PolicyEvaluation(NamedTuple):
@@ -26,6 +37,9 @@ class PolicyEvaluation(NamedTuple):
     """fused, mjx or mujoco."""
     warning: str | None
     """Why MuJoCo's C engine computes something else than the fused one; None if it does not."""
+    conditions: Conditions
+    statistics: Statistics
+    """Figures of each episode, with its world."""
 
 
 def evaluate_policy(
@@ -45,6 +59,24 @@ def evaluate_policy(
     Raises:
       UserError: the engine does not support the model.
     """
+    conditions = conditions_of(env_config, options)
+    env, commands, ranges = conditions
+    on_c = options.physics == "mujoco"
+    engine = "mujoco" if on_c else env.engine.name
+    make = make_mujoco_evaluator if on_c else make_evaluator
+    evaluate = make(env, actor(env), options.episodes, recorded)
+    statistics, recording = evaluate(policy, jax.random.PRNGKey(options.seed), ranges)
+    warning = solver_warning(env.mj_model) if on_c else None
+    report = judge(env, statistics, recording, commands)
+    return PolicyEvaluation(report, engine, warning, conditions, jax.device_get(statistics))
+
+
+def conditions_of(env_config: WorldConfig, options: EvaluationOptions) -> Conditions:
+    """The environment of an evaluation, and the ranges of its worlds and commands.
+
+    Raises:
+      UserError: the engine does not support the model.
+    """
     given = {name: (value, value) for name, value in options.commands.items()}
     neutral = neutral_commands(env_config) if options.nominal else {}
     own = {name: (command.low, command.high) for name, command in env_config.commands.items()}
@@ -57,11 +89,4 @@ def evaluate_policy(
         world = world.model_copy(update={"command_interval": None})
     env = Env(on_engine(env_config.model_copy(update={"randomization": world}), options.physics))
     ranges = jax.tree.map(lambda end: jnp.asarray(end, jnp.float32)[None], env.ranges() | commands)
-    on_c = options.physics == "mujoco"
-    engine = "mujoco" if on_c else env.engine.name
-    make = make_mujoco_evaluator if on_c else make_evaluator
-    evaluate = make(env, actor(env), options.episodes, recorded)
-    key = jax.random.PRNGKey(options.seed)
-    measured = evaluate(policy, key, ranges if commands else None)
-    warning = solver_warning(env.mj_model) if on_c else None
-    return PolicyEvaluation(judge(env, *measured, commands), engine, warning)
+    return Conditions(env, commands, ranges if commands else None)

@@ -9,7 +9,7 @@ from pydantic import Field, InstanceOf
 from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.statistics import Statistics
 from bounce_mjx.task.results import Episodes, Figure, Result
-from bounce_mjx.task.shown import Recording
+from bounce_mjx.task.task import Recording
 
 
 @dataclasses.dataclass(frozen=True)

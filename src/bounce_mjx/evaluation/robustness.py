@@ -51,6 +51,9 @@ class ConditionOutcome(pydantic.BaseModel):
     """Share of the episodes that lasted until their time limit."""
     mean_length_s: float
     """Mean length of the episodes, s."""
+    lost: list[int] = []
+    """Numbers of the episodes that ended before their time limit. All conditions start from the
+    same keys, so that a number means the same reset in each."""
     measured: Annotated[dict[str, str], Field(exclude=True)] = {}
     """What each result measures, with its unit; not stored."""
 
@@ -167,6 +170,7 @@ def _outcome(
         values={result.name: result.value for result in report.results},
         failed=[result.name for result in report.results if result.passed is False],
         lasted=float(np.mean(statistics.running)),
+        lost=np.flatnonzero(~np.asarray(statistics.running, bool)).tolist(),
         mean_length_s=report.details["mean_length_s"],
         measured={result.name: result.measured for result in report.results},
     )

@@ -9,10 +9,12 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.env.env import Env, State
-from bounce_mjx.task.shown import Recording
-from bounce_mjx.task.task import Moment, Tally
+from bounce_mjx.task.task import Moment, Recording, Tally
 
 RECORDED_EPISODES = 32
+
+ENDS = ("too_fast", "non_finite")
+"""Metrics of the world that end an episode."""
 
 
 class Statistics(NamedTuple):
@@ -26,6 +28,12 @@ class Statistics(NamedTuple):
     """Sum of the rewards [E]."""
     tally: Tally
     """Sums and greatest values of what the task tallies, each [E]."""
+    ended_by: dict[str, jax.Array] = {}
+    """Whether the episode ended by each of `ENDS` [E], bool; the task ended the others."""
+    world: dict[str, jax.Array] = {}
+    """World of the episode: its values of the active terms [E, ...]."""
+    command: dict[str, jax.Array] = {}
+    """First value of each command [E]."""
 
 
 Measured = tuple[Statistics, Recording]
@@ -51,7 +59,16 @@ def empty_statistics(env: Env, states: State) -> Statistics:
     episodes = states.done.shape[-1]
     zeros = jnp.zeros(episodes)
     tally = jax.eval_shape(lambda: _tally(env, states, jnp.int32(0)))
-    return Statistics(jnp.ones(episodes, bool), zeros, zeros, jax.tree.map(lambda _: zeros, tally))
+    start = states.pipeline_state
+    return Statistics(
+        running=jnp.ones(episodes, bool),
+        steps=zeros,
+        episode_return=zeros,
+        tally=jax.tree.map(lambda _: zeros, tally),
+        ended_by={name: jnp.zeros(episodes, bool) for name in ENDS if name in states.metrics},
+        world={name: jnp.moveaxis(value, -1, 0) for name, value in start.world.items()},
+        command=dict(start.command),
+    )
 
 
 def accumulate(env: Env, statistics: Statistics, states: State, step: jax.Array) -> Statistics:
@@ -67,11 +84,15 @@ def accumulate(env: Env, statistics: Statistics, states: State, step: jax.Array)
     counted = jax.tree.map(lambda value: jnp.where(running, value, 0.0), now)
     sums = jax.tree.map(jnp.add, s.tally.sums, counted.sums)
     maxima = jax.tree.map(jnp.maximum, s.tally.maxima, counted.maxima)
-    return Statistics(
+    ended_by = {
+        name: ended | (running & (states.metrics[name] > 0)) for name, ended in s.ended_by.items()
+    }
+    return s._replace(
         running=running & (states.done == 0),
         steps=s.steps + running,
         episode_return=s.episode_return + jnp.where(running, states.reward, 0.0),
         tally=Tally(sums, maxima),
+        ended_by=ended_by,
     )
 
 

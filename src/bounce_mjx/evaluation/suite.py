@@ -15,7 +15,7 @@ from bounce_mjx.config.settings import Finite, StrictModel, merged, nested
 from bounce_mjx.config.validation import validate
 from bounce_mjx.env.env import model_nominals
 from bounce_mjx.errors import UserError, shorten
-from bounce_mjx.tasks.registry import find_task
+from bounce_mjx.task.registry import find_task
 from bounce_mjx.world.actuation import DEFAULT_PUSH_INTERVAL
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import TERMS, RandomizationConfig

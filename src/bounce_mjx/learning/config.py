@@ -6,8 +6,6 @@ import pydantic
 from pydantic import Field
 
 from bounce_mjx.config import settings
-from bounce_mjx.errors import UserError, shorten
-from bounce_mjx.tasks.registry import class_in_file, is_file
 
 PPO_NAME = "ppo"
 """Name of the algorithm of this package."""
@@ -78,11 +76,11 @@ class PPOConfig(settings.StrictModel):
 
     @pydantic.model_validator(mode="after")
     def _check_batch_and_learning_rates(self):
-        limits = (self.final_max_learning_rate, self.max_learning_rate)
-        if self.min_learning_rate > min(limits):
+        if self.min_learning_rate > min(self.max_learning_rate, self.final_max_learning_rate):
             raise ValueError(
                 f"min_learning_rate {self.min_learning_rate} is above the upper limits "
-                f"max_learning_rate {limits[1]} and final_max_learning_rate {limits[0]}; lower it"
+                f"max_learning_rate {self.max_learning_rate} and final_max_learning_rate "
+                f"{self.final_max_learning_rate}; lower it"
             )
         adapts = self.target_kl > 0.0
         if adapts and not self.min_learning_rate <= self.learning_rate <= self.max_learning_rate:
@@ -104,18 +102,3 @@ class PPOConfig(settings.StrictModel):
     def batch_steps(self) -> int:
         """Environment steps in one iteration."""
         return self.num_envs * self.rollout_length
-
-
-def find_algorithm(name: str) -> type:
-    """The algorithm of a name, ppo or FILE.py:CLASS.
-
-    Raises:
-      UserError: there is none.
-    """
-    from bounce_mjx.learning.ppo import PPO
-
-    if is_file(name):
-        return class_in_file(name, PPO)
-    if name != PPO_NAME:
-        raise UserError(f"there is no algorithm {shorten(name)!r}; give ppo or FILE.py:CLASS")
-    return PPO

@@ -28,35 +28,53 @@ def matching_metrics(patterns: Sequence[str], known: Iterable[str]) -> tuple[str
       UserError: a pattern matches none.
     """
     known = tuple(known)
+    matching = []
     for pattern in patterns:
         if "*" not in pattern and pattern not in known:
             raise UserError(
                 f"critic_metrics names {pattern}, which the environment does not have; choose from "
                 f"{', '.join(known)}"
             )
-    return tuple(dict.fromkeys(n for p in patterns for n in fnmatch.filter(known, p)))
+        matching += fnmatch.filter(known, pattern)
+    # Each name once, in the order of the patterns.
+    return tuple(dict.fromkeys(matching))
 
 
 def step_metrics(result: vector.VectorStep, groups: int, curves: Sequence[Curve]) -> Metrics:
-    """Sums of one step over each group of environments [G], of which `rollout_metrics` makes
-    means: each curve has one by its tag, and one of what it is the mean over."""
-    ended, ones = result.terminated | result.truncated, jnp.ones_like(result.reward)
-    sums = {name: x for name, x in result.metrics.items() if name.startswith("reward")}
-    sums |= {
-        "reward": result.reward,
-        "steps": ones,
-        "ended": ended,
-        "return": jnp.where(ended, result.episode_return, 0.0),
-        "length": jnp.where(ended, result.episode_length, 0),
-    }
-    sums |= {f"task/{name}": result.metrics[name] for name in _ENDS if name in result.metrics}
+    """Sums of one step of B environments, of which `rollout_metrics` makes means.
+
+    Args:
+      result: of the step of all environments.
+      groups: number of equal groups of environments, G. A device holds whole groups.
+      curves: a task's. Each has a sum by its tag, and one of what it is the mean over.
+
+    Returns:
+      The sum over each group [G], by name.
+    """
+    ended = result.terminated | result.truncated
+    one = jnp.ones_like(result.reward)
+    values = {name: value for name, value in result.metrics.items() if name.startswith("reward")}
+    values["reward"] = result.reward
+    values["steps"] = one
+    values["ended"] = ended
+    values["return"] = jnp.where(ended, result.episode_return, 0.0)
+    values["length"] = jnp.where(ended, result.episode_length, 0)
+    for name in _ENDS:
+        if name in result.metrics:
+            values[f"task/{name}"] = result.metrics[name]
+
+    weights = {"steps": one, "episodes": ended} | result.metrics
     for curve in (*curves, *_other_curves(result.metrics, curves)):
-        value, over = result.metrics[curve.metric], {"steps": ones, "episodes": ended}
-        sums[curve.tag] = jnp.where(ended, value, 0.0) if curve.over == "episodes" else value
-        sums[_OVER + curve.tag] = (over | result.metrics)[curve.over]
+        value = result.metrics[curve.metric]
+        if curve.over == "episodes":
+            value = jnp.where(ended, value, 0.0)
+        values[curve.tag] = value
+        values[_OVER + curve.tag] = weights[curve.over]
+
     # One array, because on a GPU each small array costs a kernel.
-    rows = jnp.stack([x.astype(result.reward.dtype) for x in sums.values()])
-    return dict(zip(sums, jnp.sum(rows.reshape(len(rows), groups, -1), axis=-1), strict=True))
+    rows = jnp.stack([value.astype(result.reward.dtype) for value in values.values()])
+    sums = jnp.sum(rows.reshape(len(rows), groups, -1), axis=-1)
+    return dict(zip(values, sums, strict=True))
 
 
 def _other_curves(metrics: Metrics, curves: Sequence[Curve]) -> list[Curve]:
@@ -71,16 +89,21 @@ def _other_curves(metrics: Metrics, curves: Sequence[Curve]) -> list[Curve]:
 
 
 def rollout_metrics(steps: Metrics) -> Metrics:
-    """Metrics of a rollout from the sums of its steps and groups [T, G]: the rewards, the
+    """Metrics [] of a rollout from the sums of its steps and groups [T, G]: the rewards, the
     episodes and a task's curves. Means over episodes are NaN if none ended, means over events if
     there were none."""
-    total = {name: jnp.sum(x) for name, x in steps.items()}
-    metrics = {n: x / total["steps"] for n, x in total.items() if n.startswith("reward")}
-    curves = [name for name in total if _OVER + name in total]
-    metrics |= {name: total[name] / total[_OVER + name] for name in curves}
-    return metrics | {
+    total = {name: jnp.sum(sums) for name, sums in steps.items()}
+    metrics = {
         "episode/return": total["return"] / total["ended"],
         "episode/length": total["length"] / total["ended"],
         "episode/ended": total["ended"],
-        **{f"task/{name}": total[f"task/{name}"] for name in _ENDS if f"task/{name}" in total},
     }
+    for name, value in total.items():
+        if _OVER + name in total:
+            metrics[name] = value / total[_OVER + name]
+        elif name.startswith("reward"):
+            metrics[name] = value / total["steps"]
+    for end in _ENDS:
+        if f"task/{end}" in total:
+            metrics[f"task/{end}"] = total[f"task/{end}"]
+    return metrics

@@ -14,17 +14,20 @@ MIN_STD = 1.01 * MIN_VARIANCE**0.5
 
 
 class Normalizer(NamedTuple):
-    """Mean and standard deviation [N] with which inputs are normalised."""
+    """What inputs are normalised with."""
 
     mean: jax.Array
+    """Mean of each input [N]."""
     std: jax.Array
+    """Standard deviation of each input [N]."""
 
 
 class RunningStatistics(NamedTuple):
     """Statistics of all inputs so far."""
 
     count: jax.Array
-    """Number of inputs []. As float32 it is exact up to 2^24 times the size of a batch."""
+    """Number of inputs [], float32: it stays as it is once a batch is less than 2^-24 of it, after
+    about 2^24 iterations."""
     mean: jax.Array
     """Mean of the inputs [N]; 0 before the first input."""
     summed_variance: jax.Array
@@ -40,22 +43,29 @@ class RunningStatistics(NamedTuple):
 
 def init_normalizer(size: int) -> Normalizer:
     """The normaliser [size] that changes nothing."""
-    return Normalizer(jnp.zeros(size, jnp.float32), jnp.ones(size, jnp.float32))
+    return Normalizer(mean=jnp.zeros(size, jnp.float32), std=jnp.ones(size, jnp.float32))
 
 
 def init_statistics(size: int) -> RunningStatistics:
     """Statistics of inputs [size] before the first one."""
     mean, std = init_normalizer(size)
-    return RunningStatistics(jnp.zeros((), jnp.float32), mean, jnp.zeros_like(mean), std)
+    return RunningStatistics(
+        count=jnp.zeros((), jnp.float32),
+        mean=mean,
+        summed_variance=jnp.zeros_like(mean),
+        std=std,
+    )
 
 
 def update(statistics: RunningStatistics, batch: jax.Array) -> RunningStatistics:
     """Adds a batch of inputs [..., N] (Welford 1962; for batches, Chan, Golub and LeVeque 1979)."""
-    axes = tuple(range(batch.ndim - 1))
-    count = statistics.count + batch.size // batch.shape[-1]
+    batch_axes = tuple(range(batch.ndim - 1))
+    batch_count = batch.size // batch.shape[-1]
+    count = statistics.count + batch_count
     from_old_mean = batch - statistics.mean
-    mean = statistics.mean + jnp.sum(from_old_mean, axis=axes) / count
-    added_variance = jnp.sum(from_old_mean * (batch - mean), axis=axes)
+    mean = statistics.mean + jnp.sum(from_old_mean, axis=batch_axes) / count
+    from_new_mean = batch - mean
+    added_variance = jnp.sum(from_old_mean * from_new_mean, axis=batch_axes)
     # Rounding may make the sum negative.
     summed_variance = jnp.maximum(statistics.summed_variance + added_variance, 0.0)
     std = jnp.sqrt(summed_variance / count + MIN_VARIANCE)
@@ -72,3 +82,9 @@ def normalize(inputs: jax.Array, normalizer: Normalizer) -> jax.Array:
     standardized = (inputs - normalizer.mean) / normalizer.std
     clipped = jnp.clip(standardized, -MAX_NORMALIZED, MAX_NORMALIZED)
     return jnp.where(normalizer.std > MIN_STD, clipped, 0.0)
+
+
+def denormalize(normalized: jax.Array, normalizer: Normalizer) -> jax.Array:
+    """Inputs [..., N] in their own units, from normalised ones: the inverse of `normalize`, but for
+    an input that was clipped, and one that never varied, which is its mean."""
+    return normalizer.mean + normalizer.std * normalized

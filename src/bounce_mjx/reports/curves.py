@@ -11,15 +11,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bounce_mjx.config.files import flat
+from bounce_mjx.config.user_code import is_file, read_source
 from bounce_mjx.errors import UserError, reason_of, shorten
-from bounce_mjx.runs.config import ROBOT, load_run_config
+from bounce_mjx.runs.config import ROBOT, TrainConfig, load_run_config
 from bounce_mjx.runs.files import MANIFEST_FILE
 from bounce_mjx.runs.progress import load_results
-from bounce_mjx.task.shown import Curve
-from bounce_mjx.tasks.registry import is_file, read_source
+from bounce_mjx.task.task import Curve
 
 # Settings that may differ within a group: the seed, the run's location, its length, its devices.
 _FREE_KEYS = frozenset(("seed", "log_dir", "total_steps", "stop_when_solved", "num_devices"))
+_LEARNING_RATE = "ppo.learning_rate"
 # Maximum number of settings in a label.
 _MAX_NAMED = 3
 
@@ -105,7 +106,7 @@ def group_runs(runs: Sequence[Path]) -> list[Group]:
         groups.setdefault(json.dumps(each), []).append(i)
     return [
         Group(
-            _label({name: settings[members[0]][name] for name in shown}, len(members)),
+            _label(configs[members[0]], {x: settings[members[0]][x] for x in shown}, len(members)),
             [read_curves(runs[i]) for i in members],
             configs[members[0]].env.task.curves,
         )
@@ -124,9 +125,12 @@ def mean_and_band(curves: Sequence[LoggedCurve]) -> tuple[np.ndarray, np.ndarray
     return steps, values.mean(axis=0), values.std(axis=0)
 
 
-def _label(differences: dict[str, Any], count: int) -> str:
-    """The label of a group of a number of runs."""
-    named = [f"{name.rpartition('.')[2]} {value}" for name, value in differences.items()]
+def _label(config: TrainConfig, differences: dict[str, Any], count: int) -> str:
+    """The label of a group of a number of runs of a config."""
+    names = {key: key.rpartition(".")[2] for key in differences}
+    if config.starts_with_learning_rate and _LEARNING_RATE in names:
+        names[_LEARNING_RATE] = "first learning_rate"
+    named = [f"{names[key]} {value}" for key, value in differences.items()]
     values = ", ".join(named[:_MAX_NAMED]) + (" …" if len(named) > _MAX_NAMED else "")
     members = "one run" if count == 1 else f"{count} runs"
     return f"{values} ({members})" if values else members

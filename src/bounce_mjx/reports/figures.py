@@ -19,7 +19,7 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.statistics import paddle_points
 from bounce_mjx.reports.curves import Group, mean_and_band
-from bounce_mjx.task.shown import Curve, Histogram, Hits, Recording
+from bounce_mjx.task.task import Curve, Histogram, Hits, Recording
 
 RETURN = "episode/return"
 """Tag of the return in a training's log."""
@@ -69,13 +69,28 @@ def curves_figure(groups: Sequence[Group], columns: int = 3) -> Figure:
 @style()
 def rewards_figure(groups: Sequence[Group], columns: int = 5) -> Figure:
     """The weighted reward terms over the training, at most `columns` panels side by side."""
-    logged = dict.fromkeys(name for group in groups for run in group.runs for name in run.curves)
-    titles = {x: x.removeprefix(_REWARD).replace("_", " ") for x in logged if x.startswith(_REWARD)}
-    shown = [Curve(name, "", title=title) for name, title in titles.items()]
-    figure = _draw_curves(groups, shown, columns, height=1.6)
+    figure = _draw_curves(groups, _reward_curves(groups), columns, height=1.6)
     title = "weighted reward terms over environment steps,\nmean of a control step"
     figure.suptitle(title, fontsize=10)
     return figure
+
+
+@style()
+def reward_panels(groups: Sequence[Group]) -> dict[str, Figure]:
+    """The panels of `rewards_figure` one by one, without a legend, by the name of the term."""
+    panels = {}
+    for curve in _reward_curves(groups):
+        figure = Figure(figsize=(PANEL_WIDTH, 1.6), layout="constrained")
+        _draw_curve(figure.subplots(), groups, curve)
+        panels[curve.title] = figure
+    return panels
+
+
+def _reward_curves(groups: Sequence[Group]) -> list[Curve]:
+    """The reward terms that any of the runs has logged."""
+    logged = dict.fromkeys(name for group in groups for run in group.runs for name in run.curves)
+    terms = [name for name in logged if name.startswith(_REWARD)]
+    return [Curve(x, "", title=x.removeprefix(_REWARD).replace("_", " ")) for x in terms]
 
 
 @style()

@@ -15,6 +15,8 @@ h1 { margin-bottom: 0; } h2 { margin: 2rem 0 0.5rem; font-size: 1.15rem; }
 .wide { overflow-x: auto; }
 .figures { display: grid; gap: 0 2rem; align-items: start;
   grid-template-columns: repeat(auto-fit, minmax(min(100%, 26rem), 1fr)); }
+.panels { display: grid; gap: 0.5rem; align-items: end;
+  grid-template-columns: repeat(auto-fill, minmax(min(48%, 12rem), 1fr)); }
 figure { margin: 0; } img { width: 100%; }
 iframe { width: 100%; height: 28rem; border: 1px solid #ddd; }
 table { border-collapse: collapse; }
@@ -52,6 +54,15 @@ def figures_html(figures: Mapping[str, Figure]) -> str:
         source = data_url("image/svg+xml", image(figure, "svg"))
         parts.append(f'<figure><h2>{title}</h2><img alt="{title}" src="{source}"></figure>\n')
     return f'<div class="figures">{"".join(parts)}</div>'
+
+
+def panels_html(panels: Mapping[str, Figure]) -> str:
+    """Small figures, which have their titles, as many side by side as there is room for."""
+    parts = []
+    for title, figure in panels.items():
+        source = data_url("image/svg+xml", image(figure, "svg"))
+        parts.append(f'<img alt="{html.escape(title)}" src="{source}">\n')
+    return f'<div class="panels">{"".join(parts)}</div>'
 
 
 def data_url(kind: str, content: bytes) -> str:

@@ -17,7 +17,7 @@ from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
 from bounce_mjx.evaluation.statistics import RECORDED_EPISODES
 from bounce_mjx.reports import figures
 from bounce_mjx.reports.curves import group_runs
-from bounce_mjx.reports.html_page import data_url, figures_html, page, table
+from bounce_mjx.reports.html_page import data_url, figures_html, page, panels_html, table
 from bounce_mjx.reports.robustness import load_robustness, robustness_figure
 from bounce_mjx.reports.tables import details_line, result_cells
 from bounce_mjx.runs.checkpoints import read_actor
@@ -25,7 +25,7 @@ from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.files import write_output
 from bounce_mjx.runs.folders import Checkpoint, best_checkpoint
 from bounce_mjx.runs.progress import load_results
-from bounce_mjx.task.shown import Recording
+from bounce_mjx.task.task import Recording
 from bounce_mjx.viewers.page import replay_first_episode
 
 # Panels side by side in a figure that fits a phone, and its width in inches.
@@ -63,7 +63,6 @@ def write_report(run: Path, recording: Recording | None = None) -> Path:
     drawn = {
         "Learning curves": figures.curves_figure(groups, _COLUMNS),
         "The best checkpoint": figures.evaluation_figure(env, recording, _WIDTH),
-        "Reward terms": figures.rewards_figure(groups, _COLUMNS),
     }
     if robustness is not None:
         drawn["Perturbed worlds"] = robustness_figure(robustness)
@@ -85,6 +84,10 @@ after {results.best_steps:,} of {results.trained_steps:,} environment steps, on 
 <p>In the learning curves, lines are the training, whose actions are sampled (exploration); points
 are evaluations, whose actions are not. Errors rise first: sampled actions scatter most then.</p>
 {figures_html(drawn)}
+<h2>Reward terms</h2>
+<p>Weighted, the mean of a control step, over environment steps. The dotted line is the first
+evaluation that met all results.</p>
+{panels_html(figures.reward_panels(groups))}
 <h2>Where the time went</h2>
 {table(["phase", "seconds"], phases)}
 <details><summary>Config</summary><pre>{html.escape(dump_config(config))}</pre></details>"""

@@ -24,17 +24,18 @@ import numpy as np
 
 from bounce_mjx.baselines.mirror import MirrorLaw
 from bounce_mjx.config.files import differing_keys
+from bounce_mjx.config.user_code import is_file
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import Actor, Policy, make_networks, networks_of, untrained_policy
-from bounce_mjx.learning.ppo import Params, names_of_critic_metrics
+from bounce_mjx.learning.ppo import PPO, Params, names_of_critic_metrics
+from bounce_mjx.learning.registry import find_algorithm
 from bounce_mjx.learning.statistics import RunningStatistics, init_statistics
-from bounce_mjx.runs import folders
+from bounce_mjx.runs import earlier, folders
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config, runs_folder
 from bounce_mjx.runs.files import plain_path, seal, to_plain
 from bounce_mjx.runs.records import RECORD, Checkpoint, DamagedCheckpoint, Record, verify
-from bounce_mjx.tasks.registry import is_file
 
 POLICY, TRAINING, NETWORKS = "policy", "training", "networks"
 """Items of a checkpoint: what acts; what a training continues from; both networks, with which
@@ -130,7 +131,15 @@ def read_networks(
         params = Params(*(network.init(jax.random.PRNGKey(0)) for network in networks[:2]))
         return {"params": params, "statistics": init_statistics(size + len(names))}
 
-    stored = _read_arrays(checkpoint, items[0], jax.eval_shape(initial))
+    try:
+        stored = _read_arrays(checkpoint, items[0], jax.eval_shape(initial))
+    except DamagedCheckpoint as error:
+        if not is_file(config.algorithm):
+            raise
+        raise UserError(
+            f"{checkpoint.folder} cannot be read as networks of PPO (its algorithm is "
+            f"{config.algorithm}); --resume it, or give another run"
+        ) from error
     return stored["params"], stored["statistics"], names
 
 
@@ -142,8 +151,14 @@ def read_start(config: TrainConfig, env: Env) -> tuple[Params, RunningStatistics
 
     Raises:
       UserError: the checkpoint is missing, damaged or without a value network, or its observation
-        or hidden layers are not those of the training.
+        or hidden layers are not those of the training, or one of the two makes other networks.
     """
+    algorithm = find_algorithm(config.algorithm)
+    if algorithm.make_networks is not PPO.make_networks:
+        raise UserError(
+            f"{algorithm.__name__} makes networks of its own, which --warm-start cannot fill; "
+            "leave one of them out"
+        )
     checkpoint = folders.choose_checkpoint(config.warm_start, runs_folder(config.env.task))
     own = load_run_config(checkpoint.run)
     networks = [[getattr(ppo, key) for key in NETWORK_KEYS] for ppo in (own.ppo, config.ppo)]
@@ -177,7 +192,7 @@ def read_record(checkpoint: Checkpoint) -> Record:
     """Verifies every file of a checkpoint and reads its plain data."""
     run_config, record = load_run_config(checkpoint.run), verify(checkpoint)
     try:
-        config = type(run_config).model_validate(record.config)
+        config = type(run_config).model_validate(earlier.present_settings(record.config))
     # Pydantic's own is one.
     except ValueError as error:
         raise DamagedCheckpoint(checkpoint, error) from error
@@ -195,7 +210,7 @@ def _read_arrays(checkpoint: Checkpoint, item: str, template: Any) -> Any:
     """Reads an item of a checkpoint with exactly the structure, shapes and dtypes of `template`."""
     try:
         with plain_path(checkpoint.folder) as folder:
-            read = _read_old if checkpoint.is_old else _read_item
+            read = earlier.read_arrays if checkpoint.is_old else _read_item
             return read(folder / item, template)
     # Damaged files raise exceptions of many types.
     except Exception as error:
@@ -213,20 +228,6 @@ def _read_item(folder: Path, template: Any) -> Any:
     as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), template)
     arguments = ocp.args.PyTreeRestore(item=template, restore_args=as_numpy)
     return handler.restore(folder, args=arguments)
-
-
-def _read_old(folder: Path, template: Any) -> Any:
-    import tensorstore
-
-    def read(path: tuple, leaf: jax.ShapeDtypeStruct) -> np.ndarray:
-        name = jax.tree_util.keystr(path, simple=True, separator=".")
-        files = {"driver": "file", "path": f"{folder}/"}
-        database = {"driver": "ocdbt", "base": files, "path": f"{name}/"}
-        form = {"shape": leaf.shape, "chunks": leaf.shape, "dtype": leaf.dtype.str}
-        spec = {"driver": "zarr", "kvstore": database, "metadata": form}
-        return tensorstore.open(spec, open=True, read=True).result().read().result()
-
-    return jax.tree_util.tree_map_with_path(read, template)
 
 
 def _forms(tree: Any) -> dict[str, str]:

@@ -11,15 +11,16 @@ from pydantic import Field
 from pydantic.fields import FieldInfo
 
 from bounce_mjx.config.settings import Count, NonNegativeInt, Steps, StrictModel, fields_in
+from bounce_mjx.config.user_code import admit, is_file, is_same_code, known_class, source_file
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
-from bounce_mjx.learning.config import PPO_NAME, PPOConfig, find_algorithm
+from bounce_mjx.learning.config import PPO_NAME, PPOConfig
+from bounce_mjx.learning.registry import find_algorithm
 from bounce_mjx.robot.config import is_packaged
 from bounce_mjx.runs.files import check_integrity
 from bounce_mjx.runs.presets import BASE, SOURCES, read_config_file
+from bounce_mjx.task.registry import DEFAULT, find_task, task_name
 from bounce_mjx.task.task import Task
-from bounce_mjx.tasks import registry
-from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file
 from bounce_mjx.world.config import WorldConfig
 
 CONFIG_FILE = "config.yaml"
@@ -98,6 +99,12 @@ class TrainConfig(StrictModel):
                 sources[key] = source
         return sources
 
+    @property
+    def starts_with_learning_rate(self) -> bool:
+        """Whether `ppo.learning_rate` is only the start, as `target_kl` adapts it after each
+        minibatch; an algorithm of the user's may have a schedule of its own."""
+        return self.algorithm == PPO_NAME and self.ppo.target_kl > 0.0
+
     def set_sources(self, sources: dict[str, str]) -> None:
         """Notes what set the values, by their dotted keys."""
         self._sources = sources
@@ -110,7 +117,7 @@ class TrainConfig(StrictModel):
     @classmethod
     def _make_absolute(cls, name: str) -> str:
         """A run's config is read from other folders too."""
-        return f"{registry.source_file(name)}:{name.rpartition(':')[2]}" if is_file(name) else name
+        return f"{source_file(name)}:{name.rpartition(':')[2]}" if is_file(name) else name
 
     @pydantic.model_validator(mode="before")
     @classmethod
@@ -118,7 +125,7 @@ class TrainConfig(StrictModel):
         """The settings of a task determine it."""
         env = values.get("env") if isinstance(values, dict) else None
         if isinstance(env, WorldConfig) and env.task is not None and "task" not in values:
-            return values | {"task": registry.task_name(env.task)}
+            return values | {"task": task_name(env.task)}
         return values
 
     @pydantic.field_validator("env", mode="before")
@@ -220,13 +227,13 @@ def _task_of_run(name: str, run: Path, given: str | None) -> type[Task]:
       UserError: the user has not named the file; or the run has another task.
     """
     if given is not None:
-        if not registry.is_same_code(name, given):
+        if not is_same_code(name, given):
             if not is_file(name):
                 raise UserError(f"{run} has the task {name}, and --task is {given}; leave it out")
             note = f"{given} differs from the task that {run} was trained with, {name}"
             print(f"warning: {note}", file=sys.stderr)
         if is_file(name):
-            registry.admit(name, find_task(given))
+            admit(name, find_task(given))
     return task_in(f"the run {run}", name)
 
 
@@ -236,7 +243,7 @@ def task_in(source: str, name: str) -> type[Task]:
     Raises:
       UserError: there is none, or it is in a file that the user has not named.
     """
-    task = registry.known_task(name) if is_file(name) else find_task(name)
+    task = known_class(name, Task) if is_file(name) else find_task(name)
     if task is None:
         raise unnamed_code(source, "task", name)
     return task

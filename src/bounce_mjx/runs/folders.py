@@ -31,15 +31,17 @@ from typing import Any
 
 import bounce_mjx
 from bounce_mjx.config.files import dump_config
+from bounce_mjx.config.user_code import is_file, read_source, source_file
 from bounce_mjx.errors import UserError, suggest, warn_once
 from bounce_mjx.lazy import mujoco
 from bounce_mjx.resources import POLICIES, PRETRAINED, TASK_POLICIES, resource_path
+from bounce_mjx.runs import earlier
 from bounce_mjx.runs.config import CONFIG_FILE, ROBOT, TrainConfig, dump_sources, runs_folder
 from bounce_mjx.runs.files import seal, writable, write_atomically
 from bounce_mjx.runs.presets import BASE
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.records import Checkpoint, DamagedCheckpoint, Record, verify
-from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file, read_source, source_file
+from bounce_mjx.task.registry import DEFAULT, find_task
 
 LATEST = "latest"
 """Name of the newest run on the command line."""
@@ -246,8 +248,8 @@ def best_checkpoint(run: Path, place: Path | None = None) -> Checkpoint:
     def quality(checkpoint: Checkpoint) -> tuple[Any, ...]:
         record = records[checkpoint]
         score = record.report.score if record and record.report else ()
-        # Version 0.1 wrote no evaluation, and had a folder for the best one.
-        return score, checkpoint.folder.parent.name == "best", checkpoint.steps
+        # Version 0.1.0 wrote no evaluation of a policy that it shipped.
+        return score, checkpoint.folder.parent.name == earlier.BEST, checkpoint.steps
 
     return max(records, key=quality)
 
@@ -322,9 +324,7 @@ def stored_checkpoints(run: Path) -> list[Checkpoint]:
     with contextlib.suppress(OSError), os.scandir(folder) as entries:
         # One look, as a training may remove them meanwhile.
         paths = [folder / entry.name for entry in entries if entry.name.isdecimal()]
-    # Those of version 0.1.
-    old = (path for name in ("best", "latest") for path in folder.glob(f"{name}/*"))
-    paths = paths or [path for path in old if path.name.isdecimal()]
+    paths = paths or [*earlier.checkpoints_in(folder)]
     return [Checkpoint(run, path, int(path.name)) for path in paths if path.is_dir()]
 
 

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from bounce_mjx.config.files import read_mapping
+from bounce_mjx.config.user_code import is_file, source_file
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.lazy import jax
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.config import is_packaged
-from bounce_mjx.tasks.registry import is_file, source_file
+from bounce_mjx.runs.earlier import present_settings
 
 BASE = "base"
 """Key of a config file with the name of the preset on which it lies, or null for none."""
@@ -111,7 +112,7 @@ def read_config_file(
 ) -> dict[str, Any]:
     """The values of a config file (`read_mapping`), with absolute paths of the MJCF file and of the
     files of the task and the algorithm, which start at the folder of the file."""
-    values = read_mapping(path, kind, example)
+    values = present_settings(read_mapping(path, kind, example))
     for key in {"task", "algorithm"} & values.keys():
         name = str(values[key])
         if is_file(name):

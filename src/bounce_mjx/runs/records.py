@@ -3,6 +3,7 @@
 A `UserError` refuses a checkpoint of which a file is damaged.
 """
 
+import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,13 +11,11 @@ import pydantic
 
 from bounce_mjx.errors import UserError, reason_of, shorten, warn_once
 from bounce_mjx.evaluation.results import Report
+from bounce_mjx.runs import earlier
 from bounce_mjx.runs.files import MANIFEST_FILE, check_integrity
 
 RECORD = "record"
 """Item of a checkpoint with its `Record`."""
-
-# Version 0.1 wrote a checkpoint's plain data into this file.
-_OLD_RECORD = "run.json"
 
 
 class Checkpoint(NamedTuple):
@@ -32,8 +31,8 @@ class Checkpoint(NamedTuple):
 
     @property
     def is_old(self) -> bool:
-        """Whether version 0.1 wrote it."""
-        return (self.folder / _OLD_RECORD).is_file()
+        """Whether version 0.1.0 wrote it."""
+        return (self.folder / earlier.RECORD_FILE).is_file()
 
 
 class Record(pydantic.BaseModel):
@@ -45,16 +44,6 @@ class Record(pydantic.BaseModel):
     """The evaluations so far (`Progress`); with several seeds, a list of them under "seeds"."""
     report: Report | None = None
     """The evaluation of its policy; None if it was not evaluated."""
-
-    @pydantic.model_validator(mode="before")
-    @classmethod
-    def _find_report(cls, plain: Any) -> Any:
-        """Earlier versions stored the evaluation of the best policy alone, in its `progress`."""
-        if not isinstance(plain, dict) or "report" in plain:
-            return plain
-        progress = plain.get("progress")
-        is_best = isinstance(progress, dict) and progress.get("best_steps") == plain.get("steps")
-        return plain | {"report": progress.get("best") if is_best else None}
 
 
 class DamagedCheckpoint(UserError):
@@ -81,8 +70,10 @@ def verify(checkpoint: Checkpoint) -> Record:
         else:
             # An earlier version was killed before it wrote the manifest.
             warn_once(f"{folder} has no {MANIFEST_FILE} to find damage by")
-        name = _OLD_RECORD if checkpoint.is_old else f"{RECORD}/metadata"
-        return Record.model_validate_json((folder / name).read_bytes())
+        if checkpoint.is_old:
+            record = json.loads((folder / earlier.RECORD_FILE).read_bytes())
+            return Record.model_validate(earlier.with_report(record))
+        return Record.model_validate_json((folder / RECORD / "metadata").read_bytes())
     # One of pydantic's is a ValueError.
     except (OSError, ValueError) as error:
         raise DamagedCheckpoint(checkpoint, error) from error

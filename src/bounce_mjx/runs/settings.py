@@ -31,9 +31,11 @@ from pydantic.fields import FieldInfo
 from bounce_mjx.config.command_line import Flag
 from bounce_mjx.config.files import differing_keys, flat
 from bounce_mjx.config.settings import Layer, StrictModel, merged, nested
+from bounce_mjx.config.user_code import is_file, is_same_code
 from bounce_mjx.config.validation import describe, key_of
 from bounce_mjx.errors import UserError, shorten
-from bounce_mjx.learning.config import PPO_NAME, PPOConfig, find_algorithm
+from bounce_mjx.learning.config import PPO_NAME, PPOConfig
+from bounce_mjx.learning.registry import find_algorithm
 from bounce_mjx.resources import POLICIES
 from bounce_mjx.runs.config import (
     TrainConfig,
@@ -44,8 +46,8 @@ from bounce_mjx.runs.config import (
 )
 from bounce_mjx.runs.presets import BASE, SOURCES, preset_files, read_config_file, shown_file
 from bounce_mjx.runs.worlds import robot_and_world
+from bounce_mjx.task.registry import DEFAULT, find_task
 from bounce_mjx.task.task import Task
-from bounce_mjx.tasks.registry import DEFAULT, find_task, is_file, is_same_code
 from bounce_mjx.world.named import without_idle_curriculum
 
 FLAGS = "flags"

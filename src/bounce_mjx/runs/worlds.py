@@ -8,8 +8,8 @@ from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
 from bounce_mjx.runs.config import TrainConfig, task_in
 from bounce_mjx.runs.presets import ROBOTS, WORLDS, named_file, read_config_file, shown_file
+from bounce_mjx.task.registry import DEFAULT
 from bounce_mjx.task.task import Task
-from bounce_mjx.tasks.registry import DEFAULT
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.named import CURRICULUM, NamedWorld, read_world
 
@@ -55,15 +55,20 @@ def in_world(config: TrainConfig, world: Path) -> tuple[TrainConfig, NamedWorld]
     Raises:
       UserError: the world is wrong, or of another robot than the run.
     """
+    env, named = env_in_world(config.env, world)
+    return config.model_copy(update={"env": env}), named
+
+
+def env_in_world(trained: WorldConfig, world: Path) -> tuple[WorldConfig, NamedWorld]:
+    """`in_world` of the environment alone."""
     path = named_file(world, WORLDS, "world")
-    named, values = read_world(path), config.env.model_dump()
+    named, values = read_world(path), trained.model_dump()
     # The curriculum of the training goes too.
     del values["randomization"]
     if named.robot is not None:
-        values = merged(values, _layer_of_same_robot(config.env, named, path).values["env"])
+        values = merged(values, _layer_of_same_robot(trained, named, path).values["env"])
     values = merged(values, named.settings)
-    env = validate(type(config.env), values, f"the world {path}")
-    return config.model_copy(update={"env": env}), named
+    return validate(type(trained), values, f"the world {path}"), named
 
 
 def _layer_of_world(task: type[Task], world: NamedWorld, path: Path) -> Layer:

@@ -1,19 +1,23 @@
-"""What a task is made of. The tasks themselves, one file each, are in `bounce_mjx.tasks`.
+"""Tasks: what the arm and the ball are to do. Those of the package have a file each, as yours has.
 
-    task.py      `Task`, and what an environment gives it and gets: `Start`, `Step`, `TaskStep`
-    rewards.py   the terms of a reward, as settings with a formula
-    flight.py    the free flight of the ball, for rewards and observations
+    task.py      `Task`, and what an environment, a report and a viewer give it and get from it
+    rewards.py   the terms of a reward, as settings with a formula, and the ball's free flight
     results.py   what judges a policy
-    shown.py     what viewers and reports draw
+    registry.py  how a task is found by its name
 
-A task's file reads `from bounce_mjx import task`, and has each of these names as `task.NAME`; the
-settings and the observation of the world, which it extends, are among them. It goes in this order:
-constants, reward terms, observation, `Config`, then the task with its start, its step (reward, end,
-metrics), its quantities of the observation, its results, and what is shown.
+    bounce.py    the task of the original specification, with its terms in bounce_rewards.py
+    track.py     the ball bounces over a point that moves along a path of paths.py
+    balance.py   the ball rests on the paddle and follows a point on it
+    catch.py     a thrown ball comes to rest on the paddle
+    juggle.py    two or three balls on one paddle
+
+A task's file reads `from bounce_mjx import task`, and has each of the names below as `task.NAME`;
+the settings and the observation of the world, which it extends, are among them. It goes in this
+order: constants, reward terms, observation, `Config`, then the task with its start, its step
+(reward, end, metrics), its quantities of the observation, its results, and what is shown.
 """
 
 from bounce_mjx.config.settings import StrictModel
-from bounce_mjx.task.flight import GRAVITY, Flight, closest, flight
 from bounce_mjx.task.results import (
     Episodes,
     Figure,
@@ -25,10 +29,14 @@ from bounce_mjx.task.results import (
     share_of_events,
 )
 from bounce_mjx.task.rewards import (
+    GRAVITY,
+    Flight,
     Gaussian,
     Near,
     Proportional,
     RewardTerm,
+    closest,
+    flight,
     gaussian,
     horizontal_distance,
     length,
@@ -36,8 +44,21 @@ from bounce_mjx.task.rewards import (
     term_names,
     weighted_terms,
 )
-from bounce_mjx.task.shown import Curve, Histogram, Hits, Marker, Recording
-from bounce_mjx.task.task import Moment, Start, Step, Tally, Task, TaskStep, Values, latest
+from bounce_mjx.task.task import (
+    Curve,
+    Histogram,
+    Hits,
+    Marker,
+    Moment,
+    Recording,
+    Start,
+    Step,
+    Tally,
+    Task,
+    TaskStep,
+    Values,
+    latest,
+)
 from bounce_mjx.world.config import (
     PADDLE_HOME,
     ActionConfig,

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.lazy import jax, jnp
+from bounce_mjx.lazy import jax, jnp, np
 from bounce_mjx.task.results import Episodes, Figure, Result
-from bounce_mjx.task.shown import Curve, Histogram, Hits, Marker, Recording
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.observation import Kinematics
 
 if TYPE_CHECKING:
     from bounce_mjx.robot.geometry import Geometry
 
-State = Any
+TaskState = Any
 """A pytree that a task keeps of an episode."""
 
 Values = dict[str, "jax.Array"]
@@ -52,7 +51,7 @@ class Step(NamedTuple):
 class TaskStep(NamedTuple):
     """A task's part of a control step."""
 
-    state: State
+    state: TaskState
     """The task's state after the step."""
     reward: Values
     """Weighted terms [] of the reward, which is their sum."""
@@ -69,7 +68,7 @@ class Moment(NamedTuple):
     """Positions and velocities after the step."""
     command: Values
     """Value [] of each command after the step."""
-    state: State
+    state: TaskState
     """The task's state after the step."""
     metrics: Values
     """The environment's metrics of the step, each []."""
@@ -86,6 +85,77 @@ class Tally(NamedTuple):
     """Numbers that are summed over the steps of an episode."""
     maxima: Values = {}
     """Numbers of which the greatest over the steps of an episode counts; at least 0."""
+
+
+class Marker(NamedTuple):
+    """A shape in the scene without contact. A site of its name in the MJCF replaces its look."""
+
+    name: str
+    position: tuple[float, float, float]
+    """Centre, m."""
+    size: tuple[float, float, float]
+    """Half-sizes of a box or of a frame; radius and half-height of a cylinder, and 0, m."""
+    rgba: tuple[float, float, float, float]
+    shape: Literal["box", "frame", "cylinder"] = "box"
+    """A frame is the outline of a box around its z axis."""
+
+
+class Recording(NamedTuple):
+    """T control steps of K episodes; entries after the end of an episode are undefined."""
+
+    joint_angles: jax.Array
+    """Positions of the acting joints after the step [T, n, K], rad."""
+    ball: jax.Array
+    """Ball positions after the step [T, 3, K], m."""
+    paddle: jax.Array
+    """Positions of the paddle's centre after the step [T, 3, K], m."""
+    command: dict[str, jax.Array]
+    """Commands [T, K]."""
+    running: jax.Array
+    """Whether the episode had not ended before the step [T, K], bool."""
+    command_velocity: jax.Array | None = None
+    """Velocities of the joints' commands at the end of the step [T, n, K], rad/s; None if the
+    commands do not move within limits."""
+    qpos: jax.Array | None = None
+    """Generalised positions after the step [T, nq, K], in MuJoCo's order."""
+    metrics: dict[str, jax.Array] = {}
+    """Metrics of the step [T, K]."""
+
+
+class Curve(NamedTuple):
+    """A number that the training logs: how a metric adds up over a rollout."""
+
+    tag: str
+    """Name in the log."""
+    metric: str
+    """Metric of the environment's step."""
+    over: str = "steps"
+    """steps for the mean over steps, episodes for the mean of the last values of episodes, or the
+    metric that counts the events over which it is the mean."""
+    title: str = ""
+    """Title in the report; "" leaves it out there."""
+    scale: float = 1.0
+    """Factor from the metric's unit to the title's."""
+
+
+class Histogram(NamedTuple):
+    """A histogram of errors, with lines at a bound on each side of 0."""
+
+    title: str
+    """With the unit of the values."""
+    counted: str
+    """What is counted, such as bounces."""
+    values: np.ndarray
+    """[N]."""
+    bound: float
+
+
+class Hits(NamedTuple):
+    """Positions of the ball over the paddle at some steps, in the paddle's own frame."""
+
+    title: str
+    steps: np.ndarray
+    """Whether a step of a recording is drawn [T, K], bool."""
 
 
 class Task:
@@ -154,11 +224,11 @@ class Task:
         """
         return None
 
-    def reset(self, start: Start) -> State:
+    def reset(self, start: Start) -> TaskState:
         """The task's state at the start of an episode."""
         raise NotImplementedError
 
-    def step(self, state: State, step: Step) -> TaskStep:
+    def step(self, state: TaskState, step: Step) -> TaskStep:
         """The task's part of a control step: events, reward, end and metrics.
 
         Args:
@@ -175,7 +245,7 @@ class Task:
         """
         return command
 
-    def next_command(self, state: State, command: Values) -> Values:
+    def next_command(self, state: TaskState, command: Values) -> Values:
         """The commands from now on, for a task whose commands move within an episode; it follows
         `first_command` too.
 
@@ -185,7 +255,7 @@ class Task:
         """
         return command
 
-    def first_quantities(self, measured: Values) -> tuple[State, Values]:
+    def first_quantities(self, measured: Values) -> tuple[TaskState, Values]:
         """What the task remembers of the measurements at a reset, and the first value [size] of
         each quantity of the observation that is the task's own.
 
@@ -195,8 +265,8 @@ class Task:
         return (), {}
 
     def next_quantities(
-        self, memory: State, histories: Values, measured: Values
-    ) -> tuple[State, Values]:
+        self, memory: TaskState, histories: Values, measured: Values
+    ) -> tuple[TaskState, Values]:
         """What the task remembers after the measurements of a control step, and the histories of
         its own quantities.
 

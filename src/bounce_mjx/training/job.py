@@ -19,6 +19,7 @@ import numpy as np
 from rich.console import Console
 
 import bounce_mjx
+from bounce_mjx.config.user_code import is_file
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report
@@ -29,7 +30,6 @@ from bounce_mjx.runs import checkpoints, folders
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.files import writable
 from bounce_mjx.runs.progress import Progress
-from bounce_mjx.tasks.registry import is_file
 from bounce_mjx.training import events, faults, hosts
 from bounce_mjx.training.clock import Clock
 from bounce_mjx.training.evaluators import Evaluators

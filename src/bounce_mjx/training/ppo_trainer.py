@@ -17,7 +17,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning import ppo
-from bounce_mjx.learning.config import PPOConfig, find_algorithm
+from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.registry import find_algorithm
 from bounce_mjx.learning.statistics import RunningStatistics
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training import hosts

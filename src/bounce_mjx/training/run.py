@@ -11,19 +11,27 @@ from typing import Any
 import jax
 from rich.console import Console
 
+from bounce_mjx.adapters.policies import (
+    environment_config,
+    environment_of,
+    in_library,
+    policy_path,
+)
 from bounce_mjx.config.command_line import stdout
 from bounce_mjx.config.validation import validate
+from bounce_mjx.deploy.interface import check_interface, interface_of
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import reason_of
 from bounce_mjx.evaluation.config import EvaluationOptions
 from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.reports.tables import details_line, results_table, seeds_table, unsolved_line
+from bounce_mjx.resources import POLICIES
 from bounce_mjx.runs import folders
 from bounce_mjx.runs.checkpoints import read_actor
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.progress import load_results
-from bounce_mjx.runs.settings import PYTHON, Choice, Stack, stack
+from bounce_mjx.runs.settings import FLAGS, PYTHON, Choice, Stack, stack
 from bounce_mjx.training import hosts, job
 from bounce_mjx.training.events import Callback, say
 from bounce_mjx.training.setup import set_up_jax
@@ -35,11 +43,12 @@ class Run:
     those of the best one."""
 
     folder: Path
+    """The folder, or the name of a policy that comes with the package, such as robust."""
     task: str | None = None
     """The task as the user names it: a run of a task in a file, FILE.py:CLASS, needs it once."""
 
     def __post_init__(self):
-        object.__setattr__(self, "folder", Path(self.folder))
+        object.__setattr__(self, "folder", policy_path(self.folder))
 
     @property
     def config(self) -> TrainConfig:
@@ -74,6 +83,38 @@ class Run:
         """The best checkpoint's policy: the most likely actions [..., A] of observations [..., N].
         It can be compiled and differentiated."""
         return _read_policy(self.checkpoint, self.task)
+
+    def env(self, world: str | Path | None = None, **settings: Any) -> Env:
+        """The environment of the policy's training.
+
+        Args:
+          world: nominal (the default), training for the worlds that the training sampled, or a
+            named world.
+          settings: fields of the task's config, such as episode_seconds=30, on top of it.
+
+        Raises:
+          UserError: a setting is wrong, or the policy relies on another value of it.
+        """
+        return Env(environment_config("Run.env", self.task, self.folder, world, settings))
+
+    def policy_in(self, env: Any) -> Callable[[Any], Any]:
+        """The best checkpoint's policy in an environment of any library: the most likely actions
+        [..., A] of its observations [..., N], as arrays of the same library.
+
+        Args:
+          env: of Gymnasium, Stable-Baselines3, PyTorch, brax, gymnax or Playground, or an `Env`.
+
+        Raises:
+          UserError: the environment has another task, arm, action, control step or observation than
+            that of the policy's training.
+        """
+        name = next((x for x in POLICIES if policy_path(x) == self.folder), str(self.folder))
+        config = self.config.env
+        advice = f"make the environment with policy={name!r}, or take Run({name!r}).env()"
+        check_interface(
+            interface_of(config), interface_of(environment_of(env).config), name, advice
+        )
+        return in_library(jax.jit(self.policy), config.layout.size)
 
     def evaluate(self, **options: Any) -> Report:
         """Measures the results of the best checkpoint, as `bounce-mjx eval` does.
@@ -166,7 +207,7 @@ def run_training(
     """Trains with a config, which has its settings from layers, and returns the run."""
     if layers.resume is None:
         say(console, f"config: {layers.title}")
-    for note in layers.notes:
+    for note in (*layers.notes, *notes_on_starts(config)):
         say(console, f"note: {note}")
     seeds = job.train(config, console, resume=layers.resume, callbacks=callbacks)
     best = print_results(seeds, console)
@@ -174,6 +215,18 @@ def run_training(
         leave_report(best, console)
     run = best.run if len(seeds) == 1 else best.run.parent
     return Run(run, config.task)
+
+
+def notes_on_starts(config: TrainConfig) -> list[str]:
+    """A sentence where the user sets the learning rate, and it is only the one at the start."""
+    is_said = config.sources["ppo.learning_rate"] in (FLAGS, PYTHON)
+    if not (is_said and config.starts_with_learning_rate):
+        return []
+    return [
+        f"ppo.learning_rate {config.ppo.learning_rate} is only the first one, since ppo.target_kl "
+        f"{config.ppo.target_kl} adapts it after each minibatch; to compare learning rates, set "
+        "target_kl to 0, or change target_kl itself"
+    ]
 
 
 def print_results(seeds: Sequence[job.SeedRun], console: Console) -> job.SeedRun:

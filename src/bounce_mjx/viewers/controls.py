@@ -7,9 +7,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import viser
 
+from bounce_mjx.viewers.film import FilmPlayer, world_rows
 from bounce_mjx.viewers.options import PageStart
 from bounce_mjx.viewers.simulation import Simulation
-from bounce_mjx.viewers.world import WorldSlider, sliders_for
+from bounce_mjx.viewers.world import WorldSlider
 from bounce_mjx.world.config import Command
 
 # Slowest and fastest speed, as factors of real time.
@@ -80,6 +81,8 @@ class Controls:
 
     def __init__(self, gui: viser.GuiApi, simulation: Simulation, start: PageStart):
         self._simulation = simulation
+        # A film shows the values that hold, and takes none.
+        self._is_film = simulation.is_film
         # Callbacks run in threads of the server; the simulation's loop obeys their requests.
         self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         gui.add_html(f'<div style="padding:0 12px"><b>{html.escape(start.title)}</b></div>')
@@ -89,13 +92,15 @@ class Controls:
         self._num_shown = gui.add_slider(
             "robots", 1, max(2, most), 1, start.num_shown, disabled=most == 1
         )
-        reset = gui.add_button("reset the robots", icon=viser.Icon.REFRESH)
+        reset = gui.add_button(
+            "play it again" if self._is_film else "reset the robots", icon=viser.Icon.REFRESH
+        )
         reset.on_click(self._reset)
         self._commands = {
             name: self._add_command(gui, name, command)
             for name, command in simulation.env.config.commands.items()
         }
-        with gui.add_folder("push the ball"):
+        with gui.add_folder("push the ball", visible=not self._is_film):
             self._push_speed = gui.add_slider("speed, m/s", *_PUSH_RANGE, 0.05, 0.2)
             push = gui.add_button_group("push", [f"ball {towards}" for towards in _DIRECTIONS])
         push.on_click(lambda event: self._push(push.value.removeprefix("ball "), event))
@@ -117,12 +122,13 @@ class Controls:
         # The folder has the whole name, as the panel is narrow.
         short = label.split()[-1] + (f", {command.unit}" if command.unit else "")
         with gui.add_folder(label):
-            sampled = gui.add_checkbox(_SAMPLED, given is None)
+            sampled = gui.add_checkbox(_SAMPLED, given is None, visible=not self._is_film)
             if command.names:
-                handle = gui.add_dropdown(short, command.names)
+                handle = gui.add_dropdown(short, command.names, disabled=self._is_film)
             else:
                 low, high = min(start, *ends), max(start, *ends)
-                handle = gui.add_slider(short, low, high, command.step / _STEPS_PER_KEY, start)
+                step = command.step / _STEPS_PER_KEY
+                handle = gui.add_slider(short, low, high, step, start, disabled=self._is_film)
         setting = _Setting(handle, sampled, command.names)
         if command.names:
             setting.show(start)
@@ -130,16 +136,26 @@ class Controls:
 
     def _add_world(self, gui: viser.GuiApi) -> None:
         """The world's sliders, of those terms that the simulation lets move."""
-        sliders = sliders_for(self._simulation.env.config.randomization)
+        sliders = self._simulation.sliders
         if not sliders:
             return
         is_sampled = self._simulation.world is None
         with gui.add_folder("world"):
-            sampled = gui.add_checkbox(_SAMPLED, is_sampled, visible=is_sampled)
+            is_free = is_sampled and not self._is_film
+            sampled = gui.add_checkbox(_SAMPLED, is_sampled, visible=is_free)
             for slider in sliders:
-                handle = gui.add_slider(slider.label, *slider.limits, slider.step, slider.nominal)
+                handle = gui.add_slider(
+                    slider.label,
+                    *slider.limits,
+                    slider.step,
+                    slider.nominal,
+                    disabled=self._is_film,
+                )
                 self._world[slider] = _Setting(handle, sampled)
-            gui.add_button("make the world nominal").on_click(self._make_nominal)
+            nominal = gui.add_button("make the world nominal", visible=not self._is_film)
+            nominal.on_click(self._make_nominal)
+            if isinstance(self._simulation, FilmPlayer):
+                gui.add_html(_world_table(self._simulation.world_values))
 
     def show_values(self) -> None:
         """Shows the sampled values that hold in the first environment."""
@@ -203,6 +219,10 @@ class Controls:
 
     def apply(self) -> None:
         """Applies the settings and the requests to the simulation."""
+        if self._is_film:
+            while not self._requests.empty():
+                self._requests.get()()
+            return
         self._simulation.command = {
             name: setting.value
             for name, setting in self._commands.items()
@@ -214,6 +234,15 @@ class Controls:
             self._simulation.world = None if is_sampled else world
         while not self._requests.empty():
             self._requests.get()()
+
+
+def _world_table(values: dict[str, np.ndarray]) -> str:
+    """Every term of a world and its value, in the unit of its setting, as HTML."""
+    rows = "".join(
+        f"<tr><td>{html.escape(name)}</td><td>{html.escape(value)}</td></tr>"
+        for name, value in world_rows(values)
+    )
+    return f'<table style="margin:0 12px;font-size:11px">{rows}</table>'
 
 
 def _clip(slider: viser.GuiSliderHandle) -> float:

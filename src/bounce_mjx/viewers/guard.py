@@ -54,12 +54,13 @@ def open_server(host: str, port: int, allowed: Collection[str] = ()) -> Iterator
     Raises:
       UserError: this version of viser cannot be guarded.
     """
-    serve, is_own = websockets.asyncio.server.serve, _make_rule(host, allowed)
-    guarded = False
+    serve = websockets.asyncio.server.serve
+    is_own = _make_rule(host, allowed)
+    server_thread = None
 
     def guarded_serve(*args: Any, process_request: Callable[..., Any], **options: Any) -> Any:
-        nonlocal guarded
-        guarded = True
+        nonlocal server_thread
+        server_thread = threading.current_thread()
         asyncio.get_running_loop().set_exception_handler(lambda loop, context: None)
 
         def answer(connection: ServerConnection, request: Request) -> Response | None:
@@ -71,39 +72,54 @@ def open_server(host: str, port: int, allowed: Collection[str] = ()) -> Iterator
         return serve(*args, process_request=answer, **options)
 
     # viser starts its websocket server in its constructor, and has no parameter for a guard.
-    with _STARTING, _quiet_console():
+    with _STARTING, _QUIET_CONSOLE:
         websockets.asyncio.server.serve = guarded_serve
         try:
             server = viser.ViserServer(host=host, port=port, verbose=False)
         finally:
             websockets.asyncio.server.serve = serve
     try:
-        if not guarded:
+        if server_thread is None:
             raise UserError(
                 f"viser {viser.__version__} would admit every website to the page; install viser "
                 "1.1"
             )
         yield server
     finally:
-        stopping = threading.Thread(target=_stop, args=(server,), daemon=True)
+        stopping = threading.Thread(target=_stop, args=(server, server_thread), daemon=True)
         stopping.start()
         stopping.join(_STOP_SECONDS)
 
 
-@contextlib.contextmanager
-def _quiet_console() -> Iterator[None]:
-    """Silences rich's global console, on which viser prints; this package uses others."""
-    console = rich.get_console()
-    console.quiet = True
-    try:
-        yield
-    finally:
-        console.quiet = False
+class _QuietConsole:
+    """Silences rich's global console, on which viser prints; this package uses others. One server
+    may start while another one still stops."""
+
+    def __init__(self):
+        self._lock = threading.Lock()
+        self._users = 0
+
+    def __enter__(self) -> None:
+        self._change(1)
+
+    def __exit__(self, *error: object) -> None:
+        self._change(-1)
+
+    def _change(self, users: int) -> None:
+        with self._lock:
+            self._users += users
+            rich.get_console().quiet = self._users > 0
 
 
-def _stop(server: viser.ViserServer) -> None:
-    with _quiet_console():
+_QUIET_CONSOLE = _QuietConsole()
+
+
+def _stop(server: viser.ViserServer, server_thread: threading.Thread | None) -> None:
+    with _QUIET_CONSOLE:
         server.stop()
+        if server_thread is not None:
+            # Its last act is to print, after `stop` may have lost its patience.
+            server_thread.join()
 
 
 def _make_rule(host: str, allowed: Collection[str]) -> Callable[[Headers], bool]:

@@ -2,11 +2,9 @@
 
 from collections.abc import Sequence
 
-import jax
-import numpy as np
-
 from bounce_mjx.env.env import Env
-from bounce_mjx.task.shown import Recording
+from bounce_mjx.task.task import Recording
+from bounce_mjx.viewers.film import episode_frames
 from bounce_mjx.viewers.guard import open_server
 from bounce_mjx.viewers.scene import Scene
 from bounce_mjx.viewers.simulation import EnvFrame, frame_at, resample
@@ -19,22 +17,7 @@ _VISER_TITLE = "<title>Viser</title>"
 
 def replay_first_episode(env: Env, recording: Recording) -> str:
     """A page (HTML) that replays the first recorded episode up to its end, or for 10 s."""
-    length = int(np.sum(recording.running[:, 0]))
-    steps = min(length, round(_EPISODE_SECONDS / env.dt))
-    episode = jax.tree.map(lambda x: np.asarray(x)[:steps, ..., :1], recording)
-    qpos = np.moveaxis(episode.qpos, -1, 1)
-    over = np.zeros((steps, 1), bool)
-    over[-1] = steps == length < len(recording.running)
-    frames = EnvFrame(
-        time=env.dt * np.arange(1, steps + 1)[:, None],
-        qpos=qpos,
-        balls=np.stack([qpos[..., list(ball.qpos[:3])] for ball in env.addresses.balls], axis=2),
-        paddle=np.moveaxis(episode.paddle, -1, 1),
-        command=episode.command,
-        metrics=episode.metrics,
-        over=over,
-        lost=over,
-    )
+    frames = episode_frames(env, recording, seconds=_EPISODE_SECONDS)
     return replay(env, frames)
 
 

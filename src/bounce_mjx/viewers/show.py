@@ -13,6 +13,7 @@ from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.robot.model import fingerprint
 from bounce_mjx.runs.files import check_output, write_output
+from bounce_mjx.viewers.film import FilmPlayer
 from bounce_mjx.viewers.native import has_display, show_window
 from bounce_mjx.viewers.options import MAX_ENVS, Address, PageStart, ViewerOptions
 from bounce_mjx.viewers.simulation import Controller, Simulation
@@ -29,6 +30,8 @@ class Shown(NamedTuple):
     make_controller: Callable[[Env], Controller]
     title: str
     policy: Policy | None = None
+    film: Callable[[], FilmPlayer] | None = None
+    """Simulates an episode of an evaluation, which is shown in place of new ones."""
 
 
 def show(
@@ -56,6 +59,8 @@ def show(
 
     def simulate() -> Simulation:
         with console.status("compiling"):
+            if shown[0].film is not None:
+                return shown[0].film()
             return _simulate(shown, each, options.seed, commands, viewer == "browser")
 
     start = PageStart(shown[0].title, None, each)
@@ -113,7 +118,8 @@ def _record(
 
     simulation = simulate()
     with console.status("recording"):
-        recording = simulation.record(options.seconds or _RECORDED_SECONDS)
+        seconds = options.seconds or (None if simulation.is_film else _RECORDED_SECONDS)
+        recording = simulation.record(seconds)
         if options.html is not None:
             page = replay(simulation.env, recording, options.fps, start.names)
             write_output(options.html, page)

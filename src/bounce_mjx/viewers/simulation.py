@@ -11,6 +11,7 @@ import numpy as np
 
 from bounce_mjx.env.env import Env, EnvState, State
 from bounce_mjx.learning.policy import Actor, Policy
+from bounce_mjx.viewers.world import WorldSlider, sliders_for
 from bounce_mjx.world.randomization import TERMS, Ranges, World
 
 _PICTURES_PER_SECOND = 50.0
@@ -88,6 +89,9 @@ def frame_at(recording: EnvFrame, i: int) -> EnvFrame:
 class Simulation:
     """N environments under a controller; an environment is reset when its episode ends."""
 
+    is_film = False
+    """Whether it plays an episode that nothing can change."""
+
     def __init__(
         self,
         env: Env,
@@ -143,6 +147,11 @@ class Simulation:
             frame = _side_by_side([frame, *(other.frame for other in self.others)])
         given = {name: np.full_like(frame.command[name], x) for name, x in self.command.items()}
         return frame._replace(command=frame.command | given)
+
+    @property
+    def sliders(self) -> tuple[WorldSlider, ...]:
+        """Sliders of the terms that can be moved."""
+        return sliders_for(self.env.config.randomization)
 
     def world_value(self, term: str) -> float:
         """The first entry of a term of the world in the first environment."""

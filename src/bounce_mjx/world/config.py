@@ -91,13 +91,6 @@ class ResetConfig(settings.StrictModel):
     """Half-width of the uniform noise of each ball coordinate, m."""
 
 
-_FORMER_RESET_KEYS = {
-    "joint_angle_noise": "joint_angles",
-    "joint_velocity_noise": "joint_velocities",
-    "ball_position_noise": "ball_position",
-}
-
-
 class RobotSettings(settings.StrictModel):
     """The robot, its sensors and its ball: the settings that a named world may have."""
 
@@ -122,7 +115,6 @@ class WorldConfig(RobotSettings):
     """The world of an environment: the robot, the ball, the time steps, the resets, the sensors
     and the randomisation. The config of a task extends it."""
 
-    former = {"estimator": ...}
     task: ClassVar[Any] = None
     """The class of the task that these settings are of (`task.Task`)."""
 
@@ -152,16 +144,6 @@ class WorldConfig(RobotSettings):
     """The noise of a reset."""
     observation: ObservationConfig = ObservationConfig()
     """The quantities that the policy sees."""
-
-    @pydantic.model_validator(mode="before")
-    @classmethod
-    def _read_former(cls, values: Any) -> Any:
-        """The configs of 0.1.0 have the noise of a reset among the other settings."""
-        if not (isinstance(values, dict) and values.keys() & _FORMER_RESET_KEYS):
-            return values
-        kept = dict(values)
-        moved = {now: kept.pop(key) for key, now in _FORMER_RESET_KEYS.items() if key in kept}
-        return kept | {"reset": moved | dict(kept.get("reset", {}))}
 
     @pydantic.model_validator(mode="after")
     def _check_numbers(self):

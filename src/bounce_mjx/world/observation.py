@@ -57,8 +57,6 @@ class ObservationConfig(StrictModel):
     """The quantities that the policy sees, and how many values of each: 0 for none, 1 for the
     newest, N for the last N, the newest first."""
 
-    former = {"position": "measured"}
-
     joint_angles: Annotated[History, Quantity(None, "rad", "state")] = 1
     """Measured positions of the acting joints: 0 leaves them out, and N shows the last N. So do the
     numbers of the other quantities."""

@@ -198,8 +198,6 @@ class RandomizationConfig(StrictModel):
     """The world that each episode samples: a range for each term, null for off. In a file, a term
     of several joints or axes may have a range for each: two lists, of lower and of upper ends."""
 
-    former = {"restitution_slope": None, "air_lift": None}
-
     restitution: Annotated[
         Sampled, physical("contact_damping", RESTITUTION, NUMBER, bounds=(0.4, 0.98))
     ] = None

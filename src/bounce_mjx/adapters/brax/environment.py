@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import functools
+import os
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -15,11 +16,12 @@ import numpy as np
 from brax.io import image, mjcf
 from flax import struct
 
+from bounce_mjx.adapters.policies import environment_config
 from bounce_mjx.adapters.randomization import randomized_task
 from bounce_mjx.config.validation import validate
 from bounce_mjx.env.env import Env, EnvState, State
+from bounce_mjx.errors import UserError
 from bounce_mjx.task.task import Task
-from bounce_mjx.tasks.registry import DEFAULT, task_config
 from bounce_mjx.viewers.offscreen import choose_opengl
 from bounce_mjx.world.config import WorldConfig
 
@@ -69,23 +71,34 @@ class BraxBounceBall(brax.envs.Env):
     def __init__(
         self,
         config: WorldConfig | None = None,
-        task: str | type[Task] = DEFAULT,
+        task: str | type[Task] | None = None,
+        policy: str | os.PathLike | None = None,
+        world: str | os.PathLike | None = None,
         **settings: Any,
     ):
         """Makes the environment.
 
         Args:
           config: all settings; None for the defaults of the task.
-          task: its class, its name, or FILE.py:CLASS, if there is no config.
+          task: its class, its name, or FILE.py:CLASS, if there is no config; None for the policy's,
+            or the default one.
+          policy: a name, a run's folder, a checkpoint in it or an .onnx file, whose environment it
+            is (`adapters.policies`), if there is no config.
+          world: of the policy: nominal (the default), training for the worlds that its training
+            sampled, or a named world.
           settings: fields of the task's config, such as episode_seconds=30, which replace fields of
             `config`.
 
         Raises:
-          UserError: a setting is wrong.
+          UserError: a setting is wrong, or the policy's environment has another value.
         """
-        given = {} if config is None else config.model_dump()
-        kind = task_config(task) if config is None else type(config)
-        self.task = Env(validate(kind, given | settings, ENV_NAME))
+        if config is None:
+            config = environment_config(ENV_NAME, task, policy, world, settings)
+        elif policy is not None:
+            raise UserError("config and policy both say the environment; give one of them")
+        else:
+            config = validate(type(config), config.model_dump() | settings, ENV_NAME)
+        self.task = Env(config)
         self.dt, self.mj_model = self.task.dt, self.task.mj_model
         """Time of one control step, s, and MuJoCo's model."""
         self._model = _Model(self.mj_model)

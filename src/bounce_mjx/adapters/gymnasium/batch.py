@@ -11,10 +11,9 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from bounce_mjx.adapters.gymnasium.programs import Episodes, Programs, shared_programs
-from bounce_mjx.config.validation import validate
+from bounce_mjx.adapters.policies import environment_config, settings_class
 from bounce_mjx.errors import UserError, suggest
 from bounce_mjx.task.task import Task
-from bounce_mjx.tasks.registry import task_config
 
 Commands = dict[str, float | np.ndarray]
 """Some of the task's commands, each [] or [B]; NaN samples it."""
@@ -54,7 +53,9 @@ class Batch:
 
     def __init__(
         self,
-        task: str | type[Task],
+        task: str | type[Task] | None,
+        policy: str | os.PathLike | None,
+        world: str | os.PathLike | None,
         num_envs: int,
         max_episode_steps: int | None,
         settings: dict[str, Any],
@@ -62,7 +63,9 @@ class Batch:
         """Compiles nothing; the first start and the first step do, unless equal ones exist.
 
         Args:
-          task: its class, its name, or FILE.py:CLASS.
+          task: its class, its name, or FILE.py:CLASS; None for the policy's, or the default one.
+          policy: whose environment it is (`environment_config`), or None.
+          world: that of the policy.
           max_episode_steps: a shorter time limit than the config's, in steps; None or -1 for the
             config's.
           settings: fields of the task's config.
@@ -70,11 +73,12 @@ class Batch:
         Raises:
           UserError: an argument is wrong; an unknown setting is a TypeError too.
         """
-        kind = task_config(task)
-        for name in settings.keys() - kind.model_fields.keys():
-            advice = suggest(name, kind.model_fields) or f"give {', '.join(kind.model_fields)}"
+        title = "the environment's settings"
+        known = settings_class(task, policy, settings).model_fields
+        for name in settings.keys() - known.keys():
+            advice = suggest(name, known) or f"give {', '.join(known)}"
             raise UnexpectedArgument(f"got an unexpected keyword argument {name!r}; {advice}")
-        self.config = validate(kind, settings, "the environment's settings")
+        self.config = environment_config(title, task, policy, world, settings)
         self.num_envs = whole_number("num_envs", num_envs)
         self.episode_steps = self.config.episode_steps
         """Time limit of an episode in steps."""

@@ -4,6 +4,7 @@ Keyword arguments are the settings of the task's config.
 """
 
 import dataclasses
+import os
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -27,7 +28,6 @@ from bounce_mjx.adapters.gymnasium.pictures import Pictures
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.task.task import Task
-from bounce_mjx.tasks.registry import DEFAULT
 
 # Of one environment.
 _CHOSEN = np.ones(1, bool)
@@ -47,29 +47,35 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def __init__(
         self,
-        task: str | type[Task] = DEFAULT,
+        task: str | type[Task] | None = None,
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
         width: int = 640,
         height: int = 480,
         camera: str | None = None,
+        policy: str | os.PathLike | None = None,
+        world: str | os.PathLike | None = None,
         **settings: Any,
     ):
         """Makes the environment. The first reset compiles it, unless an equal one exists.
 
         Args:
-          task: its class, its name, or FILE.py:CLASS.
+          task: its class, its name, or FILE.py:CLASS; None for the policy's, or the default one.
           max_episode_steps: a shorter time limit than the config's, in steps; None or -1 for the
             config's.
           width: of the pictures, in pixels, as is `height`.
           camera: name of a camera of the model; None for the overview.
+          policy: a name, a run's folder, a checkpoint in it or an .onnx file: the environment of
+            its training, on which settings may change only what the policy does not rely on.
+          world: of the policy: nominal (the default), training for the worlds that its training
+            sampled, or a named world.
           settings: fields of the task's config, such as episode_seconds=30.
 
         Raises:
           UserError: an argument is wrong, or there is no OpenGL library for rendering; an unknown
             argument is a TypeError too.
         """
-        self._batch = Batch(task, 1, max_episode_steps, settings)
+        self._batch = Batch(task, policy, world, 1, max_episode_steps, settings)
         self._has_ended = False
         self._pictures = Pictures(self._batch, render_mode, width, height, camera)
         self.render_mode = render_mode
@@ -163,7 +169,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
 
     def __init__(
         self,
-        task: str | type[Task] = DEFAULT,
+        task: str | type[Task] | None = None,
         num_envs: int = 1,
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
@@ -171,6 +177,8 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         width: int = 640,
         height: int = 480,
         camera: str | None = None,
+        policy: str | os.PathLike | None = None,
+        world: str | os.PathLike | None = None,
         **settings: Any,
     ):
         """Makes `num_envs` environments; the other arguments and the errors are as in `TaskEnv`.
@@ -179,7 +187,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
           autoreset_mode: the reset of an ended episode: in the next step, in the same step, or
             disabled, which leaves it to reset(options={"reset_mask": ...}).
         """
-        self._batch = Batch(task, num_envs, max_episode_steps, settings)
+        self._batch = Batch(task, policy, world, num_envs, max_episode_steps, settings)
         self._pictures = Pictures(self._batch, render_mode, width, height, camera)
         self.num_envs = self._batch.num_envs
         self.render_mode = render_mode

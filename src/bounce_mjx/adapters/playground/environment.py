@@ -1,6 +1,7 @@
 """The environment for MuJoCo Playground's trainers and wrappers, with this project's physics."""
 
 import functools
+import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,8 +11,8 @@ import mujoco
 import numpy as np
 from flax import struct
 
+from bounce_mjx.adapters.policies import environment_config
 from bounce_mjx.adapters.randomization import randomized_task
-from bounce_mjx.config.validation import validate
 from bounce_mjx.env import env as core
 from bounce_mjx.env.env import Env, EnvState
 from bounce_mjx.errors import needed
@@ -20,7 +21,6 @@ from bounce_mjx.physics import PhysicsState
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.arm import locate
 from bounce_mjx.task.task import Task
-from bounce_mjx.tasks.registry import DEFAULT, task_config
 from bounce_mjx.viewers.offscreen import choose_opengl
 
 with needed("MuJoCo Playground", "playground<1"):
@@ -31,9 +31,14 @@ with needed("MuJoCo Playground", "playground<1"):
 ENV_NAME = "BounceBall"
 
 
-def default_config(task: str | type[Task] = DEFAULT) -> config_dict.ConfigDict:
-    """The settings of a task's config, some under Playground's own names."""
-    config = task_config(task)()
+def default_config(
+    task: str | type[Task] | None = None,
+    policy: str | os.PathLike | None = None,
+    world: str | os.PathLike | None = None,
+) -> config_dict.ConfigDict:
+    """The settings of a task's config, or of a policy's environment (`adapters.policies`), some
+    under Playground's own names."""
+    config = environment_config(ENV_NAME, task, policy, world, {})
     return config_dict.create(
         ctrl_dt=config.control_dt,
         sim_dt=config.physics_dt,
@@ -77,20 +82,29 @@ class PlaygroundBounceBall(MjxEnv):
         self,
         config: config_dict.ConfigDict | None = None,
         config_overrides: dict[str, Any] | None = None,
-        task: str | type[Task] = DEFAULT,
+        task: str | type[Task] | None = None,
+        policy: str | os.PathLike | None = None,
+        world: str | os.PathLike | None = None,
     ):
-        """Makes the environment; a config must be the one of the task.
+        """Makes the environment; a config must be the one of the task or the policy.
+
+        Args:
+          task: its class, its name, or FILE.py:CLASS; None for the policy's, or the default one.
+          policy: a name, a run's folder, a checkpoint in it or an .onnx file, whose environment it
+            is (`adapters.policies`).
+          world: of the policy: nominal (the default), training for the worlds that its training
+            sampled, or a named world.
 
         Raises:
-          UserError: a setting is wrong.
+          UserError: a setting is wrong, or the policy's environment has another value.
         """
-        super().__init__(config or default_config(task), config_overrides)
+        super().__init__(config or default_config(task, policy, world), config_overrides)
         settings = self._config.task.to_dict() | {
             "control_dt": self._config.ctrl_dt,
             "physics_dt": self._config.sim_dt,
             "episode_seconds": self._config.episode_length * self._config.ctrl_dt,
         }
-        self.task = Env(validate(task_config(task), settings, ENV_NAME))
+        self.task = Env(environment_config(ENV_NAME, task, policy, world, settings))
 
     def reset(self, rng: jax.Array) -> State:
         """Starts an episode; consumes the key `rng`."""

@@ -11,17 +11,17 @@ from mujoco_playground.config import manipulation_params
 
 from bounce_mjx.adapters import randomization
 from bounce_mjx.adapters.brax.ppo import network_settings, ppo_settings
-from bounce_mjx.adapters.gymnasium.registration import TASKS
 from bounce_mjx.adapters.playground.environment import (
     ENV_NAME,
     PlaygroundBounceBall,
     default_config,
 )
+from bounce_mjx.resources import TASK_POLICIES
 from bounce_mjx.robot.model import load_model
 from bounce_mjx.runs.settings import read_preset
-from bounce_mjx.tasks.registry import DEFAULT, task_config
+from bounce_mjx.task.registry import DEFAULT, task_config
 
-ENVIRONMENTS = {ENV_NAME: DEFAULT} | {f"BounceMjx{task.title()}": task for task in TASKS}
+ENVIRONMENTS = {ENV_NAME: DEFAULT} | {f"BounceMjx{task.title()}": task for task in TASK_POLICIES}
 """The package's tasks by their names in the registry."""
 
 

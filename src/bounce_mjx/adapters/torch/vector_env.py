@@ -5,18 +5,19 @@ for the device, because DLPack makes each library's stream wait for the other's.
 donated to the next step, so a step returns no view of it.
 """
 
+import os
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import torch
 
+from bounce_mjx.adapters.policies import environment_config
 from bounce_mjx.adapters.torch.packing import Layout
 from bounce_mjx.env import vector
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.metrics import matching_metrics
-from bounce_mjx.tasks.registry import DEFAULT, task_config
 
 
 class StepResult(NamedTuple):
@@ -56,20 +57,28 @@ class TorchVectorEnv:
         seed: int = 0,
         critic_metrics: tuple[str, ...] | None = None,
         reward_scale: float = 1.0,
+        policy: str | os.PathLike | None = None,
+        world: str | os.PathLike | None = None,
     ):
         """Compiles nothing; the first calls of `reset` and `step` do.
 
         Args:
-          env: the task; None for the default one.
+          env: the task; None for the policy's, or the default one.
           seed: seed of all resets.
           critic_metrics: names of the metrics that are additional inputs of the value network;
             a pattern such as world/* names many; None for the task's own.
           reward_scale: factor of the rewards.
+          policy: a name, a run's folder, a checkpoint in it or an .onnx file, whose environment it
+            is (`adapters.policies`), in place of `env`.
+          world: of the policy: nominal (the default), training for the worlds that its training
+            sampled, or a named world.
 
         Raises:
-          UserError: torch cannot use JAX's device, or a metric is unknown.
+          UserError: torch cannot use JAX's device, a metric is unknown, or there is no such policy.
         """
-        self.env = env or Env(task_config(DEFAULT)())
+        if env is not None and policy is not None:
+            raise UserError("env and policy both say the environment; give one of them")
+        self.env = env or Env(environment_config("TorchVectorEnv", None, policy, world, {}))
         self.num_envs = num_envs
         self.num_observations = self.env.observation_size
         self.num_actions = self.env.action_size

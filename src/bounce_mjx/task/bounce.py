@@ -14,7 +14,7 @@ from pydantic import Field
 from bounce_mjx import task
 from bounce_mjx.config import settings
 from bounce_mjx.lazy import jax, jnp
-from bounce_mjx.tasks.bounce_rewards import BounceReward, RewardInputs
+from bounce_mjx.task.bounce_rewards import BounceReward, RewardInputs
 
 SETTLING_SECONDS = 2.0
 """Time at the start of an episode that does not count for the horizontal position and the height,

@@ -10,7 +10,7 @@ from pydantic import Field
 from bounce_mjx import task
 from bounce_mjx.config.settings import Ascending, Coordinate, Finite, Length, Positive
 from bounce_mjx.lazy import jax, jnp
-from bounce_mjx.tasks import paths
+from bounce_mjx.task import paths
 
 SETTLING_SECONDS = 2.0
 """Time since a reset or a sample of the commands after which apexes count, s."""

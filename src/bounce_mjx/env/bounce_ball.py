@@ -3,7 +3,7 @@
 from typing import Any
 
 from bounce_mjx.env.env import Env
-from bounce_mjx.tasks.bounce import BounceConfig
+from bounce_mjx.task.bounce import BounceConfig
 
 
 class BounceBall(Env):

@@ -1,0 +1,88 @@
+"""The commands of a task as flags, such as `--target-height 0.5` of the task bounce."""
+
+from collections.abc import Sequence
+from typing import Annotated, Any, NamedTuple, TypeVar
+
+from pydantic.fields import FieldInfo
+
+from bounce_mjx.commands.which_policy import WhichPolicy
+from bounce_mjx.config.command_line import Flag, flag_names, parse, read_flags, typed
+from bounce_mjx.config.files import flat
+from bounce_mjx.config.settings import fields_in
+from bounce_mjx.errors import UserError
+from bounce_mjx.task.registry import find_task, registered_tasks
+from bounce_mjx.world.config import Command, WorldConfig
+
+CommandT = TypeVar("CommandT", bound=WhichPolicy)
+
+_GROUP = "commands."
+"""Begin of the dotted keys of a task's commands."""
+
+
+class GivenCommands(NamedTuple):
+    """The values that a user gave to a task's commands."""
+
+    values: dict[str, str]
+    """By name, as they stand on the command line."""
+    flags: dict[str, str]
+    """The flag of each command by name."""
+
+    def checked(self, env: WorldConfig) -> dict[str, float]:
+        """The values as numbers.
+
+        Raises:
+          UserError: a flag is not of the run's task, or its value is outside its limits.
+        """
+        numbers = {}
+        for name, word in self.values.items():
+            flag = self.flags[name]
+            if name not in env.commands:
+                raise UserError(f"{flag} is not a command of the run's task; omit it")
+            numbers[name] = env.commands[name].checked(word, flag)
+        return numbers
+
+
+def parse_with_commands(
+    command_class: type[CommandT], args: Sequence[str], *, prog: str
+) -> tuple[CommandT, GivenCommands]:
+    """Reads a command line in which the commands of the run's task are flags too.
+
+    Raises:
+      UserError: a flag has a bad value, or no task has it.
+    """
+    task = parse(WhichPolicy, args, prog=prog, is_first=True).task
+    fields = fields_in(command_class) | _fields_of(task)
+    given = read_flags(
+        fields,
+        args,
+        prog=prog,
+        # Python's option -OO leaves out docstrings.
+        description=command_class.__doc__ or "",
+        defaults=flat(command_class().model_dump()),
+    )
+    names = flag_names(fields)
+    command = typed(command_class, given, names, prog)
+    values = _of_group(given)
+    return command, GivenCommands(values, _of_group(names))
+
+
+def _fields_of(task: str | None) -> dict[str, FieldInfo]:
+    """The commands of a task, or of every task, as settings by dotted key."""
+    commands: dict[str, Command] = {}
+    # Without --task, the run may be of any task.
+    for name in [task] if task else registered_tasks():
+        commands |= find_task(name).Config().commands
+    fields = {}
+    for name, command in commands.items():
+        flag = Flag(metavar="|".join(command.names) or command.unit.upper() or "FLOAT")
+        field = FieldInfo.from_annotation(Annotated[str, flag])
+        field.description = "Command of the task, if the run's has it."
+        fields[_GROUP + name] = field
+    return fields
+
+
+def _of_group(values: dict[str, Any]) -> dict[str, Any]:
+    """What belongs to a task's commands, by the command's name."""
+    return {
+        key.removeprefix(_GROUP): value for key, value in values.items() if key.startswith(_GROUP)
+    }

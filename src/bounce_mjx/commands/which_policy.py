@@ -1,0 +1,151 @@
+"""Which policy a command is about, and the flags that several commands share."""
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from pydantic import Field
+
+from bounce_mjx.config.command_line import Flag
+from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.config.validation import validate
+from bounce_mjx.errors import UserError, suggest
+from bounce_mjx.runs import config as run_configs
+from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.runs.worlds import in_world
+from bounce_mjx.task.registry import DEFAULT, find_task
+from bounce_mjx.world.randomization import RandomizationConfig
+
+if TYPE_CHECKING:
+    from bounce_mjx.runs.folders import Checkpoint
+
+MIRROR = "mirror"
+"""Name of the mirror law in place of a checkpoint."""
+
+OnePolicy = Annotated[
+    Path | None,
+    Flag(metavar="[CHECKPOINT]", is_positional=True),
+    Field(
+        description="A run's folder (its best checkpoint), a checkpoint in it, latest for the "
+        "newest run, a policy that comes with the package (pretrained, robust, robust_small, or "
+        "the name of a task or an arm), or mirror for the mirror law, a model-based baseline. The "
+        "default is the newest run, or the task's policy in the package if there is no run."
+    ),
+]
+"""Type of the flag for one policy or the mirror law."""
+
+MirrorRobot = Annotated[
+    Path | None,
+    Field(description="Robot of the mirror law; a policy has that of its training."),
+]
+"""Type of the flag for the robot of the mirror law."""
+
+OtherWorld = Annotated[
+    Path | None,
+    Field(
+        description="World in place of that of the training: a YAML file, or the name of one in "
+        "configs/worlds/ (ur5e_rtde, panda_fci, iiwa_fri or fast_servo)."
+    ),
+]
+"""Type of the flag for the world of the episodes."""
+
+
+OtherRandomization = Annotated[
+    RandomizationConfig,
+    Field(description="World of the episodes if a term is given, in place of the training's."),
+]
+"""Type of the flags for a what-if world."""
+
+
+def check_one_world(nominal: bool, world: Path | None, randomization: RandomizationConfig) -> None:
+    """Refuses more than one of the flags that say in which world the episodes are.
+
+    Raises:
+      UserError: several are given.
+    """
+    flags = {"--nominal": nominal, "--world": world, "--randomization": randomization.terms}
+    given = [flag for flag, value in flags.items() if value]
+    if len(given) > 1:
+        raise UserError(f"{' and '.join(given)} cannot be combined; omit one")
+
+
+def in_what_if_world(config: TrainConfig, randomization: RandomizationConfig) -> TrainConfig:
+    """A config with the terms of the world that a user gives, if any, in place of its own.
+
+    Raises:
+      UserError: a term does not fit the arm.
+    """
+    if not randomization.terms:
+        return config
+    given = dict(config.env) | {"randomization": randomization}
+    env = validate(type(config.env), given, "the flags --randomization")
+    return config.model_copy(update={"env": env})
+
+
+class WhichPolicy(StrictModel):
+    """Which policy a command is about: in whose runs it is looked for. A command adds the flags
+    for its paths, and for the robot and the world if it simulates."""
+
+    task: str | None = None
+    """Task of the run. A run of a task in a file, FILE.py:CLASS, needs it, as the file is code."""
+    log_dir: Path | None = None
+    """Folder in which to look for the newest run; by default, that of the task's runs."""
+
+    @property
+    def folder(self) -> Path:
+        """Folder in which to look for the newest run."""
+        return self.log_dir or run_configs.runs_folder(find_task(self.task or DEFAULT))
+
+    def choose(self, path: Path | None, robot: Path | None = None) -> "Checkpoint":
+        """`choose_checkpoint`, or `MIRROR_LAW` for the word mirror.
+
+        Args:
+          robot: of the mirror law.
+
+        Raises:
+          UserError: there is none, or a robot is given for a policy.
+        """
+        from bounce_mjx.runs.folders import MIRROR_LAW, choose_checkpoint
+
+        is_folder = path is not None and os.path.isdir(path)
+        if str(path) == MIRROR and not is_folder:
+            return MIRROR_LAW
+        if path is not None and not is_folder and (near := suggest(str(path), [MIRROR])):
+            raise UserError(f"there is no checkpoint folder and no policy {path}; {near}")
+        if robot is not None:
+            raise UserError("--robot is for the mirror law; omit it, or give mirror as checkpoint")
+        return choose_checkpoint(path, self.folder)
+
+    def config_of_run(self, run: Path) -> TrainConfig:
+        """The config of a run.
+
+        Raises:
+          UserError: as `load_run_config`.
+        """
+        return run_configs.load_run_config(run, self.task)
+
+    def config_of(
+        self, checkpoint: "Checkpoint", robot: Path | None = None, world: Path | None = None
+    ) -> TrainConfig:
+        """The config of a checkpoint's run, or that of the mirror law: the task's preset.
+
+        Args:
+          robot: of the mirror law.
+          world: in place of that of the training.
+
+        Raises:
+          UserError: as `load_run_config`, `read_preset` and `in_world`.
+        """
+        from bounce_mjx.baselines.mirror import observing
+        from bounce_mjx.runs.folders import MIRROR_LAW
+
+        if checkpoint is MIRROR_LAW:
+            preset = read_preset(Path("default"), robot, self.task)
+            config = preset.model_copy(update={"env": observing(preset.env)})
+        else:
+            config = self.config_of_run(checkpoint.run)
+        if world is None:
+            return config
+        config, _ = in_world(config, world)
+        return config

@@ -1,0 +1,99 @@
+"""What an environment refuses before its first step: settings that its task or its model cannot
+have. Each check raises a `UserError` of one sentence."""
+
+import mujoco
+import numpy as np
+
+from bounce_mjx.errors import UserError
+from bounce_mjx.robot.model import Addresses, joint_names, joint_ranges
+from bounce_mjx.task.task import Task
+from bounce_mjx.world.config import WorldConfig
+
+# Two turns of a joint without a range, rad; or m.
+_MAX_ANGLE = 4.0 * np.pi
+# Poses in files are rounded, rad or m.
+_ROUNDING = 1e-3
+# A ball that starts farther beside the paddle falls before the paddle is under it, m.
+_FARTHEST_BESIDE = 0.3
+
+
+def check_task(config: WorldConfig, task: Task) -> None:
+    """Refuses what the task cannot have, whatever the model."""
+    _check_commands_are_seen(config)
+    _check_num_balls(config, task)
+
+
+def _check_commands_are_seen(config: WorldConfig) -> None:
+    """Refuses a command that varies and that the policy does not see."""
+    if config.observation.lengths("task"):
+        # The task's own quantities may show any command.
+        return
+    seen = config.observation.lengths()
+    for name, command in config.commands.items():
+        varies = command.low < command.high
+        if varies and name not in seen and not command.hidden:
+            raise UserError(
+                f"the policy does not see the command {name}, which varies from "
+                f"{command.low:g} to {command.high:g}; give the observation a quantity {name}, "
+                "fix the command, or mark it as hidden if it acts through others"
+            )
+
+
+def _check_num_balls(config: WorldConfig, task: Task) -> None:
+    """Refuses a number of balls that the task does not take."""
+    if config.num_balls in task.num_balls:
+        return
+    takes = " or ".join(map(str, task.num_balls))
+    raise UserError(
+        f"num_balls is {config.num_balls}, but the task {type(task).__name__} takes {takes}; set "
+        f"num_balls to {takes}"
+    )
+
+
+def check_joint_angles(config: WorldConfig, mj_model: mujoco.MjModel, addresses: Addresses) -> None:
+    """Refuses joint angles of a reset that do not fit the arm."""
+    angles = config.default_joint_angles
+    joints = joint_names(mj_model, addresses)
+    if len(angles) != len(joints):
+        model = f"the MJCF file {config.mjcf}" if config.mjcf else "the model"
+        raise UserError(
+            f"default_joint_angles has {len(angles)} numbers, but {model} has {len(joints)} "
+            f"joints with an actuator ({', '.join(joints)}); give one number for each"
+        )
+    ranges = joint_ranges(mj_model, addresses)
+    lows, highs = np.nan_to_num(ranges, posinf=_MAX_ANGLE, neginf=-_MAX_ANGLE)
+    for joint, angle, low, high in zip(joints, angles, lows, highs, strict=True):
+        if not low - _ROUNDING <= angle <= high + _ROUNDING:
+            raise UserError(
+                f"default_joint_angles has {angle:g} for {joint}, whose range is {low:.4g} to "
+                f"{high:.4g}; give radians, or metres for a slide, within the range"
+            )
+
+
+def check_start(config: WorldConfig, task: Task) -> None:
+    """Refuses heights that are not over the paddle of a reset, and a ball that starts within or
+    beside it; a task that throws the ball has its own start. The task has the model's geometry."""
+    geometry = task.geometry
+    paddle_x, paddle_y, paddle_height = geometry.paddle_home
+    for name, height in config.heights.items():
+        if height <= paddle_height:
+            raise UserError(
+                f"{name} has the height {height:g} m, which is not over the paddle at "
+                f"{paddle_height:.4g} m, where default_joint_angles hold it; change one of the two"
+            )
+    throws = type(task).throw is not Task.throw
+    if throws:
+        return
+    ball_x, ball_y, ball_height = config.ball_init_pos
+    beside = np.hypot(ball_x - paddle_x, ball_y - paddle_y)
+    if beside > _FARTHEST_BESIDE:
+        raise UserError(
+            f"ball_init_pos is {beside:.3g} m beside the paddle at ({paddle_x:.3g}, "
+            f"{paddle_y:.3g}) m, where default_joint_angles hold it; start it over the paddle"
+        )
+    rest_height = paddle_height + geometry.rest_height
+    if ball_height < rest_height - _ROUNDING:
+        raise UserError(
+            f"ball_init_pos has the height {ball_height:g} m, but a ball of the radius "
+            f"{geometry.ball_radius:g} m rests on the paddle at {rest_height:.4g} m; raise it"
+        )

@@ -1,0 +1,177 @@
+"""The episodes of an evaluation that failed: what failed, when and in which world; the terms of the
+world that go with failure; and a film of one."""
+
+import math
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from bounce_mjx.env.env import Env
+from bounce_mjx.evaluation.episodes import make_filmer
+from bounce_mjx.evaluation.policy_evaluation import Conditions
+from bounce_mjx.evaluation.statistics import Statistics
+from bounce_mjx.learning.policy import Actor, Policy
+from bounce_mjx.task.results import Episodes
+from bounce_mjx.task.task import Recording
+
+# Quantile of the normal distribution for 95% intervals.
+_Z = 1.959964
+_CAUSES = {"too_fast": "a joint too fast", "non_finite": "the physics"}
+_PARTS = 3
+
+
+class Failure(NamedTuple):
+    """An episode that ended early, or that misses a result which is a share."""
+
+    episode: int
+    """Its number, from 0."""
+    seconds: float
+    """Its length, s."""
+    lasted: bool
+    """Whether it lasted until its time limit."""
+    failed: tuple[str, ...]
+    """Why it ended early, and the results that its own figures miss."""
+    command: dict[str, float]
+    """First value of each command."""
+    world: dict[str, float | list[float]]
+    """Values of the active terms of the randomisation."""
+
+
+class Third(NamedTuple):
+    """Episodes whose value of a term is in one third of its range."""
+
+    low: float
+    high: float
+    episodes: int
+    failed: int
+    interval: tuple[float, float]
+    """Wilson's 95% interval of the share that fails."""
+
+
+class Association(NamedTuple):
+    """How failure goes with a term of the world, or with a command."""
+
+    name: str
+    thirds: tuple[Third, ...]
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the intervals of the thirds that fail the most and the least are apart."""
+        highest = max(third.interval[0] for third in self.thirds)
+        return highest > min(third.interval[1] for third in self.thirds)
+
+    @property
+    def difference(self) -> float:
+        """Difference of the largest and the smallest share that fails."""
+        shares = [third.failed / third.episodes for third in self.thirds if third.episodes]
+        return max(shares) - min(shares) if shares else 0.0
+
+
+def failures_of(conditions: Conditions, statistics: Statistics) -> list[Failure]:
+    """The failed episodes of an evaluation."""
+    env, commands, _ = conditions
+    s = jax.tree.map(np.asarray, statistics)
+    trained = {name: (c.low, c.high) for name, c in env.config.commands.items()}
+    found = []
+    for i in range(len(s.running)):
+        own = slice(i, i + 1)
+        tally = jax.tree.map(lambda x, own=own: x[own].astype(float), s.tally)
+        figures = Episodes(tally.sums, tally.maxima, s.running[own], trained | commands)
+        # A mean over all episodes says nothing of one of them.
+        shares = [x for x in env.task.results(figures) if x.measured.endswith("%")]
+        failed = [result.name for result in shares if result.passed is False]
+        if not s.running[i]:
+            failed.insert(0, _cause(s.ended_by, i))
+        if failed:
+            found.append(
+                Failure(
+                    episode=i,
+                    seconds=float(s.steps[i]) * env.dt,
+                    lasted=bool(s.running[i]),
+                    failed=tuple(failed),
+                    command={name: float(x[i]) for name, x in s.command.items()},
+                    world={name: x[i].astype(float).tolist() for name, x in s.world.items()},
+                )
+            )
+    return found
+
+
+def _cause(ended_by: dict[str, np.ndarray], index: int) -> str:
+    """Why an episode ended early, in words."""
+    causes = [_CAUSES[name] for name, ended in ended_by.items() if ended[index]]
+    return causes[0] if causes else "ended by the task"
+
+
+def associations(statistics: Statistics, failures: list[Failure]) -> list[Association]:
+    """The share of failures by third of the range of each command and each entry of each term; the
+    largest difference first."""
+    s = jax.tree.map(np.asarray, statistics)
+    has_failed = np.zeros(len(s.running), bool)
+    has_failed[[failure.episode for failure in failures]] = True
+    columns = {name: values for name, values in s.command.items()}
+    for name, values in s.world.items():
+        entries = values.reshape(len(values), -1)
+        for i, entry in enumerate(entries.T):
+            columns[f"{name}[{i}]" if entries.shape[1] > 1 else name] = entry
+    found = [
+        Association(name, _thirds(values.astype(float), has_failed))
+        for name, values in columns.items()
+        if np.ptp(values) > 0.0
+    ]
+    return sorted(found, key=lambda one: (-one.is_clear, -one.difference))
+
+
+def _thirds(values: np.ndarray, has_failed: np.ndarray) -> tuple[Third, ...]:
+    """The failures in the thirds of the range of values [E]."""
+    ends = np.linspace(values.min(), values.max(), _PARTS + 1)
+    part = np.clip(np.searchsorted(ends, values, "right") - 1, 0, _PARTS - 1)
+    thirds = []
+    for i in range(_PARTS):
+        count, failed = int(np.sum(part == i)), int(np.sum(has_failed[part == i]))
+        interval = wilson_interval(failed, count)
+        thirds.append(Third(float(ends[i]), float(ends[i + 1]), count, failed, interval))
+    return tuple(thirds)
+
+
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """The 95% interval of a share by E. B. Wilson, "Probable inference, the law of succession, and
+    statistical inference", 1927; (0, 1) without trials."""
+    if not trials:
+        return 0.0, 1.0
+    share, square = successes / trials, _Z**2
+    centre = share + square / (2.0 * trials)
+    half = _Z * math.sqrt((share * (1.0 - share) + square / (4.0 * trials)) / trials)
+    whole = 1.0 + square / trials
+    return max(0.0, (centre - half) / whole), min(1.0, (centre + half) / whole)
+
+
+class Film(NamedTuple):
+    """One episode of an evaluation."""
+
+    env: Env
+    recording: Recording
+    """Of this episode alone [T, ..., 1]."""
+    statistics: Statistics
+    """Of this episode [1]."""
+
+
+def film_episode(
+    conditions: Conditions,
+    actor: Actor,
+    policy: Policy | None,
+    episodes: int,
+    seed: int,
+    episode: int,
+) -> Film:
+    """Simulates one episode of an evaluation again, as it was (`make_filmer`).
+
+    Args:
+      episodes: number of the evaluation's episodes.
+      seed: of the evaluation's resets.
+      episode: its number, from 0.
+    """
+    run = make_filmer(conditions.env, actor, episodes, episode)
+    measured = run(policy, jax.random.PRNGKey(seed), conditions.ranges)
+    statistics, recording = jax.device_get(measured)
+    return Film(conditions.env, recording, statistics)

@@ -1,0 +1,84 @@
+"""The failed episodes of an evaluation as a table, and the terms that go with failure as lines and
+as a figure."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+from rich.table import Column, Table
+
+from bounce_mjx.evaluation.failures import Association, Failure
+from bounce_mjx.reports.figures import make_panels, style
+from bounce_mjx.reports.tables import plain_table
+
+_SHOWN_EPISODES = 20
+_SHOWN_TERMS = 3
+_PANELS = 6
+_BAR = "#c2451e"
+
+
+def failures_table(
+    failures: Sequence[Failure], associations: Sequence[Association], episodes: int
+) -> Table:
+    """The failed episodes, the shortest first, with the terms of their worlds that go with failure
+    the most."""
+    names = [one.name for one in associations[:_SHOWN_TERMS]]
+    title = f"{len(failures)} of {episodes:,} episodes failed"
+    columns = [Column(header, justify="right") for header in ("episode", "at, s", *names)]
+    table = plain_table(title, *columns, "what failed")
+    ordered = sorted(failures, key=lambda failure: (failure.seconds, failure.episode))
+    for failure in ordered[:_SHOWN_EPISODES]:
+        values = [f"{_value(failure, name):.3g}" for name in names]
+        end = "-" if failure.lasted else f"{failure.seconds:.2f}"
+        table.add_row(str(failure.episode), end, *values, ", ".join(failure.failed))
+    if len(ordered) > _SHOWN_EPISODES:
+        table.caption = f"and {len(ordered) - _SHOWN_EPISODES} more"
+    return table
+
+
+def association_lines(associations: Sequence[Association]) -> list[str]:
+    """The terms that go with failure, each with its share of failures by third of its range."""
+    clear = [one for one in associations if one.is_clear]
+    if not clear:
+        return ["no term of the world goes clearly with failure (95% intervals of its thirds meet)"]
+    lines = ["terms that go with failure: share of failures by third of the range (95% interval)"]
+    for one in clear[:_PANELS]:
+        parts = [
+            f"{third.low:.3g} to {third.high:.3g}: {_percent(third.failed, third.episodes)} "
+            f"({100 * third.interval[0]:.1f} to {100 * third.interval[1]:.1f})"
+            for third in one.thirds
+        ]
+        lines.append(f"  {one.name}: {'; '.join(parts)}")
+    return lines
+
+
+def failures_figure(associations: Sequence[Association]) -> Figure:
+    """The share of failures by third of the ranges of the terms that go with it the most."""
+    shown = list(associations[:_PANELS])
+    with style():
+        figure, axes = make_panels(len(shown), 3, 2.4)
+        for panel, one in zip(axes, shown, strict=True):
+            thirds = one.thirds
+            shares = np.array([100.0 * t.failed / max(1, t.episodes) for t in thirds])
+            ends = 100.0 * np.array([t.interval for t in thirds])
+            errors = np.abs(ends.T - shares)
+            panel.bar(range(len(thirds)), shares, color=_BAR, yerr=errors, capsize=4)
+            labels = [f"{t.low:.3g} to {t.high:.3g}\n{t.episodes} episodes" for t in thirds]
+            panel.set_xticks(range(len(thirds)), labels, fontsize=7)
+            panel.set_title(one.name, fontsize=9)
+            panel.set_ylabel("failures, %")
+            panel.set_ylim(bottom=0.0)
+    return figure
+
+
+def _value(failure: Failure, name: str) -> float:
+    """A failed episode's value of a command, of a term, or of an entry of a term."""
+    if name in failure.command:
+        return failure.command[name]
+    term, _, index = name.partition("[")
+    value = np.ravel(failure.world[term])
+    return float(value[int(index.rstrip("]")) if index else 0])
+
+
+def _percent(failed: int, episodes: int) -> str:
+    return f"{100.0 * failed / episodes:.1f}%" if episodes else "-"

@@ -1,0 +1,65 @@
+"""Tasks by name: those of the package, those of installed packages, and those in a file."""
+
+import importlib
+import importlib.metadata
+import inspect
+
+from bounce_mjx.config.user_code import class_in_file, is_file
+from bounce_mjx.errors import UserError, reason_of, shorten, suggest
+from bounce_mjx.task.task import Task
+from bounce_mjx.world.config import WorldConfig
+
+DEFAULT = "bounce"
+"""Name of the task of the original specification."""
+
+GROUP = "bounce_mjx.tasks"
+"""Entry points of installed packages that have tasks."""
+
+_OF_THE_PACKAGE = {
+    name: f"bounce_mjx.task.{name}:{name.title()}"
+    for name in ("balance", "bounce", "catch", "juggle", "track")
+}
+
+
+def find_task(name: str) -> type[Task]:
+    """The task of a name, of an entry point in `GROUP`, or of FILE.py:CLASS.
+
+    Raises:
+      UserError: there is none, or it cannot be imported.
+    """
+    if is_file(name):
+        return class_in_file(name, Task)
+    # Without a look at the installed packages, which takes 10 ms.
+    known = _OF_THE_PACKAGE if name in _OF_THE_PACKAGE else registered_tasks()
+    if name not in known:
+        advice = suggest(name, known) or "give FILE.py:CLASS or a known name"
+        raise UserError(
+            f"there is no task {shorten(name)!r} (known: {', '.join(sorted(known))}); {advice}"
+        )
+    module, _, attribute = known[name].partition(":")
+    try:
+        return getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise UserError(
+            f"the task {name} cannot be imported ({reason_of(error)}); install the package that "
+            "has it again"
+        ) from error
+
+
+def task_name(task: type[Task]) -> str:
+    """The name under which `find_task` finds a task: its registered name, or FILE.py:CLASS."""
+    place = f"{task.__module__}:{task.__qualname__}"
+    names = [name for name, value in registered_tasks().items() if value == place]
+    return names[0] if names else f"{inspect.getsourcefile(task)}:{task.__qualname__}"
+
+
+def task_config(task: str | type[Task]) -> type[WorldConfig]:
+    """The settings of a task: its class, or a name as for `find_task`."""
+    return (find_task(task) if isinstance(task, str) else task).Config
+
+
+def registered_tasks() -> dict[str, str]:
+    """MODULE:CLASS of the tasks of the package and of installed packages, by name."""
+    entries = importlib.metadata.entry_points(group=GROUP)
+    installed = {entry.name: entry.value for entry in entries}
+    return dict(sorted((installed | _OF_THE_PACKAGE).items()))

@@ -1,0 +1,130 @@
+"""The failed episodes of an evaluation, and a film of one."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bounce_mjx import EnvConfig
+from bounce_mjx.evaluation.config import EvaluationOptions
+from bounce_mjx.evaluation.episodes import make_evaluator, reset_episodes
+from bounce_mjx.evaluation.failures import (
+    Failure,
+    associations,
+    failures_of,
+    film_episode,
+    wilson_interval,
+)
+from bounce_mjx.evaluation.policy_evaluation import conditions_of
+from bounce_mjx.evaluation.statistics import Statistics
+from bounce_mjx.task.task import Tally
+from bounce_mjx.viewers.film import FilmPlayer
+
+EPISODES, SEED = 130, 5
+
+
+class _Jumpy:
+    """Actions that differ from one observation to the next, so that a last bit matters."""
+
+    def act(self, policy: jax.Array, observation: jax.Array) -> jax.Array:
+        return jnp.tanh(observation @ policy)
+
+
+@pytest.fixture(scope="module")
+def conditions():
+    world = {"action_latency": (0.0, 0.03), "paddle_tilt": (-0.05, 0.05), "restitution": (0.7, 0.9)}
+    config = EnvConfig(episode_seconds=0.5, randomization=world)
+    return conditions_of(config, EvaluationOptions(EPISODES, SEED))
+
+
+@pytest.fixture(scope="module")
+def policy(conditions):
+    return jax.random.normal(jax.random.key(0), (conditions.env.observation_size, 6))
+
+
+@pytest.fixture(scope="module")
+def measured(conditions, policy):
+    """Statistics and recording of every episode of the evaluation."""
+    evaluate = make_evaluator(conditions.env, _Jumpy(), EPISODES, EPISODES)
+    return jax.device_get(evaluate(policy, jax.random.PRNGKey(SEED), conditions.ranges))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("episode", [17, EPISODES - 1])
+def test_a_film_is_the_episode_of_the_evaluation_bit_for_bit(
+    conditions, policy, measured, episode
+) -> None:
+    statistics, recording = measured
+    film = film_episode(conditions, _Jumpy(), policy, EPISODES, SEED, episode)
+    own = jax.tree.map(lambda x: x[episode : episode + 1], statistics)
+    jax.tree.map(np.testing.assert_array_equal, film.statistics, own)
+    length = int(own.steps[0])
+    player = FilmPlayer(film)
+    assert len(player.frames.time) == length
+    np.testing.assert_array_equal(
+        player.frames.balls[:, 0, 0, 2], recording.ball[:length, 2, episode]
+    )
+    np.testing.assert_array_equal(
+        player.frames.qpos[:, 0], np.asarray(recording.qpos)[:length, :, episode]
+    )
+    # The page shows the world in the sliders, and plays the film again at its end.
+    world = {name: value[episode] for name, value in statistics.world.items()}
+    assert {slider.term for slider in player.sliders} >= world.keys()
+    for name, value in world.items():
+        assert player.world_value(name) == np.ravel(value)[0]
+    heights = [player.step().balls[0, 0, 2] for _ in range(length)]
+    assert heights == [*player.frames.balls[1:, 0, 0, 2], player.frames.balls[0, 0, 0, 2]]
+
+
+@pytest.mark.slow
+def test_each_failure_has_its_world_and_its_time(conditions, measured) -> None:
+    statistics, recording = measured
+    failures = failures_of(conditions, statistics)
+    states = reset_episodes(conditions.env, jax.random.PRNGKey(SEED), EPISODES).pipeline_state
+    lost = np.flatnonzero(~statistics.running)
+    assert {one.episode for one in failures} >= {*lost.tolist()} and len(lost)
+    for one in failures:
+        assert one.seconds == pytest.approx(recording.running[:, one.episode].sum() * 0.01)
+        assert one.lasted == bool(statistics.running[one.episode])
+        for name, value in one.world.items():
+            np.testing.assert_array_equal(value, states.world[name][..., one.episode])
+        height = states.command["target_height"][one.episode]
+        assert one.command == {"target_height": pytest.approx(float(height))}
+
+
+def test_the_terms_that_go_with_failure_are_named() -> None:
+    """A term whose upper third fails, among terms that say nothing."""
+    generator = np.random.default_rng(0)
+    world = {
+        "action_latency": generator.uniform(0.0, 0.06, 600),
+        "paddle_tilt": generator.uniform(-0.1, 0.1, (600, 2)),
+    }
+    fails = (world["action_latency"] > 0.04) & (generator.uniform(size=600) < 0.5)
+    statistics = Statistics(
+        running=~fails,
+        steps=np.ones(600),
+        episode_return=np.ones(600),
+        tally=Tally({}, {}),
+        world=world,
+        command={"target_height": np.full(600, 0.5)},
+    )
+    failures = [Failure(int(i), 1.0, False, ("stable",), {}, {}) for i in np.flatnonzero(fails)]
+    found = associations(statistics, failures)
+    # A command that does not vary cannot go with anything.
+    assert [one.name for one in found if one.is_clear] == ["action_latency"]
+    assert {one.name for one in found} == {"action_latency", "paddle_tilt[0]", "paddle_tilt[1]"}
+    assert [third.failed for third in found[0].thirds[:2]] == [0, 0]
+    assert sum(third.episodes for third in found[0].thirds) == 600
+
+
+@pytest.mark.parametrize(
+    "successes, trials, interval",
+    # R. G. Newcombe, "Two-sided confidence intervals for the single proportion", 1998, table I.
+    [(81, 263, (0.2553, 0.3662)), (15, 148, (0.0624, 0.1605)), (0, 20, (0.0, 0.1611))],
+)
+def test_an_interval_of_a_share_is_wilsons(successes, trials, interval) -> None:
+    np.testing.assert_allclose(wilson_interval(successes, trials), interval, atol=5e-5)
+
+
+def test_no_trials_say_nothing() -> None:
+    assert wilson_interval(0, 0) == (0.0, 1.0)

@@ -1,0 +1,178 @@
+"""A policy brings its environment into every library, and is refused in another one."""
+
+from pathlib import Path
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bounce_mjx import BounceBall, Run, load_policy
+from bounce_mjx.adapters.gymnasium.registration import ENV_ID, TASK_ID
+from bounce_mjx.adapters.policies import environment_of, policy_environment
+from bounce_mjx.config.files import dump_config
+from bounce_mjx.deploy.export import policy_metadata
+from bounce_mjx.deploy.interface import interface_in, interface_of
+from bounce_mjx.deploy.metadata import from_entries, to_entries
+from bounce_mjx.errors import UserError
+from bounce_mjx.resources import POLICIES
+from bounce_mjx.runs.config import load_run_config
+from bounce_mjx.runs.folders import pretrained_checkpoint
+from bounce_mjx.world.randomization import RandomizationConfig
+
+STEPS = 600
+
+
+@pytest.fixture(scope="module")
+def slow_run(tmp_path_factory) -> Path:
+    """A run whose control step is another one than the task's."""
+    run = tmp_path_factory.mktemp("slow")
+    config = load_run_config(pretrained_checkpoint().run)
+    env = config.env.model_copy(update={"control_dt": 0.008})
+    (run / "config.yaml").write_text(dump_config(config.model_copy(update={"env": env})))
+    return run
+
+
+@pytest.mark.slow
+def test_robust_keeps_the_ball_in_the_environment_that_it_brings() -> None:
+    """Through Gymnasium as on a robot, and 64 at once; with the actions of the task's own
+    environment it falls within 300 steps."""
+    env = gymnasium.make(TASK_ID, policy="robust")
+    policy = load_policy("robust", env=env)
+    envs = gymnasium.make_vec(TASK_ID, 64, policy="robust")
+    together = Run("robust").policy_in(envs)
+    observation, _ = env.reset(seed=0)
+    observations, _ = envs.reset(seed=0)
+    policy.reset()
+    ended = np.zeros(64, bool)
+    for step in range(STEPS):
+        action = policy.step(observation)
+        if step == 0:
+            np.testing.assert_allclose(action, together(observations)[0], atol=1e-4)
+        observation, _, terminated, _, _ = env.step(action)
+        assert not terminated
+        observations, _, fell, _, _ = envs.step(together(observations))
+        ended |= fell
+    assert not ended.any()
+
+
+@pytest.mark.parametrize("name", ["robust", "ur5e", "slow run"])
+def test_every_library_gets_the_environment_of_the_policy(name: str, slow_run: Path, need) -> None:
+    policy = slow_run if name == "slow run" else name
+    trained = Run(policy).config.env
+    nominal = trained.model_copy(update={"randomization": RandomizationConfig()})
+    makers = {
+        "gymnasium": lambda: gymnasium.make(TASK_ID, policy=policy),
+        "vector": lambda: gymnasium.make_vec(TASK_ID, 2, policy=policy),
+        "wrapped": lambda: gymnasium.wrappers.RecordEpisodeStatistics(
+            gymnasium.make(TASK_ID, policy=policy)
+        ),
+        "sb3": lambda: _adapter("sb3", "Sb3VecEnv", need, "stable_baselines3")(2, policy=policy),
+        "torch": lambda: _adapter("torch", "TorchVectorEnv", need, "torch")(
+            num_envs=2, policy=policy
+        ),
+        "brax": lambda: _adapter("brax", "BraxBounceBall", need, "brax")(policy=policy),
+        "gymnax": lambda: _adapter("gymnax_env", "GymnaxBounceBall", need)(policy=policy),
+        "playground": lambda: _adapter(
+            "playground", "PlaygroundBounceBall", need, "mujoco_playground"
+        )(policy=policy),
+        "jax": lambda: Run(policy).env(),
+    }
+    for library, make in makers.items():
+        env = environment_of(make())
+        assert env.config == nominal, library
+        assert interface_of(env.config) == interface_of(trained), library
+    assert policy_environment(policy, world="training").randomization.terms == (
+        trained.randomization.terms
+    )
+
+
+def _adapter(module: str, name: str, need, *libraries: str):
+    for library in libraries:
+        need(library)
+    return getattr(__import__(f"bounce_mjx.adapters.{module}", fromlist=[name]), name)
+
+
+def test_a_policy_refuses_another_environment(slow_run: Path) -> None:
+    """Of each thing that gives its numbers another meaning, whichever way they meet."""
+    config = load_run_config(pretrained_checkpoint().run).env
+    for change, words in (
+        ({"action": {"base": "target"}}, "its action base is measured, there target"),
+        ({"action_scale": 0.03}, "its action scale is 0.02 rad, there 0.03 rad"),
+        ({"control_dt": 0.02}, "its control step is 0.01 s, there 0.02 s"),
+        ({"observation": {"joint_angles": 2}}, "1 x joint_angles where there is 2 x joint_angles"),
+        ({"observation": {"velocity": "differences"}}, "1 x ball_velocity by differences"),
+        ({"default_joint_angles": (0.0, 0.7, 1.92, 0.0, -1.05, 0.1)}, "its start pose is 0 0.698"),
+    ):
+        with pytest.raises(UserError, match=words):
+            gymnasium.make(TASK_ID, policy="pretrained", **change)
+        other = BounceBall(type(config).model_validate(config.model_dump() | _deep(config, change)))
+        with pytest.raises(UserError, match=f"{words}.*make the environment with policy='pretr"):
+            Run("pretrained").policy_in(other)
+        with pytest.raises(UserError, match=words):
+            load_policy("pretrained", env=other)
+    for make, words in (
+        (lambda: gymnasium.make(ENV_ID, policy="catch"), "of the task catch, and the environment"),
+        (lambda: gymnasium.make(TASK_ID, policy="robust", task="catch"), "leave one of them out"),
+        (lambda: load_policy("ur5e", env=BounceBall()), "its robot is ur5e, there AIR4-560"),
+        (lambda: load_policy("robust").step(np.zeros(29)), r"load_policy\(..., env=env\)"),
+        (lambda: gymnasium.make(TASK_ID, policy="robusst"), "did you mean robust"),
+        (lambda: gymnasium.make(TASK_ID, world="training"), "none is given; give policy"),
+        (lambda: Run("pretrained").policy_in(3), "int holds no environment of bounce_mjx"),
+    ):
+        with pytest.raises(UserError, match=words):
+            make()
+    scaled = gymnasium.wrappers.NormalizeObservation(gymnasium.make(ENV_ID))
+    with pytest.raises(UserError, match="NormalizeObservation changes the observations"):
+        Run("pretrained").policy_in(scaled)
+    policy = Run("pretrained").policy_in(BounceBall())
+    with pytest.raises(UserError, match=r"has the shape \[2\], but the last axis must have 29"):
+        policy(np.zeros(2))
+
+
+def _deep(config, change: dict) -> dict:
+    """A change of groups in part as whole groups."""
+    return {
+        key: getattr(config, key).model_dump() | value if isinstance(value, dict) else value
+        for key, value in change.items()
+    }
+
+
+def test_an_exported_file_brings_the_whole_environment(tmp_path: Path, monkeypatch) -> None:
+    """Also without the run; of an own arm it says that the file is missing."""
+    for name in POLICIES:
+        config = Run(name).config
+        metadata = from_entries(to_entries(policy_metadata(config, 1)))
+        assert interface_in(metadata) == interface_of(config.env), name
+        again = type(config.env).model_validate(metadata.environment)
+        assert again == config.env, name
+    with pytest.raises(UserError, match="an earlier version exported it"):
+        policy_environment(_without_environment(tmp_path))
+
+
+def _without_environment(folder: Path) -> Path:
+    import onnx
+
+    model = onnx.load(Run("pretrained").folder / "pretrained.onnx")
+    kept = [entry for entry in model.metadata_props if entry.key != "environment"]
+    del model.metadata_props[:]
+    model.metadata_props.extend(kept)
+    path = folder / "old.onnx"
+    onnx.save(model, path)
+    return path
+
+
+def test_a_policy_takes_the_arrays_of_each_library(need) -> None:
+    torch = need("torch")
+    policy = Run("pretrained").policy_in(BounceBall())
+    observations = np.random.default_rng(0).normal(size=(3, 29)).astype(np.float32)
+    expected = np.asarray(Run("pretrained").policy(jnp.asarray(observations)))
+    for convert, kind in (
+        (np.asarray, np.ndarray),
+        (torch.from_numpy, torch.Tensor),
+        (jnp.asarray, jax.Array),
+    ):
+        actions = policy(convert(observations))
+        assert isinstance(actions, kind)
+        np.testing.assert_allclose(np.asarray(actions), expected, atol=1e-6)
