@@ -5,6 +5,7 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.physics import PhysicsParameters
+from bounce_mjx.robot.contact import stiffness_and_damping
 from bounce_mjx.robot.model import find_addresses, link_bodies
 
 
@@ -13,14 +14,12 @@ def own_parameters(mj_model: mujoco.MjModel) -> PhysicsParameters:
     force limits."""
     at = find_addresses(mj_model)
     links = link_bodies(mj_model, at)
-    # The direct format.
-    stiffness, damping = -mj_model.pair_solref[0]
-    assert stiffness > 0.0
+    stiffness, damping = stiffness_and_damping(mj_model.pair_solref[0], mj_model.opt.timestep)
     return PhysicsParameters(
         ball_mass=mj_model.body_mass[at.balls[0].body],
         ball_radius=mj_model.geom_size[at.balls[0].geom, 0],
-        contact_stiffness=stiffness,
-        contact_damping=damping,
+        contact_stiffness=np.float64(stiffness),
+        contact_damping=np.float64(damping),
         servo_gain=mj_model.actuator_gainprm[at.actuators, 0],
         servo_damping=-mj_model.actuator_biasprm[at.actuators, 2],
         armature=mj_model.dof_armature[at.arm_qvel,],

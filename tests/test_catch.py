@@ -16,7 +16,7 @@ DT, REST_HEIGHT = 0.01, 0.0225
 
 @pytest.mark.slow
 def test_throws_have_their_distribution() -> None:
-    env = Env(Config(joint_angle_noise=0.0))
+    env = Env(Config(reset={"joint_angles": 0.0}))
     reset = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 4096))
     state = reset.pipeline_state
     truth = jax.vmap(env.kinematics)(state)

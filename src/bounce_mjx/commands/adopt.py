@@ -4,7 +4,7 @@ import math
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import yaml
 
@@ -14,9 +14,12 @@ from bounce_mjx.config.validation import validate
 from bounce_mjx.robot.config import PaddleConfig, RobotConfig
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.task.registry import DEFAULT, find_task
+from bounce_mjx.task.task import Task
 from bounce_mjx.world.config import WorldConfig
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from bounce_mjx.robot.adopt import Adoption
 
 
@@ -48,42 +51,59 @@ def main(args: Sequence[str]) -> None:
 
     set_up_jax()
     task = find_task(command.task)
-    given = command.paddle.model_dump(exclude_defaults=True)
-    fixed = not {"position", "quaternion"}.isdisjoint(given)
     robot = RobotConfig(site=command.site, joints=command.joints, paddle=command.paddle)
-    adoption = adopt(command.mjcf, robot, WorldConfig().control_dt, fixed)
-    pose = adoption.pose
-    x, y, z = (round(coordinate, 4) + 0.0 for coordinate in pose.paddle.tolist())
-    values = {
-        "mjcf": str(WorldConfig(mjcf=command.mjcf).mjcf),
-        "robot": adoption.config.model_dump(mode="json", exclude_defaults=True),
-        "action_scale": adoption.action_scale,
-        "default_joint_angles": [round(angle, 5) for angle in pose.angles.tolist()],
-        **task.Config.settings_at((x, y, z)),
-    }
-    values = ({} if command.task == DEFAULT else {"task": command.task}) | {"env": values}
-    config = validate(TrainConfig, values, str(command.mjcf))
+    chosen = command.paddle.model_dump(exclude_defaults=True)
+    is_mount_given = "position" in chosen or "quaternion" in chosen
+    adoption = adopt(command.mjcf, robot, WorldConfig().control_dt, is_mount_given)
+    settings = _settings(command, adoption, task)
+    config = validate(TrainConfig, settings, str(command.mjcf))
     env = Env(config.env)
     for line in describe(adoption):
         print(line)
     print(f"physics: {env.engine.name} ({env.engine.reason})")
     out = command.out or Path(f"{command.mjcf.stem}.yaml")
-    head = f"An arm with a paddle: bounce-mjx adopt {command.mjcf} --site {adoption.config.site}"
+    write_output(out, _as_yaml(command, settings))
+    print(f"config: {out}")
+    flags = ["--robot", str(out)]
+    if command.task != DEFAULT:
+        flags = ["--task", command.task, *flags]
+    print(f"see it: bounce-mjx view {shlex.join(flags)} --actions zero")
+    print(f"train it: bounce-mjx train {shlex.join(flags)}")
+
+
+def _settings(command: AdoptCommand, adoption: "Adoption", task: type[Task]) -> dict[str, Any]:
+    """The settings of a training that follow from an adopted arm."""
+    env = {
+        "mjcf": str(WorldConfig(mjcf=command.mjcf).mjcf),
+        "robot": adoption.config.model_dump(mode="json", exclude_defaults=True),
+        "action_scale": adoption.action_scale,
+        "default_joint_angles": [round(angle, 5) for angle in adoption.pose.angles.tolist()],
+    }
+    x, y, z = _rounded(adoption.pose.paddle, 4)
+    env |= task.Config.settings_at((x, y, z))
+    if command.task == DEFAULT:
+        return {"env": env}
+    return {"task": command.task, "env": env}
+
+
+def _as_yaml(command: AdoptCommand, settings: dict[str, Any]) -> str:
+    """The config file, which begins with the command that wrote it."""
+    head = f"An arm with a paddle: bounce-mjx adopt {command.mjcf} --site {command.site}"
     # A path may have a line break, which would end the comment.
     head = " ".join(head.splitlines())
-    text = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)
-    write_output(out, f"# {head}\n{text}")
-    print(f"config: {out}")
-    named = [] if command.task == DEFAULT else ["--task", command.task]
-    flags = shlex.join([*named, "--robot", str(out)])
-    print(f"see it: bounce-mjx view {flags} --actions zero")
-    print(f"train it: bounce-mjx train {flags}")
+    text = yaml.safe_dump(settings, sort_keys=False, default_flow_style=None, width=100)
+    return f"# {head}\n{text}"
+
+
+def _rounded(position: "np.ndarray", digits: int) -> list[float]:
+    """The coordinates of a position [3], m, without a minus before a 0."""
+    return [round(coordinate, digits) + 0.0 for coordinate in position.tolist()]
 
 
 def describe(adoption: "Adoption") -> list[str]:
     """Lines about an adopted arm: its pose, its servos, and the changes to the user's model."""
     pose = adoption.pose
-    x, y, z = (round(coordinate, 6) + 0.0 for coordinate in pose.paddle.tolist())
+    x, y, z = _rounded(pose.paddle, 6)
     strength = f"{pose.acceleration:.0f} m/s^2 upward in addition to holding the arm"
     if math.isinf(pose.acceleration):
         strength = "no force limit"
@@ -108,4 +128,6 @@ def describe(adoption: "Adoption") -> list[str]:
             f"  {name}: {angle:+.3f} rad, inertia {inertia:.3g}, kp {servo.stiffness:.4g}, "
             f"kv {servo.damping:.4g}, {limit}"
         )
-    return [*lines, "changes to the model:", *(f"  {change}" for change in adoption.arm.changes)]
+    lines.append("changes to the model:")
+    lines += [f"  {change}" for change in adoption.arm.changes]
+    return lines

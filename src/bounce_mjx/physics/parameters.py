@@ -50,7 +50,7 @@ class PhysicsParameters(NamedTuple):
     damping: Array | None = None
     """Viscous damping [n] of the joints, N m s/rad."""
     frictionloss: Array | None = None
-    """Dry friction [n] of the joints, N m; the mjx engine refuses it."""
+    """Dry friction [n] of the joints, N m: `frictionloss`; the mjx engine refuses it."""
     link_mass: Array | None = None
     """Masses [n] of the links, kg; first moment and inertia scale in proportion, the centre of mass
     stays in place."""
@@ -59,7 +59,7 @@ class PhysicsParameters(NamedTuple):
     paddle_rotation: Array | None = None
     """Orientation [4] of the paddle in the frame of its body: a unit quaternion w, x, y, z."""
     gravity: Array | None = None
-    """Gravitational acceleration [3] in the world, m/s^2."""
+    """Gravitational acceleration [3] in the world, m/s^2: the MJCF's `<option gravity>`."""
     entries: Mapping[str, Array] | None = None
     """Other entries [] of the MjModel by their names, such as `dof_damping[2]`, `geom_size[3, 0]`
     or `opt.gravity[2]`; they prevail over the fields above. The fused engine refuses the name of an

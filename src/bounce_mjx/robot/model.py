@@ -46,7 +46,8 @@ class Addresses(NamedTuple):
     arm_qvel: tuple[int, ...]
     """Velocities of the acting joints in qvel."""
     actuators: tuple[int, ...]
-    """Servos of the acting joints in ctrl."""
+    """Servos in ctrl: each moves the acting joint of the same place in `arm_joints`
+    (`robot/actuators.py` finds them)."""
     balls: tuple[BallAddresses, ...]
     paddle_geom: int
 

@@ -154,8 +154,8 @@ def rank_poses(
 
 
 class _Search:
-    """Level poses of one arm. `qpos`, `dofs` and `joints` are the acting joints' places in MuJoCo's
-    arrays; all postures are arrays [n] of their positions, rad or m."""
+    """Level poses of one arm. `_qpos`, `_dofs` and `_joints` are the acting joints' places in
+    MuJoCo's arrays; each posture is an array [n] of their positions, rad or m."""
 
     def __init__(
         self, model: mujoco.MjModel, addresses: Addresses, force_limits: Sequence[float | None]

@@ -81,7 +81,8 @@ def move_ball(ball: Ball, acceleration: Vec, angular_acceleration: Vec, dt: floa
 
 
 def turn(turning: Turning, angular_acceleration: Vec, dt: float) -> Turning:
-    """Spin and orientation after a time dt (s), in which the new spin turns the ball."""
+    """Spin and orientation after a time dt (s), in which the new spin turns the ball; the angular
+    acceleration is that of the contacts, rad/s^2 in the world."""
     spin = turning.spin + angular_acceleration * dt
     squared_speed = spin @ spin
     is_still = squared_speed < float(jnp.finfo(squared_speed.dtype).tiny)

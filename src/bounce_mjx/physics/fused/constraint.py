@@ -238,7 +238,11 @@ def _speed(row: Row, balls: Sequence[Ball], joint_velocity: Sequence[Scalar]) ->
 def _ball_accelerations(
     model: FusedModel, rows: Sequence[Row], forces: Sequence[Scalar]
 ) -> tuple[list[Vec], list[Vec]]:
-    """Accelerations and angular accelerations of the balls by the contacts' forces."""
+    """Accelerations and angular accelerations of the balls by the contacts' forces.
+
+    Here a contact changes a ball's spin: a force along a tangent has a torque (`Row.torques`), and
+    its angular acceleration is that over the ball's inertia. A force along a normal has none.
+    """
     accelerations = [ZERO3] * len(model.balls)
     angular_accelerations = [ZERO3] * len(model.balls)
     for row, force in zip(rows, forces, strict=True):

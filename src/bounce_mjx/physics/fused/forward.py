@@ -174,11 +174,13 @@ def servo_force(
         is_within = (force > least) & (force < most)
         derivative = jnp.where(is_within, derivative, 0.0)
         force = jnp.clip(force, least, most)
+    beside_servo = carried
     if servo.carries_weight:
-        force, carried = add(force, carried), 0.0
+        force = add(force, carried)
+        beside_servo = 0.0
     if servo.joint_range is not None:
         force = jnp.clip(force, *servo.joint_range)
-    return add(force, carried), derivative
+    return add(force, beside_servo), derivative
 
 
 def fwd_acceleration(

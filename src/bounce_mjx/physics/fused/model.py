@@ -58,6 +58,7 @@ class Servo:
     stiffness: Scalar
     damping: Scalar
     ctrl_range: tuple[Scalar, Scalar] | None
+    """Range to which ctrl is clipped; None for none."""
     force_range: tuple[Scalar, Scalar] | None = None
     """Range of the servo's force at the joint (`forcerange`)."""
     joint_range: tuple[float, float] | None = None
@@ -86,7 +87,9 @@ class FusedModel:
     place of those that the parameters of an environment change."""
 
     dt: float
+    """Physics step, s."""
     gravity: Vec
+    """Gravitational acceleration in the world, m/s^2: the MJCF's, or the environment's own."""
     links: tuple[chain.Link, ...]
     servos: tuple[Servo, ...]
     """In the order of the joints."""
