@@ -13,7 +13,6 @@ from scipy.optimize import minimize
 
 from bounce_mjx.env.env import world_model
 from bounce_mjx.errors import UserError
-from bounce_mjx.identify import world
 from bounce_mjx.identify.doctor import examine
 from bounce_mjx.identify.fit import (
     Fit,
@@ -30,7 +29,7 @@ from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.reading import read_csv
 from bounce_mjx.identify.simulation import compensated, make_targets
 from bounce_mjx.identify.stages import Identified, _check_frame, identify
-from bounce_mjx.identify.unknowns import Layout
+from bounce_mjx.identify.unknowns import MOTIONS, Layout
 from bounce_mjx.identify.windows import Windows, cut
 from bounce_mjx.identify.world import compare, describe_doubts, estimates, to_yaml
 from bounce_mjx.physics import (
@@ -263,7 +262,7 @@ def test_the_page_begins_with_the_answer() -> None:
 
 
 def test_each_unknown_has_a_motion_that_would_show_it() -> None:
-    shown = {name for names in world._MOTIONS.values() for name in names.split()}
+    shown = {name for names in MOTIONS.values() for name in names.split()}
     assert shown >= Layout(6, True, 0.001, camera_rotation=0.01).terms.keys()
 
 
