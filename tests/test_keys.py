@@ -36,7 +36,7 @@ KEYS = fields_of(find_task("bounce").Config)
 
 # Other values, where neither half of the default nor one more of it is one.
 VALUES = {
-    "task": "catch", "seed": 1, "num_devices": 1000, "screening_episodes": 16,
+    "task": "catch", "seed": 1, "num_devices": 1000, "screening_episodes": 16, "save_every": 256,
     "warm_start": "nowhere", "log_dir": "elsewhere",
     "env.mjcf": "nowhere.xml", "env.friction": 0.2, "env.num_balls": 2,
     "env.default_joint_angles": [0.1, 0.7, 1.9, 0.0, -1.0, 0.0], "env.ball_init_pos": [0.5, 0, 0.4],
@@ -177,7 +177,8 @@ def of_run(config: TrainConfig) -> tuple:
         evaluators = Evaluators(config, job.env, job.trainer.mesh, job.pool)
         evaluators.final(None)
         seeds, task = str(job.trainer._seeds), type(job.env.task).__name__
-    return blocks, job.eval_steps, evaluators._chunk, measured, seeds, job.run.parent, task
+    steps = job.eval_steps, job.save_steps
+    return blocks, steps, evaluators._chunk, measured, seeds, job.run.parent, task
 
 
 # What a key that begins so may change, the cheapest first.

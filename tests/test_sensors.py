@@ -25,9 +25,9 @@ PARTS = {
 }  # fmt: skip
 SENSORS = {
     "ball_latency": (0.0, 0.03), "camera_rate": (50.0, 250.0), "frame_drop": (0.0, 0.9),
-    "ball_position_noise": (0.0, 0.5), "ball_position_bias": (-0.5, 0.5),
+    "ball_position_noise": (0.0, 0.2), "ball_position_bias": (-0.3, 0.3),
     "ball_velocity_noise": (0.0, 1.0), "ball_velocity_bias": (-1.0, 1.0),
-    "joint_angle_noise": (0.0, 0.5), "encoder_bias": (-0.5, 0.5),
+    "joint_angle_noise": (0.0, 0.05), "encoder_bias": (-0.3, 0.3),
     "joint_velocity_noise": (0.0, 1.0), "joint_velocity_bias": (-1.0, 1.0),
 }  # fmt: skip
 PERFECT = {name: (0.0, 0.0) for name in SENSORS} | {"camera_rate": (50.0, 250.0)}
