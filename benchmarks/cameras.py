@@ -24,7 +24,7 @@ from typing import NamedTuple
 import jax
 import mujoco
 import numpy as np
-from simulators import Episode, World, own_engine
+from simulators import Episode, World, judge_step, nominal_env, own_engine
 
 from bounce_mjx import load_policy
 from bounce_mjx.deploy.motion import paddle_position
@@ -32,11 +32,8 @@ from bounce_mjx.deploy.policy import DeployedPolicy
 from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.episodes import reset_episodes
 from bounce_mjx.evaluation.results import Report, judge
-from bounce_mjx.evaluation.statistics import accumulate, empty_statistics
+from bounce_mjx.evaluation.statistics import empty_statistics
 from bounce_mjx.resources import resource_path
-from bounce_mjx.runs.config import load_run_config
-from bounce_mjx.runs.folders import choose_checkpoint
-from bounce_mjx.world.config import RandomizationConfig
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "examples"))
 
@@ -146,12 +143,6 @@ class SeenEpisode(Episode):
             self.heights.append(float(ball[2] - paddle[2]))
 
 
-def nominal_env(policy: str) -> Env:
-    """The environment of a shipped policy, with nothing randomised."""
-    config = load_run_config(choose_checkpoint(Path(policy), Path()).run).env
-    return Env(config.model_copy(update={"randomization": RandomizationConfig()}))
-
-
 def play(name: str, settings: Settings, start: Start, seed: int) -> Played:
     """Plays one episode with cameras that the arm has just calibrated."""
     policy = load_policy(name)
@@ -194,26 +185,12 @@ def judge_episodes(env: Env, states, played: list[Played]) -> Report:
     Args:
       states: of the environment after the episodes' reset, batch last.
     """
-    episodes = len(played)
-
-    @jax.jit
-    def advance(states, qpos, qvel, statistics, step):
-        now = states.pipeline_state
-        no_action = jax.numpy.zeros((env.action_size, episodes))
-        _, actuation = jax.vmap(env.control, in_axes=-1, out_axes=-1)(now, no_action)
-        physics = now.physics._replace(
-            qpos=qpos.astype(now.physics.qpos.dtype), qvel=qvel.astype(now.physics.qvel.dtype)
-        )
-        finish_step = jax.vmap(env.finish_step, in_axes=-1, out_axes=-1)
-        states = finish_step(states, no_action, actuation, physics)
-        return states, accumulate(env, statistics, states, step)
-
     statistics = empty_statistics(env, states)
     for step in range(env.config.episode_steps):
         # A lost ball stays where it was last.
         qpos = np.stack([p.qpos[min(step + 1, len(p.qpos) - 1)] for p in played], axis=-1)
         qvel = np.stack([p.qvel[min(step + 1, len(p.qvel) - 1)] for p in played], axis=-1)
-        states, statistics = advance(states, qpos, qvel, statistics, step)
+        states, statistics = judge_step(env, states, qpos, qvel, statistics, step)
     return judge(env, statistics)
 
 

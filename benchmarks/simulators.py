@@ -38,10 +38,10 @@ from bounce_mjx.deploy.faults import Watch, picture_age
 from bounce_mjx.deploy.policy import DeployedPolicy
 from bounce_mjx.deploy.recorder import Recorder
 from bounce_mjx.deploy.samples import ImpossibleMeasurement
-from bounce_mjx.env.env import Env
+from bounce_mjx.env.env import Env, State
 from bounce_mjx.evaluation.episodes import reset_episodes
 from bounce_mjx.evaluation.results import Report, judge
-from bounce_mjx.evaluation.statistics import accumulate, empty_statistics
+from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
 from bounce_mjx.identify.excitation import excite
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.runs.config import load_run_config
@@ -630,13 +630,46 @@ class Episode:
         self._balls.append(self.simulator.ball_state())
 
 
+def nominal_env(policy: str) -> Env:
+    """The environment of a shipped policy, with nothing randomised."""
+    config = load_run_config(choose_checkpoint(Path(policy), Path()).run).env
+    return Env(config.model_copy(update={"randomization": RandomizationConfig()}))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def judge_step(
+    env: Env,
+    states: State,
+    qpos: jax.Array,
+    qvel: jax.Array,
+    statistics: Statistics,
+    step: jax.Array,
+) -> tuple[State, Statistics]:
+    """The environment's account of a control step whose physics ran elsewhere.
+
+    Args:
+      states: of E environments before the step, batch last.
+      qpos: positions [nq, E] after it.
+      qvel: velocities [nv, E] after it.
+      step: its index [].
+    """
+    now = states.pipeline_state
+    no_action = jax.numpy.zeros((env.action_size, qpos.shape[-1]))
+    _, actuation = jax.vmap(env.control, in_axes=-1, out_axes=-1)(now, no_action)
+    physics = now.physics._replace(
+        qpos=qpos.astype(now.physics.qpos.dtype), qvel=qvel.astype(now.physics.qvel.dtype)
+    )
+    finish_step = jax.vmap(env.finish_step, in_axes=-1, out_axes=-1)
+    states = finish_step(states, no_action, actuation, physics)
+    return states, accumulate(env, statistics, states, step)
+
+
 def evaluate(
     policy: str, name: str, world: World, episodes: int, seed: int
 ) -> tuple[Report, np.ndarray, list[str]]:
     """Results of a shipped policy in a simulator, over episodes of the task's time limit, the
     positions [T, nq] of the first episode, and the supervisor's alarms."""
-    config = load_run_config(choose_checkpoint(Path(policy), Path()).run).env
-    env = Env(config.model_copy(update={"randomization": RandomizationConfig()}))
+    env = nominal_env(policy)
     addresses = env.addresses
     arm_qpos, arm_qvel = list(addresses.arm_qpos), list(addresses.arm_qvel)
     ball_qpos = np.array([ball.qpos[:3] for ball in addresses.balls])
@@ -646,17 +679,6 @@ def evaluate(
     running = [Episode(load_policy(policy), make(), world) for _ in range(episodes)]
     states = jax.jit(reset_episodes, static_argnums=(0, 2))(env, jax.random.key(seed), episodes)
     qpos, qvel = (np.array(x, float) for x in states.pipeline_state.physics[:2])
-
-    @jax.jit
-    def advance(states, qpos, qvel, statistics, step):
-        now, actions = states.pipeline_state, jax.numpy.zeros((env.action_size, episodes))
-        _, actuation = jax.vmap(env.control, in_axes=-1, out_axes=-1)(now, actions)
-        physics = now.physics._replace(
-            qpos=qpos.astype(now.physics.qpos.dtype), qvel=qvel.astype(now.physics.qvel.dtype)
-        )
-        halves = states, actions, actuation, physics
-        states = jax.vmap(env.finish_step, in_axes=-1, out_axes=-1)(*halves)
-        return states, accumulate(env, statistics, states, step)
 
     for i, episode in enumerate(running):
         episode.reset(qpos[arm_qpos, i], qpos[ball_qpos, i], qvel[ball_qvel, i])
@@ -669,7 +691,7 @@ def evaluate(
             qpos[arm_qpos, i], qvel[arm_qvel, i] = episode.simulator.joint_state()
             qpos[ball_qpos, i], qvel[ball_qvel, i] = np.split(episode.balls[:, :6], 2, axis=1)
         path.append(qpos[:, 0].copy())
-        states, statistics = advance(states, qpos, qvel, statistics, step)
+        states, statistics = judge_step(env, states, qpos, qvel, statistics, step)
         if not np.any(statistics.running):
             break
     for episode in running:

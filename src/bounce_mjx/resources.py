@@ -25,3 +25,11 @@ def resource_path(name: str) -> Path:
     inside = _PACKAGE / name
     # Unlike os.path.exists, Path.exists raises an error for a name that is too long.
     return inside if os.path.exists(inside) else _PACKAGE.parent.parent / name
+
+
+def policy_folder(name: str | os.PathLike | None) -> Path | None:
+    """Folder of a policy of `POLICIES`; None for another name, and where a folder of the user has
+    the name."""
+    if str(name) in POLICIES and not os.path.isdir(name):
+        return resource_path(POLICIES[str(name)])
+    return None

@@ -18,7 +18,7 @@ from bounce_mjx.config.validation import validate
 from bounce_mjx.deploy.interface import check_interface, interface_of
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, shorten, suggest
-from bounce_mjx.resources import POLICIES, resource_path
+from bounce_mjx.resources import POLICIES, policy_folder
 from bounce_mjx.robot.config import is_packaged
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import find_run
@@ -139,9 +139,7 @@ def policy_environment(
 def policy_path(policy: str | os.PathLike) -> Path:
     """The path of a policy that a user names: that of one of the package, unless there is a folder
     of its name."""
-    if str(policy) in POLICIES and not os.path.isdir(policy):
-        return resource_path(POLICIES[str(policy)])
-    return Path(policy)
+    return policy_folder(policy) or Path(policy)
 
 
 def environment_of(env: Any) -> Env:

@@ -34,7 +34,13 @@ from bounce_mjx.config.files import dump_config
 from bounce_mjx.config.user_code import is_file, read_source, source_file
 from bounce_mjx.errors import UserError, suggest, warn_once
 from bounce_mjx.lazy import mujoco
-from bounce_mjx.resources import POLICIES, PRETRAINED, TASK_POLICIES, resource_path
+from bounce_mjx.resources import (
+    POLICIES,
+    PRETRAINED,
+    TASK_POLICIES,
+    policy_folder,
+    resource_path,
+)
 from bounce_mjx.runs import earlier
 from bounce_mjx.runs.config import CONFIG_FILE, ROBOT, TrainConfig, dump_sources, runs_folder
 from bounce_mjx.runs.files import seal, writable, write_atomically
@@ -298,7 +304,7 @@ def choose_checkpoint(path: Path | None, log_dir: Path) -> Checkpoint:
         with that name. For None, the newest run in `log_dir`, or the package's policy of a task
         whose default folder of runs is empty.
     """
-    if str(path) in POLICIES and not os.path.isdir(path):
+    if policy_folder(path):
         return pretrained_checkpoint(str(path))
     try:
         run = named_run(path, log_dir)
