@@ -91,9 +91,10 @@ def check_interface(policy: Interface, env: Interface, name: str, advice: str) -
     """
     differences = []
     for field in Interface._fields:
-        own, there = getattr(policy, field), getattr(env, field)
-        if not _is_same(own, there):
-            differences.append(_difference(field.replace("_", " "), own, there))
+        of_policy = getattr(policy, field)
+        of_env = getattr(env, field)
+        if not _is_same(of_policy, of_env):
+            differences.append(_difference(field.replace("_", " "), of_policy, of_env))
     if differences:
         raise UserError(
             f"the policy {name} is of another environment ({'; '.join(differences)}); {advice}"
@@ -129,30 +130,42 @@ def _quantities(parts: list[tuple[str, int]], velocity: str) -> tuple[str, ...]:
     return tuple(words)
 
 
-def _is_same(own: object, there: object) -> bool:
-    if isinstance(own, float) and isinstance(there, float):
-        return math.isclose(own, there, rel_tol=1e-6)
-    if isinstance(own, tuple) and isinstance(there, tuple) and len(own) == len(there):
-        close = [
-            math.isclose(a, b, abs_tol=1e-6) if isinstance(a, float) else a == b
-            for a, b in zip(own, there, strict=True)
-        ]
-        return all(close)
-    return own == there
+def _is_same(of_policy: object, of_env: object) -> bool:
+    if isinstance(of_policy, float) and isinstance(of_env, float):
+        return math.isclose(of_policy, of_env, rel_tol=1e-6)
+    if isinstance(of_policy, tuple) and isinstance(of_env, tuple):
+        if len(of_policy) != len(of_env):
+            return False
+        pairs = zip(of_policy, of_env, strict=True)
+        return all(_is_same_entry(first, second) for first, second in pairs)
+    return of_policy == of_env
+
+
+def _is_same_entry(first: object, second: object) -> bool:
+    """Whether two entries of tuples are alike; angles may differ by rounding."""
+    if isinstance(first, float):
+        return math.isclose(first, second, abs_tol=1e-6)
+    return first == second
+
+
+def _difference(field: str, of_policy: object, of_env: object) -> str:
+    """A difference in words."""
+    if field == "start pose":
+        return f"its start pose is {_angles(of_policy)}, there {_angles(of_env)}"
+    if field == "observation":
+        pairs = itertools.zip_longest(of_policy, of_env, fillvalue="nothing more")
+        first, other = next((a, b) for a, b in pairs if a != b)
+        return f"its observation has {first} where there is {other}"
+    unit = _UNITS.get(field, "")
+    return f"its {field} is {_value(of_policy, unit)}, there {_value(of_env, unit)}"
 
 
 def _angles(pose: tuple[float, ...]) -> str:
     return f"{' '.join(f'{angle:.3g}' for angle in pose)} rad"
 
 
-def _difference(field: str, own: object, there: object) -> str:
-    """A difference in words."""
-    if field == "start pose":
-        return f"its start pose is {_angles(own)}, there {_angles(there)}"
-    if field == "observation":
-        pairs = itertools.zip_longest(own, there, fillvalue="nothing more")
-        first, other = next((a, b) for a, b in pairs if a != b)
-        return f"its observation has {first} where there is {other}"
-    unit = _UNITS.get(field, "")
-    own, there = (f"{x:g}{unit}" if isinstance(x, float) else x or "none" for x in (own, there))
-    return f"its {field} is {own}, there {there}"
+def _value(value: object, unit: str) -> str:
+    """A value in words."""
+    if isinstance(value, float):
+        return f"{value:g}{unit}"
+    return str(value or "none")

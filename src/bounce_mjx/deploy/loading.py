@@ -66,8 +66,8 @@ def _use_environment(policy: DeployedPolicy, name: str, env: Any) -> None:
     from bounce_mjx.deploy.interface import check_interface, interface_in, interface_of
 
     config = environment_of(env).config
-    own, there = interface_in(policy.metadata), interface_of(config)
-    check_interface(own, there, name, f"make the environment with policy={name!r}")
+    advice = f"make the environment with policy={name!r}"
+    check_interface(interface_in(policy.metadata), interface_of(config), name, advice)
     places = {}
     for part in config.layout.parts:
         first = config.layout[part.name].start
