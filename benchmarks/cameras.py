@@ -167,6 +167,7 @@ def play(name: str, settings: Settings, start: Start, seed: int) -> Played:
         qvel_path.append(qvel.copy())
         if qpos[ball_qpos[2]] < LOST:
             break
+    camera.close()
     return Played(
         qpos=np.array(qpos_path),
         qvel=np.array(qvel_path),

@@ -332,6 +332,10 @@ class SeenBall:
             f"{np.max(distances):.1f} mm"
         )
 
+    def close(self) -> None:
+        """Frees the renderer."""
+        self._cameras.close()
+
     def measure(self, time: float) -> dict:
         """The newest place of the ball that has arrived, if any, and its velocity from two."""
         arrived = [entry for entry in self._measured if entry[0] <= time + 1e-6]
