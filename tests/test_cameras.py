@@ -179,6 +179,24 @@ def test_a_policy_plays_from_rendered_pictures(tmp_path) -> None:
     assert error < 4.0
 
 
+@pytest.mark.parametrize("side_light", [False, True])
+def test_a_background_that_was_drawn_before_changes_no_pixel(side_light) -> None:
+    mjcf = str(resource_path("mjcf/bounce_ball.xml"))
+    model = rendered_cameras.make_model(mjcf, "orange", side_light, quick=True)
+    rendered = rendered_cameras.RenderedCameras(model, rendered_cameras.true_cameras())
+    rng = np.random.default_rng(0)
+    data = mujoco.MjData(model)
+    for _ in range(8):
+        data.qpos[:] = model.qpos0 + rng.uniform(-1.0, 1.0, model.nq)
+        data.joint("ball_link").qpos[:3] = rng.uniform((0.3, -0.3, 0.03), (0.8, 0.3, 0.9))
+        mujoco.mj_forward(model, data)
+        for view in rendered._views:
+            picture = view.render(data)
+            assert np.array_equal(picture, view._draw(data, arm=True, room=True))
+            assert not np.array_equal(picture, view._background)
+    rendered.close()
+
+
 class DrawnCameras:
     """Stands in for `RenderedCameras`: a grey wall, and the ball as a disc. It needs no OpenGL."""
 
