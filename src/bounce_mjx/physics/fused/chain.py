@@ -1,7 +1,8 @@
 """Rigid-body dynamics of a serial chain of hinges and slides, unrolled into scalar arithmetic.
 
-Quantities of link i are in the frame of link i, unless their names say `world`. The origin of the
-frame is on the axis of joint i and moves with the link. Joint forces are torques (N m) of hinges
+Quantities of link i are in the frame of link i, unless their names or docstrings say otherwise: the
+pose of a link (`offset`, `rotation`) is in its parent's frame. The origin of the frame is on the
+axis of joint i and moves with the link. Joint forces are torques (N m) of hinges
 and forces (N) of slides. Source: Featherstone, Rigid Body Dynamics Algorithms (2008), table 5.1
 (recursive Newton-Euler) and table 6.2 (composite rigid bodies), in three-dimensional form.
 """
@@ -16,6 +17,7 @@ import jax
 from bounce_mjx.physics.scalars import (
     IDENTITY3,
     ZERO3,
+    ZERO_MATRIX3,
     Mat,
     Scalar,
     Vec,
@@ -148,14 +150,22 @@ def bias_force(
 def floating_force(links: Sequence[Link], pose: Pose, gravity: Vec) -> list[Scalar]:
     """Joint forces of MuJoCo's gravity compensation, which carries the weight of each link's
     `floating_mass`."""
-    if all(is_zero(link.floating_mass) for link in links):
-        return [0.0] * len(links)
-    none = Mat((ZERO3,) * 3)
-    floating = [
-        dataclasses.replace(x, mass=x.floating_mass, first_moment=x.floating_moment, inertia=none)
-        for x in links
-    ]
-    return bias_force(floating, pose, [0.0] * len(links), gravity)
+    at_rest = [0.0] * len(links)
+    if not any(_is_carried(link) for link in links):
+        return at_rest
+    floating_links = []
+    for link in links:
+        floating_link = dataclasses.replace(
+            link, mass=link.floating_mass, first_moment=link.floating_moment, inertia=ZERO_MATRIX3
+        )
+        floating_links.append(floating_link)
+    return bias_force(floating_links, pose, at_rest, gravity)
+
+
+def _is_carried(link: Link) -> bool:
+    """Whether gravity compensation may act on a link. Shares of either sign can cancel to no mass
+    and leave a moment."""
+    return not all(is_zero(x) for x in (link.floating_mass, *link.floating_moment))
 
 
 def mass_matrix(links: Sequence[Link], pose: Pose) -> SquareMatrix:
@@ -163,12 +173,12 @@ def mass_matrix(links: Sequence[Link], pose: Pose) -> SquareMatrix:
     n = len(links)
     matrix: SquareMatrix = [[0.0] * n for _ in range(n)]
     mass: Scalar = 0.0
-    first_moment, inertia = ZERO3, Mat((ZERO3,) * 3)
+    first_moment, inertia = ZERO3, ZERO_MATRIX3
     for i in reversed(range(n)):
         link = links[i]
         mass = add(mass, link.mass)
         first_moment = first_moment + link.first_moment
-        inertia = Mat(a + b for a, b in zip(inertia, link.inertia, strict=True))
+        inertia = inertia + link.inertia
 
         if link.slides:
             force, moment = link.axis * mass, cross(first_moment, link.axis)
