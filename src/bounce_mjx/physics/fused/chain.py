@@ -69,8 +69,8 @@ class Link:
     """Joint position at which the spring is at rest, rad or m."""
     frictionloss: Scalar = 0.0
     """Largest force of the joint's dry friction, N m or N."""
-    friction_softness: float = 0.0
-    """Regulariser of the dry friction, 1/(kg m^2) or 1/kg."""
+    friction_regulariser: float = 0.0
+    """Regulariser R of the dry friction, 1/(kg m^2) or 1/kg."""
     friction_damping: float = 0.0
     """b of the dry friction's reference acceleration, 1/s."""
     floating_mass: Scalar = 0.0
@@ -220,7 +220,9 @@ def cholesky(matrix: SquareMatrix) -> Factor:
 
 
 def solve_lower(factor: Factor, b: Sequence[Scalar]) -> list[Scalar]:
-    """L^-1 b for the factor L of `cholesky`."""
+    """L^-1 b for the factor L of `cholesky`. It is half of the solution M^-1 b = L^-T L^-1 b, and
+    the product of two of them is one with M^-1: (L^-1 a).(L^-1 b) = a.M^-1 b. Names with `half`
+    hold them."""
     x: list[Scalar] = []
     for row, inverse, entry in zip(*factor, b, strict=True):
         x.append(mul(sub(entry, dot(row[: len(x)], x)), inverse))

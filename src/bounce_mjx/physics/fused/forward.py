@@ -22,7 +22,7 @@ import jax.numpy as jnp
 
 from bounce_mjx.physics.fused import chain, joint_friction
 from bounce_mjx.physics.fused.ball import Ball, free_acceleration, move_ball
-from bounce_mjx.physics.fused.constraint import ConstraintForces, fwd_constraint
+from bounce_mjx.physics.fused.constraint import ConstraintEffects, fwd_constraint
 from bounce_mjx.physics.fused.model import FusedModel, Servo
 from bounce_mjx.physics.scalars import Scalar, Vec, add, mul, not_inlined, sub
 
@@ -210,7 +210,7 @@ def integrate(
     position: Position,
     actuation: Actuation,
     smooth: Smooth,
-    constraint: ConstraintForces,
+    constraint: ConstraintEffects,
     keep: Keep,
 ) -> Motion:
     """The next state: semi-implicit Euler, implicit in the velocity-dependent forces of the joints'
