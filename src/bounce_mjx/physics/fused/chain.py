@@ -94,22 +94,25 @@ class Pose(NamedTuple):
 
 def forward_kinematics(links: Sequence[Link], q: Sequence[Scalar]) -> Pose:
     """Pose of every link at the joint positions q (rad, m)."""
-    rotation, world_rotation, world_origin, offset = [], [], [], []
-    parent_rotation, parent_origin = IDENTITY3, ZERO3
+    pose = Pose(rotation=[], world_rotation=[], world_origin=[], offset=[])
+    parent_rotation = IDENTITY3
+    parent_origin = ZERO3
     for link, position in zip(links, q, strict=True):
-        moved = sub(position, link.zero_position)
+        displacement = sub(position, link.zero_position)
+        rotation = link.rotation
+        offset = link.offset
         if link.slides:
-            rotation.append(link.rotation)
-            offset.append(link.offset + (link.rotation @ link.axis) * moved)
+            offset = offset + (rotation @ link.axis) * displacement
         else:
-            sine, cosine = sine_cosine(moved)
-            rotation.append(link.rotation @ axis_rotation(link.axis, cosine, sine))
-            offset.append(link.offset)
-        parent_origin = parent_origin + parent_rotation @ offset[-1]
-        parent_rotation = parent_rotation @ rotation[-1]
-        world_origin.append(parent_origin)
-        world_rotation.append(parent_rotation)
-    return Pose(rotation, world_rotation, world_origin, offset)
+            sine, cosine = sine_cosine(displacement)
+            rotation = rotation @ axis_rotation(link.axis, cosine, sine)
+        parent_origin = parent_origin + parent_rotation @ offset
+        parent_rotation = parent_rotation @ rotation
+        pose.rotation.append(rotation)
+        pose.offset.append(offset)
+        pose.world_rotation.append(parent_rotation)
+        pose.world_origin.append(parent_origin)
+    return pose
 
 
 def bias_force(
@@ -117,34 +120,42 @@ def bias_force(
 ) -> list[Scalar]:
     """Joint forces that balance gravity, Coriolis and centrifugal effects at zero joint
     acceleration: recursive Newton-Euler, with gravity as an acceleration of the base."""
-    omega, alpha, acceleration = ZERO3, ZERO3, -gravity
-    forces, moments = [], []
+    # Outwards: motion of each link, and the force and moment that it needs.
+    omega = ZERO3
+    alpha = ZERO3
+    acceleration = -gravity
+    forces = []
+    moments = []
     for link, rotation, offset, speed in zip(links, pose.rotation, pose.offset, v, strict=True):
         to_link = rotation.T
-        at_origin = acceleration + (cross(alpha, offset) + cross(omega, cross(omega, offset)))
-        motion = link.axis * speed
+        about_parent = cross(alpha, offset) + cross(omega, cross(omega, offset))
         omega_of_parent = to_link @ omega
-        alpha, omega = to_link @ alpha, omega_of_parent
+        alpha_of_parent = to_link @ alpha
+        acceleration = to_link @ (acceleration + about_parent)
+        joint_motion = link.axis * speed
         if link.slides:
-            coriolis = cross(omega_of_parent, motion) * 2.0
-            acceleration = to_link @ at_origin + coriolis
+            omega = omega_of_parent
+            alpha = alpha_of_parent
+            acceleration = acceleration + cross(omega_of_parent, joint_motion) * 2.0
         else:
-            alpha = alpha + cross(omega_of_parent, motion)
-            omega = omega_of_parent + motion
-            acceleration = to_link @ at_origin
-        moment = link.first_moment
-        about_origin = cross(alpha, moment) + cross(omega, cross(omega, moment))
+            omega = omega_of_parent + joint_motion
+            alpha = alpha_of_parent + cross(omega_of_parent, joint_motion)
+        first_moment = link.first_moment
+        about_origin = cross(alpha, first_moment) + cross(omega, cross(omega, first_moment))
         forces.append(acceleration * link.mass + about_origin)
         turning = link.inertia @ alpha + cross(omega, link.inertia @ omega)
-        moments.append(turning + cross(moment, acceleration))
+        moments.append(turning + cross(first_moment, acceleration))
 
-    along_joints: list[Scalar] = [0.0] * len(links)
-    force, moment = ZERO3, ZERO3
+    # Inwards: each joint carries its link and all links behind it.
+    joint_forces: list[Scalar] = [0.0] * len(links)
+    force = ZERO3
+    moment = ZERO3
     for i in reversed(range(len(links))):
-        force, moment = forces[i] + force, moments[i] + moment
-        along_joints[i] = _along_joint(links[i], force, moment)
+        force = forces[i] + force
+        moment = moments[i] + moment
+        joint_forces[i] = _along_joint(links[i], force, moment)
         force, moment = _to_parent(pose.rotation[i], pose.offset[i], force, moment)
-    return along_joints
+    return joint_forces
 
 
 def floating_force(links: Sequence[Link], pose: Pose, gravity: Vec) -> list[Scalar]:
@@ -173,17 +184,21 @@ def mass_matrix(links: Sequence[Link], pose: Pose) -> SquareMatrix:
     n = len(links)
     matrix: SquareMatrix = [[0.0] * n for _ in range(n)]
     mass: Scalar = 0.0
-    first_moment, inertia = ZERO3, ZERO_MATRIX3
+    first_moment = ZERO3
+    inertia = ZERO_MATRIX3
     for i in reversed(range(n)):
         link = links[i]
         mass = add(mass, link.mass)
         first_moment = first_moment + link.first_moment
         inertia = inertia + link.inertia
 
+        # What a unit acceleration of the joint needs.
         if link.slides:
-            force, moment = link.axis * mass, cross(first_moment, link.axis)
+            force = link.axis * mass
+            moment = cross(first_moment, link.axis)
         else:
-            force, moment = cross(link.axis, first_moment), inertia @ link.axis
+            force = cross(link.axis, first_moment)
+            moment = inertia @ link.axis
         matrix[i][i] = add(_along_joint(link, force, moment), link.armature)
         for j in range(i, 0, -1):
             force, moment = _to_parent(pose.rotation[j], pose.offset[j], force, moment)

@@ -91,6 +91,7 @@ def fwd_constraint(
     contact_matrix = _inverse_inertia(model, rows, half_rows)
     contact_offsets = []
     for row, half_row in zip(rows, half_rows, strict=True):
+        # J a0, then -aref.
         free_acceleration = add(
             row.axis @ relative(row.contact, free_accelerations),
             dot(half_row, half_acceleration),
@@ -120,12 +121,12 @@ def fwd_constraint(
         contact_forces=contact_forces,
     )
     forces = keep(forces)
-    joint_force = []
-    for joint, friction in enumerate(dry_friction):
-        column = [row.joints[joint] for row in rows]
-        joint_force.append(add(dot(column, forces), friction))
     accelerations, angular_accelerations = _ball_accelerations(model, rows, forces)
-    return ConstraintEffects(joint_force, accelerations, angular_accelerations)
+    return ConstraintEffects(
+        joint_force=_joint_forces(rows, forces, dry_friction),
+        ball_accelerations=accelerations,
+        ball_angular_accelerations=angular_accelerations,
+    )
 
 
 def paddle_centre(model: FusedModel, pose: chain.Pose) -> Vec:
@@ -251,6 +252,17 @@ def _speed(row: Row, balls: Sequence[Ball], joint_velocity: Sequence[Scalar]) ->
     for i, torque in row.torques.items():
         speed = add(speed, torque @ balls[i].turning.spin)
     return add(speed, dot(row.joints, joint_velocity))
+
+
+def _joint_forces(
+    rows: Sequence[Row], forces: Sequence[Scalar], dry_friction: Sequence[Scalar]
+) -> list[Scalar]:
+    """Forces [n] at the joints: J^T times the contacts' forces, and dry friction."""
+    joint_forces = []
+    for joint, friction in enumerate(dry_friction):
+        column = [row.joints[joint] for row in rows]
+        joint_forces.append(add(dot(column, forces), friction))
+    return joint_forces
 
 
 def _ball_accelerations(

@@ -100,13 +100,13 @@ def substep(
     smooth = fwd_acceleration(model, motion, position, velocity, actuation, air_drag)
     constraint = fwd_constraint(
         model,
-        position.pose,
-        position.mass_factor,
-        motion.v,
-        smooth.half_acceleration,
-        motion.balls,
-        smooth.ball_accelerations,
-        keep,
+        pose=position.pose,
+        mass_factor=position.mass_factor,
+        joint_velocity=motion.v,
+        half_acceleration=smooth.half_acceleration,
+        balls=motion.balls,
+        free_accelerations=smooth.ball_accelerations,
+        keep=keep,
     )
     return integrate(model, motion, position, actuation, smooth, constraint, keep)
 

@@ -20,6 +20,7 @@ not diverge.
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 
@@ -108,7 +109,7 @@ def contact_and_dry_friction(
     )
     limits = [links[joint].frictionloss for joint in joints]
 
-    def one_round(_: int, forces: tuple[Scalars, Scalars]) -> tuple[Scalars, Scalars]:
+    def one_round(_round: jax.Array, forces: tuple[Scalars, Scalars]) -> tuple[Scalars, Scalars]:
         contact, friction = forces
         for _ in range(_SWEEPS):
             friction = not_inlined(_sweep(problem, limits, contact, friction))
