@@ -58,6 +58,8 @@ class Estimate(NamedTuple):
     """Whether the log shows it; otherwise the interval is the prior's."""
     alone: float
     """Half-width of the interval if all other unknowns had their estimates."""
+    typical: float
+    """Distance from the value within which it lies without the log: one deviation of the prior."""
 
 
 def estimates(found: Identified, joint_names: Sequence[str]) -> list[Estimate]:
@@ -74,10 +76,13 @@ def estimates(found: Identified, joint_names: Sequence[str]) -> list[Estimate]:
     given_others = misfit(found) / np.sqrt(np.diag(np.linalg.inv(found.covariance)))
     ends = layout.decode(vector + _HALF_WIDTH * np.minimum(given_others, layout.deviation))
     alone = ends - layout.decode(vector)
+    typical = layout.decode(vector + layout.deviation) - layout.decode(vector)
     for name, ends in _estimate_delays(found).items():
         place = layout.terms[name]
         low[place], high[place] = ends
-        alone[place] = np.inf
+        # A change of latency or lag alone is one of the delay, at whose place the latency is.
+        alone[place] = alone[layout.terms["action_latency"]]
+        typical[place] = typical[layout.terms["action_latency"]]
     late = layout.slices.get("ball_latency", slice(0, 0))
     for array in (values, low, high):
         array[late] += found.stamp_age
@@ -85,7 +90,7 @@ def estimates(found: Identified, joint_names: Sequence[str]) -> list[Estimate]:
         if name in TERMS:
             low[place], high[place] = (np.clip(x[place], *TERMS[name].bounds) for x in (low, high))
     seen = found.deviation < _UNSEEN * layout.deviation
-    columns = (values, low, high, seen, alone)
+    columns = (values, low, high, seen, alone, typical)
     words = layout.labels(joint_names), layout.units
     return list(map(Estimate, *words, *(column.tolist() for column in columns)))
 
@@ -260,7 +265,7 @@ def to_yaml(
     The range of each entry of a term covers what the log allows while all other unknowns have their
     estimates, with a margin of half: independent samples from the whole intervals of terms that the
     log cannot separate would be worlds that contradict it. A term that the log does not show is
-    assumed.
+    assumed, and has at most one deviation of its prior to each side.
 
     Args:
       robot: name or file of the robot's config.
@@ -334,10 +339,15 @@ def _format(entry: Estimate) -> str:
 
 
 def _widen(name: str, entries: Sequence[Estimate]) -> list[Any]:
-    value, low, high, alone = np.transpose([(e.value, e.low, e.high, e.alone) for e in entries])
-    low = value - _MARGIN * np.minimum(value - low, alone)
-    ends = np.stack([low, value + _MARGIN * np.minimum(high - value, alone)])
-    return _clip(name, ends if len(entries) > 1 else ends[:, 0])
+    """The range of a term for training, from the intervals of its entries."""
+    lows, highs = [], []
+    for entry in entries:
+        most = np.inf if entry.seen else entry.typical
+        below = _MARGIN * min(entry.value - entry.low, entry.alone)
+        above = _MARGIN * min(entry.high - entry.value, entry.alone)
+        lows.append(entry.value - min(below, most))
+        highs.append(entry.value + min(above, most))
+    return _clip(name, [lows, highs] if len(entries) > 1 else [lows[0], highs[0]])
 
 
 def _clip(name: str, ends: Any) -> list[Any]:
