@@ -192,8 +192,9 @@ def measure_arm(arm: ArmLog, toolbox: bool) -> list[dict[str, Any]]:
         row["seconds"] = time.perf_counter() - begin
         row["processor seconds"] = time.process_time() - begin_processor
         of_arm = compensated(config) if found.gravity_compensation else config
-        delay, dt = found.following.delay, config.physics_dt
-        fitted, tested = (set_points(part, delay, dt) for part in (fitted, tested))
+        fitted, tested = (
+            set_points(part, found.following, config.physics_dt) for part in (fitted, tested)
+        )
         world = found.layout.world(found.fit.vector)
         row["identified, mrad"] = (1e3 * open_loop(of_arm, world, tested)).tolist()
         row["total delay"] = total_delay(found, model)

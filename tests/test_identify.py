@@ -24,7 +24,7 @@ from bounce_mjx.identify.fit import (
     minimise,
 )
 from bounce_mjx.identify.flight import acceleration, fit_flight
-from bounce_mjx.identify.following import find_settled, follow
+from bounce_mjx.identify.following import command_delay, find_settled, follow, set_points
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.reading import read_csv
 from bounce_mjx.identify.simulation import compensated, make_targets
@@ -411,6 +411,26 @@ def test_following_finds_delay_and_offsets() -> None:
     assert found.delay == pytest.approx(0.0155, abs=1e-4)
     np.testing.assert_allclose(found.offsets, offsets, atol=1e-4)
     np.testing.assert_allclose(found.errors, 3e-4, rtol=0.1)
+
+
+def test_set_points_are_commanded_when_they_are_due() -> None:
+    """A controller's own set points, recorded every 8 ms, that the joints follow at once: the mean
+    command of a physics step is that of the set points in it."""
+    times, rates = np.arange(0.0, 10.0, 0.008), np.array([1.0, 1.7, 2.3])
+    waves = np.sin(np.outer(times, rates))
+    log = flight_log()._replace(
+        times=times, target_times=times, joint_angles=waves, servo_targets=waves
+    )
+    rows = find_settled(log)
+    following = follow(log, rows)
+    assert command_delay(log, following) == pytest.approx(0.0, abs=1e-4)
+    edges = 0.001 * np.arange(1001)
+    sent = make_targets(set_points(log, following, 0.001), edges)(0.0, 0.0)
+    middles = 0.5 * (edges[1:] + edges[:-1])
+    np.testing.assert_allclose(sent, np.sin(np.outer(middles, rates)), atol=5e-5)
+    # Commands that are held until the next are later than their stamps by half a step.
+    late = log._replace(joint_angles=np.sin(np.outer(times - 0.0155, rates)))
+    assert command_delay(late, follow(late, rows)) == pytest.approx(0.0115, abs=1e-4)
 
 
 def test_a_controller_that_carries_the_arm_lets_no_servo_sag() -> None:

@@ -25,12 +25,14 @@ from bounce_mjx.identify.fit import (
 from bounce_mjx.identify.flight import Flight, acceleration, fit_flight
 from bounce_mjx.identify.following import (
     Following,
+    command_delay,
     does_move,
     error_size,
     find_settled,
     follow,
     held_out_error,
     set_points,
+    shows_set_points,
 )
 from bounce_mjx.identify.log import Log, least_age
 from bounce_mjx.identify.simulation import Simulate, make_simulator
@@ -208,7 +210,9 @@ def identify(
     sensors = sensor_noise(log)
     settled, held_out = find_settled(log), _held_out_rows(log, windows)
     following = follow(log, settled & ~held_out)
-    log = set_points(log, following.delay, config.physics_dt)
+    delay = command_delay(log, following)
+    has_set_points = shows_set_points(log, following)
+    log = set_points(log, following, config.physics_dt)
     own, carried = (
         Problem(
             simulate=make_simulator(config, layout, log, windows, share),
@@ -222,11 +226,11 @@ def identify(
     )
     progress(f"arm: {1e3 * following.delay:.1f} ms behind its commands")
     if does_move(log):
-        fits = [_search_arm(problem, config, log, following) for problem in (own, carried)]
+        fits = [_search_arm(problem, config, delay, following) for problem in (own, carried)]
         problem, fit = _choose(own, carried, fits)
         problem, fit = _fit_arm(problem, fit)
-        follower = _stiff_follower(problem, config, log, following)
-        is_follower = _explains_better(problem, follower, fit)
+        follower = _stiff_follower(problem, config, delay, following)
+        is_follower = has_set_points or _explains_better(problem, follower, fit)
     else:
         # Gravity's tilt would explain where an arm rests.
         problem = own
@@ -424,14 +428,18 @@ def _flies(problem: Problem, fit: Fit, flying: np.ndarray) -> bool:
 
 
 def _search_arm(
-    problem: Problem, config: WorldConfig, log: Log, following: Following
+    problem: Problem, config: WorldConfig, delay: float, following: Following
 ) -> tuple[Noise, Fit]:
     """The best fit to a few windows of the arm, from candidates that differ in what a search could
-    confuse; and the noise that it leaves."""
+    confuse; and the noise that it leaves.
+
+    Args:
+      delay: time from a command to the angle, s.
+    """
     layout, windows = problem.layout, problem.windows
     rough = np.hypot(problem.sensors.angles, following.errors)
     problem = problem._replace(noise=problem.noise._replace(angles=rough))
-    vectors = np.concatenate([_own_servos(layout), _late_servos(layout, config, log, following)])
+    vectors = np.concatenate([_own_servos(layout), _late_servos(layout, config, delay)])
     few = problem.weights(0.0, _sample(problem, np.any(windows.angle_weights > 0.0, axis=1)))
     used = np.any(few > 0.0, axis=1)
     starts = np.repeat(windows.starts[None], len(vectors), axis=0)
@@ -477,16 +485,10 @@ def _servo_delays(config: WorldConfig) -> np.ndarray:
     return np.maximum(damping / stiffness, 1e-6)
 
 
-def _command_delay(log: Log, following: Following) -> float:
-    """The delay from a command to the angle, s, without the half step for which a command is held
-    until the next."""
-    return following.delay - 0.5 * float(np.median(np.diff(log.target_times)))
-
-
-def _late_servos(layout: Layout, config: WorldConfig, log: Log, following: Following) -> np.ndarray:
-    """Candidates [C, P] whose joints follow their commands as late as measured."""
+def _late_servos(layout: Layout, config: WorldConfig, delay: float) -> np.ndarray:
+    """Candidates [C, P] whose joints follow their commands as late as measured (s)."""
     own_delay = _servo_delays(config)
-    total = max(_command_delay(log, following), 2e-3)
+    total = max(delay, 2e-3)
     vectors = []
     for gain, servo_share, lag_share in itertools.product(_GAINS, _SERVO_SHARES, _LAG_SHARES):
         of_servo = servo_share * total
@@ -501,11 +503,13 @@ def _late_servos(layout: Layout, config: WorldConfig, log: Log, following: Follo
     return np.stack(vectors)
 
 
-def _stiff_follower(problem: Problem, config: WorldConfig, log: Log, following: Following) -> Fit:
+def _stiff_follower(
+    problem: Problem, config: WorldConfig, delay: float, following: Following
+) -> Fit:
     """The arm that follows its commands as the simplest model does: late, with an offset of each
     joint, by servos that are too stiff to matter."""
     layout, windows = problem.layout, problem.windows
-    total = max(_command_delay(log, following), 0.0)
+    total = max(delay, 0.0)
     own_delay = _servo_delays(config)
     vectors = []
     for gain, longest in itertools.product(_STIFF_GAINS, _STIFF_DELAYS):
