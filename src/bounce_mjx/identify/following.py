@@ -62,7 +62,8 @@ def follow(log: Log, rows: np.ndarray, shortest: float = -0.05, longest: float =
     """
     chosen = np.flatnonzero(rows)
     if not does_move(log):
-        shortest, longest = 0.0, _STEP
+        shortest = 0.0
+        longest = _STEP
     few = chosen[:: max(len(chosen) // _ROWS, 1)]
 
     def spread(delay: float, at: np.ndarray) -> float:
