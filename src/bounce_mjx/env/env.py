@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.env.checks import (
+    check_contacts,
     check_has_task,
     check_joint_angles,
     check_start,
@@ -147,6 +148,7 @@ class Env:
         self.engine: Engine = make_engine(self.mj_model, config.physics, self.addresses)
         self.layout = config.layout
         check_joint_angles(config, self.mj_model, self.addresses)
+        check_contacts(config, self.mj_model, self.addresses)
         self.task.geometry = read_geometry(
             self.mj_model, self.addresses, config.default_joint_angles
         )

@@ -1,5 +1,5 @@
 """Does MuJoCo's C solver converge with a model's own settings? The fused engine computes the
-converged solution, whatever the settings say."""
+converged solution, whatever the settings say. Trainings and evaluations print the warning."""
 
 import copy
 from collections.abc import Iterable

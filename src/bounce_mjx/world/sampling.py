@@ -24,8 +24,8 @@ def nominal_values(
 ) -> dict[str, np.ndarray]:
     """Values without randomisation of the terms that have one, each of the term's shape.
 
-    Of a term that replaces a number of the model, it is that number; a model without a contact pair
-    has none of the contact.
+    Of a term that replaces a number of the model, it is that number. A model without a contact pair
+    has none for `restitution` and `contact_friction`, which it refuses.
 
     Args:
       mj_model: the model.
@@ -72,7 +72,7 @@ def sample_world(
       num_joints: number of acting joints.
       nominals: `nominal_values`, which the terms have that are not sampled; a term without one is
         sampled in every episode.
-      share: probability [] that each term is sampled.
+      share: probability [] that each term with a nominal value is sampled, all its entries at once.
       shares: probabilities of single terms, in place of `share`.
     """
     # The order of TERMS, because JAX sorts the keys of a traced dictionary.
@@ -114,7 +114,8 @@ def apply(
     """A physical parameter of an episode.
 
     Args:
-      operation: how the sampled value changes the model's own.
+      operation: how the sampled value changes the model's own; "restitution" says what is sampled,
+        and the parameter is the damping.
       model: the model's own parameters.
       parameter: name of the field of `PhysicsParameters`.
       sampled: the term's value, of its shape.
