@@ -5,7 +5,7 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.robot.model import Addresses, contact_pairs, joint_names, joint_ranges
+from bounce_mjx.robot.model import Addresses, joint_names, joint_ranges
 from bounce_mjx.task.task import Task
 from bounce_mjx.world.config import WorldConfig
 
@@ -15,11 +15,6 @@ _MAX_ANGLE = 4.0 * np.pi
 _ROUNDING = 1e-3
 # A ball that starts farther beside the paddle falls before the paddle is under it, m.
 _FARTHEST_BESIDE = 0.3
-# Terms that give all contacts one value, and the fields that it replaces.
-_TERMS_OF_CONTACTS = {
-    "restitution": ("pair_solref",),
-    "contact_friction": ("pair_friction", "pair_dim"),
-}
 
 
 def check_has_task(config: WorldConfig) -> None:
@@ -82,23 +77,6 @@ def check_joint_angles(config: WorldConfig, mj_model: mujoco.MjModel, addresses:
                 f"default_joint_angles has {angle:g} for {joint}, whose range is {low:.4g} to "
                 f"{high:.4g}; give radians, or metres for a slide, within the range"
             )
-
-
-def check_contacts(config: WorldConfig, mj_model: mujoco.MjModel, addresses: Addresses) -> None:
-    """Refuses terms of the contact in a model whose contacts differ: such a term gives all of them
-    one value, which is then not the model's own for some, even without randomisation."""
-    pairs = contact_pairs(mj_model, addresses)
-    for term, fields in _TERMS_OF_CONTACTS.items():
-        if term not in config.randomization.terms:
-            continue
-        for field in fields:
-            numbers = getattr(mj_model, field)[pairs]
-            if np.any(numbers != numbers[:1]):
-                raise UserError(
-                    f"the contact pairs of the balls and the paddle differ in {field}, of which "
-                    f"randomization.{term} makes one for all; give them the same in the MJCF, or "
-                    f"leave {term} out"
-                )
 
 
 def check_start(config: WorldConfig, task: Task) -> None:

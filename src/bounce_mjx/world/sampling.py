@@ -15,8 +15,34 @@ from bounce_mjx.physics import PhysicsParameters
 from bounce_mjx.physics.edited import NO_PAIR, own_parameters
 from bounce_mjx.physics.scalars import Quaternion, quaternion_matrix, quaternion_product
 from bounce_mjx.robot.contact import damping_of_restitution, restitution_of_damping
-from bounce_mjx.robot.model import Addresses
+from bounce_mjx.robot.model import Addresses, contact_pairs
 from bounce_mjx.world.randomization import MODEL, TERMS, Operation, Ranges, Term, World
+
+# The fields that the terms of the contact change.
+_CONTACT_FIELDS = {
+    "restitution": ("pair_solref",),
+    "contact_friction": ("pair_friction", "pair_dim"),
+}
+
+
+def check_contacts(mj_model: mujoco.MjModel, terms: Iterable[str], addresses: Addresses) -> None:
+    """Refuses terms of the contact in a model whose contacts differ: such a term gives all of them
+    one value, which is not each one's own in an episode that does not sample it.
+
+    Raises:
+      UserError: the contact pairs of the balls and the paddle differ in what one of the terms
+        changes.
+    """
+    pairs = contact_pairs(mj_model, addresses)
+    for term in terms:
+        for field in _CONTACT_FIELDS.get(term, ()):
+            numbers = getattr(mj_model, field)[pairs]
+            if np.any(numbers != numbers[:1]):
+                raise UserError(
+                    f"the contact pairs of the balls and the paddle differ in {field}, of which "
+                    f"randomization.{term} makes one for all; give them the same in the MJCF, or "
+                    f"leave {term} out"
+                )
 
 
 def nominal_values(
