@@ -65,7 +65,7 @@ class PhysicsParameters(NamedTuple):
     entries: Mapping[str, Array] | None = None
     """Other entries [] of the MjModel by their names, such as `dof_damping[2]`, `geom_size[3, 0]`
     or `opt.gravity[2]`; they prevail over the fields above. The fused engine refuses the name of an
-    entry that it does not read."""
+    entry that it does not read; the mjx engine takes those that `mjx.Model` has."""
 
 
 MODEL_PARAMETERS = PhysicsParameters()
