@@ -30,7 +30,12 @@ from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.noise import Clock
 from bounce_mjx.world.observation import Kinematics
 from bounce_mjx.world.randomization import TERMS, Ranges, World
-from bounce_mjx.world.sampling import nominal_values, physics_parameters, sample_world
+from bounce_mjx.world.sampling import (
+    check_contacts,
+    nominal_values,
+    physics_parameters,
+    sample_world,
+)
 from bounce_mjx.world.sensing import Instant, Sensing, Sensors
 
 # MuJoCo's mjMAXVAL: a coordinate beyond it has diverged and counts as non-finite.
@@ -147,6 +152,7 @@ class Env:
         self.engine: Engine = make_engine(self.mj_model, config.physics, self.addresses)
         self.layout = config.layout
         check_joint_angles(config, self.mj_model, self.addresses)
+        check_contacts(self.mj_model, config.randomization.terms, self.addresses)
         self.task.geometry = read_geometry(
             self.mj_model, self.addresses, config.default_joint_angles
         )

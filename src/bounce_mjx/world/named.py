@@ -24,7 +24,7 @@ class NamedWorld(StrictModel):
 
     robot: str | None = None
     """Name of a robot in configs/robots/, or its file, relative to the world's folder; null for any
-    robot."""
+    robot. (`env.robot` has settings of an arm's adoption.)"""
     env: RobotSettings = RobotSettings()
     """Settings of the environment. A term of the randomisation that it does not have is as in the
     task's defaults."""
