@@ -270,7 +270,7 @@ class WorldConfig(RobotSettings):
     def unseen_noise(self) -> tuple[str, ...]:
         """Terms of the randomisation that change measurements which the policy does not see."""
         observation = self.observation
-        if observation.lengths("task"):
+        if observation.counts("task"):
             return ()
         has_sensor = observation.velocity == "measured"
         is_seen = {

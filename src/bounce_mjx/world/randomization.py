@@ -190,7 +190,8 @@ class RandomizationConfig(StrictModel):
     ball_latency: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 1.0), nominal=0.0)] = None
     """Time from a camera picture of the ball to its use, s."""
     camera_rate: Annotated[Sampled, Term(NUMBER, bounds=(1.0, 1e4))] = None
-    """Camera pictures of the ball per second, Hz; null for one at every control step."""
+    """Camera pictures of the ball per second, Hz; null for one at every control step. Of several
+    pictures in a control step only the newest counts; if it is lost, so are the others."""
     frame_drop: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 0.99), nominal=0.0)] = None
     """Probability that a camera picture is lost."""
     ball_position_noise: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 0.2), nominal=0.0)] = None
@@ -198,9 +199,11 @@ class RandomizationConfig(StrictModel):
     ball_position_bias: Annotated[Sampled, Term((3,), bounds=(-0.3, 0.3), nominal=0.0)] = None
     """Error of each measured ball coordinate, constant in an episode, m."""
     ball_velocity_noise: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 10.0), nominal=0.0)] = None
-    """Standard deviation of the noise of each component of the measured ball velocity, m/s."""
+    """Standard deviation of the noise of each component of the measured ball velocity, m/s; not
+    of a velocity from differences."""
     ball_velocity_bias: Annotated[Sampled, Term((3,), bounds=(-10.0, 10.0), nominal=0.0)] = None
-    """Error of each component of the measured ball velocity, constant in an episode, m/s."""
+    """Error of each component of the measured ball velocity, constant in an episode, m/s; not of a
+    velocity from differences."""
     joint_angle_noise: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 0.05), nominal=0.0)] = None
     """Standard deviation of the noise of each measured joint angle, rad."""
     encoder_bias: Annotated[Sampled, Term(EACH_JOINT, bounds=(-0.3, 0.3), nominal=0.0)] = None
