@@ -70,7 +70,9 @@ def fit_with_toolbox(config: WorldConfig, log: Log, optimizer: Optimizer) -> dic
     )
     options = {"x_scale": "jac"} if optimizer == "scipy" else {}
     found, _ = sysid.optimize(params, residual, optimizer=optimizer, verbose=False, **options)
-    return world(found) | {"action_latency": np.array(found["delay"].value[0])}
+    # The toolbox stamps a sensor with the end of the step at whose start it was computed.
+    delay = found["delay"].value[0] + config.physics_dt
+    return world(found) | {"action_latency": np.array(delay)}
 
 
 def _arm_alone(config: WorldConfig, names: tuple[str, ...]) -> mujoco.MjSpec:
