@@ -10,7 +10,7 @@ from pydantic import Field
 
 from bounce_mjx.config import settings
 from bounce_mjx.errors import UserError, shorten
-from bounce_mjx.robot.config import OF_SITE, RobotConfig, Vector, is_packaged
+from bounce_mjx.robot.config import NEED_SITE, RobotConfig, Vector, is_packaged
 from bounce_mjx.world.observation import ObservationConfig, ObservationLayout
 from bounce_mjx.world.randomization import EACH_JOINT, TERMS, RandomizationConfig
 
@@ -210,7 +210,7 @@ class WorldConfig(RobotSettings):
         the config of a run names all settings."""
         unused = {}
         if not self.robot.site:
-            unused |= {f"robot.{name}": "robot.site" for name in OF_SITE}
+            unused |= {f"robot.{name}": "robot.site" for name in NEED_SITE}
         if self.action.base == "measured":
             unused["action.max_lead"] = "the action.base target"
             unused["observation.servo_lead"] = "the action.base target"
