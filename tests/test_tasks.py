@@ -359,9 +359,23 @@ def test_a_package_can_have_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
     (info / "entry_points.txt").write_text(f"[{registry.GROUP}]\ngone = my_tasks:Gone\n")
     with pytest.raises(UserError, match="the task gone cannot be imported .*; install the package"):
         find_task("gone")
+    for attribute in ("Config", "__name__", "task.Task"):
+        (info / "entry_points.txt").write_text(f"[{registry.GROUP}]\nno = my_tasks:{attribute}\n")
+        words = "cannot be imported" if "." in attribute else "is no subclass of Task; correct the"
+        with pytest.raises(UserError, match=f"the task no .*{words}"):
+            find_task("no")
     (info / "entry_points.txt").write_text(f"[{registry.GROUP}]\nlow = my_tasks:Dribble\n")
     config = read_preset(None, task="low")
     assert "task: low\n" in dump_config(config) and config.log_dir == Path("runs/dribble")
+
+
+def test_a_tasks_class_without_a_config_is_one_sentence() -> None:
+    """The remedy is right for a task from scratch and for one that extends another."""
+    for base, extended in ((task.Task, "task.WorldConfig"), (rest_task.Rest, "Config")):
+        with pytest.raises(UserError, match=rf"no Config .* write Config, .* extends {extended}$"):
+            type("Mine", (base,), {})
+    with pytest.raises(UserError, match="the Config of the task Mine is .*; give a class that"):
+        type("Mine", (task.Task,), {"Config": dict})
 
 
 def test_a_robot_serves_another_task() -> None:
@@ -370,6 +384,11 @@ def test_a_robot_serves_another_task() -> None:
     config, bounce = read_preset(preset, robot, DRIBBLE).env, read_preset(preset, robot).env
     assert config.mjcf == bounce.mjcf and config.robot == bounce.robot
     assert config.default_joint_angles == bounce.default_joint_angles
+    # A viewer offers targets over the paddle, as far as over that of the package's own arm.
+    lowest, highest = bounce.commands["target_height"].span
+    assert (lowest, highest) == pytest.approx(
+        np.add(bounce.reward.paddle_home_height, (0.25, 0.75))
+    )
     env = Env(config)
     truth = env.kinematics(jax.jit(env.reset)(jax.random.PRNGKey(0)).pipeline_state)
     above = np.asarray(truth.ball_position - truth.paddle_position)

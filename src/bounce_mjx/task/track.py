@@ -84,7 +84,7 @@ class Observation(task.ObservationConfig):
 class Config(task.WorldConfig):
     """The world, the point, the ends and the reward."""
 
-    # Not `task.PADDLE_HOME`: the shipped policy was trained here. The next one moves it.
+    # Not `task.PADDLE_HOME`: the shipped policy was trained here. Move it with the next one.
     home: tuple[Coordinate, Coordinate, Coordinate] = (0.58856, 0.0, 0.05)
     """Home of the paddle, m."""
     height_range: Annotated[tuple[Height, Height], Ascending] = (0.4, 0.5)
@@ -169,7 +169,7 @@ class Track(task.Task):
     # The start, and a control step: reward, end, metrics.
 
     def reset(self, start: task.Start) -> jax.Array:
-        """Whether the ball rises [], bool."""
+        """Whether the ball rises [], bool: it starts at rest."""
         return jnp.array(False)
 
     def step(self, rose: jax.Array, step: task.Step) -> task.TaskStep:
@@ -179,8 +179,8 @@ class Track(task.Task):
         home_height = self.config.home[2]
         flight = task.flight(ball, truth.ball_velocity, self._ground())
 
-        is_high = ball[2] > home_height + MIN_APEX_HEIGHT
-        is_apex = rose & (vertical_velocity <= 0.0) & is_high
+        flies = ball[2] > home_height + MIN_APEX_HEIGHT
+        is_apex = rose & (vertical_velocity <= 0.0) & flies
         x_square, y_square, z_square = jnp.square(ball - paths.point(step.command))
         is_far = x_square + y_square + z_square > self.config.max_distance**2
         is_low = ball[2] < home_height
@@ -277,7 +277,7 @@ class Track(task.Task):
         after_step = apex & has_steps & has_reached
         sums = {
             "apexes": apex,
-            "high": apex & (moment.metrics["height_error"] <= MAX_HEIGHT_ERROR),
+            "accurate": apex & (moment.metrics["height_error"] <= MAX_HEIGHT_ERROR),
             "late": after_step,
             "near": after_step & (error <= MAX_STEP_ERROR),
         }
@@ -318,7 +318,7 @@ class Track(task.Task):
             task.share_of_events(
                 "height",
                 "apexes within 0.1 m of their height",
-                sums["high"],
+                sums["accurate"],
                 sums["apexes"],
                 MIN_APEX_SHARE,
             ),
