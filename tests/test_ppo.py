@@ -237,11 +237,37 @@ def test_settings_that_no_training_can_have_are_refused():
     config = two_state_config(critic_metrics=("n_bounces", "n_bounce"))
     with pytest.raises(UserError, match="names n_bounce, .* choose from .*n_bounces"):
         ppo.PPO(config, TwoStates(1.0), episode_steps=2)
+    config = two_state_config(critic_metrics=("wrold/*",))
+    with pytest.raises(UserError, match=r"names wrold/\*, which the environment does not have"):
+        ppo.PPO(config, TwoStates(1.0), episode_steps=2)
+    assert ppo.PPO(two_state_config(critic_metrics=("world/*",)), TwoStates(1.0), 2)
     # Limits that would change the rate after one minibatch.
     for rate in (0.02, 1e-6):
         with pytest.raises(ValueError, match=f"learning_rate {rate} is not within min_learning"):
             two_state_config(learning_rate=rate, target_kl=0.01)
         assert two_state_config(learning_rate=rate).learning_rate == rate
+
+
+class Climbing(ppo.PPO):
+    """An optimizer whose updates are to be added."""
+
+    def make_optimizer(self):
+        return optax.adam(1.0)
+
+
+class Unmeasured(ppo.PPO):
+    """An update of its own, which tells no metric."""
+
+    def update(self, state, samples, key):
+        return state, {}
+
+
+def test_an_optimizer_that_climbs_and_an_update_without_metrics_are_refused():
+    with pytest.raises(UserError, match="make_optimizer of Climbing turns a gradient around"):
+        Climbing(two_state_config(), TwoStates(1.0), episode_steps=2)
+    algorithm = Unmeasured(two_state_config(), TwoStates(1.0), episode_steps=2)
+    with pytest.raises(UserError, match="returns no metric loss/gradient_norm"):
+        jax.eval_shape(lambda key: algorithm.run(algorithm.init(key), 1), jax.random.key(0))
 
 
 class Silent(ppo.PPO):

@@ -114,8 +114,13 @@ def test_eight_devices_train_as_one(alone: Path, tmp_path: Path, monkeypatch: py
             1,
             "but the number of devices here is 8; give --num-devices 8",
         ),
-        (3, 4096, 1, "num_envs 4096 cannot be divided among 3 devices; choose a power of two"),
-        (4, 4098, 1, "num_envs 4098 cannot be divided among 4 devices"),
+        (
+            3,
+            4096,
+            1,
+            "makes 64 groups of environments, which cannot be divided among 3 devices; choose",
+        ),
+        (4, 4098, 1, "num_envs 4098 with num_minibatches"),
         (2, 4096, 3, "num_seeds 3 cannot be divided among 2 devices; choose a multiple of 2"),
     ],
 )

@@ -27,13 +27,13 @@ from bounce_mjx.world.config import WorldConfig
 _RESTITUTION = 0.85
 # Share of the way back to its place that a ball makes in one flight.
 _RETURN = 0.7
-# Bounds of the paddle's velocity over the ball's.
+# Bounds of minus the ratio of the paddle's velocity to the ball's.
 _MIRRORING = (-0.05, 0.18)
 # Largest tilt of the paddle, rad, and its largest distance from its home, m.
 _MAX_TILT = 0.2
 _MAX_DISTANCE = 0.12
-# Lowest square of the speed of an impact, m^2/s^2, and lowest height of a flight, m.
-_LEAST_SQUARE = 0.3
+# Least squared speed of an impact, m^2/s^2, and least height of a flight, m.
+_LEAST_SQUARED_SPEED = 0.3
 _LEAST_HEIGHT = 0.05
 # Iterations of the inverse kinematics with the Jacobian of the home pose.
 _ITERATIONS = 4
@@ -144,7 +144,7 @@ class MirrorLaw:
         # Speeds of the joints: the ball moves with its velocity, which gravity changes.
         ball_motion = (velocity, jnp.asarray(self._gravity))
         angles, speeds = jax.jvp(joint_angles, (ball, velocity), ball_motion)
-        # While the ball rises there is time; a sudden turn would disturb the impact that ends.
+        # While the ball rises there is time; a sudden turn would disturb the last impact.
         speeds = jnp.where(velocity[2] < 0.0, speeds, 0.0)
 
         start = seen["joint_angles"]
@@ -193,7 +193,7 @@ class MirrorLaw:
         height = ball[2] - contact_height
         rise = jnp.maximum(target - contact_height, _LEAST_HEIGHT)
         leaving = jnp.sqrt(2.0 * gravity * rise)
-        squared_speed = jnp.maximum(velocity[2] ** 2 + 2.0 * gravity * height, _LEAST_SQUARE)
+        squared_speed = jnp.maximum(velocity[2] ** 2 + 2.0 * gravity * height, _LEAST_SQUARED_SPEED)
         # A ball that touches the paddle does not show its energy.
         arriving = jnp.where(height > 0.0, jnp.sqrt(squared_speed), leaving)
         time_of_flight = (velocity[2] + arriving) / gravity
@@ -224,5 +224,5 @@ class MirrorLaw:
 
         # One scalar per joint, and a loop that stays one: on a CPU, XLA would compute the whole
         # pose again for each entry of a sum over an axis, in each of the steps before it. XLA
-        # aborts on a small product of matrices with its option of `join_loops`.
+        # aborts on a small product of matrices with the option of `training.setup.join_loops`.
         return jnp.stack(jax.lax.fori_loop(0, _ITERATIONS, improve, home))

@@ -36,8 +36,8 @@ class PPOConfig(settings.StrictModel):
     decay_steps: settings.Steps = 20_000_000
     """Environment steps over which the upper limit decays exponentially."""
     target_kl: settings.NonNegative = 0.01
-    """Target KL divergence of one update, to which the learning rate adapts; 0 keeps the rate
-    constant, whatever its limits."""
+    """Target KL divergence of the policy from that of the rollout, to which the learning rate
+    adapts after each minibatch; 0 keeps the rate constant, also outside its limits."""
     discount: settings.UnitInterval = 0.98
     """Discount factor of a control step."""
     gae_lambda: settings.UnitInterval = 0.95

@@ -12,30 +12,35 @@ from bounce_mjx.task import Curve
 
 Metrics = dict[str, jax.Array]
 
-# Prefix of the sums that a curve is the mean over.
+# Prefix of a curve's denominator: the sum of what the curve is the mean over.
 _OVER = "over/"
-# Prefixes of the environment's own metrics: what it rewards, and what it alone knows of the world.
-_NO_METRICS_OF_A_TASK = ("reward", "world/", "true/")
+# Metrics that an environment has only where its world is sampled, or its measurements are noisy.
+_WORLD_PREFIXES = ("world/", "true/")
+# What is no curve of its own: rewards are logged for each step, and the world is for a critic.
+_PREFIXES_WITHOUT_CURVE = ("reward", *_WORLD_PREFIXES)
 
 # Ends of an episode that are no task's, by their metrics, which another environment may lack.
 _ENDS = ("non_finite", "too_fast")
 
 
 def matching_metrics(patterns: Sequence[str], known: Iterable[str]) -> tuple[str, ...]:
-    """The known names that match the patterns; a pattern such as world/* matches several.
+    """The known names that match the patterns; a pattern such as world/* matches several, or none
+    where the world is not sampled.
 
     Raises:
-      UserError: a pattern matches none.
+      UserError: a name, or another pattern, matches none.
     """
     known = tuple(known)
     matching = []
     for pattern in patterns:
-        if "*" not in pattern and pattern not in known:
+        matches = fnmatch.filter(known, pattern)
+        may_be_empty = "*" in pattern and pattern.startswith(_WORLD_PREFIXES)
+        if not matches and not may_be_empty:
             raise UserError(
                 f"critic_metrics names {pattern}, which the environment does not have; choose from "
                 f"{', '.join(known)}"
             )
-        matching += fnmatch.filter(known, pattern)
+        matching += matches
     # Each name once, in the order of the patterns.
     return tuple(dict.fromkeys(matching))
 
@@ -78,13 +83,14 @@ def step_metrics(result: vector.VectorStep, groups: int, curves: Sequence[Curve]
 
 
 def _other_curves(metrics: Metrics, curves: Sequence[Curve]) -> list[Curve]:
-    """For each metric that no curve has, its mean over the steps."""
+    """For each other metric of the task, its mean over the steps: for those that no curve shows or
+    is over, but for the ends of an episode."""
     named = {curve.metric for curve in curves} | {curve.over for curve in curves}
     known = named.union(_ENDS)
     return [
-        Curve(f"task/{name}", name)
+        Curve(f"task/{name}", name, over="steps")
         for name in metrics
-        if name not in known and not name.startswith(_NO_METRICS_OF_A_TASK)
+        if name not in known and not name.startswith(_PREFIXES_WITHOUT_CURVE)
     ]
 
 

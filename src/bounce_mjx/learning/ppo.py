@@ -43,16 +43,16 @@ from bounce_mjx.learning.statistics import (
 # Factor by which one minibatch step may change the learning rate.
 _LEARNING_RATE_FACTOR = 1.1
 
-# Minimum number of groups in which samples are shuffled, a power of two, and the maximum number of
-# environments per group if there are more groups.
-_MIN_GROUPS = 64
-_GROUP_ENVS = 64
+# Number of groups in which samples are shuffled, a power of two. If there are more, each has at
+# least _MIN_GROUP_ENVS environments; if fewer, the batch cannot be divided into so many.
+_GROUPS = 64
+_MIN_GROUP_ENVS = 64
 
 # Number of steps of the recursion that are unrolled into one kernel on a GPU. For each result XLA
 # writes out all steps before it, so the kernel's code grows with the square of this number.
 _UNROLL = 16
 
-# Quantities that must be finite, in the order in which an iteration computes them.
+# Quantities that must be finite, in the order in which a fault is named.
 CHECKED = ("reward", "observation", "loss/value", "loss/policy", "gradient", "parameters")
 
 
@@ -109,7 +109,8 @@ class BootstrapInputs(NamedTuple):
 
 class Samples(NamedTuple):
     """Data of an update: [T, B, ...] of a rollout, [G, T * B / G, ...] in groups (`num_groups`),
-    [S, ...] in a minibatch, which `PPO.loss` gets."""
+    [S, ...] in a minibatch. The fields' axes are those of a rollout: in `PPO.loss`, read [S] for
+    [T, B]."""
 
     inputs: jax.Array
     """Normalised inputs of the networks [T, B, N + K]: the first N are the observation, the last K
@@ -129,8 +130,8 @@ class Samples(NamedTuple):
 
     @property
     def raw_inputs(self) -> jax.Array:
-        """The inputs in the units of the environment [T, B, N + K]; one that was more than 10
-        standard deviations from its mean is at these."""
+        """The inputs in the units of the environment [T, B, N + K]. One that was more than 10
+        standard deviations from its mean comes back at 10, and a constant one at its mean."""
         return denormalize(self.inputs, self.normalizer)
 
     def map_arrays(self, function: Callable[[jax.Array], jax.Array]) -> "Samples":
@@ -160,7 +161,8 @@ class LearnerState(NamedTuple):
 
 class PPO:
     """Training as two pure functions, `init` and `run`; `jax.jit` them (the second argument of
-    `run` is static). A subclass may change every method (docs/algorithms.md)."""
+    `run` is static). A subclass may change every method (docs/algorithms.md); its `update` returns
+    the metric loss/gradient_norm, in which a divergence shows."""
 
     Config = PPOConfig
     """Type of the settings; a subclass may add some, which become keys and flags."""
@@ -187,9 +189,12 @@ class PPO:
         """Names of the environment's metrics that the value network sees."""
         self.networks = self.make_networks()
         self.optimizer = self.make_optimizer()
+        if type(self).make_optimizer is not PPO.make_optimizer:
+            self._check_optimizer()
 
     def make_networks(self) -> Networks:
-        """The networks. That of the policy stays as its config says, for all that acts with it."""
+        """The networks. A subclass may change the value network alone: an evaluation, an export and
+        a video make the policy's network anew from the config."""
         return make_networks(
             self.config,
             self.env.observation_size,
@@ -199,10 +204,22 @@ class PPO:
         )
 
     def make_optimizer(self) -> optax.GradientTransformation:
-        """Gradient of the parameters -> direction of a step, which the learning rate scales: Adam
-        on clipped gradients."""
+        """Gradient of all parameters in one array [P] -> what the learning rate scales and a step
+        subtracts [P]: Adam on clipped gradients. So it has the gradient's sign and no learning
+        rate, as `optax.scale_by_adam`, and not as `optax.adam`."""
         clip = optax.clip_by_global_norm(self.config.max_grad_norm)
         return optax.chain(clip, optax.scale_by_adam(eps=1e-5))
+
+    def _check_optimizer(self) -> None:
+        """Refuses an optimizer with which a step would climb the loss."""
+        gradient = jnp.ones(1)
+        direction, _ = self.optimizer.update(gradient, self.optimizer.init(gradient))
+        if direction[0] < 0.0:
+            raise UserError(
+                f"make_optimizer of {type(self).__name__} turns a gradient around, as optax.adam "
+                "does, but a step subtracts what it gives; return one without a learning rate, "
+                "such as optax.scale_by_adam()"
+            )
 
     def init(self, key: jax.Array) -> TrainingState:
         """The state before the first iteration; consumes the key."""
@@ -263,6 +280,7 @@ class PPO:
         if "policy/kl" in minibatch_metrics:
             # How far the whole update has moved the policy: that of the last epoch.
             metrics["policy/kl"] = jnp.mean(minibatch_metrics["policy/kl"][-1])
+        # The rate with which the next update begins.
         metrics["policy/learning_rate"] = self.learning_rate(learned.learning_rate, state.iteration)
         metrics["loss/explained_variance"] = 1.0 - jnp.var(advantage) / jnp.var(value_target)
         metrics["fault"] = fault
@@ -286,7 +304,7 @@ class PPO:
         noise_shape = (config.rollout_length, config.num_envs, self.env.action_size)
         noise = jax.random.normal(noise_key, noise_shape, jnp.float32)
         ranges = vector.ranges_after(self.env, state.iteration, config.batch_steps)
-        # One start for each environment: one that ends twice within a rollout starts twice alike.
+        # One start for each environment: if it ends twice within a rollout, it starts twice alike.
         fresh = vector.first_states(self.env, reset_key, config.num_envs, ranges)
 
         def control_step(carry: tuple, noise: jax.Array) -> tuple:
@@ -299,7 +317,7 @@ class PPO:
             )
             action = policy.mean + policy.std * noise
             env_state, result = vector.step(
-                self.env, env_state, action, None, self.episode_steps, fresh=fresh
+                self.env, env_state, action, key=None, episode_steps=self.episode_steps, fresh=fresh
             )
             # An environment times out at most once in a rollout, because no time limit is shorter.
             final_inputs = self.network_inputs(result.final_observation, result.metrics)
@@ -512,7 +530,7 @@ class PPO:
 
     def learning_rate(self, adapted: jax.Array, iteration: jax.Array) -> jax.Array:
         """The learning rate [] of every minibatch step of an iteration. A subclass with a schedule
-        of its own overrides this, and nothing else changes the rate.
+        of its own overrides this: the KL rule then has no effect, and target_kl may be 0.
 
         Args:
           adapted: the rate that the KL rule has reached [] (`adapt_learning_rate`).
@@ -608,8 +626,8 @@ def num_groups(config: PPOConfig) -> int:
     A device that holds whole groups therefore shuffles only its own samples, and the training does
     not depend on the number of devices.
     """
-    groups = _MIN_GROUPS
-    while 2 * groups * _GROUP_ENVS <= config.num_envs:
+    groups = _GROUPS
+    while 2 * groups * _MIN_GROUP_ENVS <= config.num_envs:
         groups *= 2
     while config.num_envs % groups or (config.batch_steps // groups) % config.num_minibatches:
         groups //= 2
@@ -625,7 +643,7 @@ def group(array: jax.Array, groups: int) -> jax.Array:
 
 
 def take(array: jax.Array, order: jax.Array) -> jax.Array:
-    """Samples [G, n, ...] of each group [G, M, ...] in an order [G, n]."""
+    """Samples [G, n, ...] of those of each group [G, T * B / G, ...] in an order [G, n]."""
     return jax.vmap(lambda samples, indices: samples[indices])(array, order)
 
 
@@ -642,7 +660,7 @@ def random_order(key: jax.Array, size: int) -> jax.Array:
 
     `jax.random.permutation` sorts pairs of a random number and an index, which takes four times as
     long on a CPU as one number with the index in its low bits. Of two equal random numbers the
-    smaller index comes first; where that would happen, one order shuffles another.
+    smaller index comes first; where equal ones are likely, one order shuffles another.
     """
     low_bits = (size - 1).bit_length()
 
@@ -677,10 +695,10 @@ def policy_of(state: TrainingState, observation_size: int) -> Policy:
     return Policy(Normalizer(*of_observation), state.params.policy)
 
 
-def population(trainer: PPO) -> tuple[Callable, Callable]:
+def population(algorithm: PPO) -> tuple[Callable, Callable]:
     """`init` and `run` of S independent runs: keys [S, 2] -> states with S as the first axis of
     every array; metrics are [S, I]."""
-    return jax.vmap(trainer.init), jax.vmap(trainer.run, in_axes=(0, None))
+    return jax.vmap(algorithm.init), jax.vmap(algorithm.run, in_axes=(0, None))
 
 
 def first_fault(
@@ -694,6 +712,9 @@ def first_fault(
       statistics: the statistics that include the rollout.
       minibatch_metrics: each [epochs, minibatches]; the gradient's norm is one of them.
       params: the parameters after the update.
+
+    Raises:
+      UserError: an `update` of a subclass returns none of the metrics in which a fault shows.
     """
     number = {quantity: i for i, quantity in enumerate(CHECKED, start=1)}
     number_of_metric = {
@@ -703,6 +724,11 @@ def first_fault(
     }
     # The loss of a subclass may have other parts.
     names = [name for name in number_of_metric if name in minibatch_metrics]
+    if not names:
+        raise UserError(
+            "the update of the algorithm returns no metric loss/gradient_norm, in which a "
+            "divergence shows; return it for each minibatch step"
+        )
     # A row for each minibatch step, in their order.
     steps = jnp.stack([minibatch_metrics[name].ravel() for name in names], axis=-1)
     numbers_of_steps = len(steps) * [number_of_metric[name] for name in names]

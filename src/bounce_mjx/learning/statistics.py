@@ -75,7 +75,8 @@ def update(statistics: RunningStatistics, batch: jax.Array) -> RunningStatistics
 def normalize(inputs: jax.Array, normalizer: Normalizer) -> jax.Array:
     """Inputs [..., N] in standard deviations from their mean, clipped to +-MAX_NORMALIZED.
 
-    An input that never varied becomes 0, whatever its value. The fused physics keeps the ball's
+    An input that varied by less than about 1.4e-4 (a standard deviation) becomes 0, whatever its
+    value: it counts as constant. The fused physics keeps the ball's
     quaternion and spin constant; on other engines they drift by rounding, and this drift must not
     be magnified into a signal.
     """
@@ -85,6 +86,6 @@ def normalize(inputs: jax.Array, normalizer: Normalizer) -> jax.Array:
 
 
 def denormalize(normalized: jax.Array, normalizer: Normalizer) -> jax.Array:
-    """Inputs [..., N] in their own units, from normalised ones: the inverse of `normalize`, but for
-    an input that was clipped, and one that never varied, which is its mean."""
+    """Inputs [..., N] in their own units, from normalised ones: the inverse of `normalize`. An
+    input that was clipped stays so, and a constant one is its mean."""
     return normalizer.mean + normalizer.std * normalized

@@ -34,7 +34,7 @@ def iterations_per_block(config: TrainConfig) -> int:
 
 
 def each_seed(tree: Any, num_seeds: int) -> list[Any]:
-    """The trees of S seeds from one whose arrays are [S, ...]; with one seed, the tree itself."""
+    """The trees of S seeds from one whose arrays are [S, ...]; with one seed, the one tree."""
     if num_seeds == 1:
         return [tree]
     return [jax.tree.map(lambda x, i=i: x[i], tree) for i in range(num_seeds)]
@@ -53,11 +53,13 @@ class PPOTrainer:
         self._config, self._observation_size = config, env.observation_size
         self.mesh = make_mesh(config.num_devices, config.ppo, config.num_seeds)
         """The devices on which it trains."""
-        trainer = find_algorithm(config.algorithm)(config.ppo, env, episode_steps(config))
-        init, run, make_key = trainer.init, trainer.run, jax.random.PRNGKey
+        algorithm = find_algorithm(config.algorithm)(config.ppo, env, episode_steps(config))
+        init = algorithm.init
+        run = algorithm.run
+        make_key = jax.random.PRNGKey
         self._seeds = np.uint32(config.seed)
         if config.num_seeds > 1:
-            init, run = ppo.population(trainer)
+            init, run = ppo.population(algorithm)
             make_key = jax.vmap(make_key)
             self._seeds = config.seed + np.arange(config.num_seeds, dtype=np.uint32)
         self.state: ppo.TrainingState | None = None
@@ -89,11 +91,13 @@ class PPOTrainer:
         state = self.state_template
         if self._config.num_seeds > 1:
             return jax.tree.map(lambda x: shard(x, _AXIS), state)
+        # The environments are the last axis of each array (`env.vector`).
         env = jax.tree.map(lambda x: shard(x, *[None] * (x.ndim - 1), _AXIS), state.env)
         return jax.tree.map(shard, state)._replace(env=env)
 
     def compile(self, pool: concurrent.futures.Executor) -> concurrent.futures.Future:
-        """Starts the compilation in a pool; the future is done when training can start."""
+        """Starts the compilation in a pool; the future is that of a block's program, and `start`
+        waits for the other."""
         run = jax.jit(
             self._train_block,
             in_shardings=(self._sharding,),
@@ -101,11 +105,11 @@ class PPOTrainer:
             donate_argnums=0,
             compiler_options=compiler_options(tunes_products=True),
         )
-        self._run = pool.submit(run.lower(self.state_template).compile)
+        self._run_program = pool.submit(run.lower(self.state_template).compile)
         options = compiler_options(runs_once=True)
         init = jax.jit(self._initial_state, out_shardings=self._sharding, compiler_options=options)
-        self._init = pool.submit(init.lower(self._seeds).compile)
-        return self._run
+        self._init_program = pool.submit(init.lower(self._seeds).compile)
+        return self._run_program
 
     def start(
         self, state: Any = None, networks: tuple[ppo.Params, RunningStatistics] | None = None
@@ -117,12 +121,12 @@ class PPOTrainer:
             their inputs.
         """
         if state is None:
-            self.state = jax.block_until_ready(self._init.result()(self._seeds))
+            self.state = jax.block_until_ready(self._init_program.result()(self._seeds))
         if networks is not None:
             state = multihost_utils.process_allgather(self.state, tiled=True)
-            own = state.params, state.statistics
+            former = state.params, state.statistics
             params, statistics = jax.tree.map(
-                lambda old, new: np.broadcast_to(new, old.shape), own, networks
+                lambda old, new: np.broadcast_to(new, old.shape), former, networks
             )
             state = state._replace(params=params, statistics=statistics)
         if state is not None:
@@ -135,7 +139,7 @@ class PPOTrainer:
           Metrics, each [S, I]. "fault" is the number, from 1, of the first quantity of `checked`
           that was not finite in an iteration; 0 if all were finite.
         """
-        self.state, metrics = self._run.result()(self.state)
+        self.state, metrics = self._run_program.result()(self.state)
         shape = (self._config.num_seeds, -1)
         return {name: np.asarray(x).reshape(shape) for name, x in metrics.items()}
 
@@ -175,10 +179,18 @@ def make_mesh(num_devices: int | None, config: PPOConfig, num_seeds: int = 1) ->
     if jax.process_count() > 1 and num_devices < len(devices):
         raise UserError(f"num_devices is {num_devices}, but the hosts have {len(devices)}; omit it")
     if num_seeds > 1:
-        shared, name, advice = num_seeds, f"num_seeds {num_seeds}", f"a multiple of {num_devices}"
+        if num_seeds % num_devices:
+            raise UserError(
+                f"num_seeds {num_seeds} cannot be divided among {num_devices} devices; choose a "
+                f"multiple of {num_devices}"
+            )
     else:
-        shared, name = ppo.num_groups(config), f"num_envs {config.num_envs}"
-        advice = "a power of two as num_devices and as num_envs"
-    if shared % num_devices:
-        raise UserError(f"{name} cannot be divided among {num_devices} devices; choose {advice}")
+        groups = ppo.num_groups(config)
+        if groups % num_devices:
+            raise UserError(
+                f"num_envs {config.num_envs} with num_minibatches {config.num_minibatches} makes "
+                f"{groups} groups of environments, which cannot be divided among {num_devices} "
+                f"devices; choose a power of two as num_envs, and a divisor of {groups} as "
+                "num_devices"
+            )
     return Mesh(devices[:num_devices], (_AXIS,))

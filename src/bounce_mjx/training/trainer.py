@@ -25,7 +25,8 @@ class Snapshot(NamedTuple):
 
 
 class Trainer(Protocol):
-    """S independent runs of one algorithm, one for each seed.
+    """S independent runs of one algorithm, one for each seed, whose policies have the network that
+    the config's `ppo` describes.
 
     The job makes one by calling a class, or a function, with the run's config and its environment;
     it may raise a UserError there. Then it calls `compile`, `start` once, and `run` for each block;
@@ -42,22 +43,26 @@ class Trainer(Protocol):
         """Shapes and types of the state, `jax.ShapeDtypeStruct` as its leaves."""
 
     def compile(self, pool: concurrent.futures.Executor) -> concurrent.futures.Future:
-        """Starts the compilation in a pool; the future is done when training can start."""
+        """Starts the compilation in a pool; the future is that of a block's program, and `start`
+        waits for any other."""
 
     def start(self, state: Any = None, networks: Any = None) -> None:
         """Starts from the seeds, or from the state of a `snapshot`.
 
         Args:
           networks: those of an earlier training, which each seed starts with, and the statistics of
-            their inputs (`checkpoints.read_start`).
+            their inputs (`checkpoints.read_start`); not with a state.
         """
 
     def run(self) -> Metrics:
-        """Trains for a block of I iterations.
+        """Trains for a block of I iterations (`iterations_per_block`), each of `ppo.batch_steps`
+        environment steps.
 
         Returns:
-          Metrics, each [S, I]. "fault" is the number, from 1, of the first quantity of `checked`
-          that was not finite in an iteration; 0 if all were finite.
+          Metrics, each [S, I]. The job needs three: "fault", the number, from 1, of the first
+          quantity of `checked` that was not finite in an iteration, and 0 if all were finite;
+          "episode/ended", how many episodes ended; "task/non_finite", how many of them because the
+          physics was not finite.
         """
 
     def snapshot(self) -> Snapshot:
