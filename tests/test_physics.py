@@ -1,11 +1,13 @@
 """The fused engine steps as MuJoCo's C engine and as MJX, and refuses what it does not compute."""
 
 import re
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend.core import Jaxpr, Literal
 
 from against_c import (
     BATCH,
@@ -27,6 +29,8 @@ from against_c import (
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics import Control, PhysicsState, make_engine, mjx_engine
 from bounce_mjx.physics.convergence import solver_warning
+from bounce_mjx.physics.fused import dynamics
+from bounce_mjx.physics.fused.model import read_model as fused_model
 from bounce_mjx.physics.support import unsupported_feature
 from bounce_mjx.robot.model import Addresses, find_addresses
 
@@ -249,6 +253,33 @@ def test_supported_models_step_as_mujoco_does(mj_model, name, float64):
     shipped, _ = c_steps(mj_model, states)
     change = np.max(np.abs(expected.qvel - reordered(at, shipped).qvel))
     assert (change > 1e-3) == (name in SUPPORTED)
+
+
+def foldable_operations(program: Jaxpr) -> list[str]:
+    """Sums with 0, and products with 0, 1 or -1, in a program and the functions that it calls."""
+    trivial = {"add": (0.0,), "sub": (0.0,), "mul": (0.0, 1.0, -1.0)}
+    found = []
+    for equation in program.eqns:
+        # Of `not_inlined`, whose product with 1 has a purpose.
+        if equation.params.get("name") == "_same":
+            continue
+        for inner in jax.tree.leaves(list(equation.params.values())):
+            if hasattr(inner, "jaxpr"):
+                found += foldable_operations(inner.jaxpr)
+        constants = [x.val for x in equation.invars if isinstance(x, Literal)]
+        if any(value in trivial.get(equation.primitive.name, ()) for value in constants):
+            found.append(str(equation))
+    return found
+
+
+def test_every_constant_of_a_robot_folds():
+    """The zeros and ones of its axes and frames cost nothing, which the speed relies on."""
+    model = fused_model(edited('condim="1"', 'condim="3"'))
+    state = PhysicsState(jnp.array(model.mj_model.qpos0), jnp.zeros(model.mj_model.nv))
+    ctrl = jnp.zeros(model.mj_model.nu)
+    step = partial(dynamics.step, model, MODEL)
+    program = jax.make_jaxpr(lambda state, ctrl: step(state, Control(ctrl)))(state, ctrl)
+    assert foldable_operations(program.jaxpr) == []
 
 
 UNSUPPORTED = {

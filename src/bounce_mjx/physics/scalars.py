@@ -4,7 +4,7 @@ A scalar is a Python float (known while tracing) or a JAX array (known when runn
 the entries 0 and 1 of a robot's fixed rotations vanish here, before XLA sees them. A physics step
 has thousands of operations: `jax.lax` traces them in a fraction of the time of `jax.numpy`.
 
-The rule for its users, stated here alone:
+The rule for its users, stated here alone (a test looks for operations that it would have folded):
 
 - Where an operand may be a constant, write `add`, `sub`, `mul` and `neg`, or `Vec` and `Mat`, which
   use them: a sum with 0 and a product with 0, 1 or -1 fold.

@@ -24,7 +24,7 @@ from bounce_mjx.physics.fused import chain, joint_friction
 from bounce_mjx.physics.fused.ball import Ball, free_acceleration, move_ball
 from bounce_mjx.physics.fused.constraint import ConstraintEffects, fwd_constraint
 from bounce_mjx.physics.fused.model import FusedModel, Servo
-from bounce_mjx.physics.scalars import Scalar, Vec, add, mul, not_inlined, sub
+from bounce_mjx.physics.scalars import Scalar, Vec, add, dot, mul, not_inlined, sub
 
 Keep = Callable[[Any], Any]
 """`not_inlined` for a long program, in which XLA would compute shared values again and again; the
@@ -164,7 +164,8 @@ def servo_force(
     force limit. The limit of the joint does not change MuJoCo's derivative."""
     if servo.ctrl_range is not None:
         target = jnp.clip(target, *servo.ctrl_range)
-    force = servo.gain * target + servo.stiffness * q + servo.damping * v + servo.bias
+    force = dot((servo.gain, servo.stiffness, servo.damping), (target, q, v))
+    force = add(force, servo.bias)
     derivative = servo.damping
     if servo.force_range is not None:
         least, most = servo.force_range

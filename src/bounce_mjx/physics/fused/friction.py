@@ -89,7 +89,8 @@ def edge_regulariser(model: ContactModel, normal_regulariser: Scalar) -> Scalar:
       normal_regulariser: that of the normal force without friction, 1/kg.
     """
     squared = mul(model.friction[0], model.friction[0])
-    return 2.0 * (mul(squared, 1.0 / model.impratio) * normal_regulariser) * add(1.0, squared)
+    factor = mul(mul(2.0 / model.impratio, squared), add(1.0, squared))
+    return mul(factor, normal_regulariser)
 
 
 class _Pyramid(NamedTuple):
