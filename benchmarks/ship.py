@@ -139,7 +139,7 @@ def write_policy(
     Raises:
       UserError: the folder cannot be written.
     """
-    report, physics = evaluation
+    report = evaluation.report
     policy = read_policy(checkpoint, trained_with)
     start = read_networks(checkpoint, trained_with)[:2] if networks else None
     made_by = load_results(checkpoint.run)
@@ -153,7 +153,7 @@ def write_policy(
         "evaluation": {
             "command": f"bounce-mjx eval {name} --nominal",
             "seed": DEFAULT_SEED,
-            "physics": physics,
+            "physics": evaluation.engine,
             "device": jax.devices()[0].device_kind,
             "jax": jax.__version__,
         },

@@ -344,13 +344,13 @@ def test_new_term_of_the_rewards_page_is_a_term(tmp_path: Path) -> None:
     (tmp_path / "straight.py").write_text(example)
     task = find_task(f"{tmp_path}/straight.py:Straight")
     config = task.Config(reward={"sideways_velocity": {"weight": 2.0}}).reward
-    names = [field.name for field in dataclasses.fields(RewardInputs) if field.name != "home"]
+    names = [field.name for field in dataclasses.fields(RewardInputs) if field.name != "reward"]
     inputs = {name: np.zeros(3) for name in names}
     inputs |= {"n_bounces": np.zeros(()), "target_height": np.zeros(())}
     inputs |= {"ball_velocity": np.array([3.0, 4.0, 1.0]), "bounced": np.array(False)}
     for height, expected in ((0.3, -2.0 * 25.0), (0.05, 0.0)):  # flying, and at the paddle
         inputs["ball_position"] = np.array([0.0, 0.0, height])
-        terms = weighted_terms(config, RewardInputs(**inputs, home=config))
+        terms = weighted_terms(config, RewardInputs(**inputs, reward=config))
         assert float(terms["sideways_velocity"]) == pytest.approx(expected)
     assert terms.keys() == {*term_names(BounceReward), "sideways_velocity"}
 

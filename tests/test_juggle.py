@@ -191,7 +191,7 @@ def test_each_result_is_judged_by_its_own_figure() -> None:
             "hits": np.full(count, 70.0),
             "in_turn": np.full(count, 70.0),
             "apexes": np.full(count, 60.0),
-            "high": np.full(count, 58.0),
+            "accurate": np.full(count, 58.0),
         },
         maxima={"touched": np.zeros(count)},
         lasted=np.ones(count, bool),
@@ -203,7 +203,7 @@ def test_each_result_is_judged_by_its_own_figure() -> None:
         "kept": good._replace(lasted=~few),
         "turns": good._replace(sums=good.sums | {"in_turn": np.full(count, 69.0)}),
         "apart": good._replace(maxima={"touched": few.astype(float)}),
-        "height": good._replace(sums=good.sums | {"high": np.full(count, 56.0)}),
+        "height": good._replace(sums=good.sums | {"accurate": np.full(count, 56.0)}),
     }
     for name, episodes in cases.items():
         assert [r.name for r in JUGGLE.results(episodes) if not r.passed] == [name]

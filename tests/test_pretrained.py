@@ -1,6 +1,7 @@
 """The shipped policies meet their results, are found by name, and are what the script ships."""
 
 import json
+import runpy
 from pathlib import Path
 
 import jax
@@ -13,7 +14,7 @@ from bounce_mjx.commands.train import read_command
 from bounce_mjx.deploy.export import export_onnx
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.config import EvaluationOptions
-from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
+from bounce_mjx.evaluation.policy_evaluation import PolicyEvaluation, evaluate_policy
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import make_networks, networks_of
 from bounce_mjx.resources import ARM_POLICIES, POLICIES, TASK_POLICIES, resource_path
@@ -115,6 +116,25 @@ def test_the_policy_of_an_arm_meets_all_results_in_its_named_world() -> None:
 def test_the_policy_keeps_two_balls_up() -> None:
     values = {result.name: result.value for result in measured("juggle", 64).results}
     assert values["kept"] > 95.0 and min(values["turns"], values["apart"], values["height"]) > 98.0
+
+
+def test_a_shipped_policy_is_shipped_again_as_it_is(tmp_path: Path) -> None:
+    """With the report of another measurement."""
+    write_policy = runpy.run_path(str(FOLDER.parent / "benchmarks/ship.py"))["write_policy"]
+    folder = resource_path(POLICIES["track"])
+    checkpoint, config = best_checkpoint(folder), load_run_config(folder)
+    shipped = json.loads((folder / "results.json").read_text(encoding="utf-8"))
+    report = pydantic.TypeAdapter(Report).validate_python(shipped)
+    evaluation = PolicyEvaluation(
+        report, engine="fused", warning=None, conditions=None, statistics=None
+    )
+    write_policy(checkpoint, config, evaluation, tmp_path / "again", "track")
+    again = json.loads((tmp_path / "again" / "results.json").read_text(encoding="utf-8"))
+    for machine in ("device", "jax"):
+        del shipped["evaluation"][machine], again["evaluation"][machine]
+    assert again == shipped
+    assert load_run_config(tmp_path / "again") == config
+    assert (tmp_path / "again" / "track.onnx").read_bytes() == (folder / "track.onnx").read_bytes()
 
 
 def test_its_training_command_gives_its_config(shipped: dict, monkeypatch) -> None:

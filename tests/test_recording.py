@@ -14,7 +14,7 @@ from bounce_mjx.evaluation.statistics import accumulate, empty_statistics, paddl
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.learning.statistics import init_normalizer
-from bounce_mjx.task import Histogram, Hits, Recording
+from bounce_mjx.task import Histogram, Hits, Kinematics, Moment, Recording
 from bounce_mjx.task.bounce import Bounce
 
 EPISODES, RECORDED = 6, 4
@@ -131,6 +131,33 @@ def test_drawn_bounces_are_settled_and_before_the_end() -> None:
     _, hits = drawn(recording, control_dt=1.0)
     assert np.argwhere(hits.steps).tolist() == [[2, 0], [2, 1], [4, 0]]
     assert (recording.metrics["bounced"][0] == 1.0).all()
+
+
+def test_no_bounce_is_drawn_that_the_result_does_not_judge() -> None:
+    """Of two episodes whose target changes: drawn are the tally's `settled_bounces`."""
+    recording = made_up(8, 2)
+    recording.metrics["bounced"][:] = 1.0
+    recording.command["target_height"][:] = 0.5
+    # Within the first 2 s, and after them.
+    changes = {0: 1, 1: 4}
+    for episode, change in changes.items():
+        recording.command["target_height"][change:, episode] = 0.6
+    _, hits = drawn(recording, control_dt=1.0)
+    task = Bounce(EnvConfig(episode_seconds=8.0).model_copy(update={"control_dt": 1.0}))
+    truth = Kinematics(None, jnp.zeros(3), None, None, jnp.zeros(3), None, None)
+    metrics = {"bounced": 1.0, "n_bounces": 1.0, "apex_error": 0.0, "apex_offset": 0.0}
+    for step, episode in np.ndindex(8, 2):
+        seconds = step + 1.0
+        since_change = step - changes[episode]
+        moment = Moment(
+            truth=truth,
+            command={},
+            state=None,
+            metrics=metrics,
+            seconds=seconds,
+            command_seconds=seconds if since_change < 0 else float(since_change),
+        )
+        assert hits.steps[step, episode] == task.tally(moment).sums["settled_bounces"]
 
 
 def test_apex_errors_have_a_sign() -> None:

@@ -18,7 +18,7 @@ X_TARGET = 0.58856
 
 
 def terms_of(config: BounceReward, inputs: dict[str, jax.Array]) -> dict[str, jax.Array]:
-    return weighted_terms(config, RewardInputs(**inputs, home=config))
+    return weighted_terms(config, RewardInputs(**inputs, reward=config))
 
 
 def evaluate(config: BounceReward, states: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -6,7 +6,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -105,6 +105,58 @@ def test_a_command_that_the_policy_does_not_see_is_refused() -> None:
 
     with pytest.raises(UserError, match="not see the command velocity, which varies from 0 to 1"):
         Env(Config())
+
+
+def test_settings_without_a_task_are_refused() -> None:
+    with pytest.raises(UserError, match="WorldConfig has the settings of a world without a task"):
+        Env(task.WorldConfig())
+
+
+class _Observation(task.ObservationConfig):
+    seconds: Annotated[int, task.Quantity(1, "s")] = 1
+
+
+class _Config(rest_task.Config):
+    observation: _Observation = _Observation()
+
+
+class _Forgetful(rest_task.Rest):
+    """It returns the quantities `first` at a reset and `later` after each step."""
+
+    Config = _Config
+    first: ClassVar[tuple[str, ...]] = ("seconds",)
+    later: ClassVar[tuple[str, ...]] = ("seconds",)
+
+    def first_quantities(self, measured: task.Values) -> tuple[None, task.Values]:
+        return None, {name: jnp.zeros(1) for name in self.first}
+
+    def next_quantities(
+        self, memory: None, histories: task.Values, measured: task.Values
+    ) -> tuple[None, task.Values]:
+        return None, {name: jnp.zeros((1, 1)) for name in self.later}
+
+
+@pytest.mark.parametrize(
+    "first, later, words",
+    [
+        ((), ("seconds",), "first_quantities .* lacks the observation's quantity seconds"),
+        (("seconds", "action"), ("seconds",), "first_quantities .* has the quantity action, which"),
+        (("seconds",), (), "next_quantities .* returns the histories none; return .*: seconds"),
+        (("seconds",), ("seconds", "more"), "returns the histories seconds, more; return"),
+    ],
+)
+def test_a_task_returns_the_quantities_of_its_observation(
+    first: tuple[str, ...], later: tuple[str, ...], words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_Forgetful, "first", first)
+    monkeypatch.setattr(_Forgetful, "later", later)
+    env = Env(_Config())
+
+    def reset_and_step(key: jax.Array) -> jax.Array:
+        return env.step(env.reset(key), jnp.zeros(6)).obs
+
+    with pytest.raises(UserError, match=words):
+        jax.eval_shape(reset_and_step, jax.random.key(0))
 
 
 def test_commands_are_observed_in_one_order() -> None:
@@ -307,9 +359,23 @@ def test_a_package_can_have_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
     (info / "entry_points.txt").write_text(f"[{registry.GROUP}]\ngone = my_tasks:Gone\n")
     with pytest.raises(UserError, match="the task gone cannot be imported .*; install the package"):
         find_task("gone")
+    for attribute in ("Config", "__name__", "task.Task"):
+        (info / "entry_points.txt").write_text(f"[{registry.GROUP}]\nno = my_tasks:{attribute}\n")
+        words = "cannot be imported" if "." in attribute else "is no subclass of Task; correct the"
+        with pytest.raises(UserError, match=f"the task no .*{words}"):
+            find_task("no")
     (info / "entry_points.txt").write_text(f"[{registry.GROUP}]\nlow = my_tasks:Dribble\n")
     config = read_preset(None, task="low")
     assert "task: low\n" in dump_config(config) and config.log_dir == Path("runs/dribble")
+
+
+def test_a_tasks_class_without_a_config_is_one_sentence() -> None:
+    """The remedy is right for a task from scratch and for one that extends another."""
+    for base, extended in ((task.Task, "task.WorldConfig"), (rest_task.Rest, "Config")):
+        with pytest.raises(UserError, match=rf"no Config .* write Config, .* extends {extended}$"):
+            type("Mine", (base,), {})
+    with pytest.raises(UserError, match="the Config of the task Mine is .*; give a class that"):
+        type("Mine", (task.Task,), {"Config": dict})
 
 
 def test_a_robot_serves_another_task() -> None:
@@ -318,6 +384,11 @@ def test_a_robot_serves_another_task() -> None:
     config, bounce = read_preset(preset, robot, DRIBBLE).env, read_preset(preset, robot).env
     assert config.mjcf == bounce.mjcf and config.robot == bounce.robot
     assert config.default_joint_angles == bounce.default_joint_angles
+    # A viewer offers targets over the paddle, as far as over that of the package's own arm.
+    lowest, highest = bounce.commands["target_height"].span
+    assert (lowest, highest) == pytest.approx(
+        np.add(bounce.reward.paddle_home_height, (0.25, 0.75))
+    )
     env = Env(config)
     truth = env.kinematics(jax.jit(env.reset)(jax.random.PRNGKey(0)).pipeline_state)
     above = np.asarray(truth.ball_position - truth.paddle_position)

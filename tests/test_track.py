@@ -121,10 +121,49 @@ def test_the_aim_is_the_point_at_the_next_apex() -> None:
     assert np.linalg.norm(aim - np.array(at(0.0)) + (0.6, 0.0)) > 0.05
 
 
-def test_a_jump_of_the_point_has_no_velocity() -> None:
-    np.testing.assert_allclose(
-        seen_aim([(0.6, 0.0), (0.6, 0.0), (0.7, 0.0)]), (0.1, 0.0), atol=1e-6
-    )
+def test_after_a_jump_the_aim_is_that_of_the_new_velocity() -> None:
+    """At a reset, a new sample or a step of the hexagon the point jumps, along any direction. In
+    that step it has no velocity; from the next one on, its own, and no acceleration of the jump."""
+    seconds = np.sqrt(2 * (0.4 - 0.0725) / 9.81) + np.sqrt(2 * (0.5 - 0.0725) / 9.81)
+    velocity = np.array([0.02, -0.25])
+
+    def moving_from(x: float, y: float) -> list[tuple[float, float]]:
+        return [tuple((x, y) + velocity * DT * step) for step in range(4)]
+
+    with jax.enable_x64(True):
+        for jump in ((0.1, 0.0), (0.1, 0.009), (-0.004, 0.1), (0.07, 0.07)):
+            before = [(0.6 - 1e-4 * step, 0.0) for step in (3, 2, 1, 0)]
+            after = moving_from(0.6 + jump[0], jump[1])
+            for points, jumps_at in ((after, 0), (before + after, len(before))):
+                np.testing.assert_allclose(
+                    seen_aim(points[: jumps_at + 1]), np.subtract(after[0], (0.6, 0.0)), atol=1e-9
+                )
+                for now in (1, 2, 3):
+                    aim = seen_aim(points[: jumps_at + now + 1])
+                    expected = after[now] + velocity * seconds - (0.6, 0.0)
+                    np.testing.assert_allclose(aim, expected, atol=1e-9)
+
+
+def test_no_path_accelerates_like_a_jump() -> None:
+    """Also the tightest and fastest paths that the settings admit."""
+    for settings in ({}, {"speed_range": (1.0, 1.0)}, {"path_size": 0.03}):
+        config = Config(**settings)
+        track = Track(config)
+        phase = np.linspace(0.0, 1.0, 2001)
+        accelerations = []
+        for path in NOT_STEPS:
+            turns_a_second = config.speed_range[1] / (
+                2.0 * np.pi * config.path_size * paths.FASTEST[path]
+            )
+            for course in np.linspace(0.0, 1.0, 50, endpoint=False):
+                values = {"path": path, "course": course}
+                point = paths.offset(values, config.path_size, phase, np)[:2]
+                seconds = (phase[1] - phase[0]) / turns_a_second
+                second_difference = np.diff(point, n=2, axis=1) / seconds**2
+                accelerations.append(np.linalg.norm(second_difference, axis=0).max())
+        assert max(accelerations) < track._jump_acceleration()
+        greatest = paths.SHARPEST * config.speed_range[1] ** 2 / config.path_size
+        np.testing.assert_allclose(max(accelerations), greatest, rtol=1e-3)
 
 
 def test_every_sampled_path_has_its_middle_at_home() -> None:

@@ -26,10 +26,14 @@ _FIELDS = "pair_{} geom_{} jnt_{} dof_{} eq_{} tendon_{}_lim tendon_{}_fri".spli
 
 # Damping ratios of the contact, and the measured restitution: the mean of the drops on the held
 # paddle of tests/test_randomization.py, at 1, 2, 3 and 4 m/s and eight phases of the physics step.
+# The last ratio is of no drop: by it, each ratio between has a restitution of its own, from which
+# it follows again.
 _DROPS = (
     (0.0, 0.993), (0.005, 0.98), (0.01, 0.965), (0.0152, 0.95), (0.032, 0.90), (0.05, 0.85),
     (0.0697, 0.80), (0.0921, 0.75), (0.116, 0.70), (0.13, 0.674), (0.16, 0.622), (0.2, 0.565),
     (0.2455, 0.50), (0.2873, 0.45), (0.3352, 0.40),
+    (0.4, 0.344), (0.5, 0.275), (0.6, 0.222), (0.8, 0.150), (1.0, 0.104), (1.3, 0.063),
+    (1.6, 0.043), (100.0, 0.0),
 )  # fmt: skip
 
 

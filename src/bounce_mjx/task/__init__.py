@@ -11,10 +11,10 @@
     catch.py     a thrown ball comes to rest on the paddle
     juggle.py    two or three balls on one paddle
 
-A task's file reads `from bounce_mjx import task`, and has each of the names below as `task.NAME`;
-the settings and the observation of the world, which it extends, are among them. It goes in this
-order: constants, reward terms, observation, `Config`, then the task with its start, its step
-(reward, end, metrics), its quantities of the observation, its results, and what is shown.
+A task's file reads `from bounce_mjx import task`, and has each name that is imported below as
+`task.NAME`; the settings and the observation of the world, which it extends, are among them. It
+goes in this order: constants, reward terms, observation, `Config`, then the task with its start,
+its step (reward, end, metrics), its quantities of the observation, its results, and what is shown.
 """
 
 from bounce_mjx.config.settings import StrictModel

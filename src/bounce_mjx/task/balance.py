@@ -18,7 +18,8 @@ LIFT = 0.003
 """Height of the ball over its rest on the paddle at a reset, m, because the noise of the joint
 angles lifts the paddle by up to 2.5 mm."""
 START_HEIGHT = 0.0225 + LIFT
-"""The same over the paddle's centre, for the project's own ball and paddle, m."""
+"""Height of the ball over the paddle's centre at a reset, for the project's own ball and paddle,
+m."""
 LOST_DISTANCE = 0.1
 """The episode ends when the ball is farther from the paddle's centre, m."""
 LOST_DEPTH = 0.02
@@ -76,6 +77,7 @@ class Config(task.WorldConfig):
 
     @classmethod
     def settings_at(cls, paddle: tuple[float, float, float]) -> dict[str, Any]:
+        """The ball on the paddle, in place of the world's start over it."""
         x, y, z = paddle
         return {"ball_init_pos": [x, y, round(z + START_HEIGHT, 4)]}
 
@@ -158,6 +160,7 @@ class Balance(task.Task):
     # The results.
 
     def tally(self, moment: task.Moment) -> task.Tally:
+        # Between two steps, so that rounding does not decide.
         is_judged = moment.seconds > SETTLING_SECONDS + 0.5 * self.config.control_dt
         return task.Tally(
             sums={

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from bounce_mjx import task
 from bounce_mjx.config import settings
-from bounce_mjx.lazy import jax, jnp
+from bounce_mjx.lazy import jax, jnp, np
 from bounce_mjx.task.bounce_rewards import BounceReward, RewardInputs
 
 SETTLING_SECONDS = 2.0
@@ -42,6 +42,9 @@ UPWARD_SPEED_TARGETS = (0.4, 0.6)
 """Target heights at which the upward speed is judged, m, for a paddle with the home height
 `HOME_HEIGHT`; another home height shifts them."""
 
+OFFERED_TARGETS = (0.3, 0.8)
+"""Target heights that a viewer offers, m, for a paddle with the home height `HOME_HEIGHT`."""
+
 HOME_HEIGHT = 0.05
 """Home height of the original specification, m."""
 
@@ -54,11 +57,11 @@ class BounceObservation(task.ObservationConfig):
     """Target height."""
     apex_error: Annotated[task.History, task.Quantity(1, "m")] = 0
     """Highest measured ball position minus the target height, of the flights before the last
-    bounces."""
+    bounces: with its sign, unlike the metric of this name."""
     bounce_position: Annotated[task.History, task.Quantity(2, "m")] = 0
     """Measured horizontal position of the ball at the lowest point of the last bounces."""
     bounce_interval: Annotated[task.History, task.Quantity(1, "s")] = 0
-    """Time between the last bounces."""
+    """Time between the last bounces; of the first one, since the reset."""
     bounce_joint_angles: Annotated[task.History, task.Quantity(None, "rad")] = 0
     """Measured joint angles at the lowest points of the last bounces."""
     bounce_joint_velocities: Annotated[task.History, task.Quantity(None, "rad/s")] = 0
@@ -150,7 +153,18 @@ class BounceConfig(task.WorldConfig):
     def commands(self) -> dict[str, task.Command]:
         """The target height."""
         lowest, highest = self.target_height_range
-        return {"target_height": task.Command(lowest, highest, "m", least=1e-3, span=(0.3, 0.8))}
+        least = 1e-3
+        lowest_offered, highest_offered = OFFERED_TARGETS
+        span = (
+            max(least, round(lowest_offered + self.home_lift, 4)),
+            max(least, round(highest_offered + self.home_lift, 4)),
+        )
+        return {"target_height": task.Command(lowest, highest, "m", least=least, span=span)}
+
+    @property
+    def home_lift(self) -> float:
+        """Height of the paddle's home over that of the specification, m."""
+        return self.reward.paddle_home_height - HOME_HEIGHT
 
 
 class BounceState(NamedTuple):
@@ -222,7 +236,7 @@ class Bounce(task.Task):
             action=step.action,
             last_action=step.last_action,
             joint_velocity=truth.joint_velocities,
-            home=config.reward,
+            reward=config.reward,
         )
         apex_offset = state.apex - target
         fell = ball[2] < config.min_ball_height
@@ -236,6 +250,7 @@ class Bounce(task.Task):
                 "bounced": bounced,
                 "n_bounces": after.n_bounces,
                 "ball_xy_error": inputs.err_xy,
+                # Without a sign; the offset has one.
                 "apex_error": jnp.where(bounced, jnp.abs(apex_offset), 0.0),
                 "apex_offset": jnp.where(bounced, apex_offset, 0.0),
             },
@@ -286,7 +301,10 @@ class Bounce(task.Task):
         self, memory: MeasuredFlight, histories: task.Values, measured: task.Values
     ) -> tuple[MeasuredFlight, task.Values]:
         """A measured bounce starts when the ball is first measured near the paddle. Its position
-        and joints are taken at the ball's lowest measured point."""
+        and joints are taken at the ball's lowest measured point.
+
+        `ball_picture` is the measured `ball_position`, by the name that exported policies have.
+        """
         height = measured["ball_picture"][2]
         is_low = height < measured["paddle_position"][2] + self.config.bounce_max_distance
         starts = is_low & ~memory.is_low
@@ -322,6 +340,7 @@ class Bounce(task.Task):
         bounced = metrics["bounced"] > 0
         x = moment.truth.ball_position[0]
         vz = moment.truth.ball_velocity[2]
+        # Between two steps, so that rounding does not decide.
         settling = SETTLING_SECONDS + 0.5 * self.config.control_dt
         settled = moment.seconds > settling
         judged = bounced & (moment.command_seconds > settling)
@@ -334,6 +353,7 @@ class Bounce(task.Task):
                 "settled_bounces": judged,
                 "accurate_bounces": judged & accurate,
                 "apex_error": jnp.where(judged, metrics["apex_error"], 0.0),
+                # For comparisons of policies (benchmarks/rank.py), as are the hits.
                 "apex_error^2": jnp.where(judged, jnp.square(metrics["apex_error"]), 0.0),
                 "apex_offset": jnp.where(judged, metrics["apex_offset"], 0.0),
                 "hits": bounced,
@@ -387,7 +407,7 @@ class Bounce(task.Task):
     def _upward_speed_condition(self, episodes: task.Episodes) -> str:
         """The condition of the upward speed's bounds, in words, if the episodes do not meet it."""
         # Rounded, as a config has the heights of another arm with four digits.
-        lift = self.config.reward.paddle_home_height - HOME_HEIGHT
+        lift = self.config.home_lift
         lowest = round(UPWARD_SPEED_TARGETS[0] + lift, 4)
         highest = round(UPWARD_SPEED_TARGETS[1] + lift, 4)
         lowest_target, highest_target = episodes.commands["target_height"]
@@ -407,9 +427,10 @@ class Bounce(task.Task):
     # What is shown.
 
     def plots(self, recording: task.Recording) -> tuple[task.Histogram | task.Hits, ...]:
-        """Apex errors, and where the ball hits the paddle."""
-        bounces = (recording.metrics["bounced"] > 0) & recording.running
-        bounces[: round(SETTLING_SECONDS / self.config.control_dt)] = False
+        """Apex errors, and where the ball hits the paddle, of the bounces that the result `height`
+        judges."""
+        bounced = (recording.metrics["bounced"] > 0) & recording.running
+        bounces = bounced & self._has_settled(recording.command["target_height"])
         errors = 100.0 * recording.metrics["apex_offset"][bounces]
         return (
             task.Histogram(
@@ -417,6 +438,19 @@ class Bounce(task.Task):
             ),
             task.Hits("hits on the paddle, cm", bounces),
         )
+
+    def _has_settled(self, target_heights: np.ndarray) -> np.ndarray:
+        """Whether more than `SETTLING_SECONDS` have passed since the reset and since each change of
+        the target height [T, K], bool.
+
+        Args:
+          target_heights: after each step of K episodes [T, K], m.
+        """
+        steps = np.arange(len(target_heights))[:, None]
+        is_new = np.diff(target_heights, axis=0, prepend=target_heights[:1]) != 0.0
+        # The reset is before the first step.
+        last_change = np.maximum.accumulate(np.where(is_new, steps, -1), axis=0)
+        return steps - last_change > round(SETTLING_SECONDS / self.config.control_dt)
 
     def markers(self, command: dict[str, float], metrics: Any) -> tuple[task.Marker, ...]:
         """A disc at the target height, and the outline of the paddle's home."""

@@ -1,9 +1,9 @@
 """The reward terms of bouncing, as in the original specification, in the same order and with the
 same symbols.
 
-Each term is a class: its weight, its constants, and the formula `value`. In the formulas,
-G(x, s) = exp(-x^2 / (2 s^2)), S is the logistic sigmoid, g is gravity, and the other symbols are
-properties of `RewardInputs`: err_xy, d_vert, delta_h and err_home in m, vz in m/s.
+Each term is a class: its weight (1 where it gives none), its constants, and the formula `value`. In
+the formulas, G(x, s) = exp(-x^2 / (2 s^2)), S is the logistic sigmoid, g is gravity, and the other
+symbols are properties of `RewardInputs`: err_xy, d_vert, delta_h and err_home in m, vz in m/s.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ class RewardInputs:
     """Clipped action of the previous step [n]."""
     joint_velocity: jax.Array
     """Arm joint velocities [n], rad/s."""
-    home: BounceReward
-    """The target point, the paddle's home and gravity."""
+    reward: BounceReward
+    """Settings of all terms: the target point, the paddle's home height and gravity."""
 
     @functools.cached_property
     def err_xy(self) -> jax.Array:
         """Horizontal distance of the ball from the target point, m."""
-        return horizontal_distance(self.ball_position, (self.home.target_x, self.home.target_y))
+        return horizontal_distance(self.ball_position, (self.reward.target_x, self.reward.target_y))
 
     @functools.cached_property
     def d_vert(self) -> jax.Array:
@@ -68,21 +68,21 @@ class RewardInputs:
     @functools.cached_property
     def err_home(self) -> jax.Array:
         """Distance of the paddle's height from home, m."""
-        return jnp.abs(self.paddle_position[2] - self.home.paddle_home_height)
+        return jnp.abs(self.paddle_position[2] - self.reward.paddle_home_height)
 
 
 class PositionReward(RewardTerm):
-    """Horizontal position: keep the ball above the target point, especially when it is near the
-    paddle."""
+    """Horizontal position: keep the ball above the target point, most exactly while it is far from
+    the paddle."""
 
     weight: settings.Finite = 2.0
     """Weight of the term."""
     vertical_scale: settings.Length = 0.15
-    """Decay of the proximity weight with the vertical distance between ball and paddle, m."""
+    """Decay of the additional width with the vertical distance between ball and paddle, m."""
     base_scale: settings.Length = 0.1
     """Width of the Gaussian far from the paddle, m."""
     proximity_gain: settings.NonNegative = 3.0
-    """Factor by which the Gaussian is wider at the paddle."""
+    """Additional width of the Gaussian at the paddle, in widths far from it."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
         """G(err_xy, base_scale (1 + proximity_gain exp(-d_vert / vertical_scale)))."""
@@ -137,10 +137,10 @@ class VelocityMatchingReward(RewardTerm):
         vz = inputs.vz
         delta_h = inputs.delta_h
         rising_below = (vz > 0.0) & (delta_h > 0.0)
-        squared_up = jnp.square(vz) - 2.0 * inputs.home.gravity * delta_h
+        squared_up = jnp.square(vz) - 2.0 * inputs.reward.gravity * delta_h
         v_up = jnp.where(rising_below, safe_sqrt(squared_up), 0.0)
         falling_above = (vz < 0.0) & (delta_h < 0.0)
-        squared_down = jnp.square(vz) + 2.0 * inputs.home.gravity * jnp.abs(delta_h)
+        squared_down = jnp.square(vz) + 2.0 * inputs.reward.gravity * jnp.abs(delta_h)
         v_down = jnp.where(falling_above, -safe_sqrt(squared_down), 0.0)
         v_near = jnp.where(jnp.abs(delta_h) < self.near_distance, vz, 0.0)
 
@@ -208,7 +208,7 @@ class ControlledUpwardReward(RewardTerm):
     def value(self, inputs: RewardInputs) -> jax.Array:
         """G(err_xy, position_scale) G(vz - v_ideal, velocity_scale) S(vz / rising_scale)
         clip(vz, 0, velocity_limit), with v_ideal = sqrt(2 g max(0, delta_h)) within its limits."""
-        v_ideal = safe_sqrt(2.0 * inputs.home.gravity * inputs.delta_h)
+        v_ideal = safe_sqrt(2.0 * inputs.reward.gravity * inputs.delta_h)
         v_ideal = jnp.clip(v_ideal, self.min_ideal_velocity, self.max_ideal_velocity)
         q_pos = gaussian(inputs.err_xy, self.position_scale)
         q_vel = gaussian(inputs.vz - v_ideal, self.velocity_scale)
@@ -295,8 +295,8 @@ class PaddleHomeReward(RewardTerm):
     """Width of the sigmoid, m."""
 
     def value(self, inputs: RewardInputs) -> jax.Array:
-        """G(err_home, scale) (1 + distance_gain S((d_vert - distance_threshold) / distance_scale)),
-        in m."""
+        """G(err_home, scale)
+        (1 + distance_gain S((d_vert - distance_threshold) / distance_scale))."""
         far = jax.nn.sigmoid((inputs.d_vert - self.distance_threshold) / self.distance_scale)
         return gaussian(inputs.err_home, self.scale) * (1.0 + self.distance_gain * far)
 

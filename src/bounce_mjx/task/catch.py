@@ -12,11 +12,12 @@ from bounce_mjx.config.settings import Coordinate, Duration, Friction
 from bounce_mjx.lazy import jax, jnp
 
 SPEEDS = (1.0, 2.0)
-"""Range of a throw's horizontal speed, m/s."""
+"""Range of a throw's horizontal speed, m/s. `MAX_DISTANCE` lowers the upper end, for a far paddle
+also below the lower one."""
 FLIGHT_SECONDS = (0.6, 0.7)
 """Range of the time until a thrown ball is at its aim, s."""
 MAX_DISTANCE = 2.0
-"""Greatest horizontal distance of a start from the arm's base, m; it limits the fastest throws."""
+"""Greatest horizontal distance of a start from the arm's base, m."""
 MAX_DIRECTION = math.radians(30.0)
 """Greatest angle of a throw to the line from the paddle to the base, rad."""
 AIM_RADIUS = 0.05
@@ -88,6 +89,7 @@ class Config(task.WorldConfig):
 
     @classmethod
     def settings_at(cls, paddle: tuple[float, float, float]) -> dict[str, Any]:
+        """The ball's rest on the paddle, in place of the world's start over it."""
         x, y, z = paddle
         return {"ball_init_pos": [x, y, round(z + REST_HEIGHT, 4)]}
 
@@ -112,7 +114,8 @@ class Catch(task.Task):
 
     Config = Config
     config: Config
-    curves = (task.Curve("episode/caught", "caught", "episodes", "share of caught balls"),)
+    # Also of balls that are lost later, unlike the result.
+    curves = (task.Curve("episode/caught", "caught", "episodes", "share of balls at rest in time"),)
     num_draws = 5
 
     # The start.
@@ -120,8 +123,8 @@ class Catch(task.Task):
     def throw(self, draws: jax.Array, command: task.Values) -> tuple[jax.Array, jax.Array]:
         """The throw starts at the height of its aim, so that the ball falls at 2.9 to 3.4 m/s."""
         x, y, z = self.config.ball_init_pos
-        rest = self.geometry.paddle_home[2] + self.geometry.rest_height
-        home = jnp.array([x, y, max(z, rest)])
+        rest_height = self.geometry.paddle_home[2] + self.geometry.rest_height
+        home = jnp.array([x, y, max(z, rest_height)])
         # The root makes the aims uniform over the disc.
         aim_offset = AIM_RADIUS * jnp.sqrt(draws[0]) * _direction(2.0 * math.pi * draws[1])
 
@@ -157,16 +160,16 @@ class Catch(task.Task):
         truth = step.truth
         dt = self.config.control_dt
         offset = truth.ball_position - truth.paddle_position
-        # The mean of the step, in which the servos' speed rises and falls.
+        # Not that at the end of the step, within which the servos' speed rises and falls.
         velocity = (offset - state.offset) / dt
 
         # A ball that touches nothing falls freely.
         touches = truth.ball_velocity[2] - state.fall > -0.5 * task.GRAVITY * dt
         resting = touches & (task.length(velocity) < REST_SPEED)
         contact = jnp.where(touches | (state.contact > 0.0), state.contact + dt, 0.0)
-        rest = jnp.where(resting, state.rest + dt, 0.0)
+        rest_seconds = jnp.where(resting, state.rest + dt, 0.0)
         in_time = contact < CATCH_SECONDS + 0.5 * dt
-        caught = state.caught | (in_time & (rest > REST_SECONDS - 0.5 * dt))
+        caught = state.caught | (in_time & (rest_seconds > REST_SECONDS - 0.5 * dt))
 
         is_low = offset[2] < -LOST_DEPTH
         hits_floor = truth.paddle_position[2] < FLOOR
@@ -175,7 +178,7 @@ class Catch(task.Task):
                 fall=truth.ball_velocity[2],
                 offset=offset,
                 contact=contact,
-                rest=rest,
+                rest=rest_seconds,
                 caught=caught,
             ),
             reward=task.weighted_terms(
@@ -207,8 +210,11 @@ class Catch(task.Task):
         return task.Tally(sums={}, maxima={"caught": moment.metrics["caught"]})
 
     def results(self, episodes: task.Episodes) -> tuple[task.Result, ...]:
-        measured = f"balls at rest within {CATCH_SECONDS:g} s of the first contact"
-        caught = (episodes.maxima["caught"] > 0.0) & (episodes.lasted > 0.0)
+        measured = (
+            f"balls at rest within {CATCH_SECONDS:g} s of the first contact, "
+            "and not lost before the end"
+        )
+        caught = (episodes.maxima["caught"] > 0.0) & episodes.lasted
         return (task.share_of_episodes("caught", measured, caught, MIN_CAUGHT),)
 
     # What is shown.

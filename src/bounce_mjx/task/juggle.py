@@ -9,7 +9,6 @@ from pydantic import Field
 from bounce_mjx import task
 from bounce_mjx.config.settings import Ascending, Coordinate, Finite, Length, Positive
 from bounce_mjx.lazy import jax, jnp
-from bounce_mjx.task.rewards import check_names
 
 FLOWN = 0.125
 """Share of its flight that the last ball has flown at a reset."""
@@ -32,14 +31,23 @@ MIN_HEIGHT_SHARE = 0.95
 Height = Annotated[Finite, Field(ge=MIN_TARGET_HEIGHT, le=10.0)]
 
 
-class Rewards(task.StrictModel):
-    """The reward terms: means over the balls, whose flights are rated at each of their steps."""
+class NearByBall(task.Near):
+    """A term that falls with the length of each ball's error: the mean of `task.Near`."""
 
-    apex: task.Near = task.Near(weight=6.0)
+    def value(self, errors: jax.Array) -> jax.Array:
+        """The unweighted term [] for a row of errors for each ball [B, ...]."""
+        return jnp.mean(jax.vmap(super().value)(errors))
+
+
+class Rewards(task.StrictModel):
+    """The reward terms. Those of the balls are means over them, whose flights are rated at each of
+    their steps."""
+
+    apex: NearByBall = NearByBall(weight=6.0)
     """The flight's apex is in the column at the height, of which 0.1 m count as 0.03 m."""
-    landing: task.Near = task.Near(weight=2.0)
+    landing: NearByBall = NearByBall(weight=2.0)
     """The flight ends in the column."""
-    turn: task.Near = task.Near(weight=4.0)
+    turn: NearByBall = NearByBall(weight=4.0)
     """The next ball lands one turn later, s."""
     home: task.Near = task.Near(scale=0.05)
     """The paddle is at home."""
@@ -84,6 +92,7 @@ class Config(task.WorldConfig):
 
     @property
     def heights(self) -> dict[str, float]:
+        # Not ball_init_pos, as the balls are thrown.
         return {"height_range": self.home[2] + self.height_range[0]}
 
     @property
@@ -147,9 +156,10 @@ class Juggle(task.Task):
         height = command["target_height"]
         period = self._period(height)
         count = self.config.num_balls
-        turns_later = jnp.arange(count)[::-1, None] / count
+        # Share of a period that each ball has flown more than the last one.
+        flown_more = jnp.arange(count)[::-1, None] / count
         # Time until each ball's apex along z; negative after it.
-        rise = (0.5 - FLOWN - turns_later) * period * jnp.array([0.0, 0.0, 1.0])
+        rise = (0.5 - FLOWN - flown_more) * period * jnp.array([0.0, 0.0, 1.0])
         positions = self._columns(height) - 0.5 * task.GRAVITY * jnp.square(rise)
         velocities = task.GRAVITY * rise
         return positions, velocities
@@ -173,8 +183,8 @@ class Juggle(task.Task):
 
         rising = truth.ball_velocity[:, 2] > 0.0
         hits = rising & ~rose
-        is_high = balls[:, 2] > self.config.home[2] + MIN_APEX_HEIGHT
-        apexes = rose & ~rising & is_high
+        flies = balls[:, 2] > self.config.home[2] + MIN_APEX_HEIGHT
+        apexes = rose & ~rising & flies
 
         is_far = jnp.sum(jnp.square(balls - columns), axis=1) > self.config.max_distance**2
         is_low = balls[:, 2] < self.config.home[2]
@@ -189,20 +199,20 @@ class Juggle(task.Task):
                 rising,
                 jnp.where(jnp.any(hits), jnp.max(ball_numbers * hits), last_hit),
             ),
-            reward=self._weighted_terms(
-                {
-                    "apex": self._apex_errors(flights, columns),
-                    "landing": self._landing_errors(flights, columns),
-                    "turn": self._turn_errors(flights, self._period(height)),
-                    "home": self._home_error(step),
-                    "calm": self._calm_error(step),
-                }
+            reward=task.weighted_terms(
+                self.config.reward,
+                apex=self._apex_errors(flights, columns),
+                landing=self._landing_errors(flights, columns),
+                turn=self._turn_errors(flights, self._period(height)),
+                home=truth.paddle_position - jnp.array(self.config.home),
+                calm=self._calm_error(step),
             ),
             ended=jnp.any(is_far | is_low) | touched,
             metrics={
                 "hits": jnp.sum(hits),
                 "in_turn": jnp.sum(hits & (ball_numbers == next_in_turn)),
                 "apexes": jnp.sum(apexes),
+                # Accurate ones, neither too low nor too high.
                 "high": jnp.sum(apexes & (height_errors <= MAX_HEIGHT_ERROR)),
                 "height_error": jnp.sum(apexes * height_errors),
                 "touched": touched,
@@ -219,7 +229,7 @@ class Juggle(task.Task):
         )
         return distance < 2.0 * radius
 
-    # The reward: the error of each term, a row for each ball or one for all.
+    # The reward: the error of each term, of the balls with a row for each.
 
     def _apex_errors(self, flights: task.Flight, columns: jax.Array) -> jax.Array:
         """From the tops of the columns to the flights' apexes [B, 3], m; 0.1 m of height count as
@@ -238,30 +248,10 @@ class Juggle(task.Task):
         nearest = jnp.mod(late + 0.5 * period, period) - 0.5 * period
         return nearest[:, None]
 
-    def _home_error(self, step: task.Step) -> jax.Array:
-        """From home to the paddle [1, 3], m."""
-        error = step.truth.paddle_position - jnp.array(self.config.home)
-        return error[None]
-
     def _calm_error(self, step: task.Step) -> jax.Array:
-        """The joint velocities, and the change of the action, as one vector [1, 2 n]."""
+        """The joint velocities, and the change of the action, as one vector [2 n]."""
         action_change = step.action - step.last_action
-        return jnp.concatenate([step.truth.joint_velocities, action_change])[None]
-
-    def _weighted_terms(self, errors: task.Values) -> task.Values:
-        """Each term [] times its weight: the mean over the rows [B or 1, ...] of its errors.
-
-        Raises:
-          UserError: the config's reward has other terms.
-        """
-        reward = self.config.reward
-        names = task.term_names(type(reward))
-        check_names("the step of juggle", "term of the reward", errors, names)
-        weighted = {}
-        for name in names:
-            term = getattr(reward, name)
-            weighted[name] = term.weight * jnp.mean(jax.vmap(term.value)(errors[name]))
-        return weighted
+        return jnp.concatenate([step.truth.joint_velocities, action_change])
 
     # The observation: the next ball, from the measurements.
 
@@ -293,10 +283,10 @@ class Juggle(task.Task):
         settled = moment.command_seconds > SETTLING_SECONDS
         return task.Tally(
             sums={
-                "hits": 1.0 * metrics["hits"],
-                "in_turn": 1.0 * metrics["in_turn"],
+                "hits": metrics["hits"],
+                "in_turn": metrics["in_turn"],
                 "apexes": settled * metrics["apexes"],
-                "high": settled * metrics["high"],
+                "accurate": settled * metrics["high"],
             },
             maxima={"touched": metrics["touched"]},
         )
@@ -315,7 +305,7 @@ class Juggle(task.Task):
                 "apart", "episodes without touching balls", apart, MIN_EPISODE_SHARE
             ),
             task.share_of_events(
-                "height", "apexes within 0.1 m", sums["high"], sums["apexes"], MIN_HEIGHT_SHARE
+                "height", "apexes within 0.1 m", sums["accurate"], sums["apexes"], MIN_HEIGHT_SHARE
             ),
         )
 

@@ -24,6 +24,9 @@ STEP_SECONDS = 4.0
 """Time at a corner, s."""
 FASTEST = (1.0, 1.0, math.sqrt(2.0), math.inf, math.sqrt(32.0) / 3.0)
 """Greatest speed on each path of the size 1, per radian of its phase."""
+SHARPEST = 17.0 / 16.0
+"""Greatest acceleration on a path of the size 1 with the greatest speed 1: on the figure of eight,
+max(sin^2 a + 4 sin^2 2a) = (17 / 8)^2 for its phase a, in radians."""
 SWAY = 0.05
 """Amplitude of the height, m."""
 COMMANDS = {

@@ -25,7 +25,7 @@ def find_task(name: str) -> type[Task]:
     """The task of a name, of an entry point in `GROUP`, or of FILE.py:CLASS.
 
     Raises:
-      UserError: there is none, or it cannot be imported.
+      UserError: there is none, it cannot be imported, or it is no task.
     """
     if is_file(name):
         return class_in_file(name, Task)
@@ -38,12 +38,18 @@ def find_task(name: str) -> type[Task]:
         )
     module, _, attribute = known[name].partition(":")
     try:
-        return getattr(importlib.import_module(module), attribute)
+        task = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
         raise UserError(
             f"the task {name} cannot be imported ({reason_of(error)}); install the package that "
             "has it again"
         ) from error
+    if not (isinstance(task, type) and issubclass(task, Task) and task is not Task):
+        raise UserError(
+            f"the task {name} is {known[name]}, which is no subclass of Task; correct the entry "
+            "point of the package that has it"
+        )
+    return task
 
 
 def task_name(task: type[Task]) -> str:

@@ -119,7 +119,8 @@ def mean_of_events(
       totals: sum of the quantity in each episode [E].
       events: number of steps or events in each episode [E].
       bounds: least and greatest mean, of which one may be infinite.
-      condition: the condition that the bounds need and that does not hold, in words; "" judges.
+      condition: the condition that the bounds need and that does not hold, in words; "" where the
+        bounds judge.
     """
     mean, margin = mean_and_margin(totals, events)
     low, high = bounds

@@ -2,9 +2,10 @@
 
 `Task.step` returns the weighted terms by name, however it computes them; the metrics
 `reward/<name>`, the log and the report follow. The tasks of the package make them from settings: a
-group, the config's `reward`, in which each field of a subclass of `RewardTerm` is a term
-(`weighted_terms`). Then the config and the flags follow as well, and a subclass of the group with
-one more field adds a term.
+group, the config's `reward`, in which each field whose type is a subclass of `RewardTerm` is a term
+(`weighted_terms`). Then the config and the flags follow as well. To add a term, extend the group by
+a field, the task's `Config` by that group, and the task by that `Config`; if the task gives each
+term its own inputs, extend its `step` too.
 """
 
 from __future__ import annotations
@@ -67,7 +68,8 @@ class Proportional(RewardTerm):
 
 
 def term_names(reward: type[StrictModel]) -> tuple[str, ...]:
-    """Names of the terms in a group of settings, in order."""
+    """Names of the terms in a group of settings, in order: of the fields whose type is a subclass
+    of `RewardTerm`, and no union."""
     return tuple(
         name
         for name, field in reward.model_fields.items()
@@ -81,7 +83,7 @@ def weighted_terms(
     """Each term [] times its weight; their sum is the reward.
 
     Args:
-      inputs: what the formula of every term takes.
+      inputs: what the formula of every term takes; without any inputs it takes None.
       term_inputs: by a term's name, what its formula takes instead.
 
     Raises:
@@ -89,8 +91,8 @@ def weighted_terms(
     """
     names = term_names(type(reward))
     provided = set(term_inputs)
-    # Without inputs of single terms, the formulas may take none at all.
-    if inputs is not None or not term_inputs:
+    for_all_terms = inputs is not None or not term_inputs
+    if for_all_terms:
         provided.update(names)
     check_names("weighted_terms", "term of the reward", provided, names)
     weighted = {}

@@ -6,7 +6,7 @@ import functools
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.lazy import jax, jnp, np
 from bounce_mjx.task.results import Episodes, Figure, Result
 from bounce_mjx.world.config import WorldConfig
@@ -67,7 +67,7 @@ class Moment(NamedTuple):
     truth: Kinematics
     """Positions and velocities after the step."""
     command: Values
-    """Value [] of each command after the step."""
+    """Value [] of each command after the step; the metrics are of those during the step."""
     state: TaskState
     """The task's state after the step."""
     metrics: Values
@@ -183,9 +183,16 @@ class Task:
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
         if "Config" not in cls.__dict__:
+            inherited = getattr(cls, "Config", None)
+            base = "task.WorldConfig" if inherited is None else inherited.__qualname__
             raise UserError(
                 f"the task {cls.__name__} has no Config of its own, and settings belong to one "
-                f"task; write a class that extends that of {cls.__base__.__name__}"
+                f"task; write Config, a class that extends {base}"
+            )
+        if not (isinstance(cls.Config, type) and issubclass(cls.Config, WorldConfig)):
+            raise UserError(
+                f"the Config of the task {cls.__name__} is {shorten(repr(cls.Config))}; give a "
+                "class that extends task.WorldConfig"
             )
         owner = vars(cls.Config).get("task")
         # The cell of a notebook may run again.
@@ -201,9 +208,9 @@ class Task:
 
     @functools.cached_property
     def geometry(self) -> Geometry:
-        """Sizes and places of ball and paddle in the model. An environment sets those of its own;
-        a task without one compiles the config's model for them."""
-        # The settings alone need no JAX.
+        """Sizes and places of ball and paddle in the model. An environment sets those of its own
+        model (`env.task.geometry = ...`); a task without one compiles the config's model here."""
+        # Imported here, as a process that reads the settings alone needs no JAX.
         from bounce_mjx.robot.geometry import read_geometry
         from bounce_mjx.robot.model import find_addresses, load_model
 
@@ -237,8 +244,8 @@ class Task:
         raise NotImplementedError
 
     def first_command(self, command: Values) -> Values:
-        """The commands where they are sampled, at a reset and within an episode, for a task in
-        which a sample is not what the policy has to follow, such as the middle of a path.
+        """The commands from a new sample, at a reset or within an episode, for a task in which a
+        sample is not what the policy has to follow, such as the middle of a path.
 
         Args:
           command: value [] of each command, as it is sampled.
@@ -246,8 +253,8 @@ class Task:
         return command
 
     def next_command(self, state: TaskState, command: Values) -> Values:
-        """The commands from now on, for a task whose commands move within an episode; it follows
-        `first_command` too.
+        """The commands from now on, for a task whose commands move within an episode. It is called
+        after every step, and right after each `first_command`.
 
         Args:
           state: the task's state after the step or the reset.

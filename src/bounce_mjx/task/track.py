@@ -41,15 +41,18 @@ MIN_EPISODE_SHARE = 0.99
 """Least share of episodes that last."""
 MIN_APEX_SHARE = 0.95
 """Least share of apexes within 0.1 m of their height, and of those near the point after a step."""
-JUMP_SPEED = 1.0
-"""A point that is faster has jumped, m/s."""
+MAX_POINT_SPEED = 1.0
+"""Greatest speed of a point on a path, m/s."""
+JUMP_SPEED = 1.1
+"""A point that seems faster has jumped, m/s."""
 JUMP_ACCELERATION = 3.0
-"""A point that accelerates more has jumped, m/s^2."""
+"""A point that seems to accelerate more has jumped, or changed its path or its speed, m/s^2; tight
+and fast paths have a higher limit."""
 APEX_FACTORS = (1.0, 1.0, 0.3)
 """Factors of an apex's error along x, y and z: 0.1 m of height count as 0.03 m."""
 Height = Annotated[Finite, Field(ge=0.1, le=10.0)]
 """Over home, m; the point sways around it, and stays above a resting ball."""
-PointSpeed = Annotated[Finite, Field(ge=0.0, le=JUMP_SPEED)]
+PointSpeed = Annotated[Finite, Field(ge=0.0, le=MAX_POINT_SPEED)]
 
 
 class Rewards(task.StrictModel):
@@ -81,7 +84,7 @@ class Observation(task.ObservationConfig):
 class Config(task.WorldConfig):
     """The world, the point, the ends and the reward."""
 
-    # Not `task.PADDLE_HOME`: the shipped policy was trained here. The next one moves it.
+    # Not `task.PADDLE_HOME`: the shipped policy was trained here. Move it with the next one.
     home: tuple[Coordinate, Coordinate, Coordinate] = (0.58856, 0.0, 0.05)
     """Home of the paddle, m."""
     height_range: Annotated[tuple[Height, Height], Ascending] = (0.4, 0.5)
@@ -166,7 +169,7 @@ class Track(task.Task):
     # The start, and a control step: reward, end, metrics.
 
     def reset(self, start: task.Start) -> jax.Array:
-        """Whether the ball rises [], bool."""
+        """Whether the ball rises [], bool: it starts at rest."""
         return jnp.array(False)
 
     def step(self, rose: jax.Array, step: task.Step) -> task.TaskStep:
@@ -176,8 +179,8 @@ class Track(task.Task):
         home_height = self.config.home[2]
         flight = task.flight(ball, truth.ball_velocity, self._ground())
 
-        is_high = ball[2] > home_height + MIN_APEX_HEIGHT
-        is_apex = rose & (vertical_velocity <= 0.0) & is_high
+        flies = ball[2] > home_height + MIN_APEX_HEIGHT
+        is_apex = rose & (vertical_velocity <= 0.0) & flies
         x_square, y_square, z_square = jnp.square(ball - paths.point(step.command))
         is_far = x_square + y_square + z_square > self.config.max_distance**2
         is_low = ball[2] < home_height
@@ -218,35 +221,48 @@ class Track(task.Task):
     # The observation: where to aim, from the measurements.
 
     def first_quantities(self, measured: task.Values) -> tuple[Any, task.Values]:
+        """The point has jumped to where it is, so that its velocity is not known yet."""
         point = paths.point(measured)[:2, 0]
         velocity = jnp.zeros_like(measured["ball_position"][:2])
+        before_jump = point - 10.0 * JUMP_SPEED * self.config.control_dt
         unknown_aim = jnp.zeros_like(velocity)[None]
-        memory, histories = self.next_quantities((point, velocity), {"aim": unknown_aim}, measured)
+        memory, histories = self.next_quantities(
+            (before_jump, velocity), {"aim": unknown_aim}, measured
+        )
         return memory, {"aim": histories["aim"][0]}
 
     def next_quantities(
         self, memory: Any, histories: task.Values, measured: task.Values
     ) -> tuple[Any, task.Values]:
-        """It remembers the point [2] (m) and its velocity [2] (m/s)."""
+        """It remembers the point [2] (m) and its velocity [2] (m/s), of a jump too: the velocity
+        after it is a new one, and no acceleration.
+
+        A velocity is unknown in the step of a jump, an acceleration in the next one too; either
+        counts as 0 then.
+        """
         last_point, last_velocity = memory
+        dt = self.config.control_dt
         point = paths.point(measured)[:, 0]
-        velocity = self._rate(point[:2] - last_point, JUMP_SPEED)
-        acceleration = self._rate(velocity - last_velocity, JUMP_ACCELERATION)
+        velocity = (point[:2] - last_point) / dt
+        acceleration = (velocity - last_velocity) / dt
+        known_velocity = _unless_longer(velocity, JUMP_SPEED)
+        known_acceleration = _unless_longer(acceleration, self._jump_acceleration())
 
         ground = self._ground()
         flight = task.flight(measured["ball_position"], measured["ball_velocity"], ground)
         next_rise = task.safe_sqrt(2.0 * (point[2] - ground) / task.GRAVITY)
         seconds = flight.fall + next_rise
-        moved = seconds * velocity
-        point_then = point[:2] + moved + 0.5 * jnp.square(seconds) * acceleration
+        moved = seconds * known_velocity
+        point_then = point[:2] + moved + 0.5 * jnp.square(seconds) * known_acceleration
         aim = point_then - flight.end[:2]
         next_memory = (point[:2], velocity)
         return next_memory, {name: task.latest(old, aim) for name, old in histories.items()}
 
-    def _rate(self, change: jax.Array, limit: float) -> jax.Array:
-        """A change [2] of a control step, for each second; 0 beyond a limit, for a jump."""
-        rate = change / self.config.control_dt
-        return jnp.where(jnp.abs(rate) <= limit, rate, 0.0)
+    def _jump_acceleration(self) -> float:
+        """Acceleration over which the point has jumped, m/s^2; on its paths it has less."""
+        _, fastest = self.config.speed_range
+        greatest = paths.SHARPEST * fastest**2 / self.config.path_size
+        return max(JUMP_ACCELERATION, 1.1 * greatest)
 
     # The results.
 
@@ -261,7 +277,7 @@ class Track(task.Task):
         after_step = apex & has_steps & has_reached
         sums = {
             "apexes": apex,
-            "high": apex & (moment.metrics["height_error"] <= MAX_HEIGHT_ERROR),
+            "accurate": apex & (moment.metrics["height_error"] <= MAX_HEIGHT_ERROR),
             "late": after_step,
             "near": after_step & (error <= MAX_STEP_ERROR),
         }
@@ -302,7 +318,7 @@ class Track(task.Task):
             task.share_of_events(
                 "height",
                 "apexes within 0.1 m of their height",
-                sums["high"],
+                sums["accurate"],
                 sums["apexes"],
                 MIN_APEX_SHARE,
             ),
@@ -316,6 +332,11 @@ class Track(task.Task):
 
     def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
         return {"path": f"{paths.name(command)}, {command['point_speed']:.2f} m/s"}
+
+
+def _unless_longer(vector: jax.Array, limit: float) -> jax.Array:
+    """A vector [2], or 0 where it is longer than a limit."""
+    return jnp.where(jnp.sum(jnp.square(vector)) <= limit**2, vector, 0.0)
 
 
 def _is_in_band(speed: jax.Array, band: Band) -> jax.Array:
