@@ -112,8 +112,8 @@ def _in_package(name: str) -> Path:
     if spec is None or not spec.submodule_search_locations:
         words = _INSTALLED_AS.get(package) or (shorten(package.replace("_", "-")),)
         raise UserError(
-            f"the package {shorten(package)!r} is not installed, which package:{shorten(name)} "
-            f"names; install it with: {install_command(*words)}"
+            f"the package {shorten(package)!r} is not installed as a folder, which package:"
+            f"{shorten(name)} names; install it with: {install_command(*words)}"
         )
     return Path(spec.submodule_search_locations[0]) / file
 
@@ -715,20 +715,21 @@ def _ends_of_constraint(model: mujoco.MjModel, constraint: int) -> list[_End] | 
     for."""
     kinds = mujoco.mjtEq
     kind = kinds(model.eq_type[constraint])
-    ids = [int(model.eq_obj1id[constraint]), int(model.eq_obj2id[constraint])]
-    # -1 is the missing second one of a constraint that holds its first one still.
-    ids = [index for index in ids if index >= 0]
-    if kind == kinds.mjEQ_JOINT:
-        return [_End(mujoco.mjtObj.mjOBJ_JOINT, joint) for joint in ids]
-    if kind == kinds.mjEQ_TENDON:
-        ends = []
-        for tendon in ids:
-            ends += _ends_of_tendon(model, tendon)
-        return ends
-    if kind in (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD):
-        body_or_site = mujoco.mjtObj(model.eq_objtype[constraint])
-        return [_End(body_or_site, index) for index in ids]
-    return None
+    ends = []
+    for index in (int(model.eq_obj1id[constraint]), int(model.eq_obj2id[constraint])):
+        # The missing second part of a constraint that holds its first one still.
+        if index < 0:
+            continue
+        if kind == kinds.mjEQ_JOINT:
+            ends.append(_End(mujoco.mjtObj.mjOBJ_JOINT, index))
+        elif kind == kinds.mjEQ_TENDON:
+            ends += _ends_of_tendon(model, index)
+        elif kind in (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD):
+            # Two bodies, or two sites.
+            ends.append(_End(mujoco.mjtObj(model.eq_objtype[constraint]), index))
+        else:
+            return None
+    return ends
 
 
 def _ends_of_tendon(model: mujoco.MjModel, tendon: int) -> list[_End]:
@@ -749,7 +750,7 @@ def _acts_on_arm(
     it has an end on a loose body."""
     if any(is_below(model, _body_of(model, end), loose) for end in ends):
         return False
-    moved = [int(model.jnt_bodyid[joint]) for joint in joints]
+    moved = model.jnt_bodyid[joints].tolist()
     for end in ends:
         if end.kind == mujoco.mjtObj.mjOBJ_JOINT:
             acts = end.index in joints

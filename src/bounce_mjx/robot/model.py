@@ -276,8 +276,8 @@ def find_addresses(mj_model: mujoco.MjModel) -> Addresses:
     joints = tuple(actuator_of)
     return Addresses(
         arm_joints=joints,
-        arm_qpos=tuple(int(mj_model.jnt_qposadr[joint]) for joint in joints),
-        arm_qvel=tuple(int(mj_model.jnt_dofadr[joint]) for joint in joints),
+        arm_qpos=tuple(mj_model.jnt_qposadr[list(joints)].tolist()),
+        arm_qvel=tuple(mj_model.jnt_dofadr[list(joints)].tolist()),
         actuators=tuple(actuator_of.values()),
         balls=tuple(balls),
         paddle_geom=paddle_geom,

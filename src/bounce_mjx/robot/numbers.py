@@ -26,8 +26,11 @@ def field_of(mj_model: mujoco.MjModel, name: str) -> np.ndarray:
 
 def physical_fields(mj_model: mujoco.MjModel) -> list[str]:
     """Names of the model's fields with physics in them, not colours."""
-    names = [name for name in dir(mj_model) if name.startswith(_PHYSICAL)]
-    return [name for name in names if not name.startswith(_PICTURED)]
+    names = []
+    for name in dir(mj_model):
+        if name.startswith(_PHYSICAL) and not name.startswith(_PICTURED):
+            names.append(name)
+    return names
 
 
 def check_numbers(mj_model: mujoco.MjModel) -> None:

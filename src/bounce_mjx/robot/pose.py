@@ -100,14 +100,16 @@ def mounts(paddle: PaddleConfig) -> list[PaddleConfig]:
     """The paddle held by a handle along the site's z, in four turns about it, and flat on the
     site."""
     half = math.sqrt(0.5)
+    flat_on_site = {"position": (0.0, 0.0, 0.03), "quaternion": (1.0, 0.0, 0.0, 0.0)}
     choices = []
     for turn in range(4):
         cosine = math.cos(turn * math.pi / 4.0)
         sine = math.sin(turn * math.pi / 4.0)
         quaternion = (half * cosine, half * sine, -half * cosine, half * sine)
-        choices.append({"position": (0.0, 0.0, 0.19), "quaternion": quaternion})
-    choices.append({"position": (0.0, 0.0, 0.03), "quaternion": (1.0, 0.0, 0.0, 0.0)})
-    return [paddle.model_copy(update=choice) for choice in choices]
+        on_handle = {"position": (0.0, 0.0, 0.19), "quaternion": quaternion}
+        choices.append(paddle.model_copy(update=on_handle))
+    choices.append(paddle.model_copy(update=flat_on_site))
+    return choices
 
 
 def rank_poses(
