@@ -300,8 +300,8 @@ class Bounce(task.Task):
     def next_quantities(
         self, memory: MeasuredFlight, histories: task.Values, measured: task.Values
     ) -> tuple[MeasuredFlight, task.Values]:
-        """A measured bounce starts when the ball is first measured near the paddle. Its position
-        and joints are taken at the ball's lowest measured point.
+        """A measured bounce starts when the ball is first measured near the paddle, or under it.
+        Its position and joints are taken at the ball's lowest measured point.
 
         `ball_picture` is the measured `ball_position`, by the name that exported policies have.
         """

@@ -56,7 +56,8 @@ def offset(command: Values, size: float, phase: Any, xp: Any = None) -> Any:
     """The point from the middle of its path [3, ...], m, at places on it [...], turns.
 
     Args:
-      size: radius of the circle, half the length of the line and of the figure of eight, m.
+      size: radius of the circle, half the length of the line and of the figure of eight, and at
+        most half the width of the wandering, m.
     """
     xp = xp or jnp
     course = command["course"]

@@ -101,7 +101,8 @@ class Marker(NamedTuple):
 
 
 class Recording(NamedTuple):
-    """T control steps of K episodes; entries after the end of an episode are undefined."""
+    """T control steps of K episodes, in a report as NumPy arrays; entries after the end of an
+    episode are undefined."""
 
     joint_angles: jax.Array
     """Positions of the acting joints after the step [T, n, K], rad."""
