@@ -114,6 +114,21 @@ def test_ranges_grow_from_the_nominal_values() -> None:
     assert ends(0.0)["camera_rate"] == ends(1.0)["camera_rate"] == [60.0, 120.0]
 
 
+@pytest.mark.parametrize(
+    "names, words",
+    [
+        (("air_drag",), "a reset lacks the range action_latency; there are: action_latency, air_"),
+        (("air_drag", "action_latency", "drag"), "a range that there is not, drag; there are:"),
+    ],
+)
+def test_a_reset_takes_ranges_of_all_terms_alone(names: tuple[str, ...], words: str) -> None:
+    terms = {"action_latency": (0.0, 0.02), "air_drag": (0.0, 0.2)}
+    env = BounceBall(EnvConfig(randomization=terms))
+    ranges = {name: (jnp.zeros(()), jnp.zeros(())) for name in names}
+    with pytest.raises(UserError, match=words):
+        jax.eval_shape(lambda key: env.reset(key, ranges), jax.random.key(0))
+
+
 def test_the_range_of_a_command_grows_about_its_middle() -> None:
     grows = {"first_command_range": 0.2, "warmup_steps": 1000}
     env = BounceBall(EnvConfig(target_height_range=(0.3, 0.8), randomization=grows))

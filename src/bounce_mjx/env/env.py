@@ -211,10 +211,14 @@ class Env:
             pictures are only as long as the config's ranges need.
           share: probability that each term is sampled, in place of the config's `share` and
             `shares`.
+
+        Raises:
+          UserError: the ranges lack a term, or have an unknown one.
         """
         robot_model.check_unedited(self.mj_model, self._fingerprint)
         if ranges is None:
             ranges = self.ranges()
+        self._check_ranges(ranges)
         rng, world, clock = self._sample_world(rng, ranges, share)
         rng, randomized = self._sample_parameters(rng)
         parameters = physics_parameters(world, self.mj_model)._replace(**_given(randomized))
@@ -330,6 +334,13 @@ class Env:
             # Wrappers add their own metrics, which a step must keep.
             metrics=state.metrics | metrics,
         )
+
+    def _check_ranges(self, ranges: Ranges) -> None:
+        """Refuses ranges that lack a term or have an unknown one; those of commands may be left
+        out."""
+        terms = self.config.randomization.terms
+        commands = self.config.commands
+        check_names("a reset", "range", {*ranges, *commands}, {*terms, *commands})
 
     def _sample_world(
         self, rng: jax.Array, ranges: Ranges, share: float | None
