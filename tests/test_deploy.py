@@ -525,6 +525,16 @@ def test_load_policy_refuses_other_files(tmp_path: Path) -> None:
             load_policy(tmp_path / "a.onnx")
 
 
+def test_a_folder_wins_over_a_policy_of_its_name(tmp_path: Path, monkeypatch) -> None:
+    """As for the commands; in a checkout, `pretrained` is the package's own folder."""
+    monkeypatch.chdir(tmp_path)
+    Path("robust").mkdir()
+    with pytest.raises(UserError, match="robust is not in a run's folder"):
+        load_policy("robust")
+    Path("pretrained").symlink_to(resource_path("pretrained"))
+    assert load_policy("pretrained").metadata.task == "bounce"
+
+
 def edited(model: onnx.ModelProto, name: str, old: str, new: str) -> bytes:
     """An ONNX file with another text in an entry."""
     copy = onnx.ModelProto.FromString(model.SerializeToString())

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from bounce_mjx import EnvConfig
+from bounce_mjx.evaluation import robustness
 from bounce_mjx.evaluation.config import EvaluationOptions
 from bounce_mjx.evaluation.episodes import make_evaluator, reset_episodes
 from bounce_mjx.evaluation.failures import (
@@ -16,7 +17,9 @@ from bounce_mjx.evaluation.failures import (
     wilson_interval,
 )
 from bounce_mjx.evaluation.policy_evaluation import conditions_of
+from bounce_mjx.evaluation.robustness import find_episode, measure_conditions
 from bounce_mjx.evaluation.statistics import Statistics
+from bounce_mjx.evaluation.suite import load_suite
 from bounce_mjx.task.task import Recording, Tally
 from bounce_mjx.viewers.film import FilmPlayer
 from bounce_mjx.viewers.page import worst_episode
@@ -75,6 +78,60 @@ def test_a_film_is_the_episode_of_the_evaluation_bit_for_bit(
         assert player.world_value(name) == np.ravel(value)[0]
     heights = [player.step().balls[0, 0, 2] for _ in range(length)]
     assert heights == [*player.frames.balls[1:, 0, 0, 2], player.frames.balls[0, 0, 0, 2]]
+
+
+@pytest.mark.slow
+def test_an_episode_is_the_same_in_any_number_of_them(conditions, policy, measured) -> None:
+    episodes = 7
+    evaluate = make_evaluator(conditions.env, _Jumpy(), episodes, EPISODES)
+    few = jax.device_get(evaluate(policy, jax.random.PRNGKey(SEED), conditions.ranges))
+    statistics, recording = measured
+    jax.tree.map(
+        lambda ours, all_: np.testing.assert_array_equal(ours, all_[:episodes]),
+        few[0],
+        statistics,
+    )
+    jax.tree.map(
+        lambda ours, all_: np.testing.assert_array_equal(ours, all_[..., :episodes]),
+        few[1],
+        recording,
+    )
+
+
+@pytest.mark.slow
+def test_a_film_of_a_condition_is_its_episode(policy, tmp_path, monkeypatch) -> None:
+    """Of a suite whose conditions share a program with others, in calls of several conditions."""
+    path = tmp_path / "suite.yaml"
+    path.write_text(
+        "perturbations:\n"
+        "- {name: late, unit: ms, strengths: [10, 20], terms: {action_latency: strength}}\n"
+        "- {name: tilt, terms: {paddle_tilt: {from: -0.1, to: 0.1}}}\n"
+    )
+    conditions = load_suite(path, EnvConfig(episode_seconds=0.5))
+    judge, seen = robustness.judge, []
+
+    def judged(env, statistics, **others):
+        seen.append(jax.device_get(statistics))
+        return judge(env, statistics, **others)
+
+    monkeypatch.setattr(robustness, "judge", judged)
+    options = EvaluationOptions(10, SEED)
+    outcomes = measure_conditions(policy, lambda env: _Jumpy(), conditions, options)
+    assert [outcome.label for outcome in outcomes] == [
+        "nominal",
+        "late 10 ms",
+        "late 20 ms",
+        "tilt",
+    ]
+    shown, episodes, episode = find_episode(conditions, 3, options, 7)
+    film = film_episode(shown, _Jumpy(), policy, episodes, SEED, episode)
+    own = jax.tree.map(lambda x: x[7:8], seen[3])
+    # The sum of the rewards, which a film does not show, may round otherwise without a recording.
+    assert film.statistics.episode_return == pytest.approx(own.episode_return, rel=1e-6)
+    own = own._replace(episode_return=film.statistics.episode_return)
+    jax.tree.map(np.testing.assert_array_equal, film.statistics, own)
+    assert (7 in outcomes[3].lost) == (not film.statistics.running[0])
+    assert film.statistics.world["action_latency"][0] == 0.0
 
 
 @pytest.mark.slow

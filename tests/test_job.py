@@ -36,6 +36,7 @@ from bounce_mjx.runs.folders import (
 from bounce_mjx.runs.settings import Choice, stack
 from bounce_mjx.training import job
 from bounce_mjx.training.events import Event
+from bounce_mjx.training.faults import first_block_fault
 from bounce_mjx.training.trainer import Snapshot
 from tiny_runs import contents
 
@@ -238,7 +239,9 @@ def test_a_training_stops_once_its_results_have_a_margin(tmp_path: Path) -> None
     """It tells the first evaluation that met all results, and the end; resumed with more steps, it
     goes on."""
     margins = {2: 0.5, 3: 1.0, 4: 1.0}
-    run = train(tmp_path, RETURNS, margins=margins, stop_when_solved=True)
+    said = io.StringIO()
+    run = train(tmp_path, RETURNS, margins=margins, stop_when_solved=True, said=said)
+    assert "the training ends: all results are met with a margin" in said.getvalue()
     results = results_of(run)
     steps = [results[name] for name in ("solved_steps", "margin_steps", "trained_steps")]
     assert steps == [128, 192, 192]
@@ -259,8 +262,9 @@ def test_a_training_stops_once_its_results_have_a_margin(tmp_path: Path) -> None
     assert not layers.config({"total_steps": 10**6}).stop_when_solved
     assert layers.config().stop_when_solved
     assert latest_checkpoint(run).steps == 192
-    train(tmp_path, RETURNS, run, margins=margins)
+    train(tmp_path, RETURNS, run, margins=margins, said=(shown := io.StringIO()))
     assert latest_checkpoint(run).steps == 256
+    assert "the training ends after its 256 steps (total_steps)" in shown.getvalue()
     train(tmp_path, RETURNS, run, margins=margins, said=(shown := io.StringIO()))
     assert f"{run} has been trained to its end, 256 steps;" in shown.getvalue()
 
@@ -270,9 +274,22 @@ def test_settings_that_cannot_be_trained_are_refused_before_a_save(tmp_path: Pat
         def run(self):
             return super().run() | {"episode/ended": np.full((1, 1), float(BLOCK))}
 
+    class OtherUnit(CountingTrainer):
+        """A reward in mm for m, among terms that are in order."""
+
+        def run(self):
+            terms = {"reward/alive": 1.0, "reward/height": -2e5}
+            return super().run() | {name: np.full((1, 1), x) for name, x in terms.items()}
+
     with pytest.raises(UserError, match="these settings cannot be trained: an episode lasts 0.01"):
         train(tmp_path, RETURNS, trainer=Falling)
+    with pytest.raises(UserError, match=r"reward term height is -2e\+05 on average, not within 1"):
+        train(tmp_path, RETURNS, trainer=OtherUnit)
     assert not list(tmp_path.iterdir())
+    # Its scale counts.
+    ppo = PPOConfig(num_envs=8, rollout_length=8, num_minibatches=2, reward_scale=0.04)
+    metrics = OtherUnit.run(OtherUnit(TrainConfig(ppo=ppo), None))
+    assert first_block_fault(metrics, TrainConfig(ppo=ppo)) is None
 
 
 def test_a_callback_sees_blocks_and_evaluations_and_ends_the_training(tmp_path: Path) -> None:
@@ -323,10 +340,11 @@ def test_an_error_in_a_callback_ends_the_training(tmp_path: Path) -> None:
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_a_signal_saves_and_says_how_to_resume(tmp_path: Path, number: signal.Signals) -> None:
     signalled = before(2, lambda: os.kill(os.getpid(), number))
-    continues = "stopped after 128 steps; continue with: bounce-mjx train --resume "
-    with pytest.raises(job.TrainingStopped, match=continues):
+    with pytest.raises(job.TrainingStopped) as stopped:
         train(tmp_path, RETURNS, trainer=signalled)
     (run,) = tmp_path.iterdir()
+    continues = f"stopped after 128 steps; continue with: bounce-mjx train --resume {run}"
+    assert continues in str(stopped.value)
     assert latest_checkpoint(run).steps == 2 * BLOCK
     train(tmp_path, RETURNS, run)
     assert evaluated_steps(run) == [64, 128, 192, 256]
@@ -495,10 +513,11 @@ def test_divergence_ends_the_training_and_keeps_the_last_good_state(tmp_path: Pa
     class Alone(CountingTrainer):
         faults = {(0, 3): 2}
 
-    sentence = "loss became infinite or NaN at iteration 3; the last good checkpoint is"
-    with pytest.raises(UserError, match=sentence):
+    with pytest.raises(UserError) as diverged:
         train(tmp_path, RETURNS, trainer=Alone)
     (run,) = tmp_path.iterdir()
+    good = f"the last good checkpoint is {latest_checkpoint(run).folder}"
+    assert f"loss became infinite or NaN at iteration 3; {good}" in str(diverged.value)
     assert iterations_of(latest_checkpoint(run)) == 2
 
 

@@ -8,7 +8,6 @@ import multiprocessing
 import os
 import random
 import re
-import shlex
 import shutil
 import signal
 import subprocess
@@ -91,26 +90,17 @@ def test_resumed_training_is_the_same(run: Path, straight: Path) -> None:
     assert_same_training(run, straight)
 
 
-def resume_command(said: str) -> list[str]:
-    """The arguments in the command that a stopped training prints."""
-    return shlex.split(re.search(r"continue with: bounce-mjx train (.+)", said)[1])
-
-
 @pytest.mark.slow
-def test_a_process_that_gets_a_signal_saves_and_ends_with_0(tmp_path: Path) -> None:
+def test_a_process_that_gets_a_signal_ends_with_0(tmp_path: Path) -> None:
+    """What it saves and says is in `test_job.py`; that what it saved resumes to the same training,
+    in `test_resumed_training_is_the_same` and, at any block, `test_killed_at_any_moment`."""
     args = [*TINY, "--total-steps", 10**6, "--log-dir", tmp_path / "runs"]
     with job(tmp_path / "log", *args) as training:
         training.wait_until_said("evaluation at")
         training.process.send_signal(signal.SIGTERM)
         assert training.wait() == 0, training.said
-    said = training.said
-    assert "Traceback" not in said
-    (run,) = (tmp_path / "runs").iterdir()
-    steps = latest_checkpoint(run).steps
-    assert f"stopped after {steps:,} steps" in said
-    # That what it saved resumes to the same training is
-    # `test_resumed_training_is_the_same` and, at any block, `test_killed_at_any_moment`.
-    assert resume_command(said) == ["--resume", str(run)]
+    assert "Traceback" not in training.said
+    assert "continue with: bounce-mjx train --resume" in training.said
 
 
 @pytest.mark.parametrize("pause", [0.0, 0.8], ids=["told twice", "second Ctrl-C"])
@@ -325,9 +315,12 @@ def change_state(monkeypatch, iteration: int, change: Callable) -> None:
 
 
 @pytest.mark.slow
-def test_divergence_ends_the_training_and_keeps_the_last_good_state(
+def test_a_parameter_that_is_not_finite_ends_a_training_with_2(
     run: Path, half: Path, monkeypatch, capfd
 ) -> None:
+    """What the job says and keeps is in `test_job.py`; here the quantity is found, and nothing of
+    it reaches the run's folder."""
+
     def spoil(state):
         params = jax.tree.map(lambda x: x * jnp.nan, state.params.policy)
         return state._replace(params=state.params._replace(policy=params))
@@ -337,9 +330,7 @@ def test_divergence_ends_the_training_and_keeps_the_last_good_state(
         resume(run, "--total-steps", "100000")
     assert exit_info.value.code == 2
     sentence = capfd.readouterr().err
-    assert re.fullmatch(r"error: .+\n", sentence)
-    assert "loss/policy became infinite or NaN at iteration 4;" in sentence
-    assert f"the last good checkpoint is {latest_checkpoint(run).folder}" in sentence
+    assert re.fullmatch(r"error: .*loss/policy became infinite or NaN .+\n", sentence)
     assert_same_training(run, half)
 
 

@@ -28,8 +28,12 @@ def resource_path(name: str) -> Path:
 
 
 def policy_folder(name: str | os.PathLike | None) -> Path | None:
-    """Folder of a policy of `POLICIES`; None for another name, and where a folder of the user has
-    the name."""
-    if str(name) in POLICIES and not os.path.isdir(name):
-        return resource_path(POLICIES[str(name)])
-    return None
+    """Folder of a policy of `POLICIES`; None for another name, and where another folder of the
+    user has the name."""
+    if str(name) not in POLICIES:
+        return None
+    folder = resource_path(POLICIES[str(name)])
+    # In a checkout, `pretrained` is a folder of that name, and the policy's own.
+    if os.path.isdir(name) and not os.path.samefile(name, folder):
+        return None
+    return folder

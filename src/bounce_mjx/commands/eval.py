@@ -1,6 +1,5 @@
 """Measures the results of a trained policy: `bounce-mjx eval [CHECKPOINT]`."""
 
-import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,6 +13,7 @@ from bounce_mjx.commands.which_policy import (
     OtherWorld,
     WhichPolicy,
     check_one_world,
+    film_command,
     in_what_if_world,
 )
 from bounce_mjx.config.command_line import Flag, stdout
@@ -22,6 +22,9 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import config as evaluation
 from bounce_mjx.resources import POLICIES, resource_path
 from bounce_mjx.world.randomization import RandomizationConfig
+
+# What is of the evaluation alone; a name that ends with = has a value.
+_NOT_OF_PLAY = ("--failures", "--contacts", "--limits", "--json=", "--physics=")
 
 
 class EvalCommand(WhichPolicy):
@@ -116,21 +119,10 @@ def main(args: Sequence[str]) -> None:
             print(f"picture: {picture}")
         if failures and command.physics == "config":
             first_to_end = min(failures, key=lambda failure: failure.seconds)
-            print(f"film of one: {_film_command(args, first_to_end.episode)}")
+            shown = film_command(args, _NOT_OF_PLAY, "--episode", str(first_to_end.episode))
+            print(f"film of one: {shown}")
     if command.json_file is not None:
         plain = {"checkpoint": str(checkpoint.folder), "physics": engine, **report.to_dict()}
         plain |= {"seed": command.seed, "commands": commands, "nominal": command.nominal, **found}
         write_output(command.json_file, to_json(plain))
     sys.exit(0 if report.passed else 1)
-
-
-def _film_command(args: Sequence[str], episode: int) -> str:
-    """The command that shows an episode of this evaluation."""
-    switches = ("--failures", "--contacts", "--limits")
-    kept = [word for word in args if word not in switches]
-    for flag in ("--json", "--physics"):
-        if flag in kept:
-            place = kept.index(flag)
-            del kept[place : place + 2]
-    kept = [word for word in kept if not word.startswith(("--json=", "--physics="))]
-    return shlex.join(["bounce-mjx", "play", *kept, "--episode", str(episode)])

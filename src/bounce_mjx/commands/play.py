@@ -1,10 +1,11 @@
 """Shows a trained policy: `bounce-mjx play [CHECKPOINT ...]`."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from bounce_mjx.commands.task_commands import parse_with_commands
+from bounce_mjx.commands.task_commands import GivenCommands, parse_with_commands
 from bounce_mjx.commands.which_policy import (
     MirrorRobot,
     OtherRandomization,
@@ -12,16 +13,23 @@ from bounce_mjx.commands.which_policy import (
     WhichPolicy,
     check_one_world,
     in_what_if_world,
+    suite_conditions,
 )
 from bounce_mjx.config.command_line import Flag, stdout
 from bounce_mjx.config.settings import Count, NonNegativeInt
-from bounce_mjx.errors import UserError
-from bounce_mjx.evaluation.config import DEFAULT_EPISODES, DEFAULT_SEED, EvaluationOptions
+from bounce_mjx.errors import UserError, suggest
+from bounce_mjx.evaluation.config import (
+    DEFAULT_CONDITION_EPISODES,
+    DEFAULT_EPISODES,
+    DEFAULT_SEED,
+    EvaluationOptions,
+)
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.viewers.options import MAX_ENVS, ViewerOptions
 from bounce_mjx.world.randomization import RandomizationConfig
 
 if TYPE_CHECKING:
+    from bounce_mjx.evaluation.policy_evaluation import InEvaluation
     from bounce_mjx.runs.folders import Checkpoint
 
 
@@ -41,8 +49,13 @@ class PlayCommand(WhichPolicy):
     episode: NonNegativeInt | None = None
     """Episode of an evaluation to show again, as it was: its number in the list of bounce-mjx eval
     --failures, from 0. --seed, --episodes, --nominal and the world are then those of eval."""
-    episodes: Count = DEFAULT_EPISODES
-    """Episodes of that evaluation."""
+    condition: str | None = None
+    """Condition of bounce-mjx robustness of which an episode is shown, such as "action latency
+    40 ms"; --world is then that which the suite changes."""
+    suite: Path = Path("robustness")
+    """Suite of the condition: a file, or the name of one in configs/."""
+    episodes: Count | None = None
+    """Episodes of that evaluation; by default 1,024, of a condition 64."""
     nominal: bool = False
     """Whether that evaluation was without domain randomisation."""
     viewing: ViewerOptions = ViewerOptions()
@@ -54,10 +67,13 @@ def main(args: Sequence[str]) -> None:
     if len(command.checkpoints) > MAX_ENVS:
         raise UserError(f"{len(command.checkpoints)} policies are given; give at most {MAX_ENVS}")
     check_one_world(command.nominal, command.world, command.randomization)
-    if command.episode is None and (command.nominal or "episodes" in command.model_fields_set):
-        raise UserError("--nominal and --episodes are of an evaluation, and need --episode")
-    if command.episode is not None:
-        _check_film(command)
+    if command.episode is None:
+        flags = {"--nominal": command.nominal, "--episodes": command.episodes}
+        flags |= {"--condition": command.condition}
+        if given := [flag for flag, value in flags.items() if value]:
+            raise UserError(f"{' and '.join(given)} of an evaluation need --episode; add it")
+    else:
+        _check_film(command, given_commands)
     # Before the seconds that imports and the compilation take.
     print("starting: the simulation is compiled, which takes longer the first time", flush=True)
     from bounce_mjx.reports.tables import count_text
@@ -82,31 +98,68 @@ def main(args: Sequence[str]) -> None:
         make_controller = lambda env, actor=actor: make_policy_controller(actor(env))  # noqa: E731
         film = None
         if command.episode is not None:
-            options = _evaluation(command, commands)
             title += f", episode {command.episode}"
-            film = film_player(config.env, actor, policy, options, command.episode)
+            find = _episode_finder(command, config, commands)
+            film = film_player(find, actor, policy, _evaluation_seed(command))
         shown.append(Shown(config.env, make_controller, title, policy, film))
     show(shown, command.viewing, commands=commands, console=stdout())
 
 
 def _config(checkpoint: "Checkpoint", command: PlayCommand) -> TrainConfig:
     """The config of a checkpoint's training, with the world that is to be shown."""
-    config = command.config_of(checkpoint, command.robot, command.world)
+    world = None if command.condition else command.world
+    config = command.config_of(checkpoint, command.robot, world)
     return in_what_if_world(config, command.randomization)
 
 
-def _evaluation(command: PlayCommand, commands: dict[str, float]) -> EvaluationOptions:
-    """The evaluation of which an episode is shown."""
-    seed = command.viewing.seed if "seed" in command.viewing.model_fields_set else DEFAULT_SEED
-    return EvaluationOptions(command.episodes, seed, "config", command.nominal, commands)
+def _evaluation_seed(command: PlayCommand) -> int:
+    """Seed of the evaluation of which an episode is shown."""
+    return command.viewing.seed if "seed" in command.viewing.model_fields_set else DEFAULT_SEED
 
 
-def _check_film(command: PlayCommand) -> None:
+def _num_episodes(command: PlayCommand) -> int:
+    """Number of episodes of that evaluation."""
+    default = DEFAULT_CONDITION_EPISODES if command.condition else DEFAULT_EPISODES
+    return command.episodes or default
+
+
+def _episode_finder(
+    command: PlayCommand, config: TrainConfig, commands: dict[str, float]
+) -> "Callable[[], InEvaluation]":
+    """What finds the place of the episode in that evaluation.
+
+    Raises:
+      UserError: the suite has no such condition.
+    """
+    from bounce_mjx.evaluation.policy_evaluation import InEvaluation, conditions_of
+    from bounce_mjx.evaluation.robustness import find_episode
+
+    options = EvaluationOptions(
+        _num_episodes(command), _evaluation_seed(command), "config", command.nominal, commands
+    )
+    if command.condition is None:
+        return lambda: InEvaluation(
+            conditions_of(config.env, options), options.episodes, command.episode
+        )
+    path, conditions, _ = suite_conditions(command.suite, config, command.world)
+    labels = [condition.label for condition in conditions]
+    if command.condition not in labels:
+        advice = suggest(command.condition, labels) or f"give one such as {labels[-1]!r}"
+        raise UserError(f"{path} has no condition {command.condition!r}; {advice}")
+    index = labels.index(command.condition)
+    return partial(find_episode, conditions, index, options, command.episode)
+
+
+def _check_film(command: PlayCommand, given_commands: GivenCommands) -> None:
     """Raises UserError for what an episode cannot be shown with."""
     if len(command.checkpoints) > 1 or command.viewing.num_envs > 1:
         raise UserError("--episode shows one episode of one policy; give one policy, one robot")
-    if command.episode >= command.episodes:
+    changes = command.nominal or command.randomization.terms or given_commands.values
+    if command.condition is not None and changes:
+        raise UserError("--condition is a whole world; omit other flags that change the world")
+    episodes = _num_episodes(command)
+    if command.episode >= episodes:
         raise UserError(
-            f"--episode is {command.episode}, but the evaluation has the {command.episodes:,} "
-            f"episodes 0 to {command.episodes - 1:,}; give one of them, or its --episodes"
+            f"--episode is {command.episode}, but the evaluation has the {episodes:,} "
+            f"episodes 0 to {episodes - 1:,}; give one of them, or its --episodes"
         )

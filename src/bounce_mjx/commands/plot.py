@@ -30,9 +30,9 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.env.env import Env
     from bounce_mjx.reports import curves, figures, page
     from bounce_mjx.runs.files import writable, write_output
-    from bounce_mjx.runs.folders import find_checkpoint, named_run, runs_of_seeds
+    from bounce_mjx.runs.folders import find_checkpoint, runs_of_seeds
 
-    runs = [named_run(run, command.folder) for run in command.runs or (None,)]
+    runs = [command.choose_run(run) for run in command.runs or (None,)]
     seeds = [seed for run in runs for seed in runs_of_seeds(run)]
     checkpoints = [find_checkpoint(seed) for seed in seeds]
     configs = [command.config_of_run(checkpoint.run) for checkpoint in checkpoints]

@@ -19,9 +19,9 @@ def main(args: Sequence[str]) -> None:
     """Runs the command line."""
     command = parse(ReportCommand, args, prog="bounce-mjx report")
     from bounce_mjx.reports.page import write_report
-    from bounce_mjx.runs.folders import find_checkpoint, named_run
+    from bounce_mjx.runs.folders import find_checkpoint
     from bounce_mjx.training.setup import set_up_jax
 
-    checkpoint = find_checkpoint(named_run(command.run, command.folder))
+    checkpoint = find_checkpoint(command.choose_run(command.run))
     set_up_jax(command.config_of_run(checkpoint.run).env)
     print(write_report(checkpoint.run))

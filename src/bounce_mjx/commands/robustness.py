@@ -6,14 +6,18 @@ from pathlib import Path
 
 from rich.progress import Progress
 
-from bounce_mjx.commands.which_policy import MirrorRobot, OnePolicy, WhichPolicy
+from bounce_mjx.commands.which_policy import (
+    MirrorRobot,
+    OnePolicy,
+    WhichPolicy,
+    film_command,
+    suite_conditions,
+)
 from bounce_mjx.config.command_line import parse, stdout
 from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import config as evaluation
 from bounce_mjx.resources import POLICIES, resource_path
-from bounce_mjx.runs.presets import named_file
-from bounce_mjx.runs.worlds import in_world
 
 
 class RobustnessCommand(WhichPolicy):
@@ -45,9 +49,8 @@ def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 0 if all conditions meet all judged results, 1 if one does
     not, 2 on a mistake."""
     command = parse(RobustnessCommand, args, prog="bounce-mjx robustness")
-    from bounce_mjx.env.env import model_nominals
     from bounce_mjx.evaluation.robustness import RobustnessReport, measure_conditions
-    from bounce_mjx.evaluation.suite import load_suite, read_suite
+    from bounce_mjx.evaluation.suite import read_suite
     from bounce_mjx.reports import robustness
     from bounce_mjx.reports.figures import image
     from bounce_mjx.runs.checkpoints import read_actor
@@ -60,16 +63,11 @@ def main(args: Sequence[str]) -> None:
     console = stdout()
     checkpoint = command.choose(command.checkpoint, command.robot)
     config = command.config_of(checkpoint, command.robot)
-    path = named_file(command.suite, "configs")
-    suite, version, world, assumed = str(path), read_suite(path).version, None, {}
-    if command.world is not None:
-        there, named = in_world(config, command.world)
-        world = there.env
-        assumed = named.double_assumed(model_nominals(there.env))
-    conditions = load_suite(path, config.env, world, assumed)
+    path, conditions, doubled = suite_conditions(command.suite, config, command.world)
+    suite, version = str(path), read_suite(path).version
     if command.assumed:
         # The suite's own conditions follow.
-        conditions = conditions[: 1 + len(assumed)]
+        conditions = conditions[: 1 + doubled]
         suite, version = f"twice what {command.world} assumes", ""
     set_up_jax(*(evaluation.on_engine(condition.env, command.physics) for condition in conditions))
     checkpoint, policy, actor = read_actor(checkpoint, config)
@@ -101,4 +99,10 @@ def main(args: Sequence[str]) -> None:
     for name, content in files.items():
         write_output(out / name, content)
     print(*(out / name for name in files), sep="\n")
+    lost = [outcome for outcome in outcomes if outcome.lost and outcome.physics != "mujoco"]
+    # Films are of the whole suite's programs.
+    if lost and not command.assumed:
+        worst = min(lost, key=lambda outcome: outcome.lasted)
+        film = "--condition", worst.label, "--episode", str(worst.lost[0])
+        print(f"film of a lost ball: {film_command(args, ('--out=', '--physics='), *film)}")
     sys.exit(0 if report.passed else 1)

@@ -1,6 +1,8 @@
 """Which policy a command is about, and the flags that several commands share."""
 
 import os
+import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,14 +12,17 @@ from bounce_mjx.config.command_line import Flag
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, suggest
+from bounce_mjx.resources import policy_folder
 from bounce_mjx.runs import config as run_configs
 from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.presets import named_file
 from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.runs.worlds import in_world
 from bounce_mjx.task.registry import DEFAULT, find_task
 from bounce_mjx.world.randomization import RandomizationConfig
 
 if TYPE_CHECKING:
+    from bounce_mjx.evaluation.suite import Condition
     from bounce_mjx.runs.folders import Checkpoint
 
 MIRROR = "mirror"
@@ -83,6 +88,48 @@ def in_what_if_world(config: TrainConfig, randomization: RandomizationConfig) ->
     return config.model_copy(update={"env": env})
 
 
+def suite_conditions(
+    suite: Path, config: TrainConfig, world: Path | None
+) -> tuple[Path, list["Condition"], int]:
+    """The file of a suite, its conditions for a policy, and how many of them, after the nominal
+    one, double what the world assumes.
+
+    Args:
+      suite: a file, or the name of one in configs/.
+      config: of the policy's training.
+      world: that each condition changes; by default, the model's own.
+
+    Raises:
+      UserError: suite or world is missing or wrong.
+    """
+    from bounce_mjx.env.env import model_nominals
+    from bounce_mjx.evaluation.suite import load_suite
+
+    path = named_file(suite, "configs")
+    if world is None:
+        return path, load_suite(path, config.env), 0
+    there, named = in_world(config, world)
+    assumed = named.double_assumed(model_nominals(there.env))
+    return path, load_suite(path, config.env, there.env, assumed), len(assumed)
+
+
+def film_command(args: Sequence[str], omitted: Sequence[str], *film: str) -> str:
+    """The command that shows an episode of the evaluation that a command line started.
+
+    Args:
+      args: the words of the command line.
+      omitted: its flags that `play` lacks; a name that ends with = has a value.
+      film: the flags of the episode.
+    """
+    kept, words = [], iter(args)
+    for word in words:
+        if f"{word}=" in omitted:
+            next(words, None)
+        elif word not in omitted and f"{word.partition('=')[0]}=" not in omitted:
+            kept.append(word)
+    return shlex.join(["bounce-mjx", "play", *kept, *film])
+
+
 class WhichPolicy(StrictModel):
     """Which policy a command is about: in whose runs it is looked for. A command adds the flags
     for its paths, and for the robot and the world if it simulates."""
@@ -116,6 +163,21 @@ class WhichPolicy(StrictModel):
         if robot is not None:
             raise UserError("--robot is for the mirror law; omit it, or give mirror as checkpoint")
         return choose_checkpoint(path, self.folder)
+
+    def choose_run(self, path: Path | None) -> Path:
+        """A run with its log: `named_run`.
+
+        Raises:
+          UserError: there is none, or it is a policy of the package, which has no log.
+        """
+        from bounce_mjx.runs.folders import named_run
+
+        if policy_folder(path) is not None:
+            raise UserError(
+                f"the policy {path} comes with the package, without the log of its training; give "
+                "a run's folder"
+            )
+        return named_run(path, self.folder)
 
     def config_of_run(self, run: Path) -> TrainConfig:
         """The config of a run.

@@ -7,7 +7,7 @@ from typing import Any
 
 from bounce_mjx.deploy.policy import DeployedPolicy
 from bounce_mjx.errors import UserError
-from bounce_mjx.resources import POLICIES, resource_path
+from bounce_mjx.resources import POLICIES, policy_folder
 
 
 def load_policy(
@@ -22,7 +22,7 @@ def load_policy(
       policy: the name of a policy that comes with the package, "pretrained", "robust",
         "robust_small", or that of a task such as "juggle" or of an arm; a `.onnx` file from
         `bounce-mjx export`; or a run's folder or a checkpoint in it, which is first exported with
-        JAX.
+        JAX. A folder of that name comes first.
       task: FILE.py:CLASS, for a run of a task in a file, which is code.
       joint_names: the driver's names of the joints in the driver's order, such as `fr3_joint1`;
         angles, velocities, actions and commands then have this order. A name belongs to the joint
@@ -36,8 +36,8 @@ def load_policy(
     """
     path = Path(policy)
     source = str(policy)
-    if policy in POLICIES:
-        path = resource_path(f"{POLICIES[policy]}/{policy}.onnx")
+    if (folder := policy_folder(policy)) is not None:
+        path = folder / f"{policy}.onnx"
         source = f"the policy {policy}"
     try:
         model = _export(path, task) if path.is_dir() else path.read_bytes()

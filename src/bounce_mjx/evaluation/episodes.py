@@ -15,8 +15,8 @@ from bounce_mjx.task.task import Recording
 from bounce_mjx.world.randomization import Ranges
 
 BLOCK = 64
-"""Episodes of a film's batch. From this number on, an episode is the same bit for bit in a batch of
-any multiple of it on a CPU, whose vector instructions then have no remainder."""
+"""Episodes of a film's batch. An episode is the same bit for bit in a batch of any multiple of it
+on a CPU, whose vector instructions then have no remainder."""
 
 Evaluator = Callable[..., Measured]
 """Measures E deterministic episodes from a policy, a key and optional ranges."""
@@ -35,13 +35,14 @@ class Batch(NamedTuple):
 def make_evaluator(env: Env, actor: Actor, episodes: int, recorded: int = 0) -> Evaluator:
     """A jitted evaluation of `episodes` episodes, each from its own reset (`reset_episodes`), with
     a recording of the first `recorded`. It stops when all episodes have ended or their time limit
-    is reached. More than `BLOCK` are simulated with copies of the last one, up to whole blocks, so
-    that a film shows each of them as it was."""
+    is reached. They are simulated with copies of the last one, up to whole blocks, so that an
+    episode is the same in any number of them, and a film shows it as it was."""
+    lanes = _lanes(env, episodes)
 
     def evaluate(policy: Policy, key: jax.Array, ranges: Ranges | None = None) -> Measured:
-        states = reset_episodes(env, key, episodes, ranges)
-        states = jax.tree.map(lambda x: x[..., _whole_blocks(episodes)], states)
-        statistics, recording = run_episodes(env, actor, policy, states, recorded)
+        states = _reset_lanes(env, key, episodes, lanes, ranges)
+        shown = min(recorded, episodes)
+        statistics, recording = run_episodes(env, actor, policy, states, shown)
         return jax.tree.map(lambda x: x[:episodes], statistics), recording
 
     return jax.jit(evaluate)
@@ -54,19 +55,20 @@ def make_filmer(env: Env, actor: Actor, episodes: int, episode: int) -> Evaluato
     On a CPU it is the same bit for bit. On other devices the batch is the evaluation's own, but the
     episode has another place in it, which may change the last bits of its actions.
     """
-    lanes = _whole_blocks(episodes)
+    lanes = _lanes(env, episodes)
+    simulated = np.arange(len(lanes))
     if jax.default_backend() != "cpu":
-        lanes = np.roll(lanes, -episode)
+        simulated = np.roll(simulated, -episode)
         place = 0
     else:
         first = episode // BLOCK * BLOCK
-        lanes = lanes[first : first + BLOCK]
+        simulated = simulated[first : first + BLOCK]
         place = episode - first
     recorded = place + 1
 
     def evaluate(policy: Policy, key: jax.Array, ranges: Ranges | None = None) -> Measured:
-        states = reset_episodes(env, key, episodes, ranges)
-        states = jax.tree.map(lambda x: x[..., lanes], states)
+        states = _reset_lanes(env, key, episodes, lanes, ranges)
+        states = jax.tree.map(lambda x: x[..., simulated], states)
         statistics, recording = run_episodes(env, actor, policy, states, recorded)
         its_statistics = jax.tree.map(lambda x: x[place : place + 1], statistics)
         return its_statistics, jax.tree.map(lambda x: x[..., place : place + 1], recording)
@@ -74,10 +76,12 @@ def make_filmer(env: Env, actor: Actor, episodes: int, episode: int) -> Evaluato
     return jax.jit(evaluate)
 
 
-def _whole_blocks(episodes: int) -> np.ndarray:
-    """Indices of the episodes, the last one repeated up to whole blocks; of one block, no more than
-    there are."""
-    total = episodes if episodes <= BLOCK else -(-episodes // BLOCK) * BLOCK
+def _lanes(env: Env, episodes: int) -> np.ndarray:
+    """Indices of the episodes, the last one repeated up to whole blocks."""
+    total = -(-episodes // BLOCK) * BLOCK
+    if env.engine.name != "fused" and episodes < BLOCK:
+        # Copies in MJX take as long as its episodes.
+        total = episodes
     return np.minimum(np.arange(total), episodes - 1)
 
 
@@ -138,11 +142,17 @@ def reset_episodes(env: Env, key: jax.Array, episodes: int, ranges: Ranges | Non
         N / C episodes, and all conditions use the same keys, so that they differ only in their
         ranges. The default is one condition with the config's ranges.
     """
+    return _reset_lanes(env, key, episodes, np.arange(episodes), ranges)
+
+
+def _reset_lanes(
+    env: Env, key: jax.Array, episodes: int, lanes: np.ndarray, ranges: Ranges | None
+) -> State:
+    """`reset_episodes` of the episodes with some indices, which may repeat."""
     if ranges is None:
-        return jax.vmap(env.reset, out_axes=-1)(jax.random.split(key, episodes))
+        return jax.vmap(env.reset, out_axes=-1)(jax.random.split(key, episodes)[lanes])
     conditions = len(jax.tree.leaves(ranges)[0])
     each = episodes // conditions
-    index = jnp.arange(episodes)
-    keys = jax.random.split(key, each)[index % each]
-    ranges = jax.tree.map(lambda end: jnp.asarray(end)[index // each], ranges)
+    keys = jax.random.split(key, each)[lanes % each]
+    ranges = jax.tree.map(lambda end: jnp.asarray(end)[lanes // each], ranges)
     return jax.vmap(env.reset, out_axes=-1)(keys, ranges)

@@ -29,6 +29,16 @@ class Conditions(NamedTuple):
     """Of one condition, as for `reset_episodes`; None for the config's."""
 
 
+class InEvaluation(NamedTuple):
+    """Where an evaluation simulates one of its episodes."""
+
+    conditions: Conditions
+    episodes: int
+    """Number of episodes that one call simulates."""
+    episode: int
+    """Number of the episode among them, from 0."""
+
+
 class PolicyEvaluation(NamedTuple):
     """A report, and the physics engine that it was measured on."""
 

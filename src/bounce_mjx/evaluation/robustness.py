@@ -13,12 +13,14 @@ import pydantic
 from pydantic import Field
 
 from bounce_mjx.env.env import Env
+from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
 from bounce_mjx.evaluation.config import EvaluationOptions, Physics, on_engine
 from bounce_mjx.evaluation.episodes import make_evaluator
+from bounce_mjx.evaluation.policy_evaluation import Conditions, InEvaluation
 from bounce_mjx.evaluation.results import judge
 from bounce_mjx.evaluation.statistics import Statistics
-from bounce_mjx.evaluation.suite import Condition
+from bounce_mjx.evaluation.suite import Condition, condition_label
 from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import TERMS, RandomizationConfig, Ranges
@@ -56,6 +58,11 @@ class ConditionOutcome(pydantic.BaseModel):
     same keys, so that a number means the same reset in each."""
     measured: Annotated[dict[str, str], Field(exclude=True)] = {}
     """What each result measures, with its unit; not stored."""
+
+    @property
+    def label(self) -> str:
+        """Its perturbation and strength, such as "action latency 20 ms"."""
+        return condition_label(self.perturbation, self.strength, self.unit)
 
     @property
     def passed(self) -> bool:
@@ -122,30 +129,18 @@ def measure_conditions(
     Raises:
       UserError: the engine does not support the model.
     """
-    programs = defaultdict(list)
-    for index, condition in enumerate(conditions):
-        key = json.dumps(condition.env.model_dump(mode="json"))
-        programs[key, _SEPARATE_TERMS.intersection(condition.ranges)].append(index)
     outcomes: list[ConditionOutcome | None] = [None] * len(conditions)
     done = 0
-    for (_, separate), indices in programs.items():
+    for indices in _programs(conditions):
         members = [conditions[index] for index in indices]
-        env = Env(_spanning_config(members, options.physics))
-        dry_in_mjx = env.engine.name == "mjx" and "joint_frictionloss" in separate
-        on_c = options.physics == "mujoco" or dry_in_mjx
+        env, names, on_c = _program(members, options.physics)
         engine = "mujoco" if on_c else env.engine.name
-        own = {name: (command.low, command.high) for name, command in env.config.commands.items()}
-        # Of the commands, those for which a condition has another range than the config.
-        changed = [name for name in own if any(c.commands[name] != own[name] for c in members)]
-        names = [*env.config.randomization.terms, *changed]
         size = _batch_size(len(members), options.episodes, on_c)
         make = make_mujoco_evaluator if on_c else make_evaluator
         evaluate = make(env, actor(env), size * options.episodes)
         for start in range(0, len(members), size):
             batch = members[start : start + size]
-            # Padding the last call with a repeated condition avoids compiling another shape.
-            padded = batch + [batch[-1]] * (size - len(batch))
-            ranges = _stack_ranges(names, padded)
+            ranges = _stack_ranges(names, _padded(batch, size))
             statistics, _ = evaluate(policy, jax.random.PRNGKey(options.seed), ranges)
             for i, condition in enumerate(batch):
                 its = slice(i * options.episodes, (i + 1) * options.episodes)
@@ -154,6 +149,60 @@ def measure_conditions(
             done += len(batch)
             progress(done)
     return outcomes
+
+
+def find_episode(
+    conditions: Sequence[Condition], index: int, options: EvaluationOptions, episode: int
+) -> InEvaluation:
+    """Where `measure_conditions` simulates an episode of one of the conditions.
+
+    Raises:
+      UserError: MuJoCo's C engine simulates it.
+    """
+    condition = conditions[index]
+    (indices,) = [program for program in _programs(conditions) if index in program]
+    members = [conditions[member] for member in indices]
+    env, names, on_c = _program(members, options.physics)
+    if on_c:
+        raise UserError(
+            f"the condition {condition.label} is simulated on MuJoCo's C engine, which has no "
+            "films; choose another condition"
+        )
+    size = _batch_size(len(members), options.episodes, on_c)
+    place = indices.index(index)
+    start = place // size * size
+    ranges = _stack_ranges(names, _padded(members[start : start + size], size))
+    place_in_call = (place - start) * options.episodes + episode
+    return InEvaluation(
+        Conditions(env, condition.commands, ranges), size * options.episodes, place_in_call
+    )
+
+
+def _programs(conditions: Sequence[Condition]) -> list[list[int]]:
+    """The indices of the conditions that share a compiled program, for each program."""
+    programs = defaultdict(list)
+    for index, condition in enumerate(conditions):
+        key = json.dumps(condition.env.model_dump(mode="json"))
+        programs[key, _SEPARATE_TERMS.intersection(condition.ranges)].append(index)
+    return [*programs.values()]
+
+
+def _program(members: Sequence[Condition], physics: Physics) -> tuple[Env, list[str], bool]:
+    """The environment of conditions that share a program, the names of the ranges that are its
+    inputs, and whether MuJoCo's C engine simulates it."""
+    env = Env(_spanning_config(members, physics))
+    is_dry = any("joint_frictionloss" in condition.ranges for condition in members)
+    on_c = physics == "mujoco" or (env.engine.name == "mjx" and is_dry)
+    own = {name: (command.low, command.high) for name, command in env.config.commands.items()}
+    # Of the commands, those for which a condition has another range than the config.
+    changed = [name for name in own if any(c.commands[name] != own[name] for c in members)]
+    return env, [*env.config.randomization.terms, *changed], on_c
+
+
+def _padded(batch: list[Condition], size: int) -> list[Condition]:
+    """The conditions of a call. Padding the last one with a repeated condition avoids compiling
+    another shape."""
+    return batch + [batch[-1]] * (size - len(batch))
 
 
 def _outcome(

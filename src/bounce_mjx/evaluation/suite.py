@@ -82,6 +82,11 @@ class Condition(NamedTuple):
     trained: bool
     """Whether the training ranges of the policy contain the condition."""
 
+    @property
+    def label(self) -> str:
+        """Its perturbation and strength, such as "action latency 20 ms"."""
+        return condition_label(self.perturbation.name, self.strength, self.perturbation.unit)
+
     def range(self, name: str) -> Bounds:
         """Range of a command, or of a term; neutral if it is not perturbed."""
         return self.ranges.get(name) or neutral_range(name, self.env)
@@ -90,6 +95,11 @@ class Condition(NamedTuple):
     def commands(self) -> dict[str, tuple[float, float]]:
         """Range of each command."""
         return {name: tuple(map(float, self.ranges[name])) for name in self.env.commands}
+
+
+def condition_label(perturbation: str, strength: float | None, unit: str) -> str:
+    """A perturbation and its strength in words."""
+    return perturbation if strength is None else f"{perturbation} {strength:g} {unit}".rstrip()
 
 
 def read_suite(path: Path) -> Suite:

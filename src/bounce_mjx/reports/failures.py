@@ -23,7 +23,11 @@ def failures_table(
     """The failed episodes, the shortest first, with the terms of their worlds that go with failure
     the most."""
     names = [one.name for one in associations[:_SHOWN_TERMS]]
-    title = f"{len(failures)} of {episodes:,} episodes failed"
+    missed = sum(failure.lasted for failure in failures)
+    title = (
+        f"{len(failures)} of {episodes:,} episodes failed: {len(failures) - missed} ended early, "
+        f"{missed} lasted and missed a result"
+    )
     columns = [Column(header, justify="right") for header in ("episode", "at, s", *names)]
     table = plain_table(title, *columns, "what failed")
     ordered = sorted(failures, key=lambda failure: (failure.seconds, failure.episode))

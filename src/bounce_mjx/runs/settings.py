@@ -36,7 +36,7 @@ from bounce_mjx.config.validation import describe, key_of
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.learning.config import PPO_NAME, PPOConfig
 from bounce_mjx.learning.registry import find_algorithm
-from bounce_mjx.resources import POLICIES
+from bounce_mjx.resources import policy_folder
 from bounce_mjx.runs.config import (
     TrainConfig,
     fields_of,
@@ -291,7 +291,7 @@ def _policy(choice: Choice, files: Sequence[Layer], whole: TrainConfig | None) -
         log_dir = runs_folder(whole.env.task if whole else find_task(task or DEFAULT))
     checkpoint = choose_checkpoint(Path(path), Path(log_dir))
     config = load_run_config(checkpoint.run, task)
-    return _Policy(Path(path) if str(path) in POLICIES else checkpoint.folder, config)
+    return _Policy(Path(path) if policy_folder(path) else checkpoint.folder, config)
 
 
 # Merging and validating -------------------------------------------------------------------------

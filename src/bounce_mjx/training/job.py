@@ -33,7 +33,7 @@ from bounce_mjx.physics.convergence import solver_warning
 from bounce_mjx.runs import checkpoints, folders
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.files import writable
-from bounce_mjx.runs.progress import Progress
+from bounce_mjx.runs.progress import PATIENCE, Progress
 from bounce_mjx.training import events, faults, hosts
 from bounce_mjx.training.clock import Clock
 from bounce_mjx.training.evaluators import Evaluators
@@ -414,8 +414,8 @@ class Job:
           UserError: the state could not be saved.
         """
         stopping, where = self.is_stopping(), ""
-        if self.is_ended and self.steps < self.config.total_steps:
-            self.say(f"a callback ended the training after {self.steps:,} steps; {self.go_on}")
+        if self.is_finished() and not stopping:
+            self.say(self.why_it_ends())
         if stopping and self.is_new and self.steps == 0:
             jax.distributed.shutdown()
             raise Interrupted
@@ -479,6 +479,19 @@ class Job:
         """Whether the results end the training."""
         solved = all(seed.progress.solved for seed in self.healthy())
         return self.config.stop_when_solved and solved
+
+    def why_it_ends(self) -> str:
+        """Why the training ends here, in words."""
+        if self.is_ended and self.steps < self.config.total_steps:
+            return f"a callback ended the training after {self.steps:,} steps; {self.go_on}"
+        if not self.is_solved():
+            return f"the training ends after its {self.steps:,} steps (total_steps)"
+        if all(seed.progress.margin_steps is not None for seed in self.healthy()):
+            return "the training ends: all results are met with a margin (stop_when_solved)"
+        return (
+            f"the training ends: all results are met, and no margin came within {PATIENCE:g} times "
+            "the steps until then (stop_when_solved)"
+        )
 
     def is_evaluated(self) -> bool:
         """Whether the current policies are evaluated."""

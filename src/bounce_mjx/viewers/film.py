@@ -6,14 +6,12 @@ import jax
 import numpy as np
 
 from bounce_mjx.env.env import Env
-from bounce_mjx.evaluation.config import EvaluationOptions
 from bounce_mjx.evaluation.failures import Film, film_episode
-from bounce_mjx.evaluation.policy_evaluation import conditions_of
+from bounce_mjx.evaluation.policy_evaluation import InEvaluation
 from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.task.task import Recording
 from bounce_mjx.viewers.simulation import EnvFrame, Simulation, frame_at
 from bounce_mjx.viewers.world import WorldSlider, sliders_for, with_sliders
-from bounce_mjx.world.config import WorldConfig
 
 
 class FilmPlayer(Simulation):
@@ -80,19 +78,22 @@ class FilmPlayer(Simulation):
 
 
 def film_player(
-    config: WorldConfig,
+    find: Callable[[], InEvaluation],
     actor: Callable[[Env], Actor],
     policy: Policy | None,
-    options: EvaluationOptions,
-    episode: int,
+    seed: int,
 ) -> Callable[[], FilmPlayer]:
-    """What simulates an episode of an evaluation, and gives its film."""
+    """What simulates an episode of an evaluation, and gives its film.
+
+    Args:
+      find: gives its place in the evaluation.
+      seed: of the evaluation's resets.
+    """
 
     def simulate() -> FilmPlayer:
-        conditions = conditions_of(config, options)
+        conditions, episodes, episode = find()
         acting = actor(conditions.env)
-        film = film_episode(conditions, acting, policy, options.episodes, options.seed, episode)
-        return FilmPlayer(film)
+        return FilmPlayer(film_episode(conditions, acting, policy, episodes, seed, episode))
 
     return simulate
 
