@@ -1,15 +1,18 @@
 """Identification of real robots and real balls from public logs: errors on unseen data, beside the
 simplest models.
 
-`python benchmarks/real_logs.py FOLDER... [--out FILE.json]`. A folder is a clone of
+`python benchmarks/real_logs.py FOLDER... [--toolbox] [--out FILE.json]`. A folder is a clone of
 
 - github.com/marcocognetti/FrankaEmikaPandaDynModel (a Franka Panda, 20 s at 1 kHz);
 - github.com/swiatecki/ProjectMoose (a UR5, 125 Hz);
 - github.com/cogsys-tuebingen/tt3d (139 table-tennis flights with one bounce each).
 
+or a CSV file, a log of the project's own arm, of which the arm's part counts.
+
 An arm's log is cut into halves: each is fitted alone, and the world is tested on the other on
-MuJoCo's C engine, open loop from its first row, with nothing refitted. Flights are moved over the
-paddle of the project's arm, which rests, and compared with a direct fit of the same air.
+MuJoCo's C engine, open loop from its first row, with nothing refitted. With --toolbox, so is
+MuJoCo's own identification. Flights are moved over the paddle of the project's arm, which rests,
+and compared with a direct fit of the same air.
 """
 
 import argparse
@@ -36,8 +39,9 @@ from bounce_mjx.identify.following import (
     set_points,
 )
 from bounce_mjx.identify.log import Log
+from bounce_mjx.identify.reading import read_csv
 from bounce_mjx.identify.simulation import compensated, make_targets
-from bounce_mjx.identify.stages import Identified, identify
+from bounce_mjx.identify.stages import identify
 from bounce_mjx.identify.world import describe_doubts, total_delay
 from bounce_mjx.physics import edited_model
 from bounce_mjx.robot.model import find_addresses, joint_names
@@ -62,7 +66,8 @@ class ArmLog(NamedTuple):
     """A real arm's log."""
 
     name: str
-    robot: str
+    robot: str | None
+    """None for the project's own."""
     log: Log
 
 
@@ -92,6 +97,16 @@ def ur5_logs(folder: Path) -> Iterator[ArmLog]:
             yield ArmLog(f"UR5, 125 Hz: {path.stem}", "ur5e", log)
 
 
+def own_log(path: Path) -> ArmLog:
+    """The arm's part of a CSV log of the project's own arm."""
+    names = joint_names(world_model(read_preset(Path("default")).env, visual=False))
+    nothing = np.zeros(0)
+    log = read_csv(path, names)._replace(
+        picture_times=nothing, ball_positions=np.zeros((0, 3)), arrivals=nothing
+    )
+    return ArmLog(f"project's own arm: {path.stem}", None, log)
+
+
 def _arm_log(path: Path, times: np.ndarray, angles: np.ndarray, targets: np.ndarray) -> Log:
     nothing = np.zeros(0)
     return Log(str(path), times, angles, times, targets, nothing, np.zeros((0, 3)), nothing)
@@ -113,20 +128,16 @@ def halves(log: Log) -> tuple[Log, Log]:
     return part(early, early_sent), part(~early, ~early_sent)
 
 
-def open_loop(config: WorldConfig, found: Identified, log: Log) -> np.ndarray:
-    """Errors [n] of an identified arm on a log, root mean square, rad: one simulation on MuJoCo's C
+def open_loop(config: WorldConfig, world: dict[str, np.ndarray], log: Log) -> np.ndarray:
+    """Errors [n] of an arm's world on a log, root mean square, rad: one simulation on MuJoCo's C
     engine from the log's first row."""
-    if found.gravity_compensation:
-        config = compensated(config)
     plain, dt = world_model(config, visual=False), config.physics_dt
-    world = found.layout.world(found.fit.vector)
     model = edited_model(plain, physics_parameters(world, plain))
     data, addresses = mujoco.MjData(model), find_addresses(model)
     qpos, servos = list(addresses.arm_qpos), list(addresses.actuators)
-    log = set_points(log, found.following.delay, dt)
     count = int((log.times[-1] - log.times[0]) / dt) + 1
     send = make_targets(log, log.times[0] + dt * np.arange(count + 1))
-    targets = send(float(world["action_latency"]), float(world["servo_lag"]))
+    targets = send(float(world["action_latency"]), float(world.get("servo_lag", 0.0)))
     held = world.get("servo_offset", 0.0) - world.get("encoder_bias", 0.0)
     data.qpos[qpos] = log.joint_angles[0] - world.get("encoder_bias", 0.0)
     # The ball would fall through the floor.
@@ -151,9 +162,14 @@ def late_errors(simple: Following, log: Log) -> np.ndarray:
     return np.sqrt(np.mean((log.joint_angles[rows] - expected) ** 2, axis=0))
 
 
-def measure_arm(arm: ArmLog) -> list[dict[str, Any]]:
-    """A row for each way round."""
-    config = read_preset(Path("default"), Path(arm.robot)).env
+def measure_arm(arm: ArmLog, toolbox: bool) -> list[dict[str, Any]]:
+    """A row for each way round.
+
+    Args:
+      toolbox: whether MuJoCo's own identification is measured too.
+    """
+    robot = None if arm.robot is None else Path(arm.robot)
+    config = read_preset(Path("default"), robot).env
     model = world_model(config, visual=False)
     names, rows = joint_names(model), []
     parts = halves(arm.log)
@@ -167,19 +183,43 @@ def measure_arm(arm: ArmLog) -> list[dict[str, Any]]:
         if checkup.faults:
             rows.append(row | {"refused": checkup.faults[0].text})
             continue
-        begin = time.perf_counter()
+        begin, begin_processor = time.perf_counter(), time.process_time()
         try:
             found = identify(config, fitted)
         except UserError as error:
             rows.append(row | {"refused": str(error)})
             continue
         row["seconds"] = time.perf_counter() - begin
-        row["identified, mrad"] = (1e3 * open_loop(config, found, tested)).tolist()
+        row["processor seconds"] = time.process_time() - begin_processor
+        of_arm = compensated(config) if found.gravity_compensation else config
+        fitted, tested = (
+            set_points(part, found.following, config.physics_dt) for part in (fitted, tested)
+        )
+        world = found.layout.world(found.fit.vector)
+        row["identified, mrad"] = (1e3 * open_loop(of_arm, world, tested)).tolist()
         row["total delay"] = total_delay(found, model)
         row["gravity compensation"] = found.gravity_compensation
         row["doubts"] = describe_doubts(found, names)
+        if toolbox:
+            row |= measure_toolbox(of_arm, fitted, tested)
         rows.append(row)
     return rows
+
+
+def measure_toolbox(config: WorldConfig, fitted: Log, tested: Log) -> dict[str, Any]:
+    """Errors and time of MuJoCo's own identification, with its own and with SciPy's search."""
+    # Only here, as it needs an extra.
+    from toolbox import fit_with_toolbox
+
+    row: dict[str, Any] = {}
+    for optimizer, name in (("mujoco", "mujoco.sysid"), ("scipy", "least_squares(trf)")):
+        begin, begin_processor = time.perf_counter(), time.process_time()
+        world = fit_with_toolbox(config, fitted, optimizer)
+        row[f"{name}, seconds"] = time.perf_counter() - begin
+        row[f"{name}, processor seconds"] = time.process_time() - begin_processor
+        row[f"{name}, mrad"] = (1e3 * open_loop(config, world, tested)).tolist()
+        row[f"{name}, world"] = {term: value.tolist() for term, value in world.items()}
+    return row
 
 
 class Flight(NamedTuple):
@@ -335,14 +375,16 @@ def measure_flights(folder: Path, most: int) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folders", type=Path, nargs="+", metavar="FOLDER")
+    parser.add_argument("--toolbox", action="store_true", help="also MuJoCo's identification")
     parser.add_argument("--flights", type=int, default=1000, help="most flights")
     parser.add_argument("--out", type=Path, default=None, help="JSON file")
     given = parser.parse_args()
     set_up_jax(read_preset(Path("default")).env)
     rows: list[dict[str, Any]] = []
     for folder in given.folders:
-        for arm in (*panda_logs(folder), *ur5_logs(folder)):
-            rows += measure_arm(arm)
+        own = [own_log(folder)] if folder.suffix == ".csv" else []
+        for arm in (*own, *panda_logs(folder), *ur5_logs(folder)):
+            rows += measure_arm(arm, given.toolbox)
             print(json.dumps(rows[-2:], indent=1), flush=True)
         if any(folder.rglob("3D_gt/*.csv")):
             rows.append(measure_flights(folder, given.flights))

@@ -1,46 +1,86 @@
-"""MuJoCo's own identification toolbox (`mujoco[sysid]`) on the log of a hidden robot, next to
-benchmarks/identify.py: time and error for the parameters that it has.
+"""MuJoCo's own identification toolbox (`mujoco[sysid]`) on an arm's log, for
+benchmarks/real_logs.py --toolbox.
 
-`python benchmarks/toolbox.py LOG.csv --seed SEED`. It fits the arm during the excitation, from one
-rollout of 20 s on MuJoCo's C engine: gain, damping and dry friction of each joint, and one delay.
-The toolbox delays sensors; without a ball this equals a delay of the targets.
+It has the unknowns of `bounce-mjx identify` that a model file can express: gain, damping, offset
+and dry friction of each servo, and one delay. The toolbox delays sensors; for an arm alone this
+equals a delay of the targets. The whole log is one rollout on MuJoCo's C engine.
 """
 
-import argparse
-import time
-from pathlib import Path
+from typing import Literal
 
 import mujoco
 import numpy as np
-from identify import hidden_robot
 from mujoco import sysid
 
-from bounce_mjx.identify.reading import read_csv
-from bounce_mjx.resources import resource_path
-from bounce_mjx.robot.model import find_addresses, joint_names, load_model, scene_spec
-from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.env.env import world_model
+from bounce_mjx.identify.following import SETTLING
+from bounce_mjx.identify.log import Log
+from bounce_mjx.identify.simulation import make_targets
+from bounce_mjx.robot.model import find_addresses, joint_names, scene_spec
+from bounce_mjx.world.config import WorldConfig
 
-_STARTS = {"servo_gain": 1.0, "servo_damping": 1.0, "joint_frictionloss": 1.0}
-_LIMITS = {
-    "servo_gain": (0.5, 2.0),
-    "servo_damping": (0.5, 2.0),
-    "joint_frictionloss": (0.0, 20.0),
+# First value, and bounds, of each joint's unknowns.
+_OF_JOINTS = {
+    "servo_gain": (1.0, 0.1, 100.0),
+    "servo_damping": (1.0, 0.05, 20.0),
+    "servo_offset": (0.0, -0.1, 0.1),
+    "joint_frictionloss": (1.0, 0.0, 20.0),
 }
 _DELAY = (0.02, 0.0, 0.08)
+Optimizer = Literal["mujoco", "scipy"]
+"""MuJoCo's own least squares, or SciPy's `least_squares(method="trf")`."""
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("log", type=Path)
-    parser.add_argument("--seed", type=int, required=True)
-    parser.add_argument("--seconds", type=float, default=20.0)
-    given = parser.parse_args()
-    config = read_preset(resource_path("configs/default.yaml")).env
+def fit_with_toolbox(config: WorldConfig, log: Log, optimizer: Optimizer) -> dict[str, np.ndarray]:
+    """The world of an arm, from the toolbox's fit of a log."""
+    names = joint_names(world_model(config, visual=False))
+    spec = _arm_alone(config, names)
+    model = spec.compile()
+    addresses = find_addresses(model)
+    actuators = list(addresses.actuators)
+    params = sysid.ParameterDict()
+    for term, (first, low, high) in _OF_JOINTS.items():
+        for joint in range(len(names)):
+            params.add(sysid.Parameter(f"{term} {joint}", first, low, high))
+    params.add(sysid.Parameter("delay", *_DELAY))
+
+    def world(values: sysid.ParameterDict) -> dict[str, np.ndarray]:
+        return {
+            term: np.array([float(values[f"{term} {j}"].value[0]) for j in range(len(names))])
+            for term in _OF_JOINTS
+        }
+
+    def build(values: sysid.ParameterDict, spec: mujoco.MjSpec) -> mujoco.MjModel:
+        built, servos = spec.compile(), world(values)
+        stiffness = servos["servo_gain"] * model.actuator_gainprm[actuators, 0]
+        damping = servos["servo_damping"] * model.actuator_biasprm[actuators, 2]
+        built.actuator_gainprm[actuators, 0] = stiffness
+        built.actuator_biasprm[actuators, 0] = stiffness * servos["servo_offset"]
+        built.actuator_biasprm[actuators, 1] = -stiffness
+        built.actuator_biasprm[actuators, 2] = damping
+        built.dof_frictionloss[list(addresses.arm_qvel)] = servos["joint_frictionloss"]
+        return built
+
+    transform = sysid.SignalTransform()
+    transform.delay("*_angle", params["delay"])
+    residual = sysid.build_residual_fn(
+        models_sequences=[_rollout(model, spec, log, names)],
+        build_model=build,
+        modify_residual=transform.apply,
+    )
+    options = {"x_scale": "jac"} if optimizer == "scipy" else {}
+    found, _ = sysid.optimize(params, residual, optimizer=optimizer, verbose=False, **options)
+    # The toolbox stamps a sensor with the end of the step at whose start it was computed.
+    delay = found["delay"].value[0] + config.physics_dt
+    return world(found) | {"action_latency": np.array(delay)}
+
+
+def _arm_alone(config: WorldConfig, names: tuple[str, ...]) -> mujoco.MjSpec:
+    """The model without contacts, with a sensor of each joint's angle."""
     spec, _ = scene_spec(config.mjcf, config.robot)
     for pair in list(spec.pairs):
         spec.delete(pair)
     spec.option.timestep = config.physics_dt
-    names = joint_names(load_model(config.mjcf, config.physics_dt, visual=False))
     for name in names:
         spec.add_sensor(
             name=f"{name}_angle",
@@ -48,71 +88,34 @@ def main() -> None:
             objtype=mujoco.mjtObj.mjOBJ_JOINT,
             objname=name,
         )
-    model = spec.compile()
-    addresses, log = find_addresses(model), read_csv(given.log, names)
+    return spec
+
+
+def _rollout(
+    model: mujoco.MjModel, spec: mujoco.MjSpec, log: Log, names: tuple[str, ...]
+) -> sysid.ModelSequences:
+    """The log as one rollout from its first row, which need not rest: its first angles do not
+    count."""
+    addresses, dt = find_addresses(model), model.opt.timestep
+    start = log.times[0]
+    count = int((log.times[-1] - start) / dt) + 1
     # Targets are held between two control steps; the toolbox would interpolate them.
-    times = np.arange(0.0, given.seconds, config.physics_dt)
-    index = np.searchsorted(log.target_times, times + 1e-3, side="right") - 1
-    ctrl = np.zeros((len(times), model.nu))
-    ctrl[:, list(addresses.actuators)] = log.servo_targets[np.maximum(index, 0)]
-    measured = log.times < given.seconds
+    send = make_targets(log, start + dt * np.arange(count + 1))
+    ctrl = np.zeros((count, model.nu))
+    ctrl[:, list(addresses.actuators)] = send(0.0, 0.0)
     data = mujoco.MjData(model)
-    data.qpos[list(addresses.arm_qpos)] = config.default_joint_angles
-    sequences = sysid.ModelSequences(
+    data.qpos[list(addresses.arm_qpos)] = log.joint_angles[0]
+    counts = log.times - start > SETTLING
+    return sysid.ModelSequences(
         "arm",
         spec,
-        "excitation",
+        "log",
         sysid.create_initial_state(model, data.qpos),
-        sysid.TimeSeries.from_control_names(times, ctrl, model),
+        sysid.TimeSeries.from_control_names(dt * np.arange(count), ctrl, model),
         sysid.TimeSeries.from_names(
-            np.maximum(log.times[measured], 0.0),
-            log.joint_angles[measured],
+            log.times[counts] - start,
+            log.joint_angles[counts],
             model,
             [f"{name}_angle" for name in names],
         ),
     )
-    params = sysid.ParameterDict()
-    for term, start in _STARTS.items():
-        for j in range(len(names)):
-            params.add(sysid.Parameter(f"{term} {j}", start, *_LIMITS[term]))
-    params.add(sysid.Parameter("delay", *_DELAY))
-
-    def build(params: sysid.ParameterDict, spec: mujoco.MjSpec) -> mujoco.MjModel:
-        built = spec.compile()
-        for j, actuator in enumerate(addresses.actuators):
-            gain, damping, friction = (float(params[f"{t} {j}"].value[0]) for t in _STARTS)
-            built.actuator_gainprm[actuator, 0] = gain * model.actuator_gainprm[actuator, 0]
-            built.actuator_biasprm[actuator, 1] = gain * model.actuator_biasprm[actuator, 1]
-            built.actuator_biasprm[actuator, 2] = damping * model.actuator_biasprm[actuator, 2]
-            built.dof_frictionloss[addresses.arm_qvel[j]] = friction
-        return built
-
-    transform = sysid.SignalTransform()
-    transform.delay("*_angle", params["delay"])
-    residual = sysid.build_residual_fn(
-        models_sequences=[sequences], build_model=build, modify_residual=transform.apply
-    )
-    begin, begin_processor = time.perf_counter(), time.process_time()
-    found, _ = sysid.optimize(params, residual, optimizer="mujoco", verbose=False)
-    seconds, processor = time.perf_counter() - begin, time.process_time() - begin_processor
-    true = hidden_robot(given.seed).world
-    ratio = np.array(
-        [
-            float(found[f"servo_damping {j}"].value[0] / found[f"servo_gain {j}"].value[0])
-            for j in range(len(names))
-        ]
-    )
-    worst = np.max(np.abs(ratio / (true["servo_damping"] / true["servo_gain"]) - 1.0))
-    delay = float(found["delay"].value[0])
-    print(f"{seconds:.0f} s, {processor:.0f} s of a processor")
-    print(
-        f"delay {1e3 * delay:.2f} ms, action_latency {1e3 * float(true['action_latency']):.2f} ms"
-    )
-    print(
-        f"servo_lag of the robot, which the toolbox lacks: {1e3 * float(true['servo_lag']):.2f} ms"
-    )
-    print(f"damping / gain of a joint: off by {100.0 * worst:.1f}% at most")
-
-
-if __name__ == "__main__":
-    main()

@@ -233,7 +233,8 @@ def fit_circle(
     for tolerance in np.linspace(_EDGE_TOLERANCE + 0.5 * length, last_tolerance, 8):
         offsets = edge - _nearest_on_path(edge, centre, blur)
         distances = np.linalg.norm(offsets, axis=1)
-        is_near = np.abs(distances - radius) < tolerance
+        # A point at the centre itself shows no direction.
+        is_near = (np.abs(distances - radius) < tolerance) & (distances > 0.0)
         if np.count_nonzero(is_near) < 8:
             return None
         # Gauss-Newton: a shift of the centre changes a distance by its component along the offset.

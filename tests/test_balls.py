@@ -26,9 +26,13 @@ from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import c_episodes
 from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, make_engine, servo_targets
+from bounce_mjx.physics.edited import edited_model
 from bounce_mjx.physics.support import unsupported_feature
+from bounce_mjx.resources import resource_path
+from bounce_mjx.robot.balls import add_balls
 from bounce_mjx.robot.model import find_addresses, load_model
 from bounce_mjx.world.randomization import RandomizationConfig
+from bounce_mjx.world.sampling import nominal_values, physics_parameters
 from random_worlds import random_parameters
 from rest_task import Rest
 from test_friction import sticking_and_sliding
@@ -108,6 +112,33 @@ def test_one_step_of_several_balls_is_mujocos(num_balls, friction, float64):
     assert min(np.sum(pressed == n) for n in range(1, num_balls + 2)) >= 20
     expected, _ = c_steps(model, states)
     assert_same_step(compiled_steps(model, MODEL, states), expected)
+
+
+def test_terms_are_of_each_ball_or_refused_where_the_balls_differ(tmp_path, float64):
+    """A second ball twice as heavy and a tenth larger stays so; one value of the contact would
+    change one of two that differ."""
+    model = balls_model(2)
+    first, second = find_addresses(model).balls
+    model.body_mass[second.body] *= 2.0
+    model.geom_size[second.geom, 0] *= 1.1
+    nominals = nominal_values(model, ("ball_mass", "ball_radius"))
+    same = edited_model(model, physics_parameters(jax.tree.map(jnp.asarray, nominals), model))
+    np.testing.assert_allclose(same.body_mass, model.body_mass, rtol=1e-12)
+    np.testing.assert_allclose(same.geom_size, model.geom_size, rtol=1e-12)
+    sampled = {"ball_mass": jnp.asarray(1.5), "ball_radius": jnp.asarray(1.2)}
+    changed = edited_model(model, physics_parameters(sampled, model))
+    for ball in (first, second):
+        assert changed.body_mass[ball.body] == pytest.approx(1.5 * model.body_mass[ball.body])
+        assert changed.geom_size[ball.geom, 0] == pytest.approx(1.2 * model.geom_size[ball.geom, 0])
+
+    spec = mujoco.MjSpec.from_file(str(resource_path("mjcf/bounce_ball.xml")))
+    add_balls(spec, 2)
+    spec.pairs[-1].solref = [-5e4, -30.0]
+    path = tmp_path / "two.xml"
+    path.write_text(spec.to_xml())
+    Env(Two.Config(mjcf=path, randomization={"contact_friction": (0.1, 0.2)}))
+    with pytest.raises(UserError, match="differ in pair_solref, of which randomization.rest"):
+        Env(Two.Config(mjcf=path, randomization={"restitution": (0.8, 0.9)}))
 
 
 @pytest.mark.slow

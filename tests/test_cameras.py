@@ -88,6 +88,17 @@ def test_what_is_no_ball_gives_nothing() -> None:
     assert cameras.find_circles(bar, colour, None, near) == []
 
 
+@pytest.mark.filterwarnings("error")
+def test_points_without_a_circle_give_nothing_or_a_circle_of_a_ball() -> None:
+    """Also where the fit's centre comes to lie on one of them."""
+    mask = np.full((60, 60), 255, np.uint8)
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        points = rng.integers(20, 30, (int(rng.integers(8, 40)), 2)).astype(float)
+        circle = cameras.fit_circle(points, mask, (2.0, 6.0), rng.uniform(-8.0, 8.0, 2))
+        assert circle is None or 2.0 <= circle.radius <= 6.0
+
+
 def test_rays_and_projections_are_inverse() -> None:
     pair = true_cameras()
     for place in SEEN:
@@ -177,6 +188,24 @@ def test_a_policy_plays_from_rendered_pictures(tmp_path) -> None:
     assert "20 poses" in done.stdout and "36 pairs of pictures, 0 without a ball" in done.stdout
     error = float(done.stdout.split("off by ")[1].split(" mm")[0])
     assert error < 4.0
+
+
+@pytest.mark.parametrize("side_light", [False, True])
+def test_a_background_that_was_drawn_before_changes_no_pixel(opengl, side_light) -> None:
+    mjcf = str(resource_path("mjcf/bounce_ball.xml"))
+    model = rendered_cameras.make_model(mjcf, "orange", side_light, quick=True)
+    rendered = rendered_cameras.RenderedCameras(model, rendered_cameras.true_cameras())
+    rng = np.random.default_rng(0)
+    data = mujoco.MjData(model)
+    for _ in range(8):
+        data.qpos[:] = model.qpos0 + rng.uniform(-1.0, 1.0, model.nq)
+        data.joint("ball_link").qpos[:3] = rng.uniform((0.3, -0.3, 0.03), (0.8, 0.3, 0.9))
+        mujoco.mj_forward(model, data)
+        for view in rendered._views:
+            picture = view.render(data)
+            assert np.array_equal(picture, view._draw(data, arm=True, room=True))
+            assert not np.array_equal(picture, view._background)
+    rendered.close()
 
 
 class DrawnCameras:

@@ -141,7 +141,7 @@ def draw_inputs(name: str, runs: dict[str, Path]) -> tuple[dict, np.ndarray]:
     checkpoint = find_checkpoint(runs[name])
     config = load_run_config(checkpoint.run)
     policy = checkpoints.read_policy(checkpoint, config)
-    layout, counts = config.env.layout, config.env.observation.lengths()
+    layout, counts = config.env.layout, config.env.observation.counts()
     rng = np.random.default_rng(3)
     # Some observations are beyond the clipping range of the normaliser.
     spread = rng.choice([1.0, 1.0, 1.0, 20.0], size=(1000, 1))
@@ -266,7 +266,7 @@ def test_metadata_describes_the_training_and_survives_the_file() -> None:
     }  # fmt: skip
     config = EnvConfig()
     assert {p.name: p.history for p in metadata.observation} == {
-        input_name(name): count for name, count in config.observation.lengths().items()
+        input_name(name): count for name, count in config.observation.counts().items()
     }
     assert metadata.joint_names == tuple(f"Joint{i}" for i in range(1, 7))
     assert metadata.control_dt == config.control_dt and metadata.torque_limits == (None,) * 6
@@ -343,7 +343,7 @@ def test_histories_are_those_of_the_environment(name: str, runs, policies) -> No
     env, policy = Env(load_run_config(runs[name]).env), policies[name]
     step, state = jax.jit(env.step), jax.jit(env.reset)(jax.random.PRNGKey(5))
     policy.reset()
-    own = {name: set() for name in env.config.observation.lengths("task")}
+    own = {name: set() for name in env.config.observation.counts("task")}
     commands, reached = set(), set()
     for i in range(300):
         state_now = state.pipeline_state

@@ -74,6 +74,17 @@ def rk4(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.fixture(scope="module")
+def elliptic(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The shipped model with elliptic cones of friction, which its frictionless contact ignores."""
+    path = tmp_path_factory.mktemp("model") / "elliptic.xml"
+    text = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
+    changed = text.replace('cone="pyramidal"', 'cone="elliptic"')
+    assert changed != text
+    path.write_text(changed, encoding="utf-8")
+    return path
+
+
 @pytest.mark.parametrize(
     ("user", "joined"),
     [
@@ -85,7 +96,7 @@ def rk4(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )
 def test_the_engine_decides_unless_the_user_does(
-    rk4: Path, monkeypatch, user: str | None, joined: str
+    rk4: Path, elliptic: Path, monkeypatch, user: str | None, joined: str
 ) -> None:
     def flags(*configs: EnvConfig) -> str | None:
         monkeypatch.delenv("XLA_FLAGS", raising=False)
@@ -96,10 +107,13 @@ def test_the_engine_decides_unless_the_user_does(
 
     fused, chosen = EnvConfig(), EnvConfig(physics="fused")
     mjx, falls_to_mjx = EnvConfig(physics="mjx"), EnvConfig(mjcf=rk4)
-    for configs in ((fused,), (chosen,), (fused, chosen)):
+    without, with_friction = EnvConfig(mjcf=elliptic), EnvConfig(mjcf=elliptic, friction=0.3)
+    for configs in ((fused,), (chosen,), (fused, chosen), (without,)):
         assert flags(*configs) == joined
     for configs in ((mjx,), (falls_to_mjx,), (fused, mjx), (chosen, falls_to_mjx)):
         assert flags(*configs) == user
+    # The fused physics has no elliptic cone of friction.
+    assert flags(with_friction) == flags(without, with_friction) == user
 
 
 def test_the_presets_of_all_machines_have_one_task() -> None:

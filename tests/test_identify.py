@@ -24,7 +24,7 @@ from bounce_mjx.identify.fit import (
     minimise,
 )
 from bounce_mjx.identify.flight import acceleration, fit_flight
-from bounce_mjx.identify.following import find_settled, follow
+from bounce_mjx.identify.following import command_delay, find_settled, follow, set_points
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.reading import read_csv
 from bounce_mjx.identify.simulation import compensated, make_targets
@@ -220,6 +220,33 @@ def test_a_world_has_the_range_of_each_joint_and_axis(tmp_path: Path) -> None:
     assert [line.split(" is ")[0] for line in changed] == ["paddle_tilt x", "paddle_tilt y"]
 
 
+def test_a_world_contradicts_no_log_that_does_not_tell_terms_apart(tmp_path: Path) -> None:
+    """Where a log shows the sum of latency and lag alone, the sums of a world are those of the log;
+    and a term that it does not show is within one deviation of its prior."""
+    log, layout, path = flight_log(), Layout(6, True, 0.001), tmp_path / "world.yaml"
+    places = layout.slices
+    vector = layout.vector({"action_latency": 0.02, "servo_lag": 0.005})
+    shown = 0.1 * layout.deviation
+    shown[places["gravity_tilt"]] = layout.deviation[places["gravity_tilt"]]
+    covariance = np.diag(shown**2)
+    # A lag of 0 to 15 ms, and a sum that is known to 0.1 ms.
+    delay, variance = places["delay"].start, places["delay_variance"].start
+    slope = 1.0 / (2.0 * 0.005)
+    covariance[variance, variance] = layout.deviation[variance] ** 2
+    covariance[delay, variance] = covariance[variance, delay] = (
+        slope * covariance[variance, variance]
+    )
+    covariance[delay, delay] = 1e-4**2 + slope**2 * covariance[variance, variance]
+    found = identified(layout, log, vector, covariance)
+    path.write_text(to_yaml(found, log, NAMES, None), encoding="utf-8")
+    ranges = read_world(path).settings["randomization"]
+    sums = np.add(ranges["action_latency"], ranges["servo_lag"])
+    np.testing.assert_allclose(sums, [0.025, 0.025], atol=2 * 1.5 * 1.96 * 1e-4 + 1e-5)
+    assert sums[0] < 0.025 < sums[1]
+    deviation = layout.deviation[places["gravity_tilt"]]
+    np.testing.assert_allclose(ranges["gravity_tilt"], [-deviation, deviation])
+
+
 def at_home(shift: tuple[float, float, float]) -> Log:
     """An arm at rest, on whose paddle the ball bounces; the ball's frame is off by a shift [3]."""
     log, config = flight_log(), read_preset(Path("default")).env
@@ -384,6 +411,26 @@ def test_following_finds_delay_and_offsets() -> None:
     assert found.delay == pytest.approx(0.0155, abs=1e-4)
     np.testing.assert_allclose(found.offsets, offsets, atol=1e-4)
     np.testing.assert_allclose(found.errors, 3e-4, rtol=0.1)
+
+
+def test_set_points_are_commanded_when_they_are_due() -> None:
+    """A controller's own set points, recorded every 8 ms, that the joints follow at once: the mean
+    command of a physics step is that of the set points in it."""
+    times, rates = np.arange(0.0, 10.0, 0.008), np.array([1.0, 1.7, 2.3])
+    waves = np.sin(np.outer(times, rates))
+    log = flight_log()._replace(
+        times=times, target_times=times, joint_angles=waves, servo_targets=waves
+    )
+    rows = find_settled(log)
+    following = follow(log, rows)
+    assert command_delay(log, following) == pytest.approx(0.0, abs=1e-4)
+    edges = 0.001 * np.arange(1001)
+    sent = make_targets(set_points(log, following, 0.001), edges)(0.0, 0.0)
+    middles = 0.5 * (edges[1:] + edges[:-1])
+    np.testing.assert_allclose(sent, np.sin(np.outer(middles, rates)), atol=5e-5)
+    # Commands that are held until the next are later than their stamps by half a step.
+    late = log._replace(joint_angles=np.sin(np.outer(times - 0.0155, rates)))
+    assert command_delay(late, follow(late, rows)) == pytest.approx(0.0115, abs=1e-4)
 
 
 def test_a_controller_that_carries_the_arm_lets_no_servo_sag() -> None:

@@ -13,7 +13,14 @@ from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.limits import limit_shares
 from bounce_mjx.physics import servo_targets
-from bounce_mjx.robot.setpoints import JointLimits, Setpoint, command, next_setpoint
+from bounce_mjx.robot.config import LimitsConfig
+from bounce_mjx.robot.setpoints import (
+    JointLimits,
+    Setpoint,
+    command,
+    joint_limits,
+    next_setpoint,
+)
 from bounce_mjx.task.task import Recording
 
 VELOCITY, ACCELERATION, JERK = 2.0, 15.0, 7500.0
@@ -147,6 +154,16 @@ def test_the_engines_follow_the_commands_like_c(world: tuple) -> None:
             data.ctrl[:] = row
             mujoco.mj_step(model, data)
         np.testing.assert_allclose(data.qpos[:6], rollout.qpos[i + 1, :6], atol=1e-8)
+
+
+def test_a_command_without_a_range_moves_within_its_other_limits() -> None:
+    limits = joint_limits(LimitsConfig(velocity=(2.0,), acceleration=(15.0,)))
+    setpoint = Setpoint(np.zeros(1), np.zeros(1), np.zeros(1))
+    velocities = []
+    for _ in range(20):
+        setpoint = next_setpoint(limits, setpoint, 1e3, 0.01, np)
+        velocities.append(setpoint.velocity[0])
+    np.testing.assert_allclose(velocities, np.minimum(0.15 * np.arange(1, 21), 2.0))
 
 
 def test_an_action_adds_to_a_moving_command() -> None:

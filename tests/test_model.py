@@ -11,7 +11,7 @@ from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.env.env import EnvState
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics import PhysicsState
-from bounce_mjx.robot.model import load_model
+from bounce_mjx.robot.model import contact_pairs, find_addresses, load_model
 
 SERVO_2 = '<position name="act2" joint="Joint2"/>'
 REFUSED = {
@@ -30,6 +30,13 @@ REFUSED = {
         'biasprm="0 -20000 -200"/>',
         "Joint2",
     ),
+    "servo that never rests": (
+        SERVO_2,
+        '<position name="act2" joint="Joint2" forcerange="2 10"/>',
+        "the forcerange 2 to 10 on Joint2",
+    ),
+    # A compiler's default, and MuJoCo converts the ranges of limited joints alone.
+    "range in degrees": (' angle="radian"', "", "of Joint1 in degrees"),
     "position nan": ('name="Link1" pos="0 0 0.1"', 'name="Link1" pos="0 0 nan"', "nan in body_pos"),
     "mass inf": ('mass="0.0027"', 'mass="inf"', "inf in body_mass"),
     "gravity nan": ('gravity="0 0 -9.81"', 'gravity="0 0 nan"', "nan in gravity"),
@@ -50,6 +57,26 @@ def test_models_that_cannot_be_simulated_are_refused(tmp_path, name):
         load_model(mjcf, 0.001)
     assert "\n" not in str(error.value)
     assert str(mjcf) in str(error.value)
+
+
+def test_a_ball_is_its_geom_in_a_pair_with_the_paddle(tmp_path):
+    """Also of the balls that are added, whatever the names and the other pairs are."""
+    shell = '<geom name="ball" type="sphere" size="0.019" mass="0.0027"'
+    core = shell.replace('"ball"', '"core"').replace("0.0027", "1e-9")
+    assert shell in XML
+    text = XML.replace(shell, f"{core}/>{core.replace('core', 'a_core')}/>{shell}", 1)
+    pair = '<pair geom1="blocker" geom2="ball" condim="1" solref="-98696 -31.4" '
+    pair += 'solimp="0.95 0.99 0.001"/>'
+    assert pair in text
+    other = pair.replace('"blocker"', '"floor"').replace('"ball"', '"core"')
+    text = text.replace(pair, other + pair, 1)
+    (tmp_path / "robot.xml").write_text(text)
+    model = load_model(tmp_path / "robot.xml", 0.001, num_balls=2)
+    addresses = find_addresses(model)
+    touching = [ball.geom for ball in addresses.balls]
+    assert touching == [model.geom(name).id for name in ("ball", "ball2")]
+    # The paddle with each ball, and the balls with each other.
+    assert len(contact_pairs(model, addresses)) == 3
 
 
 @pytest.mark.parametrize("memory", ["1K", "900T"])

@@ -8,11 +8,12 @@ import pytest
 from mujoco import mjx
 
 from against_c import assert_same_step, c_steps, converged, fused_steps, touching_states, world
-from bounce_mjx.adapters.randomization import parameters_of
+from bounce_mjx.adapters.randomization import domain_randomize, parameters_of
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics import Control, PhysicsState, make_engine
 from bounce_mjx.physics.edited import edited_model
 from bounce_mjx.physics.parameters import PhysicsParameters
+from bounce_mjx.world.randomization import RandomizationConfig
 from random_worlds import random_parameters
 
 BATCH = 3
@@ -85,6 +86,20 @@ def test_models_of_parameters_are_read_back(mj_model, base):
                 np.testing.assert_allclose(
                     field_of(again, name), field_of(model, name), 1e-5, 1e-12, err_msg=name
                 )
+
+
+def test_terms_of_a_randomization_fn_have_their_shares(mj_model, base):
+    """A term that an episode does not sample is the model's; a warm-up would never grow."""
+    terms = {"ball_mass": (0.5, 2.0), "link_mass": (1.5, 2.0)}
+    config = RandomizationConfig(**terms, share=0.0, shares={"link_mass": 1.0})
+    model, axes = domain_randomize(mj_model, base, jax.random.split(jax.random.key(0), 8), config)
+    ball = mj_model.body("ball_link").id
+    assert axes.body_mass == 0
+    np.testing.assert_allclose(model.body_mass[:, ball], mj_model.body_mass[ball], rtol=1e-6)
+    assert np.all(model.body_mass[:, 2:7] > 1.4 * mj_model.body_mass[2:7])
+    grows = RandomizationConfig(**terms, warmup_steps=100)
+    with pytest.raises(UserError, match="the ranges of a randomization_fn do not grow"):
+        domain_randomize(mj_model, base, jax.random.split(jax.random.key(0), 8), grows)
 
 
 @pytest.mark.slow

@@ -118,6 +118,11 @@ OPTIONS = piece("<option ", ' limited="false"')
 INERTIAL = '<inertial pos="0.1 0 0.02" quat="1 2 3 4" mass="0.5" diaginertia="0.01 0.012 0.02"/>'
 SIDE_LINK = f'<body pos="0.02 0 0.01" euler="0.3 0 1">{INERTIAL}<joint name="side"/></body>'
 WELDED = f'<body pos="0.02 0 0.01" euler="0.3 0 1">{INERTIAL}'
+# Of two bodies with one mass, one is carried and one is pressed down: a moment without a force.
+CARRIED_PAIR = (
+    f'<body pos="0.1 0 0" gravcomp="1">{INERTIAL}</body>'
+    f'<body pos="-0.1 0 0" gravcomp="-1">{INERTIAL}</body>'
+)
 
 # Models that the fused engine supports, each as one edit of the MJCF.
 SUPPORTED = {
@@ -152,7 +157,10 @@ SUPPORTED = {
     "slide": ('name="Joint2"', 'name="Joint2" type="slide"'),
     "spring": ("<joint ", '<joint stiffness="500" springref="0.3" '),
     "joint force range": ("<joint ", '<joint actuatorfrcrange="-40 60" '),
-    "gravity compensation of a link": ('<body name="Link3"', '<body name="Link3" gravcomp="2"'),
+    "gravity compensation as a couple": (
+        '<body name="Link6"',
+        f'{CARRIED_PAIR}<body name="Link6"',
+    ),
     "gravity compensation of either sign": (
         ARM_BODY,
         ARM_BODY.replace('<body name="Link3"', '<body name="Link3" gravcomp="2"').replace(

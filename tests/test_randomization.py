@@ -22,6 +22,7 @@ from bounce_mjx.learning.ppo import PPO
 from bounce_mjx.physics import Control, PhysicsState, edited_model, servo_targets
 from bounce_mjx.physics.control import drag
 from bounce_mjx.robot.config import RobotConfig
+from bounce_mjx.robot.contact import damping_of_restitution, restitution_of_damping
 from bounce_mjx.robot.model import load_model
 from bounce_mjx.robot.torques import largest_torques, torque_ranges
 from bounce_mjx.world.actuation import add_delay, start_actuation
@@ -203,6 +204,11 @@ def test_a_share_of_the_terms_is_drawn() -> None:
         ({"warmup_steps": 1000}, "warmup_steps is given without a term whose range grows"),
         ({"camera_rate": (60, 90), "share": 0.5}, "share is given without a term that it is of"),
         ({"restitution": [[0.7], [0.8]]}, "is not a range; give two numbers"),
+        ({"ball_mass": [[], []]}, "ball_mass ((), ()) is not a range; give two numbers"),
+        ({"ball_mass": [1.0, []]}, "ball_mass (1.0, ()) is not a range; give two numbers"),
+        ({"servo_gain": [[], []]}, "servo_gain ((), ()) is not a range; give two numbers, or two"),
+        ({"joint_damping": (0, 501)}, "is not a range within 0 to 500 N m s/rad; give the lower"),
+        ({"joint_frictionloss": (0, 501)}, "is not a range within 0 to 500 N m; give the lower"),
         ({"paddle_tilt": [[0.0] * 3, [0.1] * 3]}, "two lists with one for each of 2 axes"),
         ({"paddle_tilt": [[0.0, 0.2], [0.1, 0.1]]}, "paddle_tilt (0.2, 0.1) is not a range"),
         ({"servo_gain": [[0.9] * 6, [1.1] * 5]}, "two numbers, or two lists with one for each"),
@@ -219,7 +225,7 @@ def test_a_wrong_range_is_one_sentence(values: dict, words: str) -> None:
     assert words in str(error.value) and "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("restitution", [None, 0.4, 0.6, 0.72, 0.9, 0.96])
+@pytest.mark.parametrize("restitution", [None, 0.08, 0.2, 0.4, 0.6, 0.72, 0.9, 0.96])
 def test_drops_bounce_as_asked(mj_model, restitution: float | None) -> None:
     """On MuJoCo's C engine: ratio of the speeds after and before an impact on the held paddle,
     without gravity, at several phases of the time step. The model's own restitution is 0.85."""
@@ -317,6 +323,16 @@ def test_the_nominal_of_a_term_is_the_models(float64) -> None:
         "geom_size geom_pos geom_quat actuator_gainprm actuator_biasprm actuator_forcerange"
     ).split():
         np.testing.assert_allclose(getattr(same, field), getattr(model, field), rtol=1e-12)
+
+
+def test_every_contact_has_its_damping_again_from_its_restitution(float64) -> None:
+    """Also MuJoCo's default contact, whose damping ratio is 1, and beyond the drops."""
+    stiffness = 2500.0
+    for ratio in (0.0, 0.01, 0.2, 0.34, 0.7, 1.0, 1.5, 3.0, 20.0):
+        damping = 2.0 * ratio * math.sqrt(stiffness)
+        restitution = restitution_of_damping(damping, stiffness)
+        again = damping_of_restitution(jnp.asarray(restitution), stiffness)
+        assert float(again) == pytest.approx(damping, rel=1e-9), ratio
 
 
 def test_episodes_without_a_term_have_the_models_value() -> None:

@@ -1,5 +1,6 @@
 """An unsuitable arm is refused in one sentence; another one becomes the scene, with its motion."""
 
+import copy
 import re
 from pathlib import Path
 
@@ -24,9 +25,10 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.contacts import ContactChecker
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.adopt import adopt, check_as_alone
-from bounce_mjx.robot.arm import build_arm, compile_spec, locate, read_spec
-from bounce_mjx.robot.config import RobotConfig
-from bounce_mjx.robot.model import find_addresses, joint_names, load_model
+from bounce_mjx.robot.arm import build_arm, compile_spec, locate, naming, read_spec
+from bounce_mjx.robot.config import PaddleConfig, RobotConfig
+from bounce_mjx.robot.model import data_at, find_addresses, joint_names, load_model
+from bounce_mjx.robot.pose import mounts, place_paddle
 from bounce_mjx.runs.settings import read_preset
 from random_worlds import random_parameters
 
@@ -44,6 +46,12 @@ TWO_JOINTS = mjcf(
     motors("a b"),
 )
 
+
+# A gripper's fingers move together; in the file this comes before what is wrong.
+HAND = f'<body pos="0 0 0.05"><geom size=".02" mass=".1"/>{FINGERS}</body>'
+MIMIC = '<joint joint1="left" joint2="right"/>'
+GRIP = '<fixed name="grip"><joint joint="left" coef="1"/><joint joint="right" coef="1"/></fixed>'
+BELT = '<fixed name="{}"><joint joint="j2" coef="1"/><joint joint="j3" coef="-1"/></fixed>'
 
 BROKEN = {
     "two joints": (TWO_JOINTS, "tool", "too few joints", "2 (a, b)"),
@@ -99,6 +107,30 @@ BROKEN = {
         ),
         "tool",
         "the unnamed tendon (j2, j3) on the arm",
+    ),
+    "loop after a gripper's constraint": (
+        mjcf(
+            arm(tip=HAND),
+            motors(ARM_JOINTS),
+            f'<equality>{MIMIC}<joint name="loop" joint1="j2" joint2="j3"/></equality>',
+        ),
+        "tool",
+        "the equality constraint loop on the arm",
+    ),
+    "tendon after a gripper's": (
+        mjcf(
+            arm(tip=HAND),
+            motors(ARM_JOINTS),
+            f"<tendon>{GRIP}{BELT.format('belt')}</tendon>",
+        ),
+        "tool",
+        "the tendon belt on the arm",
+    ),
+    "motors of a ship": (
+        mjcf(arm(), motors(ARM_JOINTS, 1e6)),
+        "tool",
+        "servo_force_limit is 1000000.0, but must be less than or equal to 100000",
+        "units",
     ),
     "servos that reach no pose": (
         mjcf(
@@ -160,13 +192,17 @@ def written(tmp_path_factory) -> dict[str, Path]:
     """Configs of a small arm with motors and a gripper, and of the UR5e."""
     folder = tmp_path_factory.mktemp("adopted")
     small = folder / "small.xml"
-    hand = f'<body pos="0 0 0.05"><geom size=".02" mass=".1"/>{FINGERS}</body>'
     table = '<geom type="plane" size="1 1 1"/><body><freejoint/><geom size=".1"/></body>'
     # A shape of the world that touches.
     table += '<geom type="box" size=".4 .4 .02" pos="0 0 -.02"/>'
+    table += '<site name="here"/><site name="there" pos="1 0 0"/>'
     more = '<keyframe><key qpos="1 0 0 1 0 0 0 0 0 0 0 0 0 0 0"/></keyframe>'
+    more += f"<equality>{MIMIC}</equality><tendon>{GRIP}"
+    more += '<spatial><site site="here"/><site site="there"/></spatial></tendon>'
+    # A suction cup, at a site with the name of a joint.
+    drives = motors(f"{ARM_JOINTS} left") + '<general site="j2" gear="0 0 1 0 0 0"/>'
     small.write_text(
-        mjcf(table + arm(tip=hand), motors(f"{ARM_JOINTS} left"), more)
+        mjcf(table + arm(tip=f'{HAND}<site name="j2"/>'), drives, more)
         .replace("<worldbody>", '<option timestep="0.005" gravity="0 0 -1.6"/><worldbody>')
         .replace('<motor joint="j2"', '<motor jointinparent="j2"')
     )
@@ -203,12 +239,14 @@ def test_the_start_pose_holds_the_paddle_level_at_the_target_point(env) -> None:
     assert np.allclose(
         np.array(config.target_height_range) - paddle.xpos[2], [0.35, 0.55], atol=1e-3
     )
-    # A motor became a servo with critical damping at 1 / control_dt: kp / kv = 1 / (2 control_dt).
+    # A motor became a servo with critical damping at 1 / control_dt: kp / kv = 1 / (2 control_dt),
+    # where kv contains the joint's own damping.
     servos, model = list(env.addresses.actuators), env.mj_model
     if env.config.robot.servo_force_limit:
         np.testing.assert_allclose(model.actuator_forcerange[servos, 1], 100.0)
-        rates = -model.actuator_gainprm[servos, 0] / model.actuator_biasprm[servos, 2]
-        np.testing.assert_allclose(rates, 50.0, rtol=1e-3)
+        damping = model.dof_damping[list(env.addresses.arm_qvel)]
+        damping = damping - model.actuator_biasprm[servos, 2]
+        np.testing.assert_allclose(model.actuator_gainprm[servos, 0] / damping, 50.0, rtol=1e-3)
     low, high = env.mj_model.jnt_range[list(env.addresses.arm_joints)].T
     assert np.all(low < config.default_joint_angles) and np.all(config.default_joint_angles < high)
 
@@ -219,6 +257,7 @@ def test_only_the_arm_is_left(env) -> None:
     assert (env.observation_size, env.action_size) == (29, 6)
     assert env.backend == "fused" and len(joint_names(model)) == 6
     assert (model.njnt, model.nkey, model.neq, model.ntendon) == (7, 0, 0, 0)
+    assert model.nu == 6
     assert not np.any(model.geom_contype) and not np.any(model.jnt_limited)
     assert model.opt.gravity[2] == -9.81 and model.npair == 1
 
@@ -387,7 +426,8 @@ def test_an_arm_in_degrees_has_the_start_pose_of_the_same_arm_in_radians(tmp_pat
 
 
 def test_adopt_prints_each_servo_and_each_change_of_the_world(tmp_path, capsys) -> None:
-    option = '<option gravity="0 0 -1.6" density="1.2" wind="1 0 0"/>'
+    option = '<option gravity="0 0 -1.6" density="1.2" wind="1 0 0" actuatorgroupdisable="3">'
+    option += '<flag damper="disable" contact="disable"/></option>'
     flat = "--paddle.position 0 0 0.03 --paddle.quaternion 1 0 0 0"
     text = mjcf(arm(), motors(ARM_JOINTS)).replace("<worldbody>", f"{option}<worldbody>")
     # What does not move with the arm may be constrained, and a path have a line break.
@@ -405,6 +445,55 @@ def test_adopt_prints_each_servo_and_each_change_of_the_world(tmp_path, capsys) 
         numbers = f"kp {stiffness:.4g}, kv {damping:.4g}, force limit 100"
         assert re.search(rf"  {name}: .* rad, inertia .*, {re.escape(numbers)}\n", said)
     assert "gravity [0.0, 0.0, -1.6], wind [1.0, 0.0, 0.0], density 1.2" in said
+    assert "the disabled damper, the disabled actuator groups" in said
+
+
+def test_contacts_are_turned_off_where_the_arm_has_some(tmp_path) -> None:
+    """Not on the floor or the gripper, which are removed; a shape may have half of the two bits."""
+    untouched = arm().replace("<geom ", '<geom contype="0" conaffinity="0" ')
+    floor = '<geom type="plane" size="1 1 1"/>'
+    cases = {
+        arm(): True,
+        arm().replace("<geom ", '<geom conaffinity="0" '): True,
+        untouched: False,
+        floor + untouched.replace("<site", f"{HAND}<site"): False,
+    }
+    for world, touches in cases.items():
+        (tmp_path / "arm.xml").write_text(mjcf(world, motors(ARM_JOINTS)))
+        changes = build_arm(tmp_path / "arm.xml", RobotConfig(site="tool")).changes
+        assert any("contacts" in change for change in changes) == touches
+
+
+@pytest.mark.parametrize("mount", mounts(PaddleConfig()))
+def test_a_moved_paddle_weighs_as_one_that_is_built_there(mount, tmp_path) -> None:
+    """The search moves the paddle of a compiled scene: its mass must move with it."""
+    (tmp_path / "arm.xml").write_text(ARM)
+    matrices = []
+    for built_at in (PaddleConfig(), mount):
+        config = RobotConfig(site="tool", paddle=built_at)
+        spec = build_arm(tmp_path / "arm.xml", config).spec
+        spec.compiler.fusestatic = False
+        model = compile_spec(spec, tmp_path)
+        addresses = find_addresses(model)
+        place_paddle(model, addresses.paddle_geom, mount)
+        data = data_at(model, addresses, [0.1, 0.6, 1.1, -0.4, 0.9, 0.3])
+        mujoco.mj_forward(model, data)
+        matrix = np.zeros((model.nv, model.nv))
+        mujoco.mj_fullM(model, data, matrix)
+        matrices.append(matrix)
+    np.testing.assert_allclose(*matrices, rtol=1e-9, atol=1e-12)
+
+
+def test_an_error_keeps_its_cause() -> None:
+    """Also one that has the file's name already."""
+    with pytest.raises(UserError) as caught, naming(Path("arm.xml")), naming(Path("arm.xml")):
+        try:
+            raise ValueError("the cause")
+        except ValueError as cause:
+            raise UserError("no joint") from cause
+    assert str(caught.value) == "the MJCF file arm.xml has no joint"
+    assert str(caught.value.__cause__) == "no joint"
+    assert str(caught.value.__cause__.__cause__) == "the cause"
 
 
 @pytest.mark.slow
@@ -436,7 +525,9 @@ LIFT = link(
 @pytest.mark.slow
 def test_three_joints_suffice_to_lift_and_tilt(tmp_path, capsys) -> None:
     """Also on a base with a free joint, which is fixed; the observation has 2n + 17 numbers."""
-    base = f'<body><freejoint/><geom size="0.1"/>{LIFT}</body>'
+    pitch = hinge("pitch", "0 1 0")
+    damped = LIFT.replace(pitch, pitch.replace('damping="0.1"', 'damping="20"'))
+    base = f'<body><freejoint/><geom size="0.1"/>{damped}</body>'
     (tmp_path / "arm.xml").write_text(mjcf(base, motors("lift roll pitch", 60.0)))
     for task in ("juggle", "bounce"):
         line = f"{tmp_path}/arm.xml --site tool --out {tmp_path}/arm.yaml --task {task}"
@@ -449,10 +540,19 @@ def test_three_joints_suffice_to_lift_and_tilt(tmp_path, capsys) -> None:
     assert after.obs.shape == (env.observation_size,) == (23,)
     assert env.layout["joint_velocities"] == slice(10, 13)
     assert joint_names(env.mj_model) == ("lift", "roll", "pitch")
-    # A slide is slower: its action of 1 commands 0.6 m/s, that of a hinge 2 rad/s.
-    robot = env.config.robot
-    speed = env.config.action_scale * np.divide(robot.servo_stiffness, robot.servo_damping)
-    np.testing.assert_allclose(speed, [0.6, 2.0, 2.0], rtol=1e-3)
+    # A slide is slower: its action of 1 commands 0.6 m/s, that of a hinge 2 rad/s, where no force
+    # is left; also where the joint itself is damped more than its servo would be.
+    model = copy.copy(env.mj_model)
+    model.actuator_forcelimited[:] = False
+    data = mujoco.MjData(model)
+    data.qpos[list(env.addresses.arm_qpos)] = env.config.default_joint_angles
+    data.qvel[list(env.addresses.arm_qvel)] = [0.6, 2.0, 2.0]
+    servos = list(env.addresses.actuators)
+    data.ctrl[servos] = np.array(env.config.default_joint_angles) + env.config.action_scale
+    mujoco.mj_forward(model, data)
+    left = (data.qfrc_actuator + data.qfrc_passive)[list(env.addresses.arm_qvel)]
+    np.testing.assert_allclose(left, 0.0, atol=1e-3 * np.max(data.ctrl))
+    assert model.actuator_biasprm[servos, 2].tolist()[2] == 0.0
 
 
 def test_the_config_of_the_packages_arm_has_the_defaults() -> None:

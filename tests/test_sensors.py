@@ -203,6 +203,11 @@ def test_lost_pictures_do_not_come_later(watch) -> None:
                 assert not is_new or age[t] == pytest.approx(now[3], abs=2e-6)
     share = lost / new
     assert abs(share - 0.3) < 4 * np.sqrt(0.21 / new)
+    # At 250 Hz, the two or three pictures of a control step are lost together.
+    fast = watch(frame_drop=(0.5, 0.5), camera_rate=(250.0, 250.0))
+    growth = np.diff(fast.parts["ball_age"][:, :, 0, 0], axis=1)
+    is_held = np.isclose(growth, DT, atol=1e-6)
+    assert abs(is_held.mean() - 0.5) < 4 * np.sqrt(0.25 / is_held.size)
 
 
 def test_noise_has_its_size_and_is_held_with_the_picture(watch) -> None:
@@ -332,6 +337,9 @@ def test_latency_without_a_camera_and_velocity_by_differences(float64) -> None:
         np.testing.assert_allclose(seen.parts["ball_age"][w, :, 0, 0], latency, atol=1e-9)
         velocity = seen.parts["ball_velocity"][w, :, 0]
         np.testing.assert_allclose(velocity[5:], np.diff(expected, axis=0)[4:] / DT, atol=1e-6)
+    # No sensor measures the velocity, so its errors do not act.
+    noisy = run(ball_latency=(0.0, 0.03), ball_velocity_noise=(1.0, 1.0))
+    np.testing.assert_array_equal(noisy.parts["ball_velocity"], seen.parts["ball_velocity"])
 
 
 COUNT = 20_000

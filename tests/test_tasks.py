@@ -6,7 +6,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -105,6 +105,58 @@ def test_a_command_that_the_policy_does_not_see_is_refused() -> None:
 
     with pytest.raises(UserError, match="not see the command velocity, which varies from 0 to 1"):
         Env(Config())
+
+
+def test_settings_without_a_task_are_refused() -> None:
+    with pytest.raises(UserError, match="WorldConfig has the settings of a world without a task"):
+        Env(task.WorldConfig())
+
+
+class _Observation(task.ObservationConfig):
+    seconds: Annotated[int, task.Quantity(1, "s")] = 1
+
+
+class _Config(rest_task.Config):
+    observation: _Observation = _Observation()
+
+
+class _Forgetful(rest_task.Rest):
+    """It returns the quantities `first` at a reset and `later` after each step."""
+
+    Config = _Config
+    first: ClassVar[tuple[str, ...]] = ("seconds",)
+    later: ClassVar[tuple[str, ...]] = ("seconds",)
+
+    def first_quantities(self, measured: task.Values) -> tuple[None, task.Values]:
+        return None, {name: jnp.zeros(1) for name in self.first}
+
+    def next_quantities(
+        self, memory: None, histories: task.Values, measured: task.Values
+    ) -> tuple[None, task.Values]:
+        return None, {name: jnp.zeros((1, 1)) for name in self.later}
+
+
+@pytest.mark.parametrize(
+    "first, later, words",
+    [
+        ((), ("seconds",), "first_quantities .* lacks the observation's quantity seconds"),
+        (("seconds", "action"), ("seconds",), "first_quantities .* has the quantity action, which"),
+        (("seconds",), (), "next_quantities .* returns the histories none; return .*: seconds"),
+        (("seconds",), ("seconds", "more"), "returns the histories seconds, more; return"),
+    ],
+)
+def test_a_task_returns_the_quantities_of_its_observation(
+    first: tuple[str, ...], later: tuple[str, ...], words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_Forgetful, "first", first)
+    monkeypatch.setattr(_Forgetful, "later", later)
+    env = Env(_Config())
+
+    def reset_and_step(key: jax.Array) -> jax.Array:
+        return env.step(env.reset(key), jnp.zeros(6)).obs
+
+    with pytest.raises(UserError, match=words):
+        jax.eval_shape(reset_and_step, jax.random.key(0))
 
 
 def test_commands_are_observed_in_one_order() -> None:

@@ -7,6 +7,9 @@ import pytest
 import yaml
 
 from bounce_mjx.commands.train import read_command
+from bounce_mjx.config.settings import merged
+from bounce_mjx.config.validation import validate
+from bounce_mjx.env.env import model_nominals
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.suite import load_suite
 from bounce_mjx.resources import resource_path
@@ -16,6 +19,7 @@ from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.runs.worlds import in_world
 from bounce_mjx.world.config import ActionConfig
 from bounce_mjx.world.named import read_world
+from bounce_mjx.world.randomization import TERMS
 
 TWICE = "twice the assumed"
 NAMES = ("ur5e_rtde", "panda_fci", "iiwa_fri", "fast_servo")
@@ -98,12 +102,45 @@ def test_a_world_with_ranges_of_axes_trains_and_is_doubled(tmp_path: Path) -> No
         resource_path("configs/robustness.yaml"),
         there.env,
         there.env,
-        named.double_assumed({"paddle_tilt": 0.0}),
+        named.double_assumed(model_nominals(there.env)),
     )
     nominal, twice = (c for c in conditions if c.perturbation.group in ("nominal", TWICE))
     np.testing.assert_allclose(nominal.ranges["paddle_tilt"], TILT)
     np.testing.assert_allclose(twice.ranges["paddle_tilt"], 2.0 * np.array(TILT))
     assert nominal.trained and not twice.trained
+
+
+def test_assumed_numbers_are_doubled_entry_by_entry() -> None:
+    """As `bounce-mjx robustness --world` doubles them: about the model's value of each entry."""
+    there, named = in_world(TrainConfig(), Path("fast_servo"))
+    nominals = model_nominals(there.env)
+    doubled = named.double_assumed(nominals)
+    assert doubled.keys() == set(named.assumed)
+    for key, settings in doubled.items():
+        term = key.removeprefix("randomization.")
+        assert settings.keys() == {"randomization"} and settings["randomization"].keys() == {term}
+        low, high = getattr(there.env.randomization, term)
+        expected_low = np.clip(2.0 * np.array(low) - nominals[term], *TERMS[term].bounds)
+        expected_high = np.clip(2.0 * np.array(high) - nominals[term], *TERMS[term].bounds)
+        doubled_low, doubled_high = settings["randomization"][term]
+        np.testing.assert_allclose(doubled_low, expected_low)
+        np.testing.assert_allclose(doubled_high, expected_high)
+        validate(type(there.env), merged(there.env.model_dump(), settings), key)
+
+
+def test_less_of_a_limit_is_harder(tmp_path: Path) -> None:
+    keys = ["max_joint_velocity", "action_scale", "randomization.torque_limit"]
+    env = {
+        "max_joint_velocity": 4.0,
+        "action_scale": 0.02,
+        "randomization": {"torque_limit": [20.0, 40.0]},
+    }
+    path = written(tmp_path, env=env, sources=dict.fromkeys(keys, "An example."), assumed=keys)
+    assert read_world(path).double_assumed({}) == {
+        "max_joint_velocity": {"max_joint_velocity": 2.0},
+        "action_scale": {"action_scale": 0.04},
+        "randomization.torque_limit": {"randomization": {"torque_limit": [10.0, 20.0]}},
+    }
 
 
 def test_a_world_brings_its_robot() -> None:

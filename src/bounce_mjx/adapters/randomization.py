@@ -1,8 +1,8 @@
 """The domain randomisation of brax and MuJoCo Playground on this project's physics.
 
 Their `randomization_fn` returns a MuJoCo model with a batch axis in some fields. The entries that
-differ between environments become `PhysicsParameters.entries`, and the engine refuses the name of
-one that it does not read.
+differ between environments become `PhysicsParameters.entries`, of which the fused engine refuses
+the name of one that it does not read.
 """
 
 import dataclasses
@@ -18,13 +18,13 @@ import numpy as np
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
-from bounce_mjx.physics.edited import edited
+from bounce_mjx.physics.edited import INSEPARABLE, edited
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS, PhysicsParameters
 from bounce_mjx.physics.scalars import scalars_of
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.world.randomization import TERMS, RandomizationConfig
-from bounce_mjx.world.sampling import physics_parameters, sample_world
+from bounce_mjx.world.sampling import nominal_values, physics_parameters, sample_world
 
 Fields = dict[str, Any]
 """Arrays of a model by their names, such as `body_mass` and `opt.gravity`."""
@@ -44,28 +44,45 @@ def domain_randomize(
     rng: jax.Array,
     config: RandomizationConfig | None = None,
 ) -> tuple[Any, Any]:
-    """A `randomization_fn` of brax and Playground that samples terms of `env.randomization`.
+    """A `randomization_fn` of brax and Playground that samples terms of `env.randomization`, once
+    its first argument is bound (`functools.partial`).
 
     Args:
       mj_model: the environment's model.
       model: brax's system or MJX's model, made of it.
       rng: keys [B].
-      config: ranges of the terms, of which only those that change the physics act; None for
-        `default_terms`.
+      config: ranges and shares of the terms, of which only those that change the physics act; None
+        for `default_terms`.
 
     Returns:
-      The model with a batch axis in the changed fields, and the axes for `jax.vmap`.
+      The model with a batch axis in the changed fields, and the axes for `jax.vmap`. What follows
+      from them, such as an inertia from a mass, is not in it: this project's environments derive it
+      (`parameters_of`).
+
+    Raises:
+      UserError: the ranges would have to grow, which those of a model cannot.
     """
-    ranges = (config or default_terms()).ranges()
+    config = config or default_terms()
+    if config.warmup_steps:
+        raise UserError(
+            "the randomisation has warmup_steps, but the ranges of a randomization_fn do not grow; "
+            "set warmup_steps to 0"
+        )
     addresses = find_addresses(mj_model)
     num_joints = len(addresses.arm_joints)
+    ranges = config.ranges()
+    nominals = nominal_values(mj_model, config.terms, addresses)
+    dtype = jnp.result_type(float)
 
     def sample(key: jax.Array) -> Fields:
-        world = sample_world(ranges, key, jnp.result_type(float), num_joints)
-        parameters = scalars_of(physics_parameters(world, mj_model), jnp.result_type(float))
+        world = sample_world(
+            ranges, key, dtype, num_joints, nominals, config.share, config.shares or {}
+        )
+        parameters = scalars_of(physics_parameters(world, mj_model), dtype)
         world_model = edited(mj_model, addresses, parameters)
-        fields = world_model.fields
-        return {name: world_model.array(name) for name in fields if world_model.rows(name)}
+        # The fields with entries of their own.
+        fields = [name for name in world_model.fields if world_model.rows(name)]
+        return {name: world_model.array(name) for name in fields}
 
     fields = jax.jit(jax.vmap(sample))(rng)
     axes = jax.tree.map(lambda _: None, model)
@@ -94,8 +111,7 @@ def parameters_of(mj_model: mujoco.MjModel, base: Any, model: Any) -> PhysicsPar
     entries = {}
     for name, batch in _batches(changed).items():
         varied = np.any(batch != np.asarray(before[name]), axis=0)
-        if name == "pair_solref":
-            # One of the two numbers tells the meaning of the other.
+        if name in INSEPARABLE:
             varied |= varied.any(axis=1, keepdims=True)
         for index in np.argwhere(varied).tolist():
             entries[f"{name}[{', '.join(map(str, index))}]"] = changed[name][tuple(index)]
@@ -133,6 +149,9 @@ def _equal(a: Any, b: Any) -> bool:
 def _batches(fields: Fields) -> Fields:
     """The values of the fields in all environments, the batch in front.
 
+    Inside `jax.vmap`, the value of one environment is a tracer. The vmap rule of a function gets
+    the array behind it, with all environments.
+
     Raises:
       UserError: the values are not known while the program is traced.
     """
@@ -146,6 +165,7 @@ def _batches(fields: Fields) -> Fields:
     def look(axis_size: int, in_batched: Any, arrays: list[jax.Array]) -> Any:
         for name, array, batched in zip(traced, arrays, in_batched[0], strict=True):
             if isinstance(array, jax.core.Tracer):
+                # Inside `jax.jit` too, where nobody knows the numbers.
                 break
             batches[name] = np.asarray(array) if batched else np.asarray(array)[None]
         return arrays, in_batched[0]

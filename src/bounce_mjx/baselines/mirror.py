@@ -82,7 +82,7 @@ class MirrorLaw:
         """
         config = env.config
         needed = _needs(config)
-        missing = [name for name in needed if name not in config.observation.lengths()]
+        missing = [name for name in needed if name not in config.observation.counts()]
         if missing or config.num_balls > 1:
             raise UserError(
                 f"the mirror law bounces one ball with {', '.join(needed)} in the "

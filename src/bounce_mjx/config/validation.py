@@ -14,7 +14,9 @@ from bounce_mjx.errors import UserError, shorten
 
 ConfigT = TypeVar("ConfigT", bound=StrictModel)
 
-_UNIT = re.compile(r", (1/m|s/m|m/s\^2|m/s|rad/s|rad|m|s|kg|Hz|N m)(?=[.;]| \()")
+_UNIT = re.compile(
+    r", (1/m|s/m|m/s\^2|m/s|rad/s\^3|rad/s\^2|rad/s|rad|m|s|kg|Hz|N m s/rad|N m)(?=[.;]| \()"
+)
 
 
 def validate(

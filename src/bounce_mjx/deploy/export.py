@@ -293,7 +293,7 @@ def _control_step(
     """A control step as a function of named arrays, and their shapes: the action, and what the task
     remembers of the measurements, as the environment computes it."""
     task = env.task(env)
-    of_task = env.observation.lengths("task")
+    of_task = env.observation.counts("task")
     inputs = {part.name: _floats(part.history, part.size) for part in _inputs(env)}
     if not of_task:
         return lambda histories: {"action": network(histories)}, inputs

@@ -1,4 +1,5 @@
-"""The environment of the task bounce, without its import of JAX for the settings alone."""
+"""The environment of the task bounce, in a file of its own: `task/bounce.py`, with the settings,
+does not import JAX."""
 
 from typing import Any
 

@@ -17,6 +17,15 @@ _ROUNDING = 1e-3
 _FARTHEST_BESIDE = 0.3
 
 
+def check_has_task(config: WorldConfig) -> None:
+    """Refuses settings of the world alone."""
+    if config.task is None:
+        raise UserError(
+            f"{type(config).__name__} has the settings of a world without a task; give a task's, "
+            "such as BounceConfig or your task's Config"
+        )
+
+
 def check_task(config: WorldConfig, task: Task) -> None:
     """Refuses what the task cannot have, whatever the model."""
     _check_commands_are_seen(config)
@@ -25,10 +34,10 @@ def check_task(config: WorldConfig, task: Task) -> None:
 
 def _check_commands_are_seen(config: WorldConfig) -> None:
     """Refuses a command that varies and that the policy does not see."""
-    if config.observation.lengths("task"):
-        # The task's own quantities may show any command.
+    if config.observation.counts("task"):
+        # The task computes its own quantities from all measurements and commands.
         return
-    seen = config.observation.lengths()
+    seen = config.observation.counts()
     for name, command in config.commands.items():
         varies = command.low < command.high
         if varies and name not in seen and not command.hidden:
@@ -72,7 +81,7 @@ def check_joint_angles(config: WorldConfig, mj_model: mujoco.MjModel, addresses:
 
 def check_start(config: WorldConfig, task: Task) -> None:
     """Refuses heights that are not over the paddle of a reset, and a ball that starts within or
-    beside it; a task that throws the ball has its own start. The task has the model's geometry."""
+    beside it; a task that throws the ball has its own start. It needs `task.geometry`."""
     geometry = task.geometry
     paddle_x, paddle_y, paddle_height = geometry.paddle_home
     for name, height in config.heights.items():

@@ -10,7 +10,12 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from bounce_mjx.env.checks import check_joint_angles, check_start, check_task
+from bounce_mjx.env.checks import (
+    check_has_task,
+    check_joint_angles,
+    check_start,
+    check_task,
+)
 from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, edited_model
 from bounce_mjx.physics.engine import Engine, make_engine
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
@@ -25,12 +30,18 @@ from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.noise import Clock
 from bounce_mjx.world.observation import Kinematics
 from bounce_mjx.world.randomization import TERMS, Ranges, World
-from bounce_mjx.world.sampling import nominal_values, physics_parameters, sample_world
+from bounce_mjx.world.sampling import (
+    check_contacts,
+    nominal_values,
+    physics_parameters,
+    sample_world,
+)
 from bounce_mjx.world.sensing import Instant, Sensing, Sensors
 
 # MuJoCo's mjMAXVAL: a coordinate beyond it has diverged and counts as non-finite.
 _MAX_COORDINATE = 1e10
-# What a critic may see beside noisy measurements; the ball's quaternion tells nothing of a sphere.
+# What a critic may see beside noisy measurements. Without the ball's quaternion: the orientation of
+# a sphere tells nothing.
 _TRUE_QUANTITIES = (
     "joint_angles",
     "ball_position",
@@ -72,7 +83,7 @@ class EnvState(NamedTuple):
     command: dict[str, jax.Array]
     """Value [] of each command."""
     last_action: jax.Array
-    """Clipped action of the last step [n]."""
+    """Clipped action of the step that led here [n]; zero after a reset."""
     task: Any = ()
     """What the task keeps of the episode."""
     parameters: PhysicsParameters = PhysicsParameters()
@@ -80,7 +91,7 @@ class EnvState(NamedTuple):
     world: World = {}
     """The values that the reset sampled for the active randomisation terms."""
     clock: Clock | None = None
-    """For a randomised world, or an observation with a history."""
+    """For a randomised world, or where there is `sensing`."""
     redraw: Redraw | None = None
     """For commands that change within an episode."""
     actuation: Actuation = Actuation()
@@ -115,7 +126,7 @@ class Env:
     """One environment, unbatched and pure: apply `jax.vmap` and `jax.jit` to `reset` and `step`.
 
     It has the interface of brax's `Env` by structure. `done` is 1 where the episode terminated;
-    the time limit belongs to the training wrapper.
+    the time limit is that of `env.vector.step`, or of another library's wrapper.
     """
 
     def __init__(
@@ -130,8 +141,9 @@ class Env:
             for the model's own.
 
         Raises:
-          UserError: the MJCF file or the engine does not fit the task.
+          UserError: the config has no task, or the MJCF file or the engine does not fit it.
         """
+        check_has_task(config)
         self.config = config
         self.task: Task = config.task(config)
         check_task(config, self.task)
@@ -140,6 +152,7 @@ class Env:
         self.engine: Engine = make_engine(self.mj_model, config.physics, self.addresses)
         self.layout = config.layout
         check_joint_angles(config, self.mj_model, self.addresses)
+        check_contacts(self.mj_model, config.randomization.terms, self.addresses)
         self.task.geometry = read_geometry(
             self.mj_model, self.addresses, config.default_joint_angles
         )
@@ -193,16 +206,18 @@ class Env:
 
         Args:
           rng: key; consumed.
-          ranges: ranges for the active terms, within the config's ranges, which are the default.
-            The queues of delayed actions and pictures are only as long as the config's ranges need.
-          share: probability that each term is sampled; by default, the config's.
+          ranges: ranges for all active terms and, if they differ from the config's, for commands,
+            within the config's ranges, which are the default. The queues of delayed actions and
+            pictures are only as long as the config's ranges need.
+          share: probability that each term is sampled, in place of the config's `share` and
+            `shares`.
         """
         robot_model.check_unedited(self.mj_model, self._fingerprint)
         if ranges is None:
             ranges = self.ranges()
         rng, world, clock = self._sample_world(rng, ranges, share)
         rng, randomized = self._sample_parameters(rng)
-        parameters = self._parameters(world, randomized)
+        parameters = physics_parameters(world, self.mj_model)._replace(**_given(randomized))
         draws = self._draw(rng)
 
         command_ranges = self._command_ranges(ranges)
@@ -211,7 +226,7 @@ class Env:
         truth = self._kinematics(physics, parameters)
         first_command = self._first_command(sampled)
         task = self.task.reset(Start(truth, first_command, draws.task))
-        command = self._next_command(task, first_command)
+        command = self._checked_next_command(task, first_command)
 
         state = EnvState(
             physics=physics,
@@ -274,6 +289,7 @@ class Env:
         before = state.pipeline_state
         physics, finite = _keep_finite(physics, before.physics)
         action, is_number = _clip_action(action)
+        # The state is then the previous one, and so is its action.
         action = jnp.where(finite, action, before.last_action)
         after = before._replace(physics=physics, last_action=action, actuation=actuation)
         truth = self.kinematics(after)
@@ -292,6 +308,7 @@ class Env:
         }
 
         after = self._redraw_commands(after)
+        # Its names were checked at the reset.
         command = self.task.next_command(result.state, after.command)
         after = after._replace(task=result.state, command=command)
         if after.clock is not None:
@@ -401,13 +418,15 @@ class Env:
         }
 
     def _first_command(self, sampled: dict[str, jax.Array]) -> dict[str, jax.Array]:
-        """The task's commands from their samples, each []."""
+        """The task's commands from their samples, at a reset and at each redraw, each []."""
         command = self.task.first_command(sampled)
         named = f"first_command of the task {type(self.task).__name__}"
         check_names(named, "command", command, sampled)
         return command
 
-    def _next_command(self, task: Any, command: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    def _checked_next_command(
+        self, task: Any, command: dict[str, jax.Array]
+    ) -> dict[str, jax.Array]:
         """The commands of a reset from now on, each []; `task` is the task's state."""
         following = self.task.next_command(task, command)
         named = f"next_command of the task {type(self.task).__name__}"
@@ -433,9 +452,10 @@ class Env:
         is_due = noise.is_due(
             state.world["command_interval"], clock.command_phase, clock.step, self.dt
         )
-        # The clock's own counter has given the phases in this stream.
+        # At the reset, the clock's counter has given the phases from this stream.
         counter = noise.next_counter(clock.counter)
         draws = noise.uniform(counter, noise.COMMAND, (len(ranges),), age.dtype)
+        # JAX has sorted the keys of the state's dictionary.
         in_order = {name: ranges[name] for name in self.config.commands}
         new_command = self._first_command(sample_commands(in_order, draws))
         command = {}
@@ -447,7 +467,7 @@ class Env:
     def _first_metrics(self, state: EnvState, truth: Kinematics) -> dict[str, jax.Array]:
         """The metrics of a reset, which are zero except for the privileged ones."""
         zero = jnp.zeros((), truth.joint_angles.dtype)
-        # The names alone: no step is computed.
+        # A step of the task is traced for the names of its metrics, and not computed.
         step = Step(
             truth=truth,
             command=state.command,
@@ -461,6 +481,7 @@ class Env:
             named = {curve.metric}
             if curve.over not in ("steps", "episodes"):
                 named.add(curve.over)
+            # A curve may not name an unknown metric, and need not name them all.
             check_names(f"the curve {curve.tag}", "metric", metrics.keys() | named, metrics)
         return metrics
 
@@ -502,26 +523,23 @@ class Env:
             values = truth._asdict() | commands
         else:
             values = dict(state.sensing.histories)
-            # A command may have been set since the last step. The order is that of the state, so
-            # that each process compiles the same program.
+            # A command may have been set since the last step.
+            # Not over a set of the names, whose order, and so the program, differs by process.
             for name, command in commands.items():
                 if name in values:
                     values[name] = jnp.concatenate([command[None], values[name][1:]])
         return self.layout.pack({name: jnp.ravel(value) for name, value in values.items()})
 
     def with_world(self, state: EnvState, world: World) -> EnvState:
-        """The state with other values of the terms of its world."""
-        randomized = MODEL_PARAMETERS
+        """The state with other values of the terms of its world; the parameters that `randomize`
+        sampled stay."""
+        parameters = physics_parameters(world, self.mj_model)
         if self._randomize is not None:
-            sampled = jax.eval_shape(self._randomize, jax.random.PRNGKey(0))
-            randomized = PhysicsParameters(**_fields_of(sampled, state.parameters))
-        return state._replace(world=world, parameters=self._parameters(world, randomized))
-
-    def _parameters(self, world: World, randomized: PhysicsParameters) -> PhysicsParameters:
-        """The physics of a world, in which the parameters of `randomize` replace those of the
-        world's terms."""
-        replaced = _fields_of(randomized, randomized)
-        return physics_parameters(world, self.mj_model)._replace(**replaced)
+            # The shapes alone say which parameters it gives.
+            shapes = jax.eval_shape(self._randomize, jax.random.PRNGKey(0))
+            kept = {name: getattr(state.parameters, name) for name in _given(shapes)}
+            parameters = parameters._replace(**kept)
+        return state._replace(world=world, parameters=parameters)
 
     def _privileged_metrics(self, world: World, truth: Kinematics) -> dict[str, jax.Array]:
         """Quantities that only a critic may see: `world/<term>` and, where the sensors differ from
@@ -583,13 +601,9 @@ def _ball_rows(coordinates: jax.Array, places: list[tuple[int, ...]], part: slic
     return rows[0] if len(rows) == 1 else jnp.stack(rows)
 
 
-def _fields_of(names: PhysicsParameters, parameters: PhysicsParameters) -> dict[str, Any]:
-    """The fields of `parameters` that `names` has, which are those that are not None."""
-    fields = {}
-    for name, value in names._asdict().items():
-        if value is not None:
-            fields[name] = getattr(parameters, name)
-    return fields
+def _given(parameters: PhysicsParameters) -> dict[str, Any]:
+    """The parameters that are not the model's own, by name."""
+    return {name: value for name, value in parameters._asdict().items() if value is not None}
 
 
 def _instant(state: EnvState, truth: Kinematics) -> Instant:
@@ -619,7 +633,8 @@ def _keep_finite(physics: PhysicsState, before: PhysicsState) -> tuple[PhysicsSt
 
 
 def _clip_action(action: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The action [n] that acts, and whether that is the clipped one []: a NaN acts as 0."""
+    """The action [n] that acts, clipped, and whether it is a number []: with a NaN in it, all its
+    entries are 0."""
     is_number = ~jnp.any(jnp.isnan(action))
     return jnp.where(is_number, jnp.clip(action, -1.0, 1.0), 0.0), is_number
 

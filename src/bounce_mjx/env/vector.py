@@ -15,7 +15,8 @@ from bounce_mjx.task import Task
 
 class AnyEnv(Protocol):
     """One environment, unbatched and pure: the part of brax's `Env` that training needs, and the
-    task, which names what to log."""
+    task, which names what to log. One with a randomisation has `warmup_steps`, `ranges` and the
+    `ranges` of a reset too, as `Env`."""
 
     task: Task | type[Task]
     """The task, of which training reads `curves` and `critic_metrics`; both may be empty."""
@@ -106,7 +107,8 @@ def first_states(env: AnyEnv, key: jax.Array, num_envs: int, ranges: Any = None)
 
 def ranges_after(env: AnyEnv, count: jax.Array | None, steps_each: int) -> Any:
     """Ranges of the randomisation after `count` [] times `steps_each` environment steps, which grow
-    over its warm-up; None, the environment's own, without one."""
+    over its warm-up; None, the environment's own, for one without a warm-up, where `count` may be
+    None too."""
     warmup_steps = getattr(env, "warmup_steps", 0)
     if not warmup_steps:
         return None

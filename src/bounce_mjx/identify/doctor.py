@@ -17,20 +17,28 @@ from bounce_mjx.identify.following import commanded, find_settled
 from bounce_mjx.identify.log import JOINT_GAP, Log
 
 # Delays that are searched, s: a trajectory server gets its targets seconds ahead.
-_SHORTEST, _LONGEST, _COARSE, _FINE = -0.5, 3.0, 0.02, 1e-3
+_SHORTEST = -0.5
+_LONGEST = 3.0
+_COARSE = 0.02
+_FINE = 1e-3
 _ROWS = 2500
 # Time over which both signals are averaged for slope and offset, s: a servo damps fast motions.
 _SMOOTH = 0.25
 # A joint whose angle or command changes by less does not move, and one that moves by less is too
 # little to judge, rad.
-_STILL, _LITTLE = 5e-3, 0.05
+_STILL = 5e-3
+_LITTLE = 0.05
 # Delays count as equally good up to this loss of correlation, and this multiple of the least.
-_TIED, _TIE = 1e-8, 1.1
+_TIED = 1e-8
+_TIE = 1.1
 # Largest delay of a servo, and largest lead that rounded stamps explain, s; and the largest
 # difference between the delays of two joints or of two parts of a log.
-_LATE, _EARLY, _APART = 0.3, -0.02, 0.05
+_LATE = 0.3
+_EARLY = -0.02
+_APART = 0.05
 # Correlations: with the own command below which a joint may belong to another, and with that one.
-_OWN, _OTHER = 0.9, 0.95
+_OWN = 0.9
+_OTHER = 0.95
 _FOLLOWS = 0.7
 _SLOPES = 0.85, 1.18
 _DEGREES = 180.0 / np.pi
@@ -39,15 +47,19 @@ _ZERO = 0.02
 _TURN = 2.0 * np.pi
 # A joint that repeats its angle to the last digit for longer while its command moves faster is
 # frozen, s and rad/s.
-_FROZEN, _FROZEN_SPEED = 0.3, 0.05
+_FROZEN = 0.3
+_FROZEN_SPEED = 0.05
 # Share of its rows in which a joint rests, within a distance, at an end of its motion although its
 # command goes beyond it, rad.
-_SATURATED, _REST, _BEYOND = 0.02, 3e-3, 0.02
+_SATURATED = 0.02
+_REST = 3e-3
+_BEYOND = 0.02
 _EXACT = 0.9
 _GRAVITY = 9.81
 # Time of a piece of flight that shows the ball's acceleration, s.
 _PIECE = 0.12
-_FEWEST_PIECES, _PIECES = 10, 300
+_FEWEST_PIECES = 10
+_PIECES = 300
 
 
 class Finding(NamedTuple):
@@ -134,7 +146,8 @@ def _examine_one(log: Log, joint_names: Sequence[str]) -> Checkup:
     correlations, delays = _correlate(log, rows[:: max(len(rows) // _ROWS, 1)])
     of_own = np.abs(np.diagonal(correlations, axis1=1, axis2=2))
     best = np.array([_least_of_best(delays, column) for column in of_own.T])
-    sent, shown = commanded(log, log.times[rows]), log.joint_angles[rows]
+    sent = commanded(log, log.times[rows])
+    shown = log.joint_angles[rows]
     moves = np.minimum(np.ptp(sent, axis=0), np.ptp(shown, axis=0)) > _LITTLE
     strong = moves & (np.max(of_own, axis=0) > _FOLLOWS)
     late = float(np.median(delays[best[strong]])) if np.any(strong) else 0.0
@@ -200,7 +213,8 @@ def _compare(log: Log, rows: np.ndarray, j: int, name: str, guess: float) -> Joi
     near = np.arange(guess - 1.5 * _COARSE, guess + 1.5 * _COARSE, _FINE)
     values = [correlation(delay) for delay in near]
     best = _least_of_best(near, np.array(values))
-    delay, strength = float(near[best]), values[best]
+    delay = float(near[best])
+    strength = values[best]
     angles, targets = _smoothed(log, rows, j, delay)
     if _ZERO < abs(np.median(angles - targets)) < _TURN / 4.0:
         # A motion that goes one way shows an offset as well as a delay.
@@ -316,7 +330,8 @@ def _find_joint_faults(log: Log, rows: np.ndarray, joints: Sequence[Joint]) -> l
 
 def _find_gain(log: Log, rows: np.ndarray, j: int, joint: Joint) -> list[Finding]:
     """A slope or an offset that no servo has."""
-    size, name = abs(joint.slope), joint.name
+    size = abs(joint.slope)
+    name = joint.name
     if (end := _find_saturation(log, rows, j, joint)) is not None:
         return [end]
     if abs(joint.correlation) < _FOLLOWS:
@@ -468,7 +483,8 @@ def _find_frozen(log: Log, joints: Sequence[Joint]) -> list[Finding]:
         return []
     same = np.all(np.diff(log.joint_angles[:, moving], axis=0) == 0.0, axis=1)
     for first, last in _runs(same):
-        begin, end = log.times[first], log.times[last + 1]
+        begin = log.times[first]
+        end = log.times[last + 1]
         sent = (log.target_times >= begin) & (log.target_times <= end)
         if end - begin > _FROZEN and np.any(sent):
             travelled = np.sum(np.abs(np.diff(log.servo_targets[sent][:, moving], axis=0)))
@@ -519,7 +535,8 @@ def _find_ball(log: Log) -> list[Finding]:
     if len(pulls) < _FEWEST_PIECES:
         return found
     pull = np.median(pulls, axis=0)
-    size, axis = float(np.linalg.norm(pull)), int(np.argmax(np.abs(pull)))
+    size = float(np.linalg.norm(pull))
+    axis = int(np.argmax(np.abs(pull)))
     shown = "(" + ", ".join(f"{x:.1f}" for x in pull) + ") m/s^2"
     if not 0.5 * _GRAVITY < size < 2.0 * _GRAVITY:
         text = (

@@ -64,8 +64,10 @@ def excite(
       UserError: the start pose has a contact with the floor or the table, or a joint cannot move.
     """
     model = load_model(config.mjcf, config.physics_dt, visual=False, robot=config.robot)
-    n, dt = config.num_joints, config.control_dt
-    home, names = np.array(config.default_joint_angles), joint_names(model)
+    n = config.num_joints
+    dt = config.control_dt
+    home = np.array(config.default_joint_angles)
+    names = joint_names(model)
     limits = config.robot.limits
     given = limits.velocity, limits.acceleration, limits.jerk
     bounds = _BELOW_LIMIT * np.array([[np.inf] * n if x is None else x for x in given])
@@ -124,9 +126,11 @@ def _lift_paddle(
 ) -> np.ndarray:
     """Joint angles [n] within limits [n] at which the paddle is higher, by steps of the
     pseudo-inverse."""
-    addresses, data = find_addresses(model), mujoco.MjData(model)
+    addresses = find_addresses(model)
+    data = mujoco.MjData(model)
     body = model.geom_bodyid[addresses.paddle_geom]
-    angles, jacobian = home.copy(), np.zeros((3, model.nv))
+    angles = home.copy()
+    jacobian = np.zeros((3, model.nv))
     for _ in range(20):
         data.qpos[list(addresses.arm_qpos)] = angles
         mujoco.mj_kinematics(model, data)
@@ -158,11 +162,14 @@ def _plan(times: np.ndarray, amplitudes: np.ndarray, bounds: np.ndarray) -> np.n
     Args:
       bounds: of each joint's velocity, acceleration and jerk [3, n].
     """
-    n, dt = len(amplitudes), times[1] - times[0]
+    n = len(amplitudes)
+    dt = times[1] - times[0]
     length = times[-1] + dt
-    alone, moved = 0.7 * length / n, np.zeros((len(times), n))
+    alone = 0.7 * length / n
+    moved = np.zeros((len(times), n))
     for j, limits in enumerate(bounds.T):
-        t, half = times - j * alone, 0.5 * alone
+        t = times - j * alone
+        half = 0.5 * alone
         for start, wave in ((0.0, _slow_sine), (half, _sweep)):
             path = wave(t - start, half, amplitudes[j], limits)
             moved[:, j] += _shrink(path * ((t >= start) & (t < start + half)), dt, limits)

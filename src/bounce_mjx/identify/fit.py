@@ -30,7 +30,8 @@ _SHARES = np.array([1.0, 0.3, 0.0])
 # Farthest that an angle of a start may be from its guess, a measurement, in deviations.
 _FARTHEST_START = 5.0
 # Decrease of the cost, and its share, at which a search ends.
-_CONVERGED, _CONVERGED_SHARE = 0.3, 2e-5
+_CONVERGED = 0.3
+_CONVERGED_SHARE = 2e-5
 # Residuals beyond this many standard deviations lose weight (Huber 1964).
 _HUBER = 3.0
 NO_FLIGHT = 25.0
@@ -56,7 +57,8 @@ AIR_LIFT = 0.006
 shows its product with the spin alone."""
 # Deviation of the spin of a flight that shows lift, rad/s, and of the acceleration by the spin
 # after a bounce from the model's, m/s^2.
-_SPIN_DEVIATION, _LIFT_DEVIATION = 150.0, 4.0
+_SPIN_DEVIATION = 150.0
+_LIFT_DEVIATION = 4.0
 
 
 class Noise(NamedTuple):
@@ -100,8 +102,9 @@ class Problem(NamedTuple):
     @property
     def deviations(self) -> np.ndarray:
         """The noise of each entry of a window's measurements [A n + 3 B]."""
-        shape = self.windows.angles.shape[1], self.windows.balls.shape[1]
-        return np.concatenate([np.tile(*x) for x in zip(self.noise, shape, strict=True)])
+        of_angles = np.tile(self.noise.angles, self.windows.angles.shape[1])
+        of_balls = np.tile(self.noise.balls, self.windows.balls.shape[1])
+        return np.concatenate([of_angles, of_balls])
 
     def predict(self, vector: np.ndarray, starts: np.ndarray) -> np.ndarray:
         """What the sensors would have measured [S, A n + 3 B], in one world."""
@@ -117,7 +120,8 @@ class Problem(NamedTuple):
         residuals' covariance is then I + C C'. With C'C = V diag(l) V', its inverse root is
         I - C V diag((1 - 1 / sqrt(1 + l)) / l) V' C'.
         """
-        w, root = self.windows, np.sqrt(weights)
+        w = self.windows
+        root = np.sqrt(weights)
         scaled = (predicted - w.measured) / self.deviations * root
         angles, balls = w.split(scaled)
         columns = self.bounce_columns() * w.split(root)[1][..., None]
@@ -184,16 +188,14 @@ def minimise(
       weights: of the measurements [S, M].
       free_states: which entries [D] of the starts may change; all by default.
     """
-    layout, guess = problem.layout, problem.windows.starts
+    layout = problem.layout
+    guess = problem.windows.starts
     deviations, _, searched = problem.scale_starts()
     unknowns = np.flatnonzero(layout.free(stages))
     entries = np.flatnonzero(searched if free_states is None else searched & free_states)
-    scale, reach = layout.deviation[unknowns], deviations[entries]
     # The start of a window that does not count stays as it is.
     used = np.any(weights > 0.0, axis=1)
-    num_tried, each = len(_DAMPINGS) * len(_SHARES), np.arange(len(guess))
-    is_angle = np.arange(len(deviations)) < layout.num_joints
-    farthest = np.where(is_angle, _FARTHEST_START * deviations, np.inf)
+    windows = np.arange(len(guess))
 
     def data_costs(white: np.ndarray, states: np.ndarray) -> np.ndarray:
         """Half the sum of squares of each candidate and window [C, S]."""
@@ -204,39 +206,80 @@ def minimise(
         return 0.5 * np.sum(((vectors - layout.mean) / layout.deviation) ** 2, axis=-1)
 
     for iteration in range(iterations):
-        vector, starts = fit.vector, fit.starts
+        vector = fit.vector
+        starts = fit.starts
         line = _linearise(problem, vector, starts, unknowns, entries, weights)
         now = float(np.sum(data_costs(line.white[None], starts[None])) + prior_costs(vector))
         fit = Fit(vector, starts, line.predicted, weights, now)
-        at_guess = (starts - guess)[:, entries] / reach
-        reduced = _eliminate(line.white, line.by_unknown * scale, line.by_state * reach, at_guess)
-        hessian = np.sum(reduced.informations, axis=0) + np.eye(len(unknowns))
-        from_mean = (vector[unknowns] - layout.mean[unknowns]) / scale
-        slope = np.sum(reduced.gradients, axis=0) + from_mean
-        room = (layout.bounds(vector) - vector)[:, unknowns] / scale
-        vectors = np.repeat(vector[None], num_tried, axis=0)
-        states = np.repeat(starts[None], num_tried, axis=0)
-        for d, damping in enumerate(_DAMPINGS):
-            damped = hessian + damping * np.diag(np.diag(hessian))
-            change = _bounded_step(damped, slope, room)
-            moved = reduced.states(change) * reach * used[:, None]
-            for i, share in enumerate(_SHARES, d * len(_SHARES)):
-                vectors[i, unknowns] += change * scale
-                states[i][:, entries] += share * moved
-                states[i] = np.clip(states[i], guess - farthest, guess + farthest)
-        outcome = problem.simulate(vectors, states, np.tile(used, (num_tried, 1)))
+        vectors, states = _list_trials(problem, fit, line, unknowns, entries, used)
+        outcome = problem.simulate(vectors, states, np.tile(used, (len(vectors), 1)))
         costs = data_costs(problem.whiten(outcome, weights), states)
         costs = np.where(np.isfinite(costs), costs, np.inf).reshape(len(_DAMPINGS), -1, len(starts))
         totals = np.sum(np.min(costs, axis=1), axis=1) + prior_costs(vectors[:: len(_SHARES)])
         damping = int(np.argmin(totals))
-        best = damping * len(_SHARES) + np.argmin(costs[damping], axis=0)
-        problem.progress(f"step {iteration + 1}: {now:.1f} -> {totals[damping]:.1f}")
-        if now > totals[damping]:
-            total = float(totals[damping])
-            fit = Fit(vectors[best[0]], states[best, each], outcome[best, each], weights, total)
-        if not now - totals[damping] >= max(_CONVERGED, _CONVERGED_SHARE * now):
+        total = float(totals[damping])
+        problem.progress(f"step {iteration + 1}: {now:.1f} -> {total:.1f}")
+        if now > total:
+            # Of the best damping, each window takes the share that suits it.
+            best = damping * len(_SHARES) + np.argmin(costs[damping], axis=0)
+            fit = Fit(
+                vector=vectors[best[0]],
+                starts=states[best, windows],
+                predicted=outcome[best, windows],
+                weights=weights,
+                cost=total,
+            )
+        if not now - total >= max(_CONVERGED, _CONVERGED_SHARE * now):
             break
     return fit
+
+
+def _list_trials(
+    problem: Problem,
+    fit: Fit,
+    line: "_Linearisation",
+    unknowns: np.ndarray,
+    entries: np.ndarray,
+    used: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The unknowns [C, P] and the starts [C, S, D] that a step tries: for each damping, each share
+    of the change of the starts.
+
+    Args:
+      line: derivatives by the F `unknowns` and the D `entries` of the starts that may change.
+      used: which windows [S] count.
+    """
+    layout = problem.layout
+    guess = problem.windows.starts
+    deviations = problem.scale_starts()[0]
+    scale = layout.deviation[unknowns]
+    reach = deviations[entries]
+    is_angle = np.arange(len(deviations)) < layout.num_joints
+    farthest = np.where(is_angle, _FARTHEST_START * deviations, np.inf)
+    reduced = _eliminate(
+        line.white,
+        line.by_unknown * scale,
+        line.by_state * reach,
+        (fit.starts - guess)[:, entries] / reach,
+    )
+    hessian = np.sum(reduced.informations, axis=0) + np.eye(len(unknowns))
+    from_mean = (fit.vector[unknowns] - layout.mean[unknowns]) / scale
+    slope = np.sum(reduced.gradients, axis=0) + from_mean
+    room = (layout.bounds(fit.vector) - fit.vector)[:, unknowns] / scale
+    vectors = []
+    states = []
+    for damping in _DAMPINGS:
+        damped = hessian + damping * np.diag(np.diag(hessian))
+        change = _bounded_step(damped, slope, room)
+        moved = reduced.states(change) * reach * used[:, None]
+        for share in _SHARES:
+            vector = fit.vector.copy()
+            vector[unknowns] += change * scale
+            starts = fit.starts.copy()
+            starts[:, entries] += share * moved
+            vectors.append(vector)
+            states.append(np.clip(starts, guess - farthest, guess + farthest))
+    return np.stack(vectors), np.stack(states)
 
 
 def _bounded_step(hessian: np.ndarray, slope: np.ndarray, room: np.ndarray) -> np.ndarray:
@@ -250,7 +293,8 @@ def _bounded_step(hessian: np.ndarray, slope: np.ndarray, room: np.ndarray) -> n
     """
     root = np.linalg.cholesky(hessian).T
     target = -np.linalg.solve(root.T, slope)
-    low, high = np.minimum(room[0], 0.0), np.maximum(room[1], 0.0)
+    low = np.minimum(room[0], 0.0)
+    high = np.maximum(room[1], 0.0)
     inside = lsq_linear(root, target, bounds=(low, np.maximum(high, low + 1e-12)), method="bvls")
     return inside.x
 
@@ -278,9 +322,12 @@ def certainty(problem: Problem, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
     (I - H_s)^-1/2 R' g_s. The result is C with each deviation widened to that of the sandwich,
     where that one is larger.
     """
-    layout, (deviations, _, searched) = problem.layout, problem.scale_starts()
-    size, entries = len(fit.vector), np.flatnonzero(searched)
-    scale, reach = layout.deviation, deviations[entries]
+    layout = problem.layout
+    deviations, _, searched = problem.scale_starts()
+    size = len(fit.vector)
+    entries = np.flatnonzero(searched)
+    scale = layout.deviation
+    reach = deviations[entries]
     vector = layout.interior(fit.vector, 2.0)
     lines = [
         _linearise(problem, vector, fit.starts, np.arange(size), entries, fit.weights, step)
@@ -358,15 +405,20 @@ def _list_differences(
     problem: Problem, vector: np.ndarray, unknowns: np.ndarray, entries: np.ndarray, size: float
 ) -> list[_Difference]:
     """The simulations for the F `unknowns` and the D `entries` of the starts."""
-    layout, n, split = problem.layout, problem.layout.num_joints, problem.windows.angles[0].size
-    angles, pictures, both = slice(0, split), slice(split, None), slice(0, None)
+    layout = problem.layout
+    n = layout.num_joints
+    split = problem.windows.angles[0].size
+    angles = slice(0, split)
+    pictures = slice(split, None)
+    both = slice(0, None)
     joints = [slice(j, split, n) for j in range(n)]
 
     found = []
 
     def add(places: Sequence[int], step: float, rows: list[slice]) -> None:
         """Unknowns of one simulation, with the other sign where they would leave the limits."""
-        at, moved = np.array(places), vector.copy()
+        at = np.array(places)
+        moved = vector.copy()
         moved[at] += size * step
         turned = np.abs(layout.clip(moved)[at] - vector[at]) < 0.5 * np.abs(size * step)
         steps = np.where(turned, -size, size) * step
@@ -375,7 +427,8 @@ def _list_differences(
     for name, place in layout.slices.items():
         if place.start not in unknowns:
             continue
-        unknown, places = layout.unknowns[name], range(place.start, place.stop)
+        unknown = layout.unknowns[name]
+        places = range(place.start, place.stop)
         rows = pictures if name not in ARM else both if unknown.ball_step is None else angles
         if unknown.own:
             add(places, unknown.step, joints)
@@ -414,7 +467,9 @@ def _linearise(
     all starts gives the column of each window. Where the rows of the angles and of the pictures
     need different steps (`Unknown.ball_step`), each have their own simulation.
     """
-    num_free, differences, used = len(unknowns), [], [np.any(weights > 0.0, axis=1)]
+    num_free = len(unknowns)
+    differences = []
+    used = [np.any(weights > 0.0, axis=1)]
     for difference in _list_differences(problem, vector, unknowns, entries, size):
         counts = [np.any(weights[:, rows] > 0.0, axis=1) for rows in difference.rows]
         if np.any(counts):
@@ -431,10 +486,15 @@ def _linearise(
     white = problem.whiten(predicted, weights)
     jacobian = np.zeros((*white.shape[1:], num_free + len(entries)))
     for i, difference in enumerate(differences, 1):
-        for column, step, rows in zip(*difference, strict=True):
+        changes = zip(difference.columns, difference.steps, difference.rows, strict=True)
+        for column, step, rows in changes:
             jacobian[:, rows, column] = (white[i] - white[0])[:, rows] / step
-    by_unknown, by_state = np.split(jacobian, [num_free], axis=2)
-    return _Linearisation(predicted[0], white[0], by_unknown, by_state)
+    return _Linearisation(
+        predicted=predicted[0],
+        white=white[0],
+        by_unknown=jacobian[:, :, :num_free],
+        by_state=jacobian[:, :, num_free:],
+    )
 
 
 class _Reduced(NamedTuple):
@@ -446,12 +506,12 @@ class _Reduced(NamedTuple):
     """Of each window [S, F]."""
     by_unknown: np.ndarray
     """Change [S, D, F] of the starts with the unknowns."""
-    own: np.ndarray
+    unmoved: np.ndarray
     """Change [S, D] of the starts if no unknown changes."""
 
     def states(self, change: np.ndarray) -> np.ndarray:
         """Change [S, D] of the starts for a change [F] of the unknowns."""
-        return self.own + self.by_unknown @ change
+        return self.unmoved + self.by_unknown @ change
 
 
 def _eliminate(
@@ -464,19 +524,22 @@ def _eliminate(
       residuals: [S, M]; its derivatives are `by_unknown` [S, M, F] and `by_state` [S, M, D].
       at_guess: distance [S, D] of the starts from their guess.
     """
-    num_free, num_states = by_unknown.shape[2], at_guess.shape[1]
+    num_free = by_unknown.shape[2]
+    num_states = at_guess.shape[1]
     columns = np.concatenate([by_unknown, residuals[:, :, None], by_state], axis=2)
     normal = _multiply(columns)
-    kept, starts = normal[:, : num_free + 1, : num_free + 1], normal[:, num_free + 1 :]
-    across, among = starts[:, :, : num_free + 1], starts[:, :, num_free + 1 :]
+    kept = normal[:, : num_free + 1, : num_free + 1]
+    starts = normal[:, num_free + 1 :]
+    across = starts[:, :, : num_free + 1]
+    among = starts[:, :, num_free + 1 :]
     across[:, :, num_free] += at_guess
     change = -np.linalg.solve(among + np.eye(num_states), across)
     reduced = kept + np.swapaxes(across, 1, 2) @ change
     return _Reduced(
-        reduced[:, :num_free, :num_free],
-        reduced[:, :num_free, num_free],
-        change[:, :, :num_free],
-        change[:, :, num_free],
+        informations=reduced[:, :num_free, :num_free],
+        gradients=reduced[:, :num_free, num_free],
+        by_unknown=change[:, :, :num_free],
+        unmoved=change[:, :, num_free],
     )
 
 

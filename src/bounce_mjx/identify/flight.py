@@ -89,7 +89,9 @@ def fit_flight(
             np.concatenate([((balls - usual_path) / noise).ravel(), np.zeros(4)]),
             rcond=None,
         )[0]
-        position, velocity, unusual_share = solution[:3], solution[3:6], deviations * solution[6:]
+        position = solution[:3]
+        velocity = solution[3:6]
+        unusual_share = deviations * solution[6:]
         gains = np.stack([gained for gained, _ in unusual], axis=2)
         velocities = velocity + usual_gain + gains @ unusual_share
     return Flight(position, velocity, unusual_share[:3], float(unusual_share[3]))

@@ -62,7 +62,8 @@ def follow(log: Log, rows: np.ndarray, shortest: float = -0.05, longest: float =
     """
     chosen = np.flatnonzero(rows)
     if not does_move(log):
-        shortest, longest = 0.0, _STEP
+        shortest = 0.0
+        longest = _STEP
     few = chosen[:: max(len(chosen) // _ROWS, 1)]
 
     def spread(delay: float, at: np.ndarray) -> float:
@@ -78,19 +79,33 @@ def follow(log: Log, rows: np.ndarray, shortest: float = -0.05, longest: float =
     return Following(delay, offsets, error_size(residuals - offsets))
 
 
-def set_points(log: Log, delay: float, dt: float) -> Log:
-    """The log with commands in every physics step, between those of the log, if the joints follow
-    too early for commands that are held: those are then a controller's own set points, recorded
-    now and then.
+def shows_set_points(log: Log, following: Following) -> bool:
+    """Whether the joints follow too early for commands that are held until the next: the commands
+    of the log are then a controller's own set points, recorded now and then."""
+    return following.delay < _hold(log)
 
-    Args:
-      delay: time from a command to the angle, s.
-      dt: physics step, s.
-    """
-    if delay >= 0.5 * float(np.median(np.diff(log.target_times))):
+
+def command_delay(log: Log, following: Following) -> float:
+    """The delay from a command to the angle, s, without the half step for which a command, if it is
+    no set point, is held until the next."""
+    if shows_set_points(log, following):
+        return following.delay
+    return following.delay - _hold(log)
+
+
+def set_points(log: Log, following: Following, dt: float) -> Log:
+    """The log with a command for each physics step of `dt` (s), between those of the log, if these
+    are set points."""
+    if not shows_set_points(log, following):
         return log
     times = np.arange(log.target_times[0], log.target_times[-1], dt)
-    return log._replace(target_times=times, servo_targets=commanded(log, times))
+    # In the middle of the step for which it is held: otherwise it would be late by half of it.
+    return log._replace(target_times=times, servo_targets=commanded(log, times + 0.5 * dt))
+
+
+def _hold(log: Log) -> float:
+    """Mean time for which a command has been held, s."""
+    return 0.5 * float(np.median(np.diff(log.target_times)))
 
 
 def error_size(residuals: np.ndarray) -> np.ndarray:

@@ -21,10 +21,13 @@ _WRONG_ROWS = 0.05
 _FAR_IN_TIME = 3600.0
 # Step of stamps from which a 32-bit number has made them useless, and how exactly they keep to it
 # in a file of decimals, s.
-_COARSE_STAMP, _ROUNDED = 2e-3, 2e-4
+_COARSE_STAMP = 2e-3
+_ROUNDED = 2e-4
 # Rows whose median an angle is compared with; distance from it beyond which it is a spike, rad, and
 # in multiples of what is usual about it.
-_SPIKE_ROWS, _SPIKE, _SPIKE_FACTOR = 7, 0.03, 10.0
+_SPIKE_ROWS = 7
+_SPIKE = 0.03
+_SPIKE_FACTOR = 10.0
 # Two pictures closer than this are one, s.
 _SAME_PICTURE = 1e-4
 # Stretches of a log in which the youngest picture is looked for; drift (s) over the log below which
@@ -113,7 +116,7 @@ class Rows(NamedTuple):
         return self.chosen(~wrong)
 
 
-_ONE_CLOCK = _WRONG_ROWS, "; give each its own time, of one clock"
+_ONE_CLOCK = "; give each its own time, of one clock"
 
 
 def make_log(source: str, angles: Rows, targets: Rows, balls: Rows) -> Log:
@@ -125,7 +128,8 @@ def make_log(source: str, angles: Rows, targets: Rows, balls: Rows) -> Log:
         cannot be.
     """
     notes: list[str] = []
-    angles, targets = (_in_order(rows, notes) for rows in (angles, targets))
+    angles = _in_order(angles, notes)
+    targets = _in_order(targets, notes)
     angles = angles.without(
         _find_spikes(angles.values), "is a spike: the joint is elsewhere before and after", notes
     )
@@ -172,7 +176,7 @@ def _clean(
     rows = rows.without(same, "repeats the one before", notes)
     middle = np.median(rows.times) if len(rows.times) else 0.0
     far = np.abs(rows.times - middle) > _FAR_IN_TIME
-    return rows.without(far, "has a time far from the others", notes, *_ONE_CLOCK)
+    return rows.without(far, "has a time far from the others", notes, _WRONG_ROWS, _ONE_CLOCK)
 
 
 def _in_order(rows: Rows, notes: list[str]) -> Rows:
@@ -183,7 +187,7 @@ def _in_order(rows: Rows, notes: list[str]) -> Rows:
     late = np.append(rows.times[:-1] >= np.minimum.accumulate(rows.times[::-1])[-2::-1], False)
     # A time that is too late makes all that follow early, and one too early all before it late.
     wrong = min(early, late[: len(early)], key=np.sum)
-    return rows.without(wrong, "has a time out of order", notes, *_ONE_CLOCK)
+    return rows.without(wrong, "has a time out of order", notes, _WRONG_ROWS, _ONE_CLOCK)
 
 
 def _check_digits(rows: Rows) -> None:
@@ -230,12 +234,14 @@ def align_clocks(log: Log) -> Log:
     """
     if len(log.picture_times) < _STRETCHES * 20:
         return log
-    ages, since = log.arrivals - log.picture_times, log.arrivals - log.arrivals[0]
+    ages = log.arrivals - log.picture_times
+    since = log.arrivals - log.arrivals[0]
     parts = np.array_split(np.arange(len(ages)), _STRETCHES)
     youngest = [part[np.argmin(ages[part])] for part in parts]
     slope = float(theilslopes(ages[youngest], since[youngest])[0])
     offset = float(np.median(ages[youngest] - slope * since[youngest]))
-    total, notes = abs(slope) * float(np.max(since)), list(log.notes)
+    total = abs(slope) * float(np.max(since))
+    notes = list(log.notes)
     if drifts := total >= _DRIFT and abs(slope) <= _FASTEST_DRIFT:
         notes.append(
             f"the camera's clock drifts by {1e6 * slope:.0f} parts in 1e6 in {log.source}, "
@@ -274,7 +280,8 @@ def check(log: Log, joint_names: Sequence[str], joint_ranges: np.ndarray) -> Non
       UserError: it is too short, its times are not seconds or of two clocks, or a joint is far
         outside its range.
     """
-    limited, ends = joint_ranges[:, :1] < joint_ranges[:, 1:], np.array([-1.0, 1.0])
+    limited = joint_ranges[:, :1] < joint_ranges[:, 1:]
+    ends = np.array([-1.0, 1.0])
     low, high = np.where(limited, joint_ranges + _BEYOND_RANGE * ends, _LARGEST_ANGLE * ends).T
     for name, times, values in (
         ("joint angles", log.times, log.joint_angles),
@@ -297,7 +304,8 @@ def check(log: Log, joint_names: Sequence[str], joint_ranges: np.ndarray) -> Non
                 f"{times[row]:.6g} s, and {low[joint]:.3g} to {high[joint]:.3g} rad is expected; "
                 f"if these are degrees, write {column} [deg]"
             )
-    begins, ends = ((log.times[i], log.target_times[i]) for i in (0, -1))
+    begins = log.times[0], log.target_times[0]
+    ends = log.times[-1], log.target_times[-1]
     if max(begins) > min(ends):
         raise UserError(
             f"the joint angles in {log.source} begin at {begins[0]:.6g} s and end at {ends[0]:.6g} "

@@ -39,8 +39,8 @@ def read_log(path: Path, model: mujoco.MjModel, topics: Topics, names: Sequence[
     Raises:
       UserError: as `read_csv`, `read_bag`, `check` and `align_clocks`, or the names do not fit.
     """
-    own = joint_names(model)
-    names = check_names(names or own, own, "--joint-names")
+    robot_names = joint_names(model)
+    names = check_names(names or robot_names, robot_names, "--joint-names")
     is_bag = path.is_dir() or path.suffix.lower() in (".mcap", ".db3", ".bag", ".zstd")
     log = read_bag(path, names, topics) if is_bag else read_csv(path, names)
     check(log, names, model.jnt_range[list(find_addresses(model).arm_joints)])
@@ -69,32 +69,47 @@ def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
                 f"{', '.join(map(shorten, list(columns)[:30]))}; if the joints have other names, "
                 "give the log's robot with --robot, or the names in this order with --joint-names"
             )
-        given, numbers = columns[name]
-        if given not in UNITS[unit]:
+        stated_unit, numbers = columns[name]
+        if stated_unit not in UNITS[unit]:
             raise UserError(
-                f"{path} has the column {name} [{shorten(given)}], whose unit must be one of "
+                f"{path} has the column {name} [{shorten(stated_unit)}], whose unit must be one of "
                 f"{', '.join(UNITS[unit])}; write {name} [{unit}]"
             )
-        return numbers * UNITS[unit][given]
+        return numbers * UNITS[unit][stated_unit]
 
     times = column("time", "s")
 
     def group(what: str, names: Sequence[str], unit: str, stamp: str = "time") -> Rows:
         """The rows with any cell of a measurement."""
         values = np.stack([column(name, unit) for name in names], axis=1)
-        used = ~np.all(np.isnan(values), axis=1)
-        arrays = 2 + np.arange(len(times)), column(stamp, "s"), times, values
-        return Rows(f"{what} in {path}", "row {}", *(array[used] for array in arrays))
+        rows = Rows(
+            name=f"{what} in {path}",
+            place="row {}",
+            # The first row below the header is the file's second.
+            numbers=2 + np.arange(len(times)),
+            times=column(stamp, "s"),
+            arrivals=times,
+            values=values,
+        )
+        return rows.chosen(~np.all(np.isnan(values), axis=1))
 
-    angles, targets = (
-        group(what, [f"{what.replace(' ', '_')}.{joint}" for joint in joint_names], "rad")
-        for what in ("joint angles", "servo targets")
-    )
-    what, ball = "pictures of the ball", [f"ball_position.{axis}" for axis in "xyz"]
-    if any(name in columns for name in (*ball, "ball_time")):
-        balls = group(what, ball, "m", "ball_time" if "ball_time" in columns else "time")
+    angle_columns = [f"joint_angles.{joint}" for joint in joint_names]
+    target_columns = [f"servo_targets.{joint}" for joint in joint_names]
+    ball_columns = [f"ball_position.{axis}" for axis in "xyz"]
+    angles = group("joint angles", angle_columns, "rad")
+    targets = group("servo targets", target_columns, "rad")
+    if any(name in columns for name in (*ball_columns, "ball_time")):
+        stamp = "ball_time" if "ball_time" in columns else "time"
+        balls = group("pictures of the ball", ball_columns, "m", stamp)
     else:
-        balls = Rows(what, "row {}", *np.zeros((3, 0)), np.zeros((0, 3)))
+        balls = Rows(
+            name="pictures of the ball",
+            place="row {}",
+            numbers=np.zeros(0),
+            times=np.zeros(0),
+            arrivals=np.zeros(0),
+            values=np.zeros((0, 3)),
+        )
     return make_log(str(path), angles, targets, balls)
 
 
@@ -160,32 +175,35 @@ def read_bag(path: Path, joint_names: Sequence[str], topics: Topics) -> Log:
       UserError: the bag cannot be read, a topic is missing or of another type, no message has a
         joint, the ball is in two frames, or as `make_log`.
     """
-    found, rows = _read_messages(path, topics), []
+    messages = _read_messages(path, topics)
+    rows = []
     for name, topic in (("joint angles", topics.joints), ("servo targets", topics.targets)):
-        given = {joint for _, message in found[topic] for joint in getattr(message, "name", ())}
-        missing = [joint for joint in joint_names if joint not in given]
-        if given and missing:
+        named = {joint for _, message in messages[topic] for joint in getattr(message, "name", ())}
+        missing = [joint for joint in joint_names if joint not in named]
+        if named and missing:
             raise UserError(
-                f"{topic} in {path} has the joints {', '.join(map(shorten, sorted(given)[:20]))}, "
+                f"{topic} in {path} has the joints {', '.join(map(shorten, sorted(named)[:20]))}, "
                 f"and {missing[0]} is missing; give the log's robot with --robot, or the driver's "
                 "names with --joint-names"
             )
-        read, source = partial(_read_angles, joint_names=joint_names), f"{topic} in {path}"
-        rows.append(_make_rows(f"{name} of {source}", found[topic], len(joint_names), read))
+        read = partial(_read_angles, joint_names=joint_names)
+        source = f"{topic} in {path}"
+        rows.append(_make_rows(f"{name} of {source}", messages[topic], len(joint_names), read))
     angles, targets = rows
     name = f"pictures of the ball of {topics.ball} in {path}"
-    balls = _make_rows(name, found[topics.ball], 3, _read_position)
+    balls = _make_rows(name, messages[topics.ball], 3, _read_position)
     seen = np.flatnonzero(np.isfinite(balls.values).all(axis=1))
-    frames = {found[topics.ball][i][1].header.frame_id for i in seen}
+    frames = {messages[topics.ball][i][1].header.frame_id for i in seen}
     if len(frames) > 1:
         raise UserError(
             f"the messages of {topics.ball} in {path} are in the frames "
             f"{', '.join(map(shorten, sorted(frames)))}; record the ball in the robot's base frame"
         )
-    own = np.isfinite(angles.times)
-    if np.any(own) and abs(np.median((angles.arrivals - angles.times)[own])) > _TWO_CLOCKS:
+    is_stamped = np.isfinite(angles.times)
+    ages = (angles.arrivals - angles.times)[is_stamped]
+    if np.any(is_stamped) and abs(np.median(ages)) > _TWO_CLOCKS:
         # Such as simulated time: pictures arrived when the angles of the same moment did.
-        arrivals = np.interp(balls.arrivals, angles.arrivals[own], angles.times[own])
+        arrivals = np.interp(balls.arrivals, angles.arrivals[is_stamped], angles.times[is_stamped])
         balls = balls._replace(arrivals=arrivals)
     return make_log(str(path), angles, targets, balls)
 
@@ -235,24 +253,33 @@ def _make_rows(
 ) -> Rows:
     """The measurements [size] of a topic; NaN where a message holds another number of them, or has
     no time stamp although others have one."""
-    arrivals, times = np.array([arrival for arrival, _ in messages]), np.zeros(len(messages))
+    arrivals = np.array([arrival for arrival, _ in messages])
+    times = np.zeros(len(messages))
     values = np.full((len(messages), size), np.nan)
     for i, (_, message) in enumerate(messages):
         if hasattr(message, "header"):
             times[i] = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
-        if len(given := read(message)) == size:
-            values[i] = given
+        numbers = read(message)
+        if len(numbers) == size:
+            values[i] = numbers
     # Some programs stamp no message, or 0 before their clock has started.
     times = np.where(times == 0.0, np.nan, times) if np.any(times) else arrivals
-    return Rows(name, "message {}", 1 + np.arange(len(times)), times, arrivals, values)
+    return Rows(
+        name=name,
+        place="message {}",
+        numbers=1 + np.arange(len(times)),
+        times=times,
+        arrivals=arrivals,
+        values=values,
+    )
 
 
 def _read_angles(message: Any, joint_names: Sequence[str]) -> Sequence[float]:
     """Angles in the robot's order; fewer if some are missing."""
     if hasattr(message, "data"):
         return message.data
-    given = dict(zip(message.name, message.position, strict=False))
-    return [given[joint] for joint in joint_names if joint in given]
+    angles = dict(zip(message.name, message.position, strict=False))
+    return [angles[joint] for joint in joint_names if joint in angles]
 
 
 def _read_position(message: Any) -> Sequence[float]:

@@ -49,15 +49,15 @@ def make_simulator(
         model's own.
       lift: acceleration of the ball across its flight, per spin and speed.
     """
-    run, n = _compile(config, layout.num_joints), layout.num_joints
+    run = _compile(config, layout.num_joints)
+    n = layout.num_joints
     count = int(windows.first.max()) + windows.steps
     send = make_targets(log, windows.origin + windows.dt * np.arange(count + 1))
     shown = windows.balls[windows.picture_weights > 0.0]
     middle = np.mean(shown, axis=0) if len(shown) else np.zeros(3)
     steps = windows.first + np.arange(windows.steps)[:, None]
-    angle_times, picture_times = (
-        times.T.astype(np.float32) for times in (windows.angle_times, windows.picture_times)
-    )
+    angle_times = windows.angle_times.T.astype(np.float32)
+    picture_times = windows.picture_times.T.astype(np.float32)
     # A log without a ball lacks these terms; the compiled simulation has them.
     absent = {name: np.zeros(_LANES) for name in ("air_drag", "ball_latency")}
     absent |= {name: np.zeros((_LANES, 3)) for name in ("ball_position_bias", CAMERA_ROTATION)}
@@ -67,9 +67,11 @@ def make_simulator(
         vectors: np.ndarray, starts: np.ndarray, c: np.ndarray, s: np.ndarray
     ) -> np.ndarray:
         """What is measured [L, A n + 3 B] in the windows s [L] of the candidates c [L]."""
-        count, fill = len(c), np.minimum(np.arange(_LANES), len(c) - 1)
+        count = len(c)
+        fill = np.minimum(np.arange(_LANES), len(c) - 1)
         # Another size would be compiled again.
-        c, s = c[fill], s[fill]
+        c = c[fill]
+        s = s[fill]
         world = absent | layout.world(vectors[c])
         targets = np.empty((windows.steps, n, _LANES), np.float32)
         for i in np.unique(c):
@@ -115,10 +117,13 @@ def compensated(config: WorldConfig) -> WorldConfig:
 def _compile(config: WorldConfig, n: int) -> Callable[..., tuple[jax.Array, jax.Array]]:
     """The part of a simulation that is compiled, which is the same for all logs: angles
     [A, n, L], rad, and balls [B, 3, L], m."""
-    own, model = (world_model(c, visual=False) for c in (config, compensated(config)))
-    engine, addresses = make_engine(model, config.physics), find_addresses(model)
+    own = world_model(config, visual=False)
+    model = world_model(compensated(config), visual=False)
+    engine = make_engine(model, config.physics)
+    addresses = find_addresses(model)
     links = sum(link_bodies(model, addresses), [])
-    ball, dt = addresses.balls[0], config.physics_dt
+    ball = addresses.balls[0]
+    dt = config.physics_dt
     gears = model.actuator_gear[list(addresses.actuators), 0]
     shown_q = (*addresses.arm_qpos, *ball.qpos[:3])
     shown_v = (*addresses.arm_qvel, *ball.qvel[:3])
@@ -127,15 +132,15 @@ def _compile(config: WorldConfig, n: int) -> Callable[..., tuple[jax.Array, jax.
         ends = [n, 2 * n, 2 * n + 3, 2 * n + 9]
         angles, velocities, position, ball_speeds, _ = jnp.split(start, ends)
         qpos = scatter(model.qpos0, shown_q, jnp.concatenate([angles, position]))
-        moving, speeds = (*addresses.arm_qvel, *ball.qvel), (velocities, ball_speeds)
-        return PhysicsState(qpos, scatter(np.zeros(model.nv), moving, jnp.concatenate(speeds)))
+        moving = (*addresses.arm_qvel, *ball.qvel)
+        speeds = jnp.concatenate([velocities, ball_speeds])
+        return PhysicsState(qpos, scatter(np.zeros(model.nv), moving, speeds))
 
     def advance(parameters, state, target, drag, lift):
         ctrl = scatter(np.zeros(model.nu), addresses.actuators, gears * target)
         after = engine.step(parameters, state, Control(ctrl, air_drag=drag), 1)
-        speed, spin = (
-            jnp.stack([after.qvel[i] for i in x]) for x in (ball.qvel[:3], ball.qvel[3:])
-        )
+        speed = jnp.stack([after.qvel[i] for i in ball.qvel[:3]])
+        spin = jnp.stack([after.qvel[i] for i in ball.qvel[3:]])
         turned = quaternion_matrix([after.qpos[i] for i in ball.qpos[3:]])
         across = jnp.cross(jnp.stack(turned @ tuple(spin)), speed)
         pushed = after.qvel.at[np.array(ball.qvel[:3])].add(dt * lift * across)
@@ -144,7 +149,8 @@ def _compile(config: WorldConfig, n: int) -> Callable[..., tuple[jax.Array, jax.
     def at(path: jax.Array, speeds: jax.Array, times: jax.Array) -> jax.Array:
         """A path [T, k, L] at times [M, L], by the nearest step and its velocity."""
         step = jnp.clip(jnp.round(times / dt), 0, len(path) - 1).astype(jnp.int32)
-        near, speed = (jnp.take_along_axis(x, step[:, None], axis=0) for x in (path, speeds))
+        near = jnp.take_along_axis(path, step[:, None], axis=0)
+        speed = jnp.take_along_axis(speeds, step[:, None], axis=0)
         return near + speed * (times - step * dt)[:, None]
 
     @jax.jit
@@ -195,7 +201,8 @@ def make_targets(log: Log, edges: np.ndarray) -> Callable[[float, float], np.nda
 
     @lru_cache(64)
     def delay(latency: float, lag: float) -> np.ndarray:
-        at, columns = edges - latency, []
+        at = edges - latency
+        columns = []
         early = np.minimum(at - times[0], 0.0)
         for integral, first in zip(integrals.T, log.servo_targets[0], strict=True):
             mean = np.diff(np.interp(at, times, integral) + early * first) / dt

@@ -25,12 +25,14 @@ from bounce_mjx.identify.fit import (
 from bounce_mjx.identify.flight import Flight, acceleration, fit_flight
 from bounce_mjx.identify.following import (
     Following,
+    command_delay,
     does_move,
     error_size,
     find_settled,
     follow,
     held_out_error,
     set_points,
+    shows_set_points,
 )
 from bounce_mjx.identify.log import Log, least_age
 from bounce_mjx.identify.simulation import Simulate, make_simulator
@@ -54,7 +56,8 @@ _GAINS = (1.0, 2.0, 4.0, 8.0, 30.0)
 _SERVO_SHARES = (0.1, 0.3, 0.6, 0.9)
 _LAG_SHARES = (0.0, 0.3, 0.6)
 # Gains and longest own delays (s) of servos that are too stiff to matter.
-_STIFF_GAINS, _STIFF_DELAYS = (30.0, 100.0), (5e-4, 1e-3, 3e-3)
+_STIFF_GAINS = (30.0, 100.0)
+_STIFF_DELAYS = (5e-4, 1e-3, 3e-3)
 # Candidates from which a search over a few windows begins, and decrease of the cost from which the
 # controller counts as carrying the arm's weight.
 _KEPT = 2
@@ -114,7 +117,8 @@ class Identified(NamedTuple):
 
 def join(logs: Sequence[Log]) -> Log:
     """Several logs, one after another; no window spans two of them."""
-    shifted, start = [], 0.0
+    shifted = []
+    start = 0.0
     for log in logs:
         shift = start - min(log.times[0], log.target_times[0])
         shifted.append(
@@ -154,7 +158,8 @@ def sensor_noise(log: Log) -> Noise:
     balls = np.full(3, 0.002)
     if len(log.ball_positions) > 200:
         # Unequal intervals, as pictures are lost: a parabola through five neighbours.
-        t, rests = log.picture_times, []
+        t = log.picture_times
+        rests = []
         for i in range(2, len(t) - 2, 2):
             near = slice(i - 2, i + 3)
             if t[i + 2] - t[i - 2] < 0.08:
@@ -170,7 +175,8 @@ def _straighten(times: np.ndarray) -> np.ndarray:
     """Stamps [T] of control steps at regular times, in each stretch in which they only jitter about
     a line: what a stamp is off by is an error of the stamp, not of the step."""
     steps = np.diff(times)
-    typical, stretches = float(np.median(steps)), []
+    typical = float(np.median(steps))
+    stretches = []
     for part in np.split(times, np.flatnonzero(steps > 1.5 * typical) + 1):
         index = np.arange(len(part)) - 0.5 * (len(part) - 1)
         slope = typical if len(part) < 50 else float(index @ part / (index @ index))
@@ -206,43 +212,47 @@ def identify(
         _check_frame(windows, config, log.source)
     layout = Layout(config.num_joints, with_ball, config.physics_dt, camera_rotation)
     sensors = sensor_noise(log)
-    settled, held_out = find_settled(log), _held_out_rows(log, windows)
+    settled = find_settled(log)
+    held_out = _held_out_rows(log, windows)
     following = follow(log, settled & ~held_out)
-    log = set_points(log, following.delay, config.physics_dt)
-    own, carried = (
-        Problem(
-            simulate=make_simulator(config, layout, log, windows, share),
-            windows=windows,
-            layout=layout,
-            sensors=sensors,
-            noise=sensors,
-            progress=progress,
-        )
-        for share in (0.0, 1.0)
+    delay = command_delay(log, following)
+    has_set_points = shows_set_points(log, following)
+    log = set_points(log, following, config.physics_dt)
+    own = Problem(
+        simulate=make_simulator(config, layout, log, windows),
+        windows=windows,
+        layout=layout,
+        sensors=sensors,
+        noise=sensors,
+        progress=progress,
     )
+    carried = own._replace(simulate=make_simulator(config, layout, log, windows, carried=1.0))
     progress(f"arm: {1e3 * following.delay:.1f} ms behind its commands")
     if does_move(log):
-        fits = [_search_arm(problem, config, log, following) for problem in (own, carried)]
+        fits = [_search_arm(problem, config, delay, following) for problem in (own, carried)]
         problem, fit = _choose(own, carried, fits)
         problem, fit = _fit_arm(problem, fit)
-        follower = _stiff_follower(problem, config, log, following)
-        is_follower = _explains_better(problem, follower, fit)
+        follower = _stiff_follower(problem, config, delay, following)
+        is_follower = has_set_points or _explains_better(problem, follower, fit)
     else:
         # Gravity's tilt would explain where an arm rests.
         problem = own
         is_follower = False
         fit = _with_offsets(own, Fit(layout.mean, windows.starts))
     share = float(problem.simulate is carried.simulate)
-    stages, states = ["arm"], windows.arm_state
+    stages = ["arm"]
+    states = windows.arm_state
     if is_follower:
         progress("a delay and offsets explain the arm as well as its servos do")
         fit = follower
         stages = []
-    pictures, seen = np.ones_like(windows.picture_weights), _training(problem)
+    pictures = np.ones_like(windows.picture_weights)
+    seen = _training(problem)
     if with_ball:
         lifted = make_simulator(config, layout, log, windows, share, AIR_LIFT)
         problem, fit, pictures = _fit_ball(problem, fit, lifted)
-        stages, states = [*stages, "flight", "bounce"], None
+        stages = [*stages, "flight", "bounce"]
+        states = None
     progress("all")
     angles = angle_weights(problem, problem.predict(fit.vector, fit.starts))
     fit = minimise(problem, fit, stages, problem.weights(pictures, seen, angles), 3, states)
@@ -290,7 +300,8 @@ def _held_out_rows(log: Log, windows: Windows) -> np.ndarray:
 
 def _joint_errors(windows: Windows, fit: Fit) -> np.ndarray:
     """Root mean square [n] of the angles' residuals where they count, rad."""
-    angles, weights = windows.split(fit.predicted)[0], windows.split(fit.weights)[0]
+    angles = windows.split(fit.predicted)[0]
+    weights = windows.split(fit.weights)[0]
     counts = np.any(weights > 0.0, axis=2)
     return error_size((angles - windows.angles)[counts])
 
@@ -312,9 +323,12 @@ def _check_frame(windows: Windows, config: WorldConfig, source: str) -> None:
     Raises:
       UserError: it does.
     """
-    model, offsets = world_model(config, visual=False), []
-    addresses, data = find_addresses(model), mujoco.MjData(model)
-    paddle, radius = addresses.paddle_geom, model.geom_size[addresses.balls[0].geom, 0]
+    model = world_model(config, visual=False)
+    offsets = []
+    addresses = find_addresses(model)
+    data = mujoco.MjData(model)
+    paddle = addresses.paddle_geom
+    radius = model.geom_size[addresses.balls[0].geom, 0]
     for s in np.flatnonzero(windows.has_ball & np.any(windows.angle_weights > 0.0, axis=1)):
         bounce = windows.bounces[s]
         since = np.abs(windows.angle_times[s] - bounce)
@@ -341,7 +355,9 @@ def _fit_ball(problem: Problem, fit: Fit, lifted: Simulate) -> tuple[Problem, Fi
     Args:
       lifted: the simulation with a ball that its spin lifts, which counts where flights show it.
     """
-    windows, states, seen = problem.windows, ~problem.windows.arm_state, _training(problem)
+    windows = problem.windows
+    states = ~problem.windows.arm_state
+    seen = _training(problem)
     problem.progress("flight")
     flying = windows.picture_times < windows.bounces[:, None] - BEFORE_BOUNCE
     plain = minimise(problem, fit, ["flight"], problem.weights(flying, seen), 4, states)
@@ -353,10 +369,12 @@ def _fit_ball(problem: Problem, fit: Fit, lifted: Simulate) -> tuple[Problem, Fi
         spinning = spinning._replace(noise=_flight_noise(spinning, guess, flying))
         turned = minimise(spinning, guess, ["flight"], problem.weights(flying, seen), 8, states)
         if _flies(spinning, turned, flying):
-            problem, fit = spinning, turned
+            problem = spinning
+            fit = turned
             problem.progress("the flights show lift by spin")
     problem.progress("bounce")
-    stages, few = ["flight", "bounce"], problem.weights(1.0, _sample(problem, windows.has_ball))
+    stages = ["flight", "bounce"]
+    few = problem.weights(1.0, _sample(problem, windows.has_ball))
     # A ball that slips and one that sticks are two valleys, and each latency may be one.
     tried = [
         _shift_flights(problem, fit, latency, friction)
@@ -378,7 +396,8 @@ def _guess_spins(problem: Problem, fit: Fit) -> Fit:
     starts = fit.starts.copy()
     vector = fit.vector.copy()
     deviations, _, _ = problem.scale_starts()
-    lift_deviation, drag_deviation = AIR_LIFT * deviations[-2], deviations[-1]
+    lift_deviation = AIR_LIFT * deviations[-2]
+    drag_deviation = deviations[-1]
     with_ball = np.flatnonzero(windows.has_ball)
     latency = vector[problem.layout.slices["ball_latency"]]
 
@@ -424,14 +443,19 @@ def _flies(problem: Problem, fit: Fit, flying: np.ndarray) -> bool:
 
 
 def _search_arm(
-    problem: Problem, config: WorldConfig, log: Log, following: Following
+    problem: Problem, config: WorldConfig, delay: float, following: Following
 ) -> tuple[Noise, Fit]:
     """The best fit to a few windows of the arm, from candidates that differ in what a search could
-    confuse; and the noise that it leaves."""
-    layout, windows = problem.layout, problem.windows
+    confuse; and the noise that it leaves.
+
+    Args:
+      delay: time from a command to the angle, s.
+    """
+    layout = problem.layout
+    windows = problem.windows
     rough = np.hypot(problem.sensors.angles, following.errors)
     problem = problem._replace(noise=problem.noise._replace(angles=rough))
-    vectors = np.concatenate([_own_servos(layout), _late_servos(layout, config, log, following)])
+    vectors = np.concatenate([_own_servos(layout), _late_servos(layout, config, delay)])
     few = problem.weights(0.0, _sample(problem, np.any(windows.angle_weights > 0.0, axis=1)))
     used = np.any(few > 0.0, axis=1)
     starts = np.repeat(windows.starts[None], len(vectors), axis=0)
@@ -473,20 +497,15 @@ def _servo_delays(config: WorldConfig) -> np.ndarray:
     """Damping divided by stiffness of each servo of the model [n], s."""
     model = world_model(config, visual=False)
     servos = list(find_addresses(model).actuators)
-    stiffness, damping = model.actuator_gainprm[servos, 0], -model.actuator_biasprm[servos, 2]
+    stiffness = model.actuator_gainprm[servos, 0]
+    damping = -model.actuator_biasprm[servos, 2]
     return np.maximum(damping / stiffness, 1e-6)
 
 
-def _command_delay(log: Log, following: Following) -> float:
-    """The delay from a command to the angle, s, without the half step for which a command is held
-    until the next."""
-    return following.delay - 0.5 * float(np.median(np.diff(log.target_times)))
-
-
-def _late_servos(layout: Layout, config: WorldConfig, log: Log, following: Following) -> np.ndarray:
-    """Candidates [C, P] whose joints follow their commands as late as measured."""
+def _late_servos(layout: Layout, config: WorldConfig, delay: float) -> np.ndarray:
+    """Candidates [C, P] whose joints follow their commands as late as measured (s)."""
     own_delay = _servo_delays(config)
-    total = max(_command_delay(log, following), 2e-3)
+    total = max(delay, 2e-3)
     vectors = []
     for gain, servo_share, lag_share in itertools.product(_GAINS, _SERVO_SHARES, _LAG_SHARES):
         of_servo = servo_share * total
@@ -501,11 +520,14 @@ def _late_servos(layout: Layout, config: WorldConfig, log: Log, following: Follo
     return np.stack(vectors)
 
 
-def _stiff_follower(problem: Problem, config: WorldConfig, log: Log, following: Following) -> Fit:
+def _stiff_follower(
+    problem: Problem, config: WorldConfig, delay: float, following: Following
+) -> Fit:
     """The arm that follows its commands as the simplest model does: late, with an offset of each
     joint, by servos that are too stiff to matter."""
-    layout, windows = problem.layout, problem.windows
-    total = max(_command_delay(log, following), 0.0)
+    layout = problem.layout
+    windows = problem.windows
+    total = max(delay, 0.0)
     own_delay = _servo_delays(config)
     vectors = []
     for gain, longest in itertools.product(_STIFF_GAINS, _STIFF_DELAYS):
@@ -532,9 +554,13 @@ def _explains_better(problem: Problem, simple: Fit, fit: Fit) -> bool:
     """Whether the simple arm leaves no more than the fit in windows that no search has seen."""
     windows = problem.windows
     unseen = problem.weights(0.0, 1.0 - _training(problem))
-    ends = [minimise(problem, x, [], unseen, 3, windows.arm_state) for x in (simple, fit)]
-    of_simple, of_fit = (float(np.sum(_joint_errors(windows, end) ** 2)) for end in ends)
-    return of_simple <= of_fit
+
+    def unseen_error(fit: Fit) -> float:
+        """Of the arm's angles, with the best starts of these windows."""
+        started = minimise(problem, fit, [], unseen, 3, windows.arm_state)
+        return float(np.sum(_joint_errors(windows, started) ** 2))
+
+    return unseen_error(simple) <= unseen_error(fit)
 
 
 def _choose(
@@ -557,7 +583,8 @@ def _choose(
 def _fit_arm(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
     """The arm in all windows that the search sees, with robust weights: first in units of the
     errors in a few windows, then in units of what the model leaves in all."""
-    states, seen = problem.windows.arm_state, _training(problem)
+    states = problem.windows.arm_state
+    seen = _training(problem)
     fit = minimise(problem, fit, ["arm"], problem.weights(0.0, seen), 8, states)
     for _ in range(2):
         problem = problem._replace(noise=_residual_noise(problem, fit))
@@ -575,11 +602,16 @@ def _residual_noise(problem: Problem, fit: Fit) -> Noise:
 def _shift_flights(problem: Problem, fit: Fit, latency: float, friction: float) -> Fit:
     """The fit with another latency of the ball and friction on the paddle, and flights that explain
     the pictures before the bounces equally well."""
-    places, n = problem.layout.slices, problem.layout.num_joints
-    vector, starts = fit.vector.copy(), fit.starts.copy()
+    places = problem.layout.slices
+    n = problem.layout.num_joints
+    vector = fit.vector.copy()
+    starts = fit.starts.copy()
     later = latency - vector[places["ball_latency"].start]
-    vector[places["ball_latency"]], vector[places["contact_friction"]] = latency, friction
-    position, velocity, spin = (slice(2 * n + i, 2 * n + i + 3) for i in (0, 3, 6))
+    vector[places["ball_latency"]] = latency
+    vector[places["contact_friction"]] = friction
+    position = slice(2 * n, 2 * n + 3)
+    velocity = slice(2 * n + 3, 2 * n + 6)
+    spin = slice(2 * n + 6, 2 * n + 9)
     lift = AIR_LIFT * problem.has_lift * starts[:, spin]
     drag = vector[places["air_drag"]] * (1.0 + starts[:, -1])
     pull = acceleration(starts[:, velocity], drag, lift)
@@ -602,7 +634,8 @@ def _measure_errors(problem: Problem, fit: Fit) -> dict[str, float]:
     as degrees of freedom."""
     white = problem.whiten(fit.predicted, fit.weights)
     parts = zip(problem.windows.split(white), problem.windows.split(fit.weights), strict=True)
-    states, errors = (2 * problem.layout.num_joints, 6), {}
+    states = (2 * problem.layout.num_joints, 6)
+    errors = {}
     for name, (residuals, weights), known in zip(
         ("joint_angles", "ball_position"), parts, states, strict=True
     ):

@@ -100,7 +100,8 @@ class Layout:
           physics_dt: step of the simulation and of the lag's filter, s.
           camera_rotation: prior standard deviation of the camera's rotation, rad.
         """
-        self.num_joints, self.physics_dt = num_joints, physics_dt
+        self.num_joints = num_joints
+        self.physics_dt = physics_dt
         self.unknowns = ARM | BALL if with_ball else dict(ARM)
         if not with_ball:
             self.unknowns.pop("encoder_bias")
@@ -120,10 +121,14 @@ class Layout:
             return np.repeat([getattr(unknown, field) for unknown in each], sizes, axis=0)
 
         self._factors = column("is_factor")
-        self.mean, self.deviation = self.encode(column("mean")), column("deviation")
-        """Prior means and standard deviations [P]."""
-        self.limits, self.units = self.encode(column("limits").T), column("unit").tolist()
-        """Lower and upper limits [2, P], and the unit of each term's entry."""
+        self.mean = self.encode(column("mean"))
+        """Prior means [P]."""
+        self.deviation = column("deviation")
+        """Prior standard deviations [P]."""
+        self.limits = self.encode(column("limits").T)
+        """Lower and upper limits [2, P]."""
+        self.units = column("unit").tolist()
+        """Of each term's entry."""
         self._stages = column("stage")
 
     def encode(self, values: np.ndarray) -> np.ndarray:
@@ -145,17 +150,20 @@ class Layout:
     def bounds(self, vector: np.ndarray) -> np.ndarray:
         """Lower and upper bounds [2, P] of a step from a vector [P]: the limits, and a delay that
         leaves a latency of at least 0 at the vector's lag."""
-        bounds, places = self.limits.copy(), self.slices
+        bounds = self.limits.copy()
+        places = self.slices
         bounds[0, places["delay"]] = self._lag_mean(vector[places["delay_variance"]])
         return bounds
 
     def interior(self, vector: np.ndarray, steps: float) -> np.ndarray:
         """The vector [P] with a delay from which the differences of derivatives, `steps` times
         each, leave a latency of at least 0: at 0, delay and variance would have one effect."""
-        delay, variance = (self.unknowns[name].step for name in ("delay", "delay_variance"))
-        places, moved = self.slices, vector.copy()
-        mean = self._lag_mean(vector[places["delay_variance"]] + steps * variance)
-        moved[places["delay"]] = np.maximum(vector[places["delay"]], mean + steps * delay)
+        delay_step = self.unknowns["delay"].step
+        variance_step = self.unknowns["delay_variance"].step
+        places = self.slices
+        moved = vector.copy()
+        mean = self._lag_mean(vector[places["delay_variance"]] + steps * variance_step)
+        moved[places["delay"]] = np.maximum(vector[places["delay"]], mean + steps * delay_step)
         return moved
 
     def _lag_mean(self, variance: np.ndarray) -> np.ndarray:
@@ -170,14 +178,17 @@ class Layout:
             name: values[..., place.start] if self.unknowns[name].size == 0 else values[..., place]
             for name, place in self.slices.items()
         }
-        delay, variance = world.pop("delay"), world.pop("delay_variance")
-        dt, mean = self.physics_dt, self._lag_mean(np.maximum(variance, 1e-14))
+        delay = world.pop("delay")
+        variance = world.pop("delay_variance")
+        dt = self.physics_dt
+        mean = self._lag_mean(np.maximum(variance, 1e-14))
         latency = np.maximum(delay - mean, 0.0)
         return {"action_latency": latency, "servo_lag": dt / np.log1p(dt / mean)} | world
 
     def vector(self, world: Mapping[str, np.ndarray]) -> np.ndarray:
         """The vector [P] of values by name; a missing one has its prior mean."""
-        values, places = self.decode(self.mean), self.slices
+        values = self.decode(self.mean)
+        places = self.slices
         for name in set(places) & set(world):
             values[places[name]] = world[name]
         if {"action_latency", "servo_lag"} <= set(world):

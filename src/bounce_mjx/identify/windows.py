@@ -22,11 +22,14 @@ later than what it shows by as much."""
 # Flight before and after a bounce that belongs to its window, s, at most. An unbroken flight shows
 # gravity and drag with the fifth power of its length, and a bounce scatters: most of each flight
 # belongs to the bounce at its end.
-_BEFORE, _AFTER = 0.55, 0.2
+_BEFORE = 0.55
+_AFTER = 0.2
 _AFTER_SHARE = 0.3
 _SECONDS = MAX_DELAY + _BEFORE + _AFTER + 0.03
 _SHORTEST = 0.16
-_FEWEST, _MOST, _MOST_BALLS = 5, 240, 180
+_FEWEST = 5
+_MOST = 240
+_MOST_BALLS = 180
 _PADDING = 8
 _PICTURE_GAP = 0.06
 # Speed that the ball must have before and after a bounce, m/s.
@@ -126,8 +129,12 @@ def cut(log: Log, physics_dt: float) -> Windows:
     begins = [max(start - MAX_DELAY, origin) for start, _, _ in spans]
     first = np.array([int((begin - origin) / physics_dt) for begin in begins], int)
     zero = origin + first * physics_dt
-    angle_rows, picture_rows, starts, used = [], [], [], -np.inf
-    settled, bounces = find_settled(log), np.array(spans)[:, 2] - zero
+    angle_rows = []
+    picture_rows = []
+    starts = []
+    used = -np.inf
+    settled = find_settled(log)
+    bounces = np.array(spans)[:, 2] - zero
     for (start, end, _), begin, bounce in zip(spans, zero, bounces, strict=True):
         inside = (log.times >= max(begin, used)) & (log.times < end) & settled
         seen = (log.picture_times >= start) & (log.picture_times <= end) & np.isfinite(bounce)
@@ -167,11 +174,13 @@ def _thin(spans: list, most: int) -> list:
 def _find_bounces(log: Log) -> list[tuple[float, float, float]]:
     """Time of each bounce in the pictures, and the time before and after it in free flight, s."""
     found = []
-    times, balls = log.picture_times, log.ball_positions
+    times = log.picture_times
+    balls = log.ball_positions
     for run in np.split(np.arange(len(times)), np.flatnonzero(np.diff(times) > _PICTURE_GAP) + 1):
         if len(run) < 12:
             continue
-        t, z = times[run], balls[run, 2]
+        t = times[run]
+        z = balls[run, 2]
         speed = _slopes(t, z, 3)
         turns = (speed[:-8] < -_BOUNCING) & (speed[8:] > _BOUNCING)
         lowest = 4 + np.flatnonzero(turns & (z == minimum_filter1d(z, 7))[4:-4])
@@ -179,10 +188,12 @@ def _find_bounces(log: Log) -> list[tuple[float, float, float]]:
         ends = [t[0], *t[lowest], t[-1]]
         for j, i in enumerate(lowest):
             # The first and the last flight of a run belong to one window each, others to two.
-            before, after = t[i] - ends[j], ends[j + 2] - t[i]
+            before = t[i] - ends[j]
+            after = ends[j + 2] - t[i]
             before -= _share_flight(before) if j > 0 else 0.0
             after = _share_flight(after) if j < len(lowest) - 1 else after
-            before, after = min(before, _BEFORE), min(after, _AFTER)
+            before = min(before, _BEFORE)
+            after = min(after, _AFTER)
             if min(before, after) > 0.5 * _SHORTEST:
                 found.append((float(t[i]), float(before), float(after)))
     return found
@@ -206,7 +217,8 @@ def _find_rests(log: Log, spans: list[tuple[float, float, float]]) -> list[tuple
     gaps = np.flatnonzero(np.diff(log.times) > JOINT_GAP)
     taken += [(log.times[i], log.times[i + 1] + SETTLING) for i in gaps]
     first = max(log.times[0], log.target_times[0]) + SETTLING
-    pieces, begin = [], first
+    pieces = []
+    begin = first
     for start, end in [*sorted(taken), (log.times[-1], np.inf)]:
         length = start - begin
         if length > _SHORTEST:
@@ -224,7 +236,8 @@ def _pad(
     # In steps, so that a simulation that was compiled for one log serves others.
     most = -(-max([len(index) for index in indices] + [1]) // _PADDING) * _PADDING
     padded = np.zeros((len(indices), most))
-    weights, kept = np.zeros_like(padded), np.zeros((*padded.shape, values.shape[1]))
+    weights = np.zeros_like(padded)
+    kept = np.zeros((*padded.shape, values.shape[1]))
     for s, index in enumerate(indices):
         padded[s, : len(index)] = times[index] - zero[s]
         weights[s, : len(index)] = 1.0

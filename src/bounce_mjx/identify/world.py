@@ -28,7 +28,9 @@ _SHARE = 0.35
 # An error in windows that the search had not seen is explained up to this multiple of the sensor's
 # noise, or up to these: a share of a joint's motion and an angle, rad; a distance of the ball, m.
 _GOOD_FIT = 2.0
-_GOOD_SHARE, _GOOD_ANGLE, _GOOD_DISTANCE = 0.02, 1e-3, 3e-3
+_GOOD_SHARE = 0.02
+_GOOD_ANGLE = 1e-3
+_GOOD_DISTANCE = 3e-3
 # Share of the windows with a ball from which its bounces count.
 _MOST_FLY = 0.5
 
@@ -58,56 +60,77 @@ class Estimate(NamedTuple):
     """Whether the log shows it; otherwise the interval is the prior's."""
     alone: float
     """Half-width of the interval if all other unknowns had their estimates."""
+    typical: float
+    """Distance from the value within which it lies without the log: one deviation of the prior."""
 
 
 def estimates(found: Identified, joint_names: Sequence[str]) -> list[Estimate]:
     """All unknowns with their intervals; a sensor whose residuals exceed its noise widens them.
     `ball_latency` is the time from the exposure to the arrival."""
-    layout, vector = found.layout, found.fit.vector
+    layout = found.layout
+    vector = found.fit.vector
     world = layout.world(vector)
     values = np.concatenate([np.ravel(world[name]) for name in layout.terms])
     # What a log does not show is as well known as before it.
     deviation = np.minimum(found.deviation * misfit(found), layout.deviation)
-    low, high = (
-        layout.decode(layout.clip(vector + side * _HALF_WIDTH * deviation)) for side in (-1.0, 1.0)
-    )
+    low = layout.decode(layout.clip(vector - _HALF_WIDTH * deviation))
+    high = layout.decode(layout.clip(vector + _HALF_WIDTH * deviation))
     given_others = misfit(found) / np.sqrt(np.diag(np.linalg.inv(found.covariance)))
     ends = layout.decode(vector + _HALF_WIDTH * np.minimum(given_others, layout.deviation))
     alone = ends - layout.decode(vector)
+    typical = layout.decode(vector + layout.deviation) - layout.decode(vector)
     for name, ends in _estimate_delays(found).items():
         place = layout.terms[name]
         low[place], high[place] = ends
-        alone[place] = np.inf
+        # A change of latency or lag alone is one of the delay, at whose place the latency is.
+        alone[place] = alone[layout.terms["action_latency"]]
+        typical[place] = typical[layout.terms["action_latency"]]
     late = layout.slices.get("ball_latency", slice(0, 0))
     for array in (values, low, high):
         array[late] += found.stamp_age
     for name, place in layout.terms.items():
         if name in TERMS:
-            low[place], high[place] = (np.clip(x[place], *TERMS[name].bounds) for x in (low, high))
+            low[place] = np.clip(low[place], *TERMS[name].bounds)
+            high[place] = np.clip(high[place], *TERMS[name].bounds)
     seen = found.deviation < _UNSEEN * layout.deviation
-    columns = (values, low, high, seen, alone)
-    words = layout.labels(joint_names), layout.units
-    return list(map(Estimate, *words, *(column.tolist() for column in columns)))
+    return [
+        Estimate(
+            label=label,
+            unit=layout.units[i],
+            value=float(values[i]),
+            low=float(low[i]),
+            high=float(high[i]),
+            seen=bool(seen[i]),
+            alone=float(alone[i]),
+            typical=float(typical[i]),
+        )
+        for i, label in enumerate(layout.labels(joint_names))
+    ]
 
 
 def _estimate_delays(found: Identified) -> dict[str, tuple[float, float]]:
     """Intervals of latency and lag from those of the delay and its variance. The latency is the
     delay less the lag, whose error is not normal near 0: its interval adds the change over the
     variance's interval to the delay's own error at a given variance."""
-    layout, vector, places = found.layout, found.fit.vector, found.layout.slices
-    delay, variance = (places[name].start for name in ("delay", "delay_variance"))
+    layout = found.layout
+    vector = found.fit.vector
+    places = found.layout.slices
+    delay = places["delay"].start
+    variance = places["delay_variance"].start
     width = _HALF_WIDTH * found.deviation[variance] * misfit(found)
     slope = found.covariance[delay, variance] / found.covariance[variance, variance]
-    own = found.covariance[delay, delay] - slope * found.covariance[delay, variance]
+    squared = found.covariance[delay, delay] - slope * found.covariance[delay, variance]
     if found.deviation[delay] >= _UNSEEN * layout.deviation[delay]:
-        own = found.covariance[delay, delay]
-    own = _HALF_WIDTH * misfit(found) * np.sqrt(max(own, 0.0))
+        squared = found.covariance[delay, delay]
+    given_variance = _HALF_WIDTH * misfit(found) * np.sqrt(max(squared, 0.0))
     ends = np.repeat(vector[None], 3, axis=0)
     ends[:, variance] = np.maximum(vector[variance] + np.array([-width, 0.0, width]), 0.0)
     ends[:, delay] += slope * (ends[:, variance] - vector[variance])
     world = layout.world(ends)
-    latency, lag = world["action_latency"], world["servo_lag"]
-    below, above = (np.hypot(f(latency) - latency[1], own) for f in (np.min, np.max))
+    latency = world["action_latency"]
+    lag = world["servo_lag"]
+    below = np.hypot(np.min(latency) - latency[1], given_variance)
+    above = np.hypot(np.max(latency) - latency[1], given_variance)
     return {
         "action_latency": (max(latency[1] - below, 0.0), latency[1] + above),
         "servo_lag": (0.0 if vector[variance] < width else lag[0], lag[2]),
@@ -155,10 +178,12 @@ def describe_doubts(found: Identified, joint_names: Sequence[str]) -> list[str]:
     The errors are those in windows that the search had not seen. A model that is off by less than
     its sensor's noise, or by a small share of the motion, is as good as a policy needs it.
     """
-    windows, doubts = found.windows, []
+    windows = found.windows
+    doubts = []
     angles = windows.angles[windows.angle_weights > 0.0]
     for j, (name, error) in enumerate(zip(joint_names, found.joint_errors, strict=False)):
-        noise, motion = found.noise.angles[j], float(np.std(angles[:, j]))
+        noise = found.noise.angles[j]
+        motion = float(np.std(angles[:, j]))
         if error > max(_GOOD_FIT * noise, _GOOD_SHARE * motion, _GOOD_ANGLE):
             doubts.append(
                 f"The model does not explain the angles of {name}: its error in windows that the "
@@ -188,7 +213,8 @@ def total_delay(found: Identified, model: mujoco.MjModel) -> str:
     It is the action's latency, the lag, and the delay of the servos themselves: damping divided by
     stiffness, which is the mean of a servo's answer to a step.
     """
-    layout, servos = found.layout, list(find_addresses(model).actuators)
+    layout = found.layout
+    servos = list(find_addresses(model).actuators)
     own = -model.actuator_biasprm[servos, 2] / model.actuator_gainprm[servos, 0]
 
     def total(vector: np.ndarray) -> float:
@@ -196,7 +222,8 @@ def total_delay(found: Identified, model: mujoco.MjModel) -> str:
         of_servos = np.mean(own * world["servo_damping"] / world["servo_gain"])
         return float(world["action_latency"] + world["servo_lag"] + of_servos)
 
-    vector, steps = found.fit.vector, 1e-3 * layout.deviation
+    vector = found.fit.vector
+    steps = 1e-3 * layout.deviation
     moved = [total(vector + step) for step in np.diag(steps)]
     slope = (np.array(moved) - total(vector)) / steps
     covariance = np.linalg.inv(found.information + np.diag(layout.deviation**-2.0))
@@ -207,7 +234,8 @@ def total_delay(found: Identified, model: mujoco.MjModel) -> str:
 
 def _describe_mistakes(found: Identified, joint_names: Sequence[str]) -> list[str]:
     """Warnings of estimates that are several deviations of the prior away."""
-    layout, vector = found.layout, found.fit.vector
+    layout = found.layout
+    vector = found.fit.vector
     means = layout.decode(layout.mean)
     off = np.abs(vector - layout.mean) / layout.deviation
     at_limit = np.any((layout.limits == vector) & (layout.limits != 0.0), axis=0)
@@ -229,7 +257,8 @@ def _describe_mistakes(found: Identified, joint_names: Sequence[str]) -> list[st
 def _describe_unseen(found: Identified, joint_names: Sequence[str]) -> list[str]:
     """Combinations of unknowns that the log cannot show: the eigenvectors of its information, in
     units of the prior, with small eigenvalues."""
-    layout, labels = found.layout, found.layout.labels(joint_names)
+    layout = found.layout
+    labels = layout.labels(joint_names)
     owners = [n for n, place in layout.terms.items() for _ in range(place.start, place.stop)]
     scaled = found.information * np.outer(layout.deviation, layout.deviation)
     values, vectors = np.linalg.eigh(scaled)
@@ -260,7 +289,7 @@ def to_yaml(
     The range of each entry of a term covers what the log allows while all other unknowns have their
     estimates, with a margin of half: independent samples from the whole intervals of terms that the
     log cannot separate would be worlds that contradict it. A term that the log does not show is
-    assumed.
+    assumed, and has at most one deviation of its prior to each side.
 
     Args:
       robot: name or file of the robot's config.
@@ -268,7 +297,8 @@ def to_yaml(
     """
     ranges: dict[str, list[Any]] = {}
     sources: dict[str, str] = {}
-    assumed, listed = [], estimates(found, joint_names)
+    assumed = []
+    listed = estimates(found, joint_names)
     for name, place in found.layout.terms.items():
         if name == CAMERA_ROTATION:
             continue
@@ -311,7 +341,8 @@ def to_yaml(
 def compare(world: NamedWorld, found: Identified, joint_names: Sequence[str]) -> list[str]:
     """Terms of a world that a log contradicts, a sentence each; none if the robot is still the
     same."""
-    given, listed = world.settings.get("randomization", {}), estimates(found, joint_names)
+    given = world.settings.get("randomization", {})
+    listed = estimates(found, joint_names)
     changed = []
     for name, place in found.layout.terms.items():
         if name not in given:
@@ -334,10 +365,16 @@ def _format(entry: Estimate) -> str:
 
 
 def _widen(name: str, entries: Sequence[Estimate]) -> list[Any]:
-    value, low, high, alone = np.transpose([(e.value, e.low, e.high, e.alone) for e in entries])
-    low = value - _MARGIN * np.minimum(value - low, alone)
-    ends = np.stack([low, value + _MARGIN * np.minimum(high - value, alone)])
-    return _clip(name, ends if len(entries) > 1 else ends[:, 0])
+    """The range of a term for training, from the intervals of its entries."""
+    lows = []
+    highs = []
+    for entry in entries:
+        most = np.inf if entry.seen else entry.typical
+        below = _MARGIN * min(entry.value - entry.low, entry.alone)
+        above = _MARGIN * min(entry.high - entry.value, entry.alone)
+        lows.append(entry.value - min(below, most))
+        highs.append(entry.value + min(above, most))
+    return _clip(name, [lows, highs] if len(entries) > 1 else [lows[0], highs[0]])
 
 
 def _clip(name: str, ends: Any) -> list[Any]:
@@ -352,11 +389,13 @@ def measure_camera(log: Log) -> tuple[float, float] | None:
 
     A picture that came together with a later one, between two control steps, is not lost.
     """
-    intervals, steps = np.diff(log.picture_times), np.searchsorted(log.times, log.arrivals)
+    intervals = np.diff(log.picture_times)
+    steps = np.searchsorted(log.times, log.arrivals)
     together = intervals < _TOGETHER
     if np.sum(together) < 50:
         return None
-    intervals, period = intervals[together], float(np.median(intervals[together]))
+    intervals = intervals[together]
+    period = float(np.median(intervals))
     for _ in range(3):
         # Stamps that are rounded, or of every second picture at times, have another median.
         periods = np.maximum(np.round(intervals / period), 1.0)
@@ -370,14 +409,24 @@ def measure_camera(log: Log) -> tuple[float, float] | None:
 def _measure_sensors(found: Identified, log: Log) -> dict[str, tuple[float, float, str]]:
     """Lower and upper end of the sensors' noise and of the camera's terms, and how they were
     measured."""
-    angles, balls = ((0.8 * np.min(noise), 1.2 * np.max(noise)) for noise in found.noise)
-    ranges = {"joint_angle_noise": (*angles, "Third differences of the joint angles")}
+    angles, balls = found.noise
+    ranges = {
+        "joint_angle_noise": (
+            0.8 * np.min(angles),
+            1.2 * np.max(angles),
+            "Third differences of the joint angles",
+        )
+    }
     if (camera := measure_camera(log)) is not None:
         rate, lost = camera
-        parabola = "Distances of pictures from a parabola through their neighbours"
+        ball_noise = (
+            0.8 * np.min(balls),
+            1.2 * np.max(balls),
+            "Distances of pictures from a parabola through their neighbours",
+        )
         ranges |= {
             "camera_rate": (0.97 * rate, 1.03 * rate, "Intervals of the pictures"),
             "frame_drop": (0.5 * lost, 1.5 * lost + 0.01, "Missing pictures"),
-            "ball_position_noise": (*balls, parabola),
+            "ball_position_noise": ball_noise,
         }
     return ranges

@@ -23,7 +23,8 @@ class Moving(NamedTuple):
     smoothing: Any = None
     """Time [nu] of the mean that limits the jerk."""
     older_acceleration: Any = None
-    """Accelerations [nu] two control steps before, for targets that are late and smoothed."""
+    """Accelerations [nu] two control steps before, for targets that are late and smoothed: their
+    mean reaches back that far."""
     control_steps: Any = None
     """Physics steps [] in a control step, with `older_acceleration`."""
 
@@ -31,9 +32,10 @@ class Moving(NamedTuple):
 class Control(NamedTuple):
     """Servo targets and disturbances over N physics steps; None leaves a disturbance out.
 
-    All engines apply it the same way: `servo_targets` gives the `ctrl` of each physics step, the
-    push changes the ball's velocity before the first step, and every step has the drag of its
-    velocity. The unit of time is the physics step in all fields but the last two.
+    All engines apply it the same way: `servo_target` gives the `ctrl` of each physics step
+    (`servo_targets` that of all steps, for the C engine), the push changes the ball's velocity
+    before the first step, and every step has the drag of its velocity. The unit of time is the
+    physics step in all fields but the last two.
     """
 
     ctrl: Any
@@ -43,7 +45,8 @@ class Control(NamedTuple):
     previous: Any = None
     """Servo targets [nu] until the physics step `switch`, if they do not move."""
     switch: Any = None
-    """Number [] of physics steps with earlier targets, a whole number."""
+    """Number [] of physics steps with the targets of an earlier control step, a whole number. Of
+    moving targets, the delay: each step has the target of `switch` steps before."""
     filtered: Any = None
     """Outputs [nu] of the servos' first-order lags before the first step."""
     lag: Any = None
@@ -91,11 +94,11 @@ def _lagging_target(control: Control, step: Scalar) -> Scalar:
 def _moving_target(control: Control, moving: Moving, step: Scalar) -> Scalar:
     """`servo_target` of a target that moves: its position at the end of the physics step."""
     start = Setpoint(control.ctrl, moving.velocity, moving.last_acceleration)
-    older_step = None
+    earlier = None
     if moving.older_acceleration is not None:
-        older_step = (moving.control_steps, moving.older_acceleration)
-    # The setpoint of a late target belongs to an earlier time.
+        earlier = (moving.control_steps, moving.older_acceleration)
     time = step + 1.0
+    # A late target is the setpoint of an earlier time, before the control step if negative.
     setpoint_time = time if control.switch is None else time - control.switch
 
     def position(setpoint_time: Scalar, lag: Scalar | None = None) -> Scalar:
@@ -106,15 +109,16 @@ def _moving_target(control: Control, moving: Moving, step: Scalar) -> Scalar:
             jnp,
             smoothing=moving.smoothing,
             lag=lag,
-            earlier=older_step,
+            earlier=earlier,
         )
 
     if control.lag is None:
         return position(setpoint_time)
-    # The lag's steady output, and its transient from the output before the first step.
+    # `position` with a lag is the lag's output after a long time with this motion. The difference
+    # of the real output from it at the start of the step fades.
     lag = jnp.maximum(control.lag, 1e-3)
-    transient = control.filtered - position(setpoint_time - time, lag)
-    return position(setpoint_time, lag) + transient * jnp.exp(-time / lag)
+    difference = control.filtered - position(setpoint_time - time, lag)
+    return position(setpoint_time, lag) + difference * jnp.exp(-time / lag)
 
 
 def servo_targets(control: Control, num_steps: int) -> jax.Array:

@@ -1,5 +1,5 @@
 """Does MuJoCo's C solver converge with a model's own settings? The fused engine computes the
-converged solution, whatever the settings say."""
+converged solution, whatever the settings say. Trainings and evaluations print the warning."""
 
 import copy
 from collections.abc import Iterable
@@ -33,8 +33,8 @@ def solver_warning(mj_model: mujoco.MjModel) -> str | None:
         return None
     at_fault = []
     for name in changed:
-        error_of_others = _largest_error(_with_defaults(mj_model, [name]), converged)
-        if error_of_others < _LARGEST_ERROR:
+        error_without_it = _largest_error(_with_defaults(mj_model, [name]), converged)
+        if error_without_it < _LARGEST_ERROR:
             at_fault.append(name)
     words = " and ".join(_as_in_mjcf(mj_model.opt, name) for name in at_fault or changed)
     return (

@@ -38,6 +38,10 @@ NO_PAIR = (
 )
 
 
+INSEPARABLE = ("pair_solref",)
+"""Fields in whose rows one number tells the meaning of another: they change together."""
+
+
 class Edit(NamedTuple):
     """The entries of a model's field that hold a parameter."""
 
@@ -50,11 +54,12 @@ class Edit(NamedTuple):
     scale: Any = 1.0
     """Value of the entries, or of each, per value of the parameter."""
     number: Any = None
-    """Which of the parameter's numbers each entry has; by default, each has its own."""
+    """Which of the parameter's numbers each entry has; by default, each its own, or all the only
+    one."""
     least: Any = None
-    """Least value of each entry, for a parameter that limits the model's own values."""
+    """The model's own value of each entry, below which a parameter that is a limit does not go."""
     greatest: Any = None
-    """Greatest value of each entry, for a parameter that limits the model's own values."""
+    """The model's own value of each entry, above which a parameter that is a limit does not go."""
 
 
 class Entry(NamedTuple):
@@ -149,6 +154,9 @@ def edits(mj_model: mujoco.MjModel, addresses: Addresses) -> tuple[Edit, ...]:
     paddle = addresses.paddle_geom
     ball_bodies = [ball.body for ball in addresses.balls]
     ball_geoms = [ball.geom for ball in addresses.balls]
+    # The parameter is the first ball's, and the others stay in proportion to it.
+    masses = mj_model.body_mass[ball_bodies]
+    radii = mj_model.geom_size[ball_geoms, 0]
     pairs = contact_pairs(mj_model, addresses)
     dofs = list(addresses.arm_qvel)
     servos = list(addresses.actuators)
@@ -157,8 +165,8 @@ def edits(mj_model: mujoco.MjModel, addresses: Addresses) -> tuple[Edit, ...]:
     bodies, links = _massive_bodies(mj_model, addresses)
     share = mj_model.body_mass[bodies] / _link_masses(mj_model, addresses)[links]
     return (
-        Edit("ball_mass", "body_mass", ball_bodies),
-        Edit("ball_radius", "geom_size", (ball_geoms, 0)),
+        Edit("ball_mass", "body_mass", ball_bodies, masses / masses[0]),
+        Edit("ball_radius", "geom_size", (ball_geoms, 0), radii / radii[0]),
         Edit("contact_stiffness", "pair_solref", (pairs, 0), -1.0),
         Edit("contact_damping", "pair_solref", (pairs, 1), -1.0),
         Edit("contact_friction", "pair_friction", (pairs, slice(0, 2))),
@@ -210,7 +218,7 @@ def edited(
     """
     model = EditedModel(mj_model, addresses)
     if parameters.contact_stiffness is not None or parameters.contact_damping is not None:
-        # Both numbers of a solref have one format.
+        # The engines read both numbers of a solref in one format: an untouched one changes too.
         for pair in contact_pairs(mj_model, addresses):
             stiffness, damping = model.stiffness_and_damping("pair", pair)
             model.put("pair_solref", pair, [-float(stiffness), -float(damping)])
@@ -229,6 +237,7 @@ def _values(mj_model: mujoco.MjModel, edit: Edit, value: Scalar | Sequence[Scala
     """The numbers of an edit's entries for a value of its parameter."""
     count = field_of(mj_model, edit.field)[edit.index].size
     if count == 0:
+        # The contact's parameters alone have entries that a model may lack.
         raise UserError(NO_PAIR)
     numbers = value if isinstance(value, tuple | list) else (value,) * count
     if edit.number is not None:
@@ -257,7 +266,8 @@ def _put_entry(model: EditedModel, name: str, value: Scalar) -> None:
 
 
 def _set_flags(model: EditedModel) -> None:
-    """Sets what an edit needs in order to act."""
+    """Sets what an edit needs in order to act, also one of `PhysicsParameters.entries`: a friction
+    makes its pair frictional, and a force limit its servo limited."""
     for pair in model.rows("pair_friction"):
         model.follow("pair_dim", pair, [max(3, int(model.mj_model.pair_dim[pair]))])
     for servo in model.rows("actuator_forcerange"):
@@ -268,8 +278,9 @@ def _set_flags(model: EditedModel) -> None:
 
 
 def _derive(model: EditedModel) -> None:
-    """Sets the entries that MuJoCo's compiler derives from edited ones. An inertia follows the
-    mass, and a ball's also the square of the radius."""
+    """Sets the entries that MuJoCo's compiler derives from edited ones, except the arm's inverse
+    weights (`body_invweight0`, `dof_invweight0`). An inertia follows the mass, and a ball's also
+    the square of the radius."""
     ball_of_body = {ball.body: ball for ball in model.addresses.balls}
     edited_sizes = model.rows("geom_size")
     edited_masses = model.rows("body_mass")
@@ -314,6 +325,7 @@ def _derive_inertia(
 
 
 def _derive_subtree_masses(model: EditedModel) -> None:
+    """Sets the mass of each body together with its descendants."""
     # MuJoCo numbers parents before children.
     masses = list(model["body_mass", ...])
     for body in range(model.mj_model.nbody - 1, 0, -1):
@@ -323,7 +335,8 @@ def _derive_subtree_masses(model: EditedModel) -> None:
 
 
 def edited_model(mj_model: mujoco.MjModel, parameters: PhysicsParameters) -> mujoco.MjModel:
-    """Copy of the model with the parameters of one environment, for MuJoCo's C engine.
+    """Copy of the model with the parameters of one environment, for MuJoCo's C engine. With a new
+    dry friction, it also has the iterations that its solver needs then (`raise_solver_limits`).
 
     Raises:
       UserError: an array does not have the shape of its field.
@@ -347,8 +360,9 @@ def _as_floats(array: Array) -> Any:
 def own_parameters(
     mj_model: mujoco.MjModel, addresses: Addresses | None = None
 ) -> PhysicsParameters:
-    """The model's own numbers, as NumPy arrays. A servo without a limit has an infinite one, and a
-    model without a contact pair of ball and paddle has None for the parameters of the contact.
+    """The model's own numbers, as NumPy arrays; of balls and of contacts, those of the first. A
+    servo without a limit has an infinite one, and a model without a contact pair of ball and paddle
+    has None for the parameters of the contact.
 
     Args:
       addresses: of its parts, if they are known.

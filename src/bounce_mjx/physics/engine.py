@@ -31,8 +31,8 @@ class Engine(NamedTuple):
 
 
 def is_fused(mj_model: mujoco.MjModel, choice: str, addresses: Addresses | None = None) -> bool:
-    """Whether the engine `choice` ("auto", "fused" or "mjx") is fused for a compiled model; this
-    starts no device of JAX's."""
+    """Whether the engine `choice` ("auto", "fused" or "mjx") is fused for a compiled model
+    (`env.world_model`); this starts no device of JAX's."""
     if choice != "auto":
         return choice == "fused"
     return unsupported_feature(mj_model, "fused", addresses) is None
@@ -62,13 +62,12 @@ def make_engine(
     else:
         name = choice
         reason = f"chosen by --physics {choice}"
-    if name == "mjx":
-        _check_mjx(mj_model, addresses, why_not_fused)
-    elif why_not_fused is not None:
-        raise UserError(f"{why_not_fused}; use --physics mjx")
     if name == "fused":
+        if why_not_fused is not None:
+            raise UserError(f"{why_not_fused}; use --physics mjx")
         implementation = dynamics
     else:
+        _check_mjx(mj_model, addresses, why_not_fused)
         # MJX takes seconds to import.
         from bounce_mjx.physics import mjx_engine as implementation
     constants = implementation.read_model(mj_model, addresses=addresses)

@@ -59,7 +59,7 @@ def step(
         return _step(model, data)
 
     with _full_precision():
-        model = world_model(constants, parameters)
+        model = environment_model(constants, parameters)
         data = mjx.make_data(model).replace(qpos=state.qpos, qvel=state.qvel)
         if control.ball_push is not None:
             pushed = np.concatenate([ball.qvel[:3] for ball in balls])
@@ -99,12 +99,12 @@ def paddle_position(
 ) -> jax.Array:
     """World position [3] (m) of the paddle's centre at qpos [nq]."""
     with _full_precision():
-        model = world_model(constants, parameters)
+        model = environment_model(constants, parameters)
         data = mjx.make_data(model).replace(qpos=qpos)
         return mjx.kinematics(model, data).geom_xpos[constants.addresses.paddle_geom]
 
 
-def world_model(constants: MjxModel, parameters: PhysicsParameters) -> mjx.Model:
+def environment_model(constants: MjxModel, parameters: PhysicsParameters) -> mjx.Model:
     """Model with the parameters of one environment.
 
     Raises:

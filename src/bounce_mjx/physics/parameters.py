@@ -28,9 +28,11 @@ class PhysicsParameters(NamedTuple):
     """
 
     ball_mass: Array | None = None
-    """Mass [] of each ball, kg; its inertia scales in proportion."""
+    """Mass [] of the ball, kg, and of the first of several, to which the others stay in proportion;
+    the inertia scales in proportion."""
     ball_radius: Array | None = None
-    """Radius [] of each ball, m; its mass stays the same, its inertia scales with the square."""
+    """Radius [] of the ball, m, and of the first of several, to which the others stay in
+    proportion; the mass stays the same, the inertia scales with the square."""
     contact_stiffness: Array | None = None
     """Stiffness [] of the contacts, 1/s^2: k of MuJoCo's direct `solref="-k -b"`."""
     contact_damping: Array | None = None
@@ -39,9 +41,9 @@ class PhysicsParameters(NamedTuple):
     """Coefficient [] of sliding friction between ball and paddle, and between balls; it turns a
     frictionless pair into one with `condim="3"`."""
     servo_gain: Array | None = None
-    """Stiffness [n] of the position servos, N m/rad: `kp`."""
+    """Stiffness [n] of the position servos at their actuators, N m/rad: `kp`."""
     servo_damping: Array | None = None
-    """Damping [n] of the position servos, N m s/rad: `kv`."""
+    """Damping [n] of the position servos at their actuators, N m s/rad: `kv`."""
     force_limit: Array | None = None
     """Largest torques [n] of the position servos at their joints, N m: `forcerange` times `gear`. A
     servo that is weaker keeps its own range."""
@@ -63,7 +65,7 @@ class PhysicsParameters(NamedTuple):
     entries: Mapping[str, Array] | None = None
     """Other entries [] of the MjModel by their names, such as `dof_damping[2]`, `geom_size[3, 0]`
     or `opt.gravity[2]`; they prevail over the fields above. The fused engine refuses the name of an
-    entry that it does not read."""
+    entry that it does not read; the mjx engine takes those that `mjx.Model` has."""
 
 
 MODEL_PARAMETERS = PhysicsParameters()

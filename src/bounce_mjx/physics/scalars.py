@@ -4,13 +4,19 @@ A scalar is a Python float (known while tracing) or a JAX array (known when runn
 the entries 0 and 1 of a robot's fixed rotations vanish here, before XLA sees them. A physics step
 has thousands of operations: `jax.lax` traces them in a fraction of the time of `jax.numpy`.
 
-The rule for its users: where an operand may be a constant, write `add`, `sub`, `mul` and `neg`, or
-`Vec` and `Mat`, which use them; the operators `+`, `-`, `*` and `/` stand where an operand is
-surely an array. A constant is a float, never an int: 0.0, not 0.
+The rule for its users, stated here alone:
+
+- Where an operand may be a constant, write `add`, `sub`, `mul` and `neg`, or `Vec` and `Mat`, which
+  use them: a sum with 0 and a product with 0, 1 or -1 fold.
+- `+`, `-` and `*` compute the same, but fold nothing: they stand where an operand is surely an
+  array, or where both are surely constants.
+- `/` stands anywhere: two constants give a constant, and there is nothing else to fold.
+- A constant is a float, never an int: 0.0, not 0.
 """
 
 import functools
 import math
+import operator
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -88,7 +94,8 @@ def dot(a: Sequence[Scalar], b: Sequence[Scalar]) -> Scalar:
 
 @jax.tree_util.register_pytree_node_class
 class Vec(tuple):
-    """A vector of scalars, mostly of three. `a @ b` is the inner product, `a * s` a multiple."""
+    """A vector of scalars, mostly of three. `a + b`, `a - b`, -a; `a @ b` is the inner product,
+    `a * s` a multiple."""
 
     def __add__(self, other: "Vec") -> "Vec":
         return Vec(map(add, self, other))
@@ -115,7 +122,7 @@ class Vec(tuple):
 
 @jax.tree_util.register_pytree_node_class
 class Mat(Vec):
-    """A matrix of scalars, as its rows."""
+    """A matrix of scalars, as its rows: `A + B`, `A @ B`, `A @ v` and `A.T`, no other operator."""
 
     def __new__(cls, rows: Iterable[Sequence[Scalar]]) -> "Mat":
         return super().__new__(cls, map(Vec, rows))
@@ -125,6 +132,9 @@ class Mat(Vec):
         """The transposed matrix."""
         return Mat(zip(*self, strict=True))
 
+    def __add__(self, other: "Mat") -> "Mat":
+        return Mat(map(operator.add, self, other))
+
     def __matmul__(self, other: Any) -> Any:
         if isinstance(other, Mat):
             columns = other.T
@@ -133,6 +143,7 @@ class Mat(Vec):
 
 
 ZERO3 = Vec((0.0, 0.0, 0.0))
+ZERO_MATRIX3 = Mat((ZERO3, ZERO3, ZERO3))
 IDENTITY3 = Mat(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
 
 
@@ -169,11 +180,14 @@ def axis_rotation(axis: tuple[float, float, float], cos: Scalar, sin: Scalar) ->
     one_minus_cos = sub(1.0, cos)
 
     def entry(i: int, j: int, skew: float) -> Scalar:
-        along = axis[i] * axis[j]
-        symmetric = cos if along == 0.0 else add(cos, mul(one_minus_cos, along))
-        if i == j:
-            return 1.0 if along == 1.0 else symmetric
-        return add(mul(one_minus_cos, along), mul(sin, skew))
+        product = axis[i] * axis[j]
+        if i != j:
+            return add(mul(one_minus_cos, product), mul(sin, skew))
+        if product == 0.0:
+            return cos
+        if product == 1.0:
+            return 1.0
+        return add(cos, mul(one_minus_cos, product))
 
     rows = ((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))
     return Mat([entry(i, j, skew) for j, skew in enumerate(row)] for i, row in enumerate(rows))
@@ -195,11 +209,11 @@ def quaternion_matrix(quaternion: Quaternion) -> Mat:
     """Rotation matrix of a unit quaternion [w, x, y, z]."""
     w, x, y, z = quaternion
 
-    def diagonal(a: Scalar, b: Scalar) -> Scalar:
+    def on_diagonal(a: Scalar, b: Scalar) -> Scalar:
         return sub(1.0, mul(2.0, add(mul(a, a), mul(b, b))))
 
-    def off(product: Scalar, turned: Scalar) -> Scalar:
-        return mul(2.0, add(product, turned))
+    def off_diagonal(product: Scalar, product_with_w: Scalar) -> Scalar:
+        return mul(2.0, add(product, product_with_w))
 
     xy = mul(x, y)
     xz = mul(x, z)
@@ -209,9 +223,9 @@ def quaternion_matrix(quaternion: Quaternion) -> Mat:
     wz = mul(w, z)
     return Mat(
         (
-            (diagonal(y, z), off(xy, neg(wz)), off(xz, wy)),
-            (off(xy, wz), diagonal(x, z), off(yz, neg(wx))),
-            (off(xz, neg(wy)), off(yz, wx), diagonal(x, y)),
+            (on_diagonal(y, z), off_diagonal(xy, neg(wz)), off_diagonal(xz, wy)),
+            (off_diagonal(xy, wz), on_diagonal(x, z), off_diagonal(yz, neg(wx))),
+            (off_diagonal(xz, neg(wy)), off_diagonal(yz, wx), on_diagonal(x, y)),
         )
     )
 
@@ -289,13 +303,15 @@ def not_inlined(values: Tree) -> Tree:
     """The same scalars, each computed only once.
 
     On a CPU, XLA emits one loop per result and recomputes cheap intermediate values in each loop.
-    A call that XLA may not inline separates the loops and prevents this.
+    A call that XLA may not inline separates the loops and prevents this. A GPU kernel is one loop,
+    and computes each value once anyway.
     """
     leaves, tree = jax.tree.flatten(values)
     arrays = [leaf for leaf in leaves if not is_constant(leaf)]
     with set_xla_metadata(inlineable="false"):
         computed = iter(_same(*arrays))
-    return tree.unflatten(leaf if is_constant(leaf) else next(computed) for leaf in leaves)
+    kept = [leaf if is_constant(leaf) else next(computed) for leaf in leaves]
+    return tree.unflatten(kept)
 
 
 @jax.jit

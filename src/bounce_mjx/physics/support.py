@@ -18,7 +18,7 @@ Feature = tuple[str, bool]
 """The name of a feature that an engine lacks, and whether a model has it."""
 
 _INTEGRATORS = {"fused": ("implicitfast", "Euler"), "mjx": ("Euler", "RK4", "implicitfast")}
-# Flags of the MJCF that `fused.read_model` obeys, or without effect on the supported models.
+# Flags of the MJCF that `fused.model.read_model` obeys, or without effect on the supported models.
 _HARMLESS = frozenset(
     "equality frictionloss limit spring warmstart filterparent sensor midphase eulerdamp "
     "autoreset nativeccd island multiccd energy fwdinv invdiscrete".split()
@@ -41,6 +41,7 @@ def unsupported_feature(
     mj_model: mujoco.MjModel, engine: str, addresses: Addresses | None = None
 ) -> str | None:
     """Name of a feature of the model that an engine does not support; None if it supports them all.
+    `engine.make_engine` refuses the model by this name, or chooses the other engine.
 
     Args:
       mj_model: the model.
@@ -79,10 +80,11 @@ def unsupported_friction(mj_model: mujoco.MjModel, pair_dim: Sequence[int]) -> s
 def _flags(m: mujoco.MjModel) -> set[str]:
     """Names of the flags that are not at their defaults, as the MJCF writes them."""
     names = set()
-    for bits, kind in (
-        (m.opt.disableflags, mujoco.mjtDisableBit),
-        (m.opt.enableflags, mujoco.mjtEnableBit),
-    ):
+    bits_of_kind = {
+        mujoco.mjtDisableBit: m.opt.disableflags,
+        mujoco.mjtEnableBit: m.opt.enableflags,
+    }
+    for kind, bits in bits_of_kind.items():
         for constant, flag in kind.__members__.items():
             # mjDSBL_GRAVITY, mjENBL_ENERGY; not the count mjNENABLE
             _, is_flag, name = constant.partition("BL_")
@@ -136,11 +138,12 @@ def _fused(m: mujoco.MjModel, addresses: Addresses) -> Iterator[Feature]:
         not _has_known_pairs(m, addresses),
     )
     friction = unsupported_friction(m, m.pair_dim)
-    yield str(friction), friction is not None
+    if friction is not None:
+        yield friction, True
 
 
 def _is_branched(m: mujoco.MjModel, joints: Sequence[int]) -> bool:
-    """Whether a joint's body hangs neither on the body of the joint before nor is the same."""
+    """Whether a joint's body neither is the body of the joint before nor hangs on it."""
     bodies = m.jnt_bodyid[list(joints)]
     bodies_before = np.array([0, *bodies[:-1]])
     parents = m.body_weldid[m.body_parentid[bodies]]

@@ -2,6 +2,9 @@
 
 An acting joint of the task has exactly one actuator, a position servo, whose control is the target
 position of the joint. An arm that is adopted may have other ones.
+
+MuJoCo counts actuators (`nactuator`) and controls (`nu`) apart, as a `<pid>` has several controls:
+`actuator_ctrladr` is the first control of each actuator.
 """
 
 from collections.abc import Collection
@@ -13,12 +16,15 @@ import numpy as np
 from bounce_mjx.errors import UserError
 from bounce_mjx.robot.names import joint_name
 
-# For a hinge or a slide, both kinds of transmission are the same.
-_JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+ACTING_KINDS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+"""Joints of one number, which a position servo can move."""
+JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+"""Of an actuator that drives a joint; for a hinge or a slide, both are the same."""
 
 
 class ServoSettings(NamedTuple):
-    """A position servo of one joint, or another actuator, which has a force limit alone."""
+    """A position servo of one joint. Of another actuator, such as a motor, stiffness and damping
+    are None."""
 
     stiffness: float | None
     """N m/rad, or N/m."""
@@ -32,7 +38,7 @@ def joint_actuators(model: mujoco.MjModel) -> dict[int, list[int]]:
     """The actuators of each joint that has some, the joints in the model's order."""
     actuators_of: dict[int, list[int]] = {}
     for actuator in range(model.nactuator):
-        if int(model.actuator_trntype[actuator]) in _JOINT_TRANSMISSIONS:
+        if int(model.actuator_trntype[actuator]) in JOINT_TRANSMISSIONS:
             joint = int(model.actuator_trnid[actuator, 0])
             actuators_of.setdefault(joint, []).append(actuator)
     return dict(sorted(actuators_of.items()))
@@ -80,7 +86,7 @@ def is_direct(model: mujoco.MjModel, actuator: int) -> bool:
 
 
 def servo_settings(model: mujoco.MjModel, joint: int, actuator: int) -> ServoSettings:
-    """The actuator that drives a joint.
+    """The settings of the actuator that drives a joint.
 
     Raises:
       UserError: it pushes one way only.
@@ -125,7 +131,6 @@ def _force_limit(model: mujoco.MjModel, joint: int, actuator: int) -> float | No
     control range of a plain motor, or by the joint's own limit."""
     gear = float(model.actuator_gear[actuator, 0])
     gain = float(model.actuator_gainprm[actuator, 0])
-    # A <pid> has several controls; the other arrays have one row for each actuator.
     control = model.actuator_ctrladr[actuator]
     is_motor = model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_NONE
     ranges = (

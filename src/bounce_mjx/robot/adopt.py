@@ -7,6 +7,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
 from bounce_mjx.robot import arm as arms
 from bounce_mjx.robot.actuators import ServoSettings
@@ -15,15 +16,17 @@ from bounce_mjx.robot.model import Addresses, find_addresses
 from bounce_mjx.robot.names import BALL_BODY_NAME, PADDLE_BODY_NAME
 from bounce_mjx.robot.pose import PaddlePose, clearance, mounts, rank_poses
 
-# Velocity of a joint that the action 1 commands: rad/s of a hinge, m/s of a slide. The Peitian
-# arm's servos give 0.02 rad x 20000 / 200 = 2 rad/s.
+# Velocity of a joint that the action 1 commands: rad/s of a hinge, m/s of a slide. The package's
+# own arm has the action scale 0.02 rad, kp 20000 and kv 200, which give 2 rad/s.
 _HINGE_SPEED = 2.0
 _SLIDE_SPEED = 0.6
-# A kept servo is at least this well damped, and answers within a factor of the others.
+# A kept servo is at least this well damped.
 _LEAST_DAMPING_RATIO = 0.5
+# One action scale serves all kept servos: those that would suit each alone differ by this factor at
+# most.
 _LARGEST_SPREAD = 4.0
-# Largest difference of an arm in the scene from its file compiled alone: MuJoCo rounds frames that
-# are almost the same.
+# Largest difference of an arm in the scene from its file compiled alone, as a share of the largest
+# number of the field: MuJoCo rounds frames that are almost the same.
 _EQUAL = 1e-6
 # Distance of the paddle from the arm's other links in the start pose, m.
 _LEAST_CLEARANCE = 0.01
@@ -42,7 +45,8 @@ class Adoption(NamedTuple):
     """Distance of the paddle from the arm's other links in the pose, m; negative inside one."""
     arm: arms.Arm
     servos: tuple[ServoSettings, ...]
-    """The servo of each acting joint."""
+    """The servo of each acting joint in the scene: the file's own, which is then also in
+    `arm.actuators`, or a made one."""
 
 
 def adopt(mjcf: Path, config: RobotConfig, control_dt: float, is_mount_given: bool) -> Adoption:
@@ -50,7 +54,8 @@ def adopt(mjcf: Path, config: RobotConfig, control_dt: float, is_mount_given: bo
 
     Args:
       mjcf: the file, as for `locate`.
-      config: the site, and the joints and the paddle if they are chosen; its servos are ignored.
+      config: the site, and the joints and the paddle if they are chosen. Its servos are ignored,
+        and its limits and gravity compensation have no part in the search.
       control_dt: time between two actions, s.
       is_mount_given: whether the paddle's position and orientation are chosen; if not, the search
         also turns the paddle about the site's z, and lays it flat.
@@ -62,9 +67,10 @@ def adopt(mjcf: Path, config: RobotConfig, control_dt: float, is_mount_given: bo
     config = _with_servos(config, None)
     with arms.naming(path):
         arm = arms.build_arm(path, config)
-        # So every body stays: the search turns the paddle's.
+        # So every body stays: the search moves the paddle's.
         arm.spec.compiler.fusestatic = False
         with_shapes = arms.compile_spec(arm.spec, path)
+        # The search needs no shapes, and is faster without them.
         arm.spec.compiler.discardvisual = True
         model = arms.compile_spec(arm.spec, path)
         addresses = find_addresses(model)
@@ -74,11 +80,13 @@ def adopt(mjcf: Path, config: RobotConfig, control_dt: float, is_mount_given: bo
         pose, distance = _clear_pose(with_shapes, poses)
         config = config.model_copy(update={"paddle": pose.mount})
         scale = _scale_of_kept_servos(model, addresses, arm, pose)
-        servos = arm.servos
+        servos = arm.actuators
         if scale is None:
             servos, scale = _made_servos(model, addresses, arm, pose, control_dt)
             config = _with_servos(config, servos)
-        config = RobotConfig.model_validate(config.model_dump())
+            # `model_copy` checks nothing.
+            doubt = "servos of another size than robots have, perhaps by wrong units"
+            config = validate(RobotConfig, config.model_dump(), doubt)
         return Adoption(
             config=config,
             action_scale=_four_digits(scale),
@@ -114,7 +122,7 @@ def _ranked_poses(
       arm: of which it is the scene.
       choices: mounts of the paddle to try.
     """
-    force_limits = [servo.force_limit for servo in arm.servos]
+    force_limits = [servo.force_limit for servo in arm.actuators]
     try:
         return rank_poses(model, addresses, force_limits, choices)
     except UserError as error:
@@ -147,13 +155,13 @@ def _scale_of_kept_servos(
     Args:
       model: the compiled scene.
       addresses: of its parts.
-      arm: with the servos.
+      arm: with its own actuators.
       pose: in which the servos must hold the arm and be damped.
     """
-    if any(servo.stiffness is None for servo in arm.servos):
+    if any(servo.stiffness is None for servo in arm.actuators):
         return None
-    stiffness = np.array([servo.stiffness for servo in arm.servos])
-    servo_damping = np.array([servo.damping for servo in arm.servos])
+    stiffness = np.array([servo.stiffness for servo in arm.actuators])
+    servo_damping = np.array([servo.damping for servo in arm.actuators])
     damping = servo_damping + model.dof_damping[list(addresses.arm_qvel)]
     # A target that is ahead by this much moves the joint at its speed.
     scales = _speeds(model, addresses) * damping / stiffness
@@ -174,8 +182,11 @@ def _made_servos(
 ) -> tuple[tuple[ServoSettings, ...], float]:
     """Servos for the inertias of a pose, and the action scale, rad or m.
 
-    Critical damping at the natural frequency 1 / control_dt: within a control step a joint comes to
-    rest, and physics steps of a fifth of it are stable.
+    A hinge is critically damped, by its servo and its own damping together, at the natural
+    frequency 1 / control_dt: 4 % of an error are left after five control steps, and physics steps
+    of a fifth of a control step are stable. The same action commands less of a slide, whose servo
+    is softer: its damping ratio is 1.8. Where the joint's own damping is larger than that, the
+    servo adds none, and is stiff enough for the commanded velocity.
 
     Args:
       model: the compiled scene.
@@ -186,14 +197,17 @@ def _made_servos(
     """
     frequency = 1.0 / control_dt
     scale = 2.0 * _HINGE_SPEED / frequency
-    damping = 2.0 * frequency * pose.inertia
+    joint_damping = model.dof_damping[list(addresses.arm_qvel)]
+    damping = np.maximum(2.0 * frequency * pose.inertia, joint_damping)
+    servo_damping = damping - joint_damping
+    # At its velocity, a target that is ahead by the scale balances the damping.
     stiffness = damping * _speeds(model, addresses) / scale
     servos = []
-    for i, servo in enumerate(arm.servos):
+    for i, servo in enumerate(arm.actuators):
         servos.append(
             ServoSettings(
                 stiffness=_four_digits(stiffness[i]),
-                damping=_four_digits(damping[i]),
+                damping=_four_digits(servo_damping[i]),
                 force_limit=servo.force_limit,
             )
         )
@@ -219,7 +233,7 @@ def check_as_alone(arm: arms.Arm, model: mujoco.MjModel) -> None:
     added = (BALL_BODY_NAME, PADDLE_BODY_NAME)
     bodies = [body for body in range(1, model.nbody) if model.body(body).name not in added]
     joints = list(find_addresses(model).arm_joints)
-    for field, expected in arm.alone.items():
+    for field, expected in arm.file_numbers.items():
         rows = bodies if field in arms.BODY_FIELDS else joints
         in_scene = getattr(model, field)[rows]
         error = np.max(np.abs(in_scene - expected))

@@ -1,6 +1,6 @@
 """Adoption of an arm: from any MJCF with a serial arm in it to the task's scene, with MjSpec.
 
-Every change to the user's model is collected as one sentence.
+Every change by which the arm moves otherwise than in the user's file is collected as one sentence.
 """
 
 import contextlib
@@ -16,6 +16,8 @@ import numpy as np
 from bounce_mjx.errors import UserError, install_command, needed, reason_of, shorten
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.actuators import (
+    ACTING_KINDS,
+    JOINT_TRANSMISSIONS,
     ServoSettings,
     joint_actuators,
     servo_range,
@@ -23,24 +25,46 @@ from bounce_mjx.robot.actuators import (
     single_actuators,
 )
 from bounce_mjx.robot.config import PaddleConfig, RobotConfig
-from bounce_mjx.robot.names import PADDLE_BODY_NAME, PADDLE_GEOM_NAME, joint_name, listed
+from bounce_mjx.robot.names import (
+    BALL_NUMBERS,
+    PADDLE_BODY_NAME,
+    PADDLE_GEOM_NAME,
+    joint_name,
+    listed,
+)
 from bounce_mjx.robot.numbers import WORLD_OPTIONS, check_numbers
 
 # Lifting and tilting the paddle about two axes takes three joints.
 MIN_JOINTS = 3
 
-# Ends of the names of a scene's balls.
-_BALL_NUMBERS = ("", "2", "3")
 BODY_FIELDS = ("body_pos", "body_quat", "body_ipos", "body_iquat", "body_mass", "body_inertia")
 JOINT_FIELDS = ("jnt_pos", "jnt_axis")
 # Viewers show the groups 0 to 2.
 HIDDEN_GROUP = 3
-_ACTING_KINDS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 # Smallest change of a joint's range that is reported, rad or m.
 _NARROWER = 1e-3
 _HANDLE_RADIUS = 0.011
-# Without what only its simulations need; a later version may move its files.
+# Flags that change how an arm moves where a file disables them; contacts are turned off anyway.
+_FLAGS = "constraint frictionloss limit spring damper gravity clampctrl actuation".split()
+# How pip installs a package that brings MJCF files, where its name alone is not enough: robosuite
+# without what only its simulations need, at the version whose files have the paths of our configs.
 _INSTALLED_AS = {"robosuite": ("--no-deps", "robosuite==1.5.2")}
+
+
+class _End(NamedTuple):
+    """A part on which an equality constraint or a tendon acts."""
+
+    kind: mujoco.mjtObj
+    index: int
+
+
+# The parts along a tendon.
+_WRAPPED = {
+    mujoco.mjtWrap.mjWRAP_JOINT: mujoco.mjtObj.mjOBJ_JOINT,
+    mujoco.mjtWrap.mjWRAP_SITE: mujoco.mjtObj.mjOBJ_SITE,
+    mujoco.mjtWrap.mjWRAP_SPHERE: mujoco.mjtObj.mjOBJ_GEOM,
+    mujoco.mjtWrap.mjWRAP_CYLINDER: mujoco.mjtObj.mjOBJ_GEOM,
+}
 
 
 class Arm(NamedTuple):
@@ -49,15 +73,15 @@ class Arm(NamedTuple):
     spec: mujoco.MjSpec
     joint_names: tuple[str, ...]
     """The acting joints, from the base to the paddle."""
-    servos: tuple[ServoSettings, ...]
-    """The MJCF's own actuator of each acting joint."""
+    actuators: tuple[ServoSettings, ...]
+    """The file's own actuator of each acting joint, a servo or another one."""
     changes: tuple[str, ...]
     """Changes to the user's model, one sentence each."""
     narrowed: tuple[str, ...]
-    """The ranges that the servos' own are narrower than, in words."""
-    alone: dict[str, np.ndarray]
-    """`BODY_FIELDS` and `JOINT_FIELDS` of the model that is the user's file compiled alone: of the
-    bodies that the scene has too, and of the acting joints."""
+    """The joints whose range a servo's ctrlrange narrows, in words."""
+    file_numbers: dict[str, np.ndarray]
+    """`BODY_FIELDS` and `JOINT_FIELDS` of the user's file compiled alone: of the bodies that the
+    scene has too, and of the acting joints."""
 
 
 def locate(mjcf: Path) -> Path:
@@ -168,12 +192,14 @@ def naming(path: Path) -> Iterator[None]:
     try:
         yield
     except UserError as error:
-        named = str(path) in str(error)
-        raise error if named else UserError(f"the MJCF file {path} has {error}") from error
+        if str(path) in str(error):
+            raise
+        raise UserError(f"the MJCF file {path} has {error}") from error
 
 
 def find_site(model: mujoco.MjModel, config: RobotConfig) -> tuple[int, np.ndarray, np.ndarray]:
-    """The body that holds the paddle, and the site's position [3] and quaternion [4] in it.
+    """The body that holds the paddle, and the site's position [3] and quaternion [4] in it. Of a
+    site and a body with the name, it is the site.
 
     Raises:
       UserError: there is no such site or body.
@@ -195,8 +221,11 @@ def _other_sites(model: mujoco.MjModel) -> str:
 
 
 class _Builder:
-    """The steps of one adoption; `_model` is the user's compiled model, whose ids are those of the
-    spec's elements."""
+    """The steps of one adoption.
+
+    `_model` is the user's file as MuJoCo compiles it. Its ids are places in the lists of the spec
+    `_arm` until the first element is deleted, in `_strip`.
+    """
 
     def __init__(self, arm: mujoco.MjSpec, model: mujoco.MjModel, config: RobotConfig):
         self._arm = arm
@@ -211,9 +240,10 @@ class _Builder:
         chain = _chain_to(model, holder)
         joints = self._acting_joints(chain)
         actuators = self._actuators(joints)
-        servos = tuple(servo_settings(model, joint, actuators[joint]) for joint in joints)
+        settings = tuple(servo_settings(model, joint, actuators[joint]) for joint in joints)
         loose = self._loose_bodies(chain, joints)
-        alone = self._numbers_alone(joints, loose)
+        self._check_couplings(joints, loose)
+        file_numbers = self._numbers_in_file(joints, loose)
         scene = read_spec(resource_path("mjcf/scene.xml"))
         self._rename(scene, holder)
         holder_name, joint_names = self._bind_names(holder, joints, actuators)
@@ -226,10 +256,10 @@ class _Builder:
         return Arm(
             spec=scene,
             joint_names=joint_names,
-            servos=servos,
+            actuators=settings,
             changes=tuple(self._changes),
             narrowed=tuple(self._narrowed),
-            alone=alone,
+            file_numbers=file_numbers,
         )
 
     def _acting_joints(self, chain: list[int]) -> list[int]:
@@ -279,7 +309,7 @@ class _Builder:
                 raise UserError(
                     f"the ball joint {name} in the arm; give an arm of hinges and slides"
                 )
-            if kind in _ACTING_KINDS:
+            if kind in ACTING_KINDS:
                 joints[name] = joint
         return joints
 
@@ -335,8 +365,26 @@ class _Builder:
                 f"{arm_joints}; give an MJCF with nothing but one arm on a fixed base"
             )
 
-    def _numbers_alone(self, joints: list[int], loose: list[int]) -> dict[str, np.ndarray]:
-        """`Arm.alone`."""
+    def _check_couplings(self, joints: list[int], loose: list[int]) -> None:
+        """Refuses an equality constraint or a tendon that acts on the arm. What has an end on a
+        loose body, such as a gripper's tendon, goes with it."""
+        model = self._model
+        couplings = []
+        for constraint, equality in enumerate(self._arm.equalities):
+            ends = _ends_of_constraint(model, constraint)
+            if ends is None or _acts_on_arm(model, ends, joints, loose):
+                couplings.append(_constraint_words(equality))
+        for tendon in range(model.ntendon):
+            if _acts_on_arm(model, _ends_of_tendon(model, tendon), joints, loose):
+                couplings.append(_tendon_words(model, tendon))
+        if couplings:
+            raise UserError(
+                f"the {couplings[0]} on the arm, so it is not a serial chain; remove it, or give a "
+                "serial arm"
+            )
+
+    def _numbers_in_file(self, joints: list[int], loose: list[int]) -> dict[str, np.ndarray]:
+        """`Arm.file_numbers`."""
         model = self._model
         kept = [body for body in range(1, model.nbody) if not is_below(model, body, loose)]
         numbers = {field: getattr(model, field)[kept] for field in BODY_FIELDS}
@@ -381,10 +429,12 @@ class _Builder:
             body.explicitinertial = True
             for field in BODY_FIELDS:
                 setattr(body, field.removeprefix("body_"), getattr(self._model, field)[i])
+            # The sign of a body without a fullinertia: MuJoCo refuses one beside an inertia.
             body.fullinertia[0] = np.nan
             # A body that the scene fuses would be turned by its angles in the scene's units.
             body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
             body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+            # The compiled pose has the frame's in it.
             if body.frame is not None:
                 body.set_frame(body.parent.add_frame())
         compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
@@ -392,8 +442,9 @@ class _Builder:
         compiler.boundinertia = 0.0
 
     def _freeze_joints(self, joints: list[int], actuators: dict[int, int]) -> None:
-        """Gives the acting joints and their actuators the numbers of the compiled model, as
-        `_freeze_bodies`, and the joints the ranges that their servos reach."""
+        """Gives the acting joints and their actuators those numbers of the compiled model that
+        would change in the scene, as `_freeze_bodies`, and the joints the ranges that their servos
+        reach. MuJoCo computes the others (pos, axis, ref, springref) as in the file."""
         spec_joints = list(self._arm.joints)
         spec_actuators = list(self._arm.actuators)
         for joint in joints:
@@ -410,6 +461,7 @@ class _Builder:
             name = joint_name(model, joint)
             self._changes.append(f"ignored the range of {name}, which is not limited")
         spec_joint.limited = mujoco.mjtLimited.mjLIMITED_FALSE
+        # In radians, also in a file in degrees: MuJoCo converts a limited joint's range alone.
         spec_joint.range = self._reached_range(joint, actuator)
         spec_joint.springdamper = np.zeros(2)
         spec_joint.stiffness[0] = model.jnt_stiffness[joint]
@@ -459,14 +511,10 @@ class _Builder:
         return reached_low, reached_high
 
     def _strip(self, joints: list[int], loose: list[int]) -> None:
-        """Removes all but the arm, and fixes its base.
-
-        Raises:
-          UserError: an equality constraint or a tendon acts on the arm.
-        """
+        """Removes all but the arm; without its free joint, a base is fixed."""
         arm = self._arm
         model = self._model
-        # Deleted elements change the lists.
+        # From here on, ids of the model are no places in the spec's lists any more.
         bodies = list(arm.bodies)
         spec_joints = list(arm.joints)
         acting_names = [spec_joints[joint].name for joint in joints]
@@ -475,31 +523,19 @@ class _Builder:
             is_loose = is_below(model, model.jnt_bodyid[joint], loose)
             if joint not in joints and not is_loose:
                 idle.append(spec_joint)
-        tendons = [_tendon_words(model, tendon) for tendon in range(model.ntendon)]
-        # With what acts on them, such as a gripper's tendons.
+        # MuJoCo deletes a body with what refers to it, such as a gripper's tendons.
         self._remove("removed the grippers and loose objects", [bodies[body] for body in loose])
         self._remove("fixed the joints that do not act", idle)
-        self._check_couplings(joints, tendons)
-        elements = [*arm.keys, *arm.sensors, *arm.pairs, *arm.excludes, *arm.lights, *arm.cameras]
-        elements += arm.equalities
-        elements += [drive for drive in arm.actuators if drive.target not in acting_names]
+        others = [*arm.keys, *arm.sensors, *arm.pairs, *arm.excludes, *arm.lights, *arm.cameras]
+        others += arm.equalities
+        for actuator in arm.actuators:
+            drives_joint = int(actuator.trntype) in JOINT_TRANSMISSIONS
+            if not (drives_joint and actuator.target in acting_names):
+                others.append(actuator)
+        others += arm.tendons
         floors = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
-        elements += [geom for geom in arm.geoms if geom.type in floors]
-        self._remove("removed what is not the arm", elements)
-
-    def _check_couplings(self, joints: list[int], tendons: list[str]) -> None:
-        """Refuses what still couples the arm's joints; `tendons` are all of the file in words."""
-        couplings = []
-        for equality in self._arm.equalities:
-            if _moves_with(self._model, equality.id, joints):
-                couplings.append(_constraint_words(equality))
-        for tendon in self._arm.tendons:
-            couplings.append(tendons[tendon.id])
-        if couplings:
-            raise UserError(
-                f"the {couplings[0]} on the arm, so it is not a serial chain; remove it, or give a "
-                "serial arm"
-            )
+        others += [geom for geom in arm.geoms if geom.type in floors]
+        self._remove("removed what is not the arm", others)
 
     def _remove(self, words: str, elements: Iterable) -> None:
         elements = list(elements)
@@ -511,11 +547,10 @@ class _Builder:
             self._changes.append(f"{words} ({len(elements)}{named})")
 
     def _disable_contacts_and_limits(self, joints: list[int]) -> None:
-        model = self._model
-        if np.any((model.geom_contype != 0) & (model.geom_conaffinity != 0)):
-            self._changes.append("turned off the arm's own contacts: only ball and paddle touch")
+        arm_touches = False
         for i, body in enumerate(self._arm.bodies):
             touching = [bool(geom.contype or geom.conaffinity) for geom in body.geoms]
+            arm_touches = arm_touches or any(touching)
             for geom, touches in zip(body.geoms, touching, strict=True):
                 # Where a link has both kinds of shapes, the others are its picture. What stands in
                 # the world, such as a table, is shown as it is.
@@ -523,7 +558,9 @@ class _Builder:
                     geom.group = HIDDEN_GROUP
                 geom.contype = 0
                 geom.conaffinity = 0
-        if np.any(model.jnt_limited[joints]):
+        if arm_touches:
+            self._changes.append("turned off the arm's own contacts: only ball and paddle touch")
+        if np.any(self._model.jnt_limited[joints]):
             self._changes.append("made the joint limits act by clipping the servo targets")
 
     def _attach(
@@ -598,7 +635,7 @@ def _rename_beside(elements: Iterable, others: Iterable, added: str = "") -> lis
     reserved = {added}
     for other in others:
         if other.name:
-            reserved.update(other.name + number for number in _BALL_NUMBERS)
+            reserved.update(other.name + number for number in BALL_NUMBERS)
     renamed = []
     for element in elements:
         if element.name and element.name in reserved:
@@ -673,19 +710,64 @@ def _constraint_words(equality: mujoco.MjsEquality) -> str:
     return f"unnamed equality constraint ({kind}: {connected})"
 
 
-def _moves_with(model: mujoco.MjModel, constraint: int, joints: list[int]) -> bool:
-    """Whether an equality constraint is one of the acting joints, or of a body that they move."""
+def _ends_of_constraint(model: mujoco.MjModel, constraint: int) -> list[_End] | None:
+    """The parts that an equality constraint joins; None of a flex, whose parts are not looked
+    for."""
     kinds = mujoco.mjtEq
-    ends = [int(model.eq_obj1id[constraint]), int(model.eq_obj2id[constraint])]
     kind = kinds(model.eq_type[constraint])
+    ids = [int(model.eq_obj1id[constraint]), int(model.eq_obj2id[constraint])]
+    # -1 is the missing second one of a constraint that holds its first one still.
+    ids = [index for index in ids if index >= 0]
     if kind == kinds.mjEQ_JOINT:
-        return not set(joints).isdisjoint(ends)
-    if kind not in (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD):
-        return True
-    if model.eq_objtype[constraint] == mujoco.mjtObj.mjOBJ_SITE:
-        ends = [int(model.site_bodyid[site]) for site in ends]
+        return [_End(mujoco.mjtObj.mjOBJ_JOINT, joint) for joint in ids]
+    if kind == kinds.mjEQ_TENDON:
+        ends = []
+        for tendon in ids:
+            ends += _ends_of_tendon(model, tendon)
+        return ends
+    if kind in (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD):
+        body_or_site = mujoco.mjtObj(model.eq_objtype[constraint])
+        return [_End(body_or_site, index) for index in ids]
+    return None
+
+
+def _ends_of_tendon(model: mujoco.MjModel, tendon: int) -> list[_End]:
+    """The joints that a tendon couples, or the sites and geoms on its path."""
+    first_wrap = model.tendon_adr[tendon]
+    ends = []
+    for wrap in range(first_wrap, first_wrap + model.tendon_num[tendon]):
+        kind = _WRAPPED.get(mujoco.mjtWrap(model.wrap_type[wrap]))
+        if kind is not None:
+            ends.append(_End(kind, int(model.wrap_objid[wrap])))
+    return ends
+
+
+def _acts_on_arm(
+    model: mujoco.MjModel, ends: list[_End], joints: list[int], loose: list[int]
+) -> bool:
+    """Whether what has these ends acts on an acting joint, or on a body that one moves; not where
+    it has an end on a loose body."""
+    if any(is_below(model, _body_of(model, end), loose) for end in ends):
+        return False
     moved = [int(model.jnt_bodyid[joint]) for joint in joints]
-    return any(is_below(model, body, moved) for body in ends)
+    for end in ends:
+        if end.kind == mujoco.mjtObj.mjOBJ_JOINT:
+            acts = end.index in joints
+        else:
+            acts = is_below(model, _body_of(model, end), moved)
+        if acts:
+            return True
+    return False
+
+
+def _body_of(model: mujoco.MjModel, end: _End) -> int:
+    """The body of a joint, a site or a geom; of a body, itself."""
+    bodies = {
+        mujoco.mjtObj.mjOBJ_JOINT: model.jnt_bodyid,
+        mujoco.mjtObj.mjOBJ_SITE: model.site_bodyid,
+        mujoco.mjtObj.mjOBJ_GEOM: model.geom_bodyid,
+    }
+    return int(bodies[end.kind][end.index]) if end.kind in bodies else end.index
 
 
 def _tendon_words(model: mujoco.MjModel, tendon: int) -> str:
@@ -693,11 +775,10 @@ def _tendon_words(model: mujoco.MjModel, tendon: int) -> str:
     name = model.tendon(tendon).name
     if name:
         return f"tendon {name}"
-    first_wrap = model.tendon_adr[tendon]
     joints = []
-    for wrap in range(first_wrap, first_wrap + model.tendon_num[tendon]):
-        if model.wrap_type[wrap] == mujoco.mjtWrap.mjWRAP_JOINT:
-            joints.append(joint_name(model, model.wrap_objid[wrap]))
+    for end in _ends_of_tendon(model, tendon):
+        if end.kind == mujoco.mjtObj.mjOBJ_JOINT:
+            joints.append(joint_name(model, end.index))
     path = listed(joints) if joints else "spatial"
     return f"unnamed tendon ({path})"
 
@@ -714,6 +795,11 @@ def _differing_options(option: mujoco.MjOption, task: mujoco.MjOption) -> str:
         tolerance = 1e-2 if name == "gravity" else 0.0
         if not np.allclose(value, getattr(task, name), atol=tolerance):
             differing.append(f"{name} {np.round(value, 6).tolist()}")
+    for flag in _FLAGS:
+        if option.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag.upper()}"):
+            differing.append(f"the disabled {flag}")
+    if option.disableactuator:
+        differing.append("the disabled actuator groups")
     return ", ".join(differing)
 
 

@@ -6,18 +6,16 @@ import mujoco
 
 from bounce_mjx.robot.arm import raise_solver_limits
 from bounce_mjx.robot.contact import PAIR_SETTINGS
-from bounce_mjx.robot.names import BALL_BODY_NAME, PADDLE_GEOM_NAME
+from bounce_mjx.robot.names import BALL_BODY_NAME, BALL_NUMBERS, PADDLE_GEOM_NAME
 
-MAX_BALLS = 3
+MAX_BALLS = len(BALL_NUMBERS)
 BALLS_APART = 0.1
 """Height of each added ball above the last one, m."""
 
 
 def ball_name(index: int) -> str:
     """Name of the body of a ball, which counts from 0: ball_link, ball_link2, ball_link3."""
-    if index == 0:
-        return BALL_BODY_NAME
-    return f"{BALL_BODY_NAME}{index + 1}"
+    return BALL_BODY_NAME + BALL_NUMBERS[index]
 
 
 def add_balls(spec: mujoco.MjSpec, num_balls: int) -> None:
@@ -34,15 +32,17 @@ def add_balls(spec: mujoco.MjSpec, num_balls: int) -> None:
     spec.copy_during_attach = True
     for i in range(1, num_balls):
         if spec.body(ball_name(i)) is None:
+            # The copy brings its pairs.
             frame = spec.worldbody.add_frame(pos=[0.0, 0.0, BALLS_APART * i])
-            frame.attach_body(spec.body(BALL_BODY_NAME), "", str(i + 1))
+            frame.attach_body(spec.body(BALL_BODY_NAME), prefix="", suffix=BALL_NUMBERS[i])
     pairs = {frozenset((pair.geomname1, pair.geomname2)): pair for pair in spec.pairs}
     touching = []
     for i in range(num_balls):
-        geoms = sorted(geom.name for geom in spec.body(ball_name(i)).geoms)
-        with_pair = [geom for geom in geoms if frozenset((geom, PADDLE_GEOM_NAME)) in pairs]
-        # A ball without a pair touches nothing.
-        touching += with_pair[:1]
+        for geom in spec.body(ball_name(i)).geoms:
+            # The one that `find_addresses` takes; a ball without a pair touches nothing.
+            if frozenset((geom.name, PADDLE_GEOM_NAME)) in pairs:
+                touching.append(geom.name)
+                break
     for first, second in itertools.combinations(touching, 2):
         if frozenset((first, second)) not in pairs:
             with_paddle = pairs[frozenset((second, PADDLE_GEOM_NAME))]

@@ -53,8 +53,9 @@ class BallConfig(settings.StrictModel):
 
 
 class LimitsConfig(settings.StrictModel):
-    """The arm's own limits, one number for each acting joint. Between two actions the servo targets
-    then move within the first three (`robot.setpoints`); without them they jump."""
+    """The arm's own limits, one number for each acting joint; those of a slide are in m in place of
+    rad. Between two actions the servo targets then move within velocity, acceleration and jerk
+    (`robot.setpoints`); without them they jump."""
 
     velocity: tuple[settings.Speed, ...] | None = None
     """Largest velocity of a joint's command, rad/s; null for no limits of the command."""
@@ -67,8 +68,10 @@ class LimitsConfig(settings.StrictModel):
 
     @pydantic.model_validator(mode="after")
     def _check_together(self):
-        velocity, acceleration, jerk, _ = (x is not None for _, x in self)
-        if velocity != acceleration or jerk > acceleration:
+        has_velocity = self.velocity is not None
+        has_acceleration = self.acceleration is not None
+        jerk_alone = self.jerk is not None and not has_acceleration
+        if has_velocity != has_acceleration or jerk_alone:
             raise ValueError("velocity or acceleration is missing; give both, or none of the three")
         return self
 
@@ -86,11 +89,11 @@ class RobotConfig(settings.StrictModel):
     """The ball of an adopted arm."""
     servo_stiffness: tuple[Stiffness, ...] | None = None
     """Stiffness of the position servo that replaces the actuator of each acting joint, N m/rad or
-    N/m; null keeps the MJCF's servos."""
+    N/m; null keeps the MJCF's servos. All three settings of the servos are given, or none."""
     servo_damping: tuple[Damping, ...] | None = None
     """Damping of each replaced servo, N m s/rad or N s/m."""
     servo_force_limit: tuple[Force | None, ...] | None = None
-    """Force limit of each replaced servo, N m or N; null for a servo without one."""
+    """Force limit of each replaced servo, N m or N; null in a servo's place for no limit."""
 
     limits: LimitsConfig = LimitsConfig()
     """The arm's own limits, as its manufacturer states them."""
@@ -100,7 +103,7 @@ class RobotConfig(settings.StrictModel):
     under it; 0 leaves the MJCF's `gravcomp`."""
 
 
-OF_SITE = RobotConfig.model_fields.keys() - {"site", "limits", "gravity_compensation"}
+NEED_SITE = RobotConfig.model_fields.keys() - {"site", "limits", "gravity_compensation"}
 """Settings that change nothing without a site."""
 
 

@@ -17,7 +17,7 @@ class Geometry(NamedTuple):
     rest_height: float
     """Height of a ball's centre over the paddle's while they touch, m."""
     paddle_home: tuple[float, float, float]
-    """Centre of the paddle at a reset without noise, m."""
+    """Centre of the paddle at a reset without noise, m; `model.paddle_home` rounds it."""
 
 
 def read_geometry(

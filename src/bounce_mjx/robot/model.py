@@ -13,15 +13,18 @@ import numpy as np
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot import arm
-from bounce_mjx.robot.actuators import is_direct, is_position_servo, single_actuators
+from bounce_mjx.robot.actuators import (
+    ACTING_KINDS,
+    is_direct,
+    is_position_servo,
+    single_actuators,
+)
 from bounce_mjx.robot.balls import MAX_BALLS, add_balls, ball_name
 from bounce_mjx.robot.config import RobotConfig
 from bounce_mjx.robot.contact import check_step
 from bounce_mjx.robot.names import BALL_BODY_NAME, PADDLE_GEOM_NAME, joint_name
 from bounce_mjx.robot.numbers import check_numbers, physical_fields
-from bounce_mjx.robot.torques import limit_torques
-
-_ACTING_KINDS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+from bounce_mjx.robot.torques import force_ranges, limit_torques
 
 
 class BallAddresses(NamedTuple):
@@ -46,8 +49,8 @@ class Addresses(NamedTuple):
     arm_qvel: tuple[int, ...]
     """Velocities of the acting joints in qvel."""
     actuators: tuple[int, ...]
-    """Servos in ctrl: each moves the acting joint of the same place in `arm_joints`
-    (`robot/actuators.py` finds them)."""
+    """Ids of the servos, and of their controls in ctrl, which `check_servos` lets be the same: each
+    moves the acting joint of the same place in `arm_joints`."""
     balls: tuple[BallAddresses, ...]
     paddle_geom: int
 
@@ -76,7 +79,7 @@ def load_model(
     robot: RobotConfig | None = None,
     num_balls: int = 1,
 ) -> mujoco.MjModel:
-    """Compiles an MJCF file.
+    """The compiled scene of an MJCF file, with the robot's settings.
 
     Args:
       mjcf: the file, as for `locate`; None for the project's own robot.
@@ -103,9 +106,10 @@ def load_model(
         check_numbers(mj_model)
         addresses = find_addresses(mj_model)
         check_servos(mj_model, addresses)
+        _check_units_of_ranges(spec, mj_model, addresses)
         _check_balls(addresses, num_balls)
     if robot.limits.torque is not None:
-        # `Env` refuses a config with another number of joints than the model.
+        # Of as many servos as there are torques: a wrong number is refused by `Env`, later.
         torques = robot.limits.torque[: len(addresses.actuators)]
         limit_torques(mj_model, addresses.actuators[: len(torques)], torques)
     mj_model.opt.timestep = physics_dt
@@ -129,6 +133,24 @@ def _drop_pictures(spec: mujoco.MjSpec) -> None:
         spec.compiler.discardvisual = True
 
 
+def _check_units_of_ranges(
+    spec: mujoco.MjSpec, mj_model: mujoco.MjModel, addresses: Addresses
+) -> None:
+    """Refuses a range in degrees that would count as one in radians (`joint_ranges`): MuJoCo
+    converts the ranges of limited joints alone."""
+    if not spec.compiler.degree:
+        return
+    for joint in addresses.arm_joints:
+        is_hinge = mj_model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
+        low, high = mj_model.jnt_range[joint]
+        if is_hinge and low < high and not mj_model.jnt_limited[joint]:
+            name = joint_name(mj_model, joint)
+            raise UserError(
+                f"the range {low:g} to {high:g} of {name} in degrees, which MuJoCo converts for "
+                'limited joints alone; write <compiler angle="radian"/> and all angles in rad'
+            )
+
+
 def _check_balls(addresses: Addresses, num_balls: int) -> None:
     present = len(addresses.balls)
     if present != num_balls:
@@ -138,7 +160,8 @@ def _check_balls(addresses: Addresses, num_balls: int) -> None:
 def paddle_home(
     mjcf: Path | None, robot: RobotConfig, joint_angles: Sequence[float]
 ) -> tuple[float, float, float]:
-    """Centre of the paddle at joint angles [n] (rad), m.
+    """Centre of the paddle at joint angles [n] (rad), m, rounded to 0.1 mm as in a config;
+    `geometry.read_geometry` has the exact one of a compiled model.
 
     Args:
       mjcf, robot: as for `load_model`.
@@ -146,7 +169,8 @@ def paddle_home(
     Raises:
       UserError: as `load_model`.
     """
-    mj_model = load_model(mjcf, 0.001, visual=False, robot=robot)
+    # Nothing moves, so any physics step will do.
+    mj_model = load_model(mjcf, physics_dt=0.001, visual=False, robot=robot)
     addresses = find_addresses(mj_model)
     data = data_at(mj_model, addresses, joint_angles)
     x, y, z = data.geom_xpos[addresses.paddle_geom].tolist()
@@ -164,7 +188,11 @@ def data_at(
 
 
 def joint_ranges(mj_model: mujoco.MjModel, addresses: Addresses) -> np.ndarray:
-    """Lower and upper ends [2, n] of the acting joints' ranges, rad; infinite without a range."""
+    """Lower and upper ends [2, n] of the acting joints' ranges, rad; infinite without a range.
+
+    A range counts also where the joint is not limited: it acts by clipping the servo targets. Of an
+    adopted arm, `arm.build_arm` has dropped the ranges that the file does not limit.
+    """
     low, high = mj_model.jnt_range[list(addresses.arm_joints)].T
     has_range = low < high
     return np.stack([np.where(has_range, low, -np.inf), np.where(has_range, high, np.inf)])
@@ -205,7 +233,7 @@ def scatter(rest: np.ndarray, places: Sequence[int], values: jax.Array) -> jax.A
 
 def check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
     """Compares the acting joints' actuators with a position servo, whose control is the target
-    position of its joint.
+    position of its joint, and which exerts no force there.
 
     Raises:
       UserError: one is another actuator; the text starts with it.
@@ -221,6 +249,14 @@ def check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
                 f'<position joint="{name}"/>, without a timeconst (env.randomization.servo_lag '
                 "simulates a lag)"
             )
+    forces = force_ranges(mj_model, addresses.actuators)
+    for joint, low, high in zip(addresses.arm_joints, *forces, strict=True):
+        if not low <= 0.0 <= high:
+            name = joint_name(mj_model, joint)
+            raise UserError(
+                f"the forcerange {low:g} to {high:g} on {name}, so its servo never rests; give a "
+                "range around 0"
+            )
 
 
 def find_addresses(mj_model: mujoco.MjModel) -> Addresses:
@@ -229,14 +265,14 @@ def find_addresses(mj_model: mujoco.MjModel) -> Addresses:
     Raises:
       UserError: a needed name is missing; the text starts with the missing part.
     """
-    balls = [_find_ball(mj_model, BALL_BODY_NAME)]
+    paddle_geom = _find(mj_model, mujoco.mjtObj.mjOBJ_GEOM, PADDLE_GEOM_NAME)
+    balls = [_find_ball(mj_model, BALL_BODY_NAME, paddle_geom)]
     for i in range(1, MAX_BALLS):
         name = ball_name(i)
         if mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_BODY, name) < 0:
             break
-        balls.append(_find_ball(mj_model, name))
-    paddle_geom = _find(mj_model, mujoco.mjtObj.mjOBJ_GEOM, PADDLE_GEOM_NAME)
-    actuator_of = _acting_joints(mj_model)
+        balls.append(_find_ball(mj_model, name, paddle_geom))
+    actuator_of = _driven_joints(mj_model)
     joints = tuple(actuator_of)
     return Addresses(
         arm_joints=joints,
@@ -248,7 +284,7 @@ def find_addresses(mj_model: mujoco.MjModel) -> Addresses:
     )
 
 
-def _find_ball(mj_model: mujoco.MjModel, name: str) -> BallAddresses:
+def _find_ball(mj_model: mujoco.MjModel, name: str, paddle_geom: int) -> BallAddresses:
     body = _find(mj_model, mujoco.mjtObj.mjOBJ_BODY, name)
     joint = mj_model.body_jntadr[body]
     if joint < 0 or mj_model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
@@ -257,9 +293,15 @@ def _find_ball(mj_model: mujoco.MjModel, name: str) -> BallAddresses:
         raise UserError(f"no geom on the body {name}; add the ball's sphere to it")
     first_qpos = int(mj_model.jnt_qposadr[joint])
     first_dof = int(mj_model.jnt_dofadr[joint])
-    # The geom in the contact pair; without a pair, the first one.
+    # The geom in a contact pair with the paddle, as in `add_balls`; without a pair, the first one.
     geoms = int(mj_model.body_geomadr[body]) + np.arange(mj_model.body_geomnum[body])
-    touching = np.isin(geoms, [mj_model.pair_geom1, mj_model.pair_geom2])
+    in_pair = np.concatenate(
+        [
+            mj_model.pair_geom1[mj_model.pair_geom2 == paddle_geom],
+            mj_model.pair_geom2[mj_model.pair_geom1 == paddle_geom],
+        ]
+    )
+    touching = np.isin(geoms, in_pair)
     return BallAddresses(
         body=body,
         geom=int(geoms[np.argmax(touching)]),
@@ -275,11 +317,11 @@ def joint_names(mj_model: mujoco.MjModel, addresses: Addresses | None = None) ->
     return tuple(joint_name(mj_model, joint) for joint in addresses.arm_joints)
 
 
-def _acting_joints(mj_model: mujoco.MjModel) -> dict[int, int]:
+def _driven_joints(mj_model: mujoco.MjModel) -> dict[int, int]:
     """The actuator of each hinge and slide that has one, in the order of the joints."""
     candidates = []
     for joint in range(mj_model.njnt):
-        if int(mj_model.jnt_type[joint]) in _ACTING_KINDS:
+        if int(mj_model.jnt_type[joint]) in ACTING_KINDS:
             candidates.append(joint)
     actuator_of = single_actuators(mj_model, candidates)
     if not actuator_of:
@@ -288,7 +330,7 @@ def _acting_joints(mj_model: mujoco.MjModel) -> dict[int, int]:
 
 
 def fingerprint(mj_model: mujoco.MjModel) -> bytes:
-    """A hash of the numbers on which a simulation depends; it ignores colours and markers."""
+    """A hash of the numbers on which a simulation depends; it ignores colours and sites."""
     digest = hashlib.blake2b()
     for name in physical_fields(mj_model):
         digest.update(np.asarray(getattr(mj_model, name)).tobytes())

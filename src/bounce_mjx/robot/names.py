@@ -8,8 +8,12 @@ from bounce_mjx.errors import shorten
 
 BALL_BODY_NAME = "ball_link"
 PADDLE_GEOM_NAME = "blocker"
+"""The paddle, which blocks the ball's way: whole scenes of users have the name since the first
+one."""
 PADDLE_BODY_NAME = "paddle"
 """The body of an adopted arm's paddle."""
+BALL_NUMBERS = ("", "2", "3")
+"""Ends of the names of a scene's balls and of their parts, one for each ball that it may have."""
 
 
 def joint_name(model: mujoco.MjModel, joint: int) -> str:

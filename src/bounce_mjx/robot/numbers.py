@@ -34,7 +34,8 @@ def check_numbers(mj_model: mujoco.MjModel) -> None:
     """Refuses numbers that MuJoCo compiles, and that nothing can simulate.
 
     Raises:
-      UserError: a number is not finite, or a joint gains energy; the text starts with the number.
+      UserError: a number is not finite, or a joint's damping, dry friction or armature is negative;
+        the text starts with the number.
     """
     for name in ("dof_damping", "dof_frictionloss", "dof_armature"):
         least = np.min(getattr(mj_model, name), initial=0.0)

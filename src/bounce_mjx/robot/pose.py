@@ -1,9 +1,10 @@
 """Search of the start pose: a level paddle at a well-conditioned point in front of the robot.
 
 Inverse kinematics by damped least squares (Wampler 1986; Buss 2004) from many seeds. The best pose
-has the largest score of conditioning, distance to the joint limits and strength. Each step of the
-search is a continuous function of the model's numbers, and equal scores are told apart by the
-posture, so that the same arm written in degrees and in radians has the same start pose.
+has the largest score of conditioning, distance to the joint limits and strength. The same arm
+written in degrees and in radians, whose numbers differ by rounding, has the same start pose: the
+search has no step that rounding changes, except at a threshold, and almost equal scores are told
+apart by the posture.
 """
 
 import itertools
@@ -29,7 +30,7 @@ _LEAST_MANIPULABILITY = 0.02
 # Scores within this share of the best one count as equal.
 _EQUAL_SCORES = 0.01
 # Of two mirrored postures, the one on the positive side of its joints is taken: distances count
-# from this far beside the middle of the ranges, rad.
+# from this far beside the reference posture, rad.
 _SIDE = 0.1
 
 # Seeds of each goal.
@@ -90,7 +91,8 @@ class PaddlePose(NamedTuple):
     holding: np.ndarray
     """Force of each acting joint that holds the arm [n], N m or N."""
     reach: float
-    """Largest horizontal distance of the paddle from the first joint, m."""
+    """Largest horizontal distance of the paddle from the first joint, m; of all mounts, with the
+    paddle where it was built."""
     score: float
 
 
@@ -155,7 +157,9 @@ def rank_poses(
 
 class _Search:
     """Level poses of one arm. `_qpos`, `_dofs` and `_joints` are the acting joints' places in
-    MuJoCo's arrays; each posture is an array [n] of their positions, rad or m."""
+    MuJoCo's arrays; each posture is an array [n] of their positions, rad or m. The ends of their
+    ranges are `_low` and `_high`, of the search `_least` and `_greatest`, and of its random seeds
+    `_least_seed` and `_greatest_seed`: each pair lies within the one before."""
 
     def __init__(
         self, model: mujoco.MjModel, addresses: Addresses, force_limits: Sequence[float | None]
@@ -176,18 +180,19 @@ class _Search:
         margin = np.minimum(_LEAST_MARGIN, 0.1 * (self._high - self._low))
         self._least = self._low + margin
         self._greatest = self._high - margin
-        self._centre = self._inside(model.qpos0[self._qpos])
+        # MuJoCo's reference posture, in which most files draw the arm.
+        self._reference = self._inside(model.qpos0[self._qpos])
         # The seeds of a hinge lie within half a turn.
         slide_width = np.where(np.isinf(self._low), 0.5, np.inf)
         width = np.where(self._is_hinge, np.pi, slide_width)
-        self._least_seed = self._inside(self._centre - width)
-        self._greatest_seed = self._inside(self._centre + width)
+        self._least_seed = self._inside(self._reference - width)
+        self._greatest_seed = self._inside(self._reference + width)
         mujoco.mj_kinematics(model, self._data)
         self._base = self._data.xanchor[self._joints[0]].copy()
         self._reach = self._largest_distance()
 
     def _inside(self, angles: np.ndarray) -> np.ndarray:
-        """The angles [n], clipped to the ranges without their margins."""
+        """The angles [n], clipped to the ranges of the search."""
         return np.clip(angles, self._least, self._greatest)
 
     def _seed(self) -> np.ndarray:
@@ -208,22 +213,22 @@ class _Search:
         return largest
 
     def rank(self, poses: Sequence[PaddlePose]) -> list[PaddlePose]:
-        """The poses by their score; equal ones by their distance to the middle of the ranges.
+        """The poses by their score; equal ones by their distance to the reference posture.
 
         Without the second rule, rounding would choose: the last joint of an arm with a flat paddle
         turns it in its plane, and a symmetric arm has each pose twice.
         """
-        middle = self._centre + _SIDE
+        beside_reference = self._reference + _SIDE
 
-        def from_middle(pose: PaddlePose) -> float:
-            return float(np.sum((pose.angles - middle) ** 2))
+        def distance(pose: PaddlePose) -> float:
+            return float(np.sum((pose.angles - beside_reference) ** 2))
 
         remaining = sorted(poses, key=lambda pose: -pose.score)
         ranked: list[PaddlePose] = []
         while remaining:
             least = (1.0 - _EQUAL_SCORES) * remaining[0].score
             equal = [pose for pose in remaining if pose.score >= least]
-            ranked += sorted(equal, key=from_middle)
+            ranked += sorted(equal, key=distance)
             remaining = remaining[len(equal) :]
         return ranked
 
@@ -263,7 +268,8 @@ class _Search:
                 yield np.array([x, self._base[1], lowest + rise * self._reach])
 
     def _is_usable(self, angles: np.ndarray, goal: np.ndarray) -> bool:
-        """Whether the paddle is in front of the robot, over the floor and clear of the links."""
+        """Whether the paddle is in front of the robot, along the world's x, over the floor and
+        clear of the links."""
         paddle, _ = self._forward(angles)
         in_front = paddle[0] - self._base[0] > 0.3 * self._from_base(goal)
         return bool(in_front and paddle[2] > _OFF_FLOOR and self._is_clear(paddle))
@@ -292,10 +298,10 @@ class _Search:
         return self._inside(angles + step)
 
     def _unwound(self, angles: np.ndarray) -> np.ndarray:
-        """The same pose with each hinge within half a turn of the middle, where its range allows
-        it."""
+        """The same pose with each hinge within half a turn of the reference posture, where its
+        range allows it."""
         # Half a turn to either side is the same pose: the positive one counts as nearer.
-        turns = np.round((angles - self._centre) / (2.0 * np.pi) - 1e-3)
+        turns = np.round((angles - self._reference) / (2.0 * np.pi) - 1e-3)
         unwound = angles - 2.0 * np.pi * turns
         allowed = self._is_hinge & (self._inside(unwound) == unwound)
         return np.where(allowed, unwound, angles)
@@ -304,9 +310,10 @@ class _Search:
         """The pose with its score."""
         paddle, _ = self._forward(angles)
         jacobian = self._jacobian(paddle)
+        lifting_and_tilting = jacobian[2:]
         # With fewer than five joints, the arm cannot choose where the paddle is.
-        task = jacobian if len(angles) >= 5 else jacobian[2:]
-        manipulability = self._manipulability(task, jacobian[2:])
+        task = jacobian if len(angles) >= 5 else lifting_and_tilting
+        manipulability = self._manipulability(task, lifting_and_tilting)
         mass, holding = self._dynamics()
         acceleration = -np.inf
         can_hold = np.all(np.abs(holding) <= self._limits)
@@ -425,12 +432,22 @@ def _is_picture(model: mujoco.MjModel, geom: int) -> bool:
 
 
 def place_paddle(model: mujoco.MjModel, paddle_geom: int, mount: PaddleConfig) -> None:
-    """Moves the paddle of a compiled scene, whose body has the frame of the site."""
-    quaternion = np.array(mount.quaternion)
-    model.geom_quat[paddle_geom] = quaternion / np.linalg.norm(quaternion)
+    """Moves the paddle of a compiled scene, with its mass. Its body has the frame of the site, and
+    no mass but the blade's."""
+    body = model.geom_bodyid[paddle_geom]
+    earlier = np.zeros(4)
+    mujoco.mju_negQuat(earlier, model.geom_quat[paddle_geom])
+    # MuJoCo may give the principal axes another order than the blade's axes.
+    principal_axes = np.zeros(4)
+    mujoco.mju_mulQuat(principal_axes, earlier, model.body_iquat[body])
+    orientation = np.array(mount.quaternion) / np.linalg.norm(mount.quaternion)
     model.geom_pos[paddle_geom] = mount.position
-    # MuJoCo skips the transformation of a geom flagged as sharing its body's frame.
+    model.geom_quat[paddle_geom] = orientation
+    model.body_ipos[body] = mount.position
+    mujoco.mju_mulQuat(model.body_iquat[body], orientation, principal_axes)
+    # MuJoCo skips the transformation of a frame that is flagged as the body's.
     model.geom_sameframe[paddle_geom] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+    model.body_sameframe[body] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
 
 
 def _levelling_turn(normal: np.ndarray) -> np.ndarray:

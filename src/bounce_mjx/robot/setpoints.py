@@ -13,7 +13,8 @@ r^2 / 2a. The excess r T / 2 - r^2 / 2a is at most a T^2 / 8. A stop of several 
 
     v1 T / 2 + v1^2 / 2a + a T^2 / 8 = (v1 + a T / 2)^2 / 2a <= left
 
-so v1 <= sqrt(2 a left) - a T / 2; a stop of one step (v1 <= a T) takes v1 T / 2, so v1 <= left / T.
+so v1 <= sqrt(2 a left) - a T / 2. A stop of one step (v1 <= a T) takes v1 T / 2 more, v1 T
+together, so v1 <= left / T.
 
 **Jerk.** A jump of the acceleration is at most 2 a. The mean of the command over the last
 s = 2 a / j seconds turns it into a ramp of the slope j, the jerk's limit. A mean keeps all limits
@@ -48,7 +49,7 @@ class JointLimits(NamedTuple):
     """rad/s^2."""
     smoothing: Number | None = None
     """Time of the mean that limits the jerk, s: twice the acceleration over the jerk; None without
-    such a limit. At most a control step."""
+    such a limit. At most a control step (`WorldConfig` refuses others)."""
     range: tuple[Number, Number] = (-np.inf, np.inf)
     """Lowest and highest command, rad; infinite for a joint without a range."""
 
@@ -64,18 +65,19 @@ class Setpoint(NamedTuple):
     """During the whole step, rad/s^2."""
 
 
-def joint_limits(limits: Any, *range: np.ndarray) -> JointLimits | None:
+def joint_limits(limits: Any, low: Number = -np.inf, high: Number = np.inf) -> JointLimits | None:
     """The limits of an arm's commands; None if they have none.
 
     Args:
       limits: velocity, acceleration and jerk of the joints, such as `LimitsConfig`.
-      range: lower and upper ends [n] of the joints' ranges, rad.
+      low: lower ends of the joints' ranges [n], rad.
+      high: upper ends [n], rad.
     """
     if limits is None or limits.velocity is None:
         return None
     acceleration = np.array(limits.acceleration)
     smoothing = None if limits.jerk is None else 2.0 * acceleration / np.array(limits.jerk)
-    return JointLimits(np.array(limits.velocity), acceleration, smoothing, range)
+    return JointLimits(np.array(limits.velocity), acceleration, smoothing, range=(low, high))
 
 
 def next_setpoint(
@@ -84,6 +86,7 @@ def next_setpoint(
     """The setpoint at the end of a control step.
 
     Args:
+      limits: of the commands.
       start: that at the step's start.
       target: the position that the action asks for, rad.
       duration: of a control step, s.
@@ -127,7 +130,8 @@ def command(
     lag: Number | None = None,
     earlier: tuple[Number, Number] | None = None,
 ) -> Number:
-    """The command of a control step, rad; in any unit of time.
+    """The command of a control step, rad. Its times, velocities and accelerations may be in seconds
+    or in another unit of time, such as the physics step, if all are in the same one.
 
     Args:
       start: the setpoint at the step's start.
@@ -135,8 +139,8 @@ def command(
       time: since the step's start; negative for the step before.
       smoothing: as `JointLimits.smoothing`.
       lag: time constant of a first-order lag behind the command, whose transient is over.
-      earlier: duration of a step, and the acceleration two steps before `acceleration`; needed for
-        a negative time with a smoothing.
+      earlier: duration of a step, and the acceleration of the step before that of
+        `start.acceleration`; needed for a negative time with a smoothing.
     """
     half = 0.0
     variance = 0.0

@@ -1,7 +1,8 @@
 """The torques that a model's servos can exert at their joints.
 
 MuJoCo limits an actuator by its `forcerange`, which the `gear` multiplies, and a joint by its
-`actuatorfrcrange`.
+`actuatorfrcrange`. Of an actuator that is no servo yet, whose control may limit it too,
+`actuators.servo_settings` has the force limit.
 """
 
 from collections.abc import Sequence
@@ -47,8 +48,8 @@ def largest_torques(
 def limit_torques(
     mj_model: mujoco.MjModel, servos: Sequence[int], torques: Sequence[float]
 ) -> None:
-    """Narrows the `forcerange` of actuators [n] to torques [n] (N m) at their joints, of which a
-    weaker servo keeps its own."""
+    """Narrows the `forcerange` of servos [n] to torques [n] (N m) at their joints; a weaker servo
+    keeps its own. Each has 0 in its range (`model.check_servos`)."""
     forces = np.asarray(torques) / np.abs(mj_model.actuator_gear[list(servos), 0])
     low, high = force_ranges(mj_model, servos)
     narrowed = np.stack([np.maximum(low, -forces), np.minimum(high, forces)], axis=1)

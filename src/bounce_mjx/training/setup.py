@@ -109,16 +109,16 @@ def join_loops(*configs: WorldConfig) -> None:
     Raises:
       UserError: an MJCF file does not fit the task.
     """
+    from bounce_mjx.env.env import world_model
     from bounce_mjx.physics.engine import is_fused
-    from bounce_mjx.robot.model import load_model
 
     flags = os.environ.get("XLA_FLAGS")
     # Without a dash, it is empty on purpose or the name of a file with flags.
     if flags is not None and (LOOPS in flags or "--" not in flags):
         return
-    models = {(c.physics, c.mjcf, c.physics_dt, c.robot, c.num_balls) for c in configs}
-    if all(
-        is_fused(load_model(mjcf, dt, visual=False, robot=robot, num_balls=balls), choice)
-        for choice, mjcf, dt, robot, balls in models
-    ):
+    # One config of each model and engine.
+    different = {}
+    for c in configs:
+        different[c.physics, c.mjcf, c.physics_dt, c.robot, c.num_balls, c.friction] = c
+    if all(is_fused(world_model(c, visual=False), c.physics) for c in different.values()):
         os.environ["XLA_FLAGS"] = JOINED_LOOPS if flags is None else f"{flags} {JOINED_LOOPS}"

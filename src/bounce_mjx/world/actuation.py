@@ -27,7 +27,8 @@ class Actuation(NamedTuple):
 
     setpoint: Setpoint | None = None
     """The joints' setpoints at the end of the last step, each entry [n], to which an action adds;
-    the position alone if the setpoints jump."""
+    the position alone in an arm without limits, whose setpoints jump. None if an action adds to the
+    measured angles."""
     queue: Control | None = None
     """Controls of the last control steps, each entry [K, nu], the newest first."""
     filtered: jax.Array | None = None
@@ -37,9 +38,10 @@ class Actuation(NamedTuple):
 class Actuators:
     """The actuators of a world.
 
-    An action goes through `Actuators.next` from top to bottom: it asks for a target of each joint,
-    the arm's limits make a setpoint of it, which is the physics' `Control`; latency and lag delay
-    that, and `physics.control.servo_target` gives its value in each physics step.
+    An action goes through `Actuators.next` from top to bottom. It asks for a target of each joint;
+    with the base "target", the next setpoint is as near to the targets as the arm's limits allow.
+    The targets, or the setpoint's motion in an arm with limits, are the physics' `Control`; latency
+    and lag delay it, and `physics.control.servo_target` gives its value in each physics step.
     """
 
     def __init__(
@@ -59,6 +61,7 @@ class Actuators:
         setpoint = None
         if self._config.action.base == "target":
             setpoint = Setpoint(targets, zeros, zeros)
+        # A step at rest: the memory has the fields of that after any step.
         after = self._next_setpoint(setpoint, targets)
         control = self._control(targets, setpoint, after)
         memory = start_actuation(self._config.randomization, self._config.control_dt, control)
@@ -137,7 +140,7 @@ class Actuators:
         """The control that takes the joints to the end of a control step, without delays.
 
         Args:
-          targets: of the joints [n], rad.
+          targets: of the joints [n], rad; in an arm without limits.
           before: the setpoint at the start of the step, in an arm with limits.
           after: the setpoint at the end of the step, in an arm with limits.
         """
@@ -175,6 +178,7 @@ class Actuators:
         is_due = noise.is_due(interval, phase, clock.step, self._config.control_dt)
         num_balls = self._config.num_balls
         shape = () if num_balls == 1 else (num_balls,)
+        # Any counter of the step would do, as nothing else reads this stream.
         counter = noise.next_counter(clock.counter)
         angle = 2.0 * math.pi * noise.uniform(counter, noise.PUSH, shape, phase.dtype)
         speed = jnp.where(is_due, world["push_speed"], 0.0)
@@ -221,7 +225,7 @@ def add_delay(
     Args:
       world: the values that the episode sampled.
       memory: before the step.
-      control: of the step's action, which has targets alone.
+      control: of the step's action, still without disturbances.
       control_dt: time of one control step, s.
       num_substeps: physics steps in a control step.
     """

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from bounce_mjx.config import settings
 from bounce_mjx.errors import UserError, shorten
-from bounce_mjx.robot.config import OF_SITE, RobotConfig, Vector, is_packaged
+from bounce_mjx.robot.config import NEED_SITE, RobotConfig, Vector, is_packaged
 from bounce_mjx.world.observation import ObservationConfig, ObservationLayout
 from bounce_mjx.world.randomization import EACH_JOINT, TERMS, RandomizationConfig
 
@@ -19,7 +19,7 @@ PADDLE_HOME = (0.59356, 0.0, 0.0498)
 
 
 NumBalls = Annotated[int, pydantic.BeforeValidator(settings.whole_number), Field(ge=1, le=3)]
-"""Number of balls."""
+"""Number of balls, up to `robot.balls.MAX_BALLS`."""
 
 
 class Command(NamedTuple):
@@ -102,7 +102,7 @@ class RobotSettings(settings.StrictModel):
     """Time between two actions, s; a whole number of physics steps."""
     friction: settings.Friction | None = None
     """Coefficient of sliding friction between ball and paddle; null for the MJCF's, which is 0 for
-    the project's own robot."""
+    the project's own robot. `randomization.contact_friction` replaces it."""
     action_scale: Annotated[settings.Positive, Field(le=0.5)] = 0.02
     """Change of the servo target for an action of 1, rad."""
     max_joint_velocity: Annotated[settings.Positive, Field(le=50.0)] = 2.0 * math.pi
@@ -206,10 +206,11 @@ class WorldConfig(RobotSettings):
 
     @pydantic.model_validator(mode="after")
     def _check_effects(self):
-        """A setting that has no effect is a mistake. A run's own config has all defaults."""
+        """A setting that has no effect is a mistake. Only a value other than the default is one, as
+        the config of a run names all settings."""
         unused = {}
         if not self.robot.site:
-            unused |= {f"robot.{name}": "robot.site" for name in OF_SITE}
+            unused |= {f"robot.{name}": "robot.site" for name in NEED_SITE}
         if self.action.base == "measured":
             unused["action.max_lead"] = "the action.base target"
             unused["observation.servo_lead"] = "the action.base target"
@@ -270,7 +271,8 @@ class WorldConfig(RobotSettings):
     def unseen_noise(self) -> tuple[str, ...]:
         """Terms of the randomisation that change measurements which the policy does not see."""
         observation = self.observation
-        if observation.lengths("task"):
+        if observation.counts("task"):
+            # A task may compute its quantities from any measurement.
             return ()
         has_sensor = observation.velocity == "measured"
         is_seen = {
@@ -284,8 +286,8 @@ class WorldConfig(RobotSettings):
 
     @property
     def heights(self) -> dict[str, float]:
-        """The heights that are over the paddle at a reset, by their settings, m; a task has its
-        own."""
+        """The world heights that must be above the paddle's at a reset, by their settings, m; a
+        task has its own."""
         return {"ball_init_pos": self.ball_init_pos[2]}
 
     @property

@@ -1,6 +1,5 @@
 """Named worlds: the numbers of a real robot and its camera in a YAML file, each with its source."""
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,8 @@ from bounce_mjx.world.config import RobotSettings
 from bounce_mjx.world.randomization import TERMS, RandomizationConfig
 
 CURRICULUM = RandomizationConfig.model_fields.keys() - TERMS.keys()
-"""Keys of the randomisation that describe the training, not the world."""
+"""Keys of the randomisation that describe the training, not the world. A world's file may have
+them, for a training in it; they need no source, as they are no numbers of the robot."""
 
 
 class NamedWorld(StrictModel):
@@ -24,10 +24,10 @@ class NamedWorld(StrictModel):
 
     robot: str | None = None
     """Name of a robot in configs/robots/, or its file, relative to the world's folder; null for any
-    robot."""
+    robot. (`env.robot` has settings of an arm's adoption.)"""
     env: RobotSettings = RobotSettings()
-    """Settings of the environment. Its randomisation is the whole one: a term that it does not have
-    is as in the model."""
+    """Settings of the environment. A term of the randomisation that it does not have is as in the
+    task's defaults."""
     sources: dict[str, str] = {}
     """Where each number comes from, one sentence, by its dotted key in `env` or that of a group."""
     assumed: tuple[str, ...] = ()
@@ -41,16 +41,20 @@ class NamedWorld(StrictModel):
         for key in numbers:
             *parents, _ = key.split(".")
             groups |= {".".join(parents[:depth]) for depth in range(1, len(parents) + 1)}
-        for key in [*self.sources, *self.assumed]:
-            if key not in numbers and (key in self.assumed or key not in groups):
-                raise ValueError(
-                    f"sources or assumed has {shorten(key)}, but env has no such key; give env "
-                    "that key, or remove it from them"
-                )
         for key, source in self.sources.items():
+            if key not in numbers and key not in groups:
+                raise ValueError(
+                    f"sources has {shorten(key)}, but env has no such key; give env that key, or "
+                    "remove the source"
+                )
             if not source.strip():
                 raise ValueError(f"{key} has an empty source; write one sentence")
         for key in self.assumed:
+            if key not in numbers:
+                raise ValueError(
+                    f"assumed has {shorten(key)}, but env has no such key; give env that key, or "
+                    "remove it"
+                )
             if not _can_be_doubled(key, numbers[key]):
                 raise ValueError(f"{key} is assumed, but is no number to double; remove it")
         for key in numbers:
@@ -71,11 +75,12 @@ class NamedWorld(StrictModel):
     def double_assumed(self, nominals: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         """For each assumed key, the nested settings of `env` in which alone its number is doubled.
 
-        A term of the randomisation goes twice as far from the model's value, within its limits; a
-        rate, an interval, or a limit, of which less is harder, is halved.
+        A term of the randomisation goes twice as far from its nominal value, within its bounds. Of
+        which less is harder is halved: a term without a nominal value, `max_joint_velocity`, and
+        the limits of the robot.
 
         Args:
-          nominals: the values of the terms without randomisation (`Env.nominals`).
+          nominals: the values of all terms without randomisation (`env.model_nominals`).
         """
         numbers = flat(self.settings)
         return {key: nested(key, _double(key, numbers[key], nominals)) for key in self.assumed}
@@ -83,7 +88,8 @@ class NamedWorld(StrictModel):
 
 def without_idle_curriculum(randomization: dict[str, Any]) -> dict[str, Any]:
     """Settings of a randomisation without the parts of the curriculum that act on none of its
-    terms: `shares` of other terms, and `share` and `warmup_steps` without a term to share."""
+    terms, which `RandomizationConfig` refuses: `shares` of other terms, and `share` and
+    `warmup_steps` without a term to share."""
     terms = [name for name in TERMS if randomization.get(name) is not None]
     acting = dict(randomization)
     if not any(TERMS[name].has_nominal for name in terms):
@@ -119,18 +125,22 @@ def _can_be_doubled(key: str, value: Any) -> bool:
 def _double(key: str, value: Any, nominals: Mapping[str, Any]) -> Any:
     """The value of an assumed setting in `double_assumed`."""
     group, _, name = key.rpartition(".")
-    factor = 2.0
-    centre = 0.0
-    least = -math.inf
-    greatest = math.inf
     if group == "randomization":
-        least, greatest = TERMS[name].bounds
-        if name in nominals:
-            centre = nominals[name]
-        else:
-            factor = 0.5
-    elif group == "robot.limits":
-        factor = 0.5
+        return [_double_end(name, end, nominals) for end in value]
+    is_limit = group == "robot.limits" or key == "max_joint_velocity"
+    factor = 0.5 if is_limit else 2.0
+    return (factor * np.array(value)).tolist()
 
-    doubled = centre + factor * (np.array(value) - centre)
+
+def _double_end(term: str, end: Any, nominals: Mapping[str, Any]) -> Any:
+    """An end of a term's range in `double_assumed`; one number for all entries becomes one for
+    each, because each has its own nominal value."""
+    if term in nominals:
+        centre = nominals[term]
+        factor = 2.0
+    else:
+        centre = 0.0
+        factor = 0.5
+    doubled = centre + factor * (np.array(end) - centre)
+    least, greatest = TERMS[term].bounds
     return np.clip(doubled, least, greatest).tolist()

@@ -15,6 +15,9 @@ from bounce_mjx.physics.scalars import sine_cosine
 BALL, JOINTS, FRAME_DROP, PUSH, COMMAND = range(5)
 """Streams: independent random numbers of one counter, by their use."""
 
+# Numbers of a stream; no use needs more at a time.
+_STREAM_SIZE = 1024
+
 
 class Clock(NamedTuple):
     """What the random events of an episode depend on."""
@@ -24,8 +27,9 @@ class Clock(NamedTuple):
     step: jax.Array
     """Control steps since the reset [], int32."""
     phases: jax.Array
-    """Phases [3] of the camera, of the pushes and of the commands at the reset, as shares of their
-    intervals: the three properties, which say from when each counts."""
+    """Phases [3] at the reset, as shares of an interval: of the camera, the time until its first
+    picture; of the pushes and of the commands, the time since the last one. The three properties
+    have their names."""
 
     @property
     def camera_phase(self) -> jax.Array:
@@ -85,7 +89,7 @@ def uniform(counter: jax.Array, stream: int, shape: tuple[int, ...], dtype: jnp.
       dtype: of the result.
     """
     size = math.prod(shape)
-    index = jnp.arange(size, dtype=jnp.int32) + jnp.int32(stream * 1024)
+    index = jnp.arange(size, dtype=jnp.int32) + jnp.int32(stream * _STREAM_SIZE)
     bits = _mix(counter + _mix(index))
     shares = jax.lax.shift_right_logical(bits, jnp.int32(9)).astype(dtype)
     return ((shares + 0.5) * 2.0**-23).reshape(shape)

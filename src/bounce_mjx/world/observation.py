@@ -57,8 +57,8 @@ class ObservationConfig(StrictModel):
     newest, N for the last N, the newest first."""
 
     joint_angles: Annotated[History, Quantity(None, "rad", "state")] = 1
-    """Measured positions of the acting joints: 0 leaves them out, and N shows the last N. So do the
-    numbers of the other quantities."""
+    """Measured positions of the acting joints: 0 leaves them out, and N shows the last N, as for
+    each quantity."""
     ball_position: Annotated[History, Quantity(3, "m", "state", True)] = 1
     """Measured position of the ball."""
     ball_quaternion: Annotated[History, Quantity(4, "", "state", True)] = 1
@@ -92,21 +92,21 @@ class ObservationConfig(StrictModel):
         in_order = sorted(quantities.items(), key=lambda item: _GROUPS.index(item[1].group))
         return dict(in_order)
 
-    def lengths(self, group: str | None = None) -> dict[str, int]:
+    def counts(self, group: str | None = None) -> dict[str, int]:
         """The number of values of each quantity that the policy sees, all or those of a group."""
-        lengths = {}
+        counts = {}
         for name, quantity in self.quantities().items():
             count = getattr(self, name)
             if count > 0 and group in (None, quantity.group):
-                lengths[name] = count
-        return lengths
+                counts[name] = count
+        return counts
 
     def layout(self, num_joints: int, num_balls: int = 1) -> ObservationLayout:
         """The order of the entries, for an arm with this number of acting joints and for this
         number of balls."""
         quantities = self.quantities()
         parts = []
-        for name, count in self.lengths().items():
+        for name, count in self.counts().items():
             size = quantities[name].entries(num_joints, num_balls)
             parts.append(Part(name, size, quantities[name].unit, count))
         return ObservationLayout(tuple(parts))
@@ -115,8 +115,8 @@ class ObservationConfig(StrictModel):
     def is_momentary(self) -> bool:
         """Whether the true state of one instant and the commands determine the whole
         observation."""
-        past = any(count > 1 for count in self.lengths().values())
-        remembered = self.lengths("past") or self.lengths("task")
+        past = any(count > 1 for count in self.counts().values())
+        remembered = self.counts("past") or self.counts("task")
         return not past and not remembered and self.velocity == "measured"
 
 

@@ -1,13 +1,15 @@
 """Domain randomisation: each episode samples its own world.
 
-`RandomizationConfig` is the table of the terms. A term's row says what it is (its comment, with the
-unit), its shape, its bounds and its nominal value; and, if it is physical, the field of
-`PhysicsParameters` that it changes and the operation by which it does, whose nominal value it has.
-`physics.edited.edits` is the table of that field's entries in the model; `sampling.py` samples.
+`RandomizationConfig` is the table of the terms. A term's row says what it is, its shape, its bounds
+and its nominal value. Of a physical term (`physical`) it says the field of `PhysicsParameters` that
+changes, and the operation by which it does, which also gives the nominal value;
+`physics.edited.edits` is the table of that field's entries in the model. The other terms act in
+`actuation.py`, `sensing.py` and `env.py`. `sampling.py` samples. Errors and pages show a row's
+comment, whose unit, if it has one, stands after a comma and before a full stop or a semicolon.
 
 A term is a key of the config with a range (low, high), from which a reset samples every entry of
-the term uniformly. Each end of a term of several entries may be one number for all, or one for each
-entry. A term that is null is off and costs nothing.
+the term uniformly. Of a term of several entries, both ends may be one number for all, or both one
+for each entry. A term that is null is off and costs nothing.
 """
 
 from __future__ import annotations
@@ -30,7 +32,8 @@ def _entrywise(end: Any, number: Callable[[Any], float]) -> float | tuple[float,
     return tuple(map(number, end)) if isinstance(end, list | tuple) else number(end)
 
 
-# Not a union of types, for which neither the command line nor an error has a short form.
+# Its type is that of a number, which a command line and an error can name; `_entrywise` takes lists
+# too. Of a union of types they would name every one.
 _End = Annotated[
     Finite, pydantic.WrapValidator(_entrywise), pydantic.PlainSerializer(lambda end: end)
 ]
@@ -39,7 +42,7 @@ Range = tuple[_End, _End]
 command line takes two numbers."""
 
 Sampled = Range | None
-"""A term's range; None for a term that is off."""
+"""The range from which a term is sampled; None for a term that is off."""
 
 World = dict[str, "jax.Array"]
 """Values sampled for one episode, by the names of the active terms."""
@@ -52,7 +55,7 @@ shape."""
 Operation = Literal["scale", "add", "tilt_frame", "tilt_vector", "replace", "restitution", "limit"]
 """How a sampled value and the model's own parameter make the episode's parameter
 (`sampling.apply`): times a factor, plus a difference, turned by two angles, in its place, as the
-damping with this restitution, or as a limit of the model's own value, which may have none."""
+damping with this restitution, or as a limit that never raises the model's own limit."""
 
 MODEL = "model"
 """Nominal value that is the model's own."""
@@ -66,7 +69,9 @@ NOMINALS: dict[Operation, float | Literal["model"] | None] = {
     "restitution": MODEL,
     "limit": None,
 }
-"""The sampled value that changes nothing, by the operation; None where no number does that."""
+"""The sampled value that changes nothing, by the operation; None where no number does that, as the
+model may have no limit. (A nominal friction makes a frictionless contact one with the least that
+MuJoCo computes with, 1e-5.)"""
 
 NUMBER = ()
 """Size of a term with one number."""
@@ -166,7 +171,7 @@ class RandomizationConfig(StrictModel):
     joint_frictionloss: Annotated[
         Sampled, physical("frictionloss", "replace", EACH_JOINT, bounds=(0.0, 500.0))
     ] = None
-    """Dry friction of each joint, N m, in place of the model's."""
+    """Dry friction of each joint in place of the model's, N m."""
     armature: Annotated[Sampled, physical("armature", "scale", EACH_JOINT, bounds=_FACTOR)] = None
     """Factor of each joint's rotor inertia."""
     link_mass: Annotated[
@@ -176,7 +181,7 @@ class RandomizationConfig(StrictModel):
     paddle_offset: Annotated[
         Sampled, physical("paddle_position", "add", (3,), bounds=(-0.3, 0.3))
     ] = None
-    """Displacement of the paddle along each axis of the last link, m."""
+    """Displacement of the paddle along each axis of its body, m."""
     paddle_tilt: Annotated[
         Sampled, physical("paddle_rotation", "tilt_frame", (2,), bounds=(-0.5, 0.5))
     ] = None
@@ -190,7 +195,8 @@ class RandomizationConfig(StrictModel):
     ball_latency: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 1.0), nominal=0.0)] = None
     """Time from a camera picture of the ball to its use, s."""
     camera_rate: Annotated[Sampled, Term(NUMBER, bounds=(1.0, 1e4))] = None
-    """Camera pictures of the ball per second, Hz; null for one at every control step."""
+    """Camera pictures of the ball per second, Hz; null for one at every control step. Of several
+    pictures in a control step only the newest counts; if it is lost, so are the others."""
     frame_drop: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 0.99), nominal=0.0)] = None
     """Probability that a camera picture is lost."""
     ball_position_noise: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 0.2), nominal=0.0)] = None
@@ -198,9 +204,11 @@ class RandomizationConfig(StrictModel):
     ball_position_bias: Annotated[Sampled, Term((3,), bounds=(-0.3, 0.3), nominal=0.0)] = None
     """Error of each measured ball coordinate, constant in an episode, m."""
     ball_velocity_noise: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 10.0), nominal=0.0)] = None
-    """Standard deviation of the noise of each component of the measured ball velocity, m/s."""
+    """Standard deviation of the noise of each component of the measured ball velocity, m/s; not
+    of a velocity from differences."""
     ball_velocity_bias: Annotated[Sampled, Term((3,), bounds=(-10.0, 10.0), nominal=0.0)] = None
-    """Error of each component of the measured ball velocity, constant in an episode, m/s."""
+    """Error of each component of the measured ball velocity, constant in an episode, m/s; not of a
+    velocity from differences."""
     joint_angle_noise: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 0.05), nominal=0.0)] = None
     """Standard deviation of the noise of each measured joint angle, rad."""
     encoder_bias: Annotated[Sampled, Term(EACH_JOINT, bounds=(-0.3, 0.3), nominal=0.0)] = None
@@ -279,16 +287,17 @@ class RandomizationConfig(StrictModel):
         other."""
         ends = getattr(self, name)
         size = TERMS[name].size
-        counts = {len(end) if isinstance(end, tuple) else 0 for end in ends}
-        fits_term = size is EACH_JOINT or counts <= {0, *size}
-        if len(counts) == 1 and fits_term:
+        shapes = {(len(end),) if isinstance(end, tuple) else NUMBER for end in ends}
+        fits_term = size is EACH_JOINT or shapes <= {NUMBER, size}
+        if len(shapes) == 1 and fits_term and (0,) not in shapes:
             return
         if size == NUMBER:
             lists = ""
         elif size is EACH_JOINT:
             lists = ", or two lists with one for each joint"
         else:
-            lists = f", or two lists with one for each of {sum(size)} axes"
+            (num_axes,) = size
+            lists = f", or two lists with one for each of {num_axes} axes"
         raise ValueError(f"{name} {shorten(str(ends))} is not a range; give two numbers{lists}")
 
     def _check_bounds(self, name: str) -> None:
@@ -316,7 +325,8 @@ class RandomizationConfig(StrictModel):
         """Ranges of the active terms.
 
         Args:
-          progress: share of the warm-up that has passed [], from 0 to 1.
+          progress: share of the warm-up that has passed [], from 0 to 1
+            (`env.vector.ranges_after`).
           nominals: `nominal_values` of the terms, from which their ranges grow; a range without one
             does not grow.
         """

@@ -15,8 +15,34 @@ from bounce_mjx.physics import PhysicsParameters
 from bounce_mjx.physics.edited import NO_PAIR, own_parameters
 from bounce_mjx.physics.scalars import Quaternion, quaternion_matrix, quaternion_product
 from bounce_mjx.robot.contact import damping_of_restitution, restitution_of_damping
-from bounce_mjx.robot.model import Addresses
+from bounce_mjx.robot.model import Addresses, contact_pairs
 from bounce_mjx.world.randomization import MODEL, TERMS, Operation, Ranges, Term, World
+
+# The fields that the terms of the contact change.
+_CONTACT_FIELDS = {
+    "restitution": ("pair_solref",),
+    "contact_friction": ("pair_friction", "pair_dim"),
+}
+
+
+def check_contacts(mj_model: mujoco.MjModel, terms: Iterable[str], addresses: Addresses) -> None:
+    """Refuses terms of the contact in a model whose contacts differ: such a term gives all of them
+    one value, which is not each one's own in an episode that does not sample it.
+
+    Raises:
+      UserError: the contact pairs of the balls and the paddle differ in what one of the terms
+        changes.
+    """
+    pairs = contact_pairs(mj_model, addresses)
+    for term in terms:
+        for field in _CONTACT_FIELDS.get(term, ()):
+            numbers = getattr(mj_model, field)[pairs]
+            if np.any(numbers != numbers[:1]):
+                raise UserError(
+                    f"the contact pairs of the balls and the paddle differ in {field}, of which "
+                    f"randomization.{term} makes one for all; give them the same in the MJCF, or "
+                    f"leave {term} out"
+                )
 
 
 def nominal_values(
@@ -24,8 +50,8 @@ def nominal_values(
 ) -> dict[str, np.ndarray]:
     """Values without randomisation of the terms that have one, each of the term's shape.
 
-    Of a term that replaces a number of the model, it is that number; a model without a contact pair
-    has none of the contact.
+    Of a term that replaces a number of the model, it is that number. A model without a contact pair
+    has none for `restitution` and `contact_friction`, which it refuses.
 
     Args:
       mj_model: the model.
@@ -72,7 +98,7 @@ def sample_world(
       num_joints: number of acting joints.
       nominals: `nominal_values`, which the terms have that are not sampled; a term without one is
         sampled in every episode.
-      share: probability [] that each term is sampled.
+      share: probability [] that each term with a nominal value is sampled, all its entries at once.
       shares: probabilities of single terms, in place of `share`.
     """
     # The order of TERMS, because JAX sorts the keys of a traced dictionary.
@@ -114,7 +140,8 @@ def apply(
     """A physical parameter of an episode.
 
     Args:
-      operation: how the sampled value changes the model's own.
+      operation: how the sampled value changes the model's own; "restitution" says what is sampled,
+        and the parameter is the damping.
       model: the model's own parameters.
       parameter: name of the field of `PhysicsParameters`.
       sampled: the term's value, of its shape.

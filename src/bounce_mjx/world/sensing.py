@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
+from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.physics import Engine
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
 from bounce_mjx.robot.model import Addresses, scatter
@@ -49,7 +50,8 @@ class Picture(NamedTuple):
     age: jax.Array
     """Time since the picture was taken [], s."""
     number: jax.Array
-    """Number of the last picture due since the reset []; negative for those taken before it."""
+    """Number of the newest picture that was due, lost or not []; the pictures are counted from the
+    reset, and negative before it."""
 
 
 class Sensing(NamedTuple):
@@ -121,16 +123,21 @@ class Sensors:
         terms = set(config.randomization.terms)
         self.are_needed = bool(_TERMS & terms) or not config.observation.is_momentary
         """Whether the observation differs from the true state of a single instant."""
-        sees_paddle = config.observation.paddle_position or config.observation.lengths("task")
+        sees_paddle = config.observation.paddle_position or config.observation.counts("task")
         self._misjudges_paddle = bool(sees_paddle and _PADDLE_TERMS & terms)
 
     def first(self, now: Instant) -> Sensing:
-        """Memory at a reset: the histories repeat the first measurements, and the ball has rested
-        until then."""
+        """Memory at a reset: the histories repeat the first measurements, and the ball counts as
+        having been where it starts, with the velocity of its start. A picture from before the reset
+        shows a thrown ball less than a tenth of its way of one control step beside that place.
+
+        Raises:
+          UserError: the task's quantities are not those of its observation.
+        """
         ball = _position_and_velocity(now.truth)
         balls = jnp.broadcast_to(ball, (self._num_remembered(), *ball.shape))
         zero = jnp.zeros((), ball.dtype)
-        # Too long ago for a velocity from the difference to it.
+        # So long ago that the first velocity from a difference is 0.
         last_picture = Picture(
             position=now.truth.ball_position,
             velocity=now.truth.ball_velocity,
@@ -140,11 +147,31 @@ class Sensors:
         picture = take_picture(self._config, now.world, now.clock, balls, last_picture)
         measured = self._measure(now, picture)
         task, quantities = self._task.first_quantities(measured)
+        self._check_first_quantities(quantities, measured)
         values = measured | quantities
         histories = {}
-        for name, count in self._config.observation.lengths().items():
+        for name, count in self._config.observation.counts().items():
             histories[name] = jnp.broadcast_to(values[name], (count, *values[name].shape))
         return Sensing(balls, picture, histories, task)
+
+    def _check_first_quantities(
+        self, quantities: dict[str, jax.Array], measured: dict[str, jax.Array]
+    ) -> None:
+        """Refuses quantities of the task that lack one of its observation, or that have the name of
+        a quantity of the world."""
+        code = f"first_quantities of the task {type(self._task).__name__}"
+        for name in self._config.observation.counts():
+            if name not in quantities and name not in measured:
+                raise UserError(
+                    f"{code} lacks the observation's quantity {shorten(name)}; return its first "
+                    "value too"
+                )
+        for name in quantities:
+            if name in measured:
+                raise UserError(
+                    f"{code} has the quantity {shorten(name)}, which is one of the world's; give "
+                    "it another name"
+                )
 
     def _num_remembered(self) -> int:
         """Control steps of which the ball is remembered: as old as the last picture can be if none
@@ -169,11 +196,19 @@ class Sensors:
                 histories[name] = with_newest(history, measured[name])
             else:
                 task_histories[name] = history
+        expected = set(task_histories)
         task, task_histories = self._task.next_quantities(before.task, task_histories, measured)
+        if set(task_histories) != expected:
+            raise UserError(
+                f"next_quantities of the task {type(self._task).__name__} returns the histories "
+                f"{', '.join(task_histories) or 'none'}; return those of its argument: "
+                f"{', '.join(sorted(expected)) or 'none'}"
+            )
         return Sensing(balls, picture, histories | task_histories, task)
 
     def _measure(self, now: Instant, picture: Picture) -> dict[str, jax.Array]:
-        """The measured value [size] of each quantity of the world and of each command."""
+        """The measured value [size] of each quantity of the world and of each command; of the
+        ball's quaternion and spin, and of an arm without errors, the present truth."""
         world = now.world
         angles, velocities = measured_joints(world, now.clock.counter, now.truth)
         measured = now.truth._asdict()
@@ -185,6 +220,7 @@ class Sensors:
             "ball_position": picture.position,
             "ball_velocity": picture.velocity,
             "ball_age": picture.age[None],
+            # By this name a task asks for what the camera saw, also in a deployed policy.
             "ball_picture": picture.position,
         }
         if now.setpoint is not None:
@@ -225,8 +261,9 @@ def take_picture(
 ) -> Picture:
     """Last picture that has arrived at a control step.
 
-    A camera takes pictures at its own rate, independent of the control steps. Each picture arrives
-    after the latency or is lost; the first one is not lost.
+    A camera takes pictures at its own rate, independent of the control steps. A picture arrives
+    after the latency, or is lost; that of the reset is not lost. Of several that arrive in one
+    control step, only the newest counts: if it is lost, so are the others of the step.
 
     Args:
       config: of the world.
@@ -237,23 +274,25 @@ def take_picture(
     """
     control_dt = config.control_dt
     dtype = balls.dtype
-    # The age of the newest picture in control steps.
-    number, age = _newest_picture(world, clock, control_dt, dtype)
-    position, velocity = _ball_at(balls, age, control_dt)
+    number, age_steps = _newest_picture(world, clock, control_dt, dtype)
+    age = age_steps * control_dt
+    last_age = last.age + control_dt
+
+    position, velocity = _ball_at(balls, age_steps, control_dt)
     noises = noise.normal(clock.counter, noise.BALL, balls.shape[1:], dtype)
     position = _add_errors(world, "ball_position", position, noises[..., :3])
-    last_age = last.age + control_dt
     if config.observation.velocity == "differences":
-        elapsed = jnp.maximum(last_age - age * control_dt, 1e-3)
-        velocity = (position - last.position) / elapsed
-    velocity = _add_errors(world, "ball_velocity", velocity, noises[..., 3:])
+        # It has the errors of the positions, and no sensor of its own.
+        velocity = (position - last.position) / jnp.maximum(last_age - age, 1e-3)
+    else:
+        velocity = _add_errors(world, "ball_velocity", velocity, noises[..., 3:])
 
     is_new = number > last.number
     arrives = is_new
     if "frame_drop" in world:
         chance = noise.uniform(clock.counter, noise.FRAME_DROP, (), dtype)
         arrives = is_new & ((chance >= world["frame_drop"]) | (clock.step == 0))
-    new = Picture(position, velocity, age * control_dt, number)
+    new = Picture(position, velocity, age, number)
     # A lost picture stays lost.
     older = last._replace(age=last_age, number=jnp.where(is_new, number, last.number))
     return jax.tree.map(lambda new, older: jnp.where(arrives, new, older), new, older)

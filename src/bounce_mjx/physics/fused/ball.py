@@ -36,7 +36,8 @@ class Ball(NamedTuple):
     velocity: Vec
     """In the world, m/s."""
     turning: Turning | None
-    """None where no contact can change the spin; `step` then turns the ball by itself."""
+    """None where no contact can change the spin; `dynamics.step` then turns the ball once in each
+    control step."""
 
 
 def read_ball(qpos: Sequence[Scalar], qvel: Sequence[Scalar]) -> Ball:

@@ -1,7 +1,8 @@
 """Rigid-body dynamics of a serial chain of hinges and slides, unrolled into scalar arithmetic.
 
-Quantities of link i are in the frame of link i, unless their names say `world`. The origin of the
-frame is on the axis of joint i and moves with the link. Joint forces are torques (N m) of hinges
+Quantities of link i are in the frame of link i, unless their names or docstrings say otherwise: the
+pose of a link (`offset`, `rotation`) is in its parent's frame. The origin of the frame is on the
+axis of joint i and moves with the link. Joint forces are torques (N m) of hinges
 and forces (N) of slides. Source: Featherstone, Rigid Body Dynamics Algorithms (2008), table 5.1
 (recursive Newton-Euler) and table 6.2 (composite rigid bodies), in three-dimensional form.
 """
@@ -16,6 +17,7 @@ import jax
 from bounce_mjx.physics.scalars import (
     IDENTITY3,
     ZERO3,
+    ZERO_MATRIX3,
     Mat,
     Scalar,
     Vec,
@@ -67,8 +69,8 @@ class Link:
     """Joint position at which the spring is at rest, rad or m."""
     frictionloss: Scalar = 0.0
     """Largest force of the joint's dry friction, N m or N."""
-    friction_softness: float = 0.0
-    """Regulariser of the dry friction, 1/(kg m^2) or 1/kg."""
+    friction_regulariser: float = 0.0
+    """Regulariser R of the dry friction, 1/(kg m^2) or 1/kg."""
     friction_damping: float = 0.0
     """b of the dry friction's reference acceleration, 1/s."""
     floating_mass: Scalar = 0.0
@@ -92,22 +94,25 @@ class Pose(NamedTuple):
 
 def forward_kinematics(links: Sequence[Link], q: Sequence[Scalar]) -> Pose:
     """Pose of every link at the joint positions q (rad, m)."""
-    rotation, world_rotation, world_origin, offset = [], [], [], []
-    parent_rotation, parent_origin = IDENTITY3, ZERO3
+    pose = Pose(rotation=[], world_rotation=[], world_origin=[], offset=[])
+    parent_rotation = IDENTITY3
+    parent_origin = ZERO3
     for link, position in zip(links, q, strict=True):
-        moved = sub(position, link.zero_position)
+        displacement = sub(position, link.zero_position)
+        rotation = link.rotation
+        offset = link.offset
         if link.slides:
-            rotation.append(link.rotation)
-            offset.append(link.offset + (link.rotation @ link.axis) * moved)
+            offset = offset + (rotation @ link.axis) * displacement
         else:
-            sine, cosine = sine_cosine(moved)
-            rotation.append(link.rotation @ axis_rotation(link.axis, cosine, sine))
-            offset.append(link.offset)
-        parent_origin = parent_origin + parent_rotation @ offset[-1]
-        parent_rotation = parent_rotation @ rotation[-1]
-        world_origin.append(parent_origin)
-        world_rotation.append(parent_rotation)
-    return Pose(rotation, world_rotation, world_origin, offset)
+            sine, cosine = sine_cosine(displacement)
+            rotation = rotation @ axis_rotation(link.axis, cosine, sine)
+        parent_origin = parent_origin + parent_rotation @ offset
+        parent_rotation = parent_rotation @ rotation
+        pose.rotation.append(rotation)
+        pose.offset.append(offset)
+        pose.world_rotation.append(parent_rotation)
+        pose.world_origin.append(parent_origin)
+    return pose
 
 
 def bias_force(
@@ -115,47 +120,63 @@ def bias_force(
 ) -> list[Scalar]:
     """Joint forces that balance gravity, Coriolis and centrifugal effects at zero joint
     acceleration: recursive Newton-Euler, with gravity as an acceleration of the base."""
-    omega, alpha, acceleration = ZERO3, ZERO3, -gravity
-    forces, moments = [], []
+    # Outwards: motion of each link, and the force and moment that it needs.
+    omega = ZERO3
+    alpha = ZERO3
+    acceleration = -gravity
+    forces = []
+    moments = []
     for link, rotation, offset, speed in zip(links, pose.rotation, pose.offset, v, strict=True):
         to_link = rotation.T
-        at_origin = acceleration + (cross(alpha, offset) + cross(omega, cross(omega, offset)))
-        motion = link.axis * speed
+        about_parent = cross(alpha, offset) + cross(omega, cross(omega, offset))
         omega_of_parent = to_link @ omega
-        alpha, omega = to_link @ alpha, omega_of_parent
+        alpha_of_parent = to_link @ alpha
+        acceleration = to_link @ (acceleration + about_parent)
+        joint_motion = link.axis * speed
         if link.slides:
-            coriolis = cross(omega_of_parent, motion) * 2.0
-            acceleration = to_link @ at_origin + coriolis
+            omega = omega_of_parent
+            alpha = alpha_of_parent
+            acceleration = acceleration + cross(omega_of_parent, joint_motion) * 2.0
         else:
-            alpha = alpha + cross(omega_of_parent, motion)
-            omega = omega_of_parent + motion
-            acceleration = to_link @ at_origin
-        moment = link.first_moment
-        about_origin = cross(alpha, moment) + cross(omega, cross(omega, moment))
+            omega = omega_of_parent + joint_motion
+            alpha = alpha_of_parent + cross(omega_of_parent, joint_motion)
+        first_moment = link.first_moment
+        about_origin = cross(alpha, first_moment) + cross(omega, cross(omega, first_moment))
         forces.append(acceleration * link.mass + about_origin)
         turning = link.inertia @ alpha + cross(omega, link.inertia @ omega)
-        moments.append(turning + cross(moment, acceleration))
+        moments.append(turning + cross(first_moment, acceleration))
 
-    along_joints: list[Scalar] = [0.0] * len(links)
-    force, moment = ZERO3, ZERO3
+    # Inwards: each joint carries its link and all links behind it.
+    joint_forces: list[Scalar] = [0.0] * len(links)
+    force = ZERO3
+    moment = ZERO3
     for i in reversed(range(len(links))):
-        force, moment = forces[i] + force, moments[i] + moment
-        along_joints[i] = _along_joint(links[i], force, moment)
+        force = forces[i] + force
+        moment = moments[i] + moment
+        joint_forces[i] = _along_joint(links[i], force, moment)
         force, moment = _to_parent(pose.rotation[i], pose.offset[i], force, moment)
-    return along_joints
+    return joint_forces
 
 
 def floating_force(links: Sequence[Link], pose: Pose, gravity: Vec) -> list[Scalar]:
     """Joint forces of MuJoCo's gravity compensation, which carries the weight of each link's
     `floating_mass`."""
-    if all(is_zero(link.floating_mass) for link in links):
-        return [0.0] * len(links)
-    none = Mat((ZERO3,) * 3)
-    floating = [
-        dataclasses.replace(x, mass=x.floating_mass, first_moment=x.floating_moment, inertia=none)
-        for x in links
-    ]
-    return bias_force(floating, pose, [0.0] * len(links), gravity)
+    at_rest = [0.0] * len(links)
+    if not any(_is_carried(link) for link in links):
+        return at_rest
+    floating_links = []
+    for link in links:
+        floating_link = dataclasses.replace(
+            link, mass=link.floating_mass, first_moment=link.floating_moment, inertia=ZERO_MATRIX3
+        )
+        floating_links.append(floating_link)
+    return bias_force(floating_links, pose, at_rest, gravity)
+
+
+def _is_carried(link: Link) -> bool:
+    """Whether gravity compensation may act on a link. Shares of either sign can cancel to no mass
+    and leave a moment."""
+    return not all(is_zero(x) for x in (link.floating_mass, *link.floating_moment))
 
 
 def mass_matrix(links: Sequence[Link], pose: Pose) -> SquareMatrix:
@@ -163,17 +184,21 @@ def mass_matrix(links: Sequence[Link], pose: Pose) -> SquareMatrix:
     n = len(links)
     matrix: SquareMatrix = [[0.0] * n for _ in range(n)]
     mass: Scalar = 0.0
-    first_moment, inertia = ZERO3, Mat((ZERO3,) * 3)
+    first_moment = ZERO3
+    inertia = ZERO_MATRIX3
     for i in reversed(range(n)):
         link = links[i]
         mass = add(mass, link.mass)
         first_moment = first_moment + link.first_moment
-        inertia = Mat(a + b for a, b in zip(inertia, link.inertia, strict=True))
+        inertia = inertia + link.inertia
 
+        # What a unit acceleration of the joint needs.
         if link.slides:
-            force, moment = link.axis * mass, cross(first_moment, link.axis)
+            force = link.axis * mass
+            moment = cross(first_moment, link.axis)
         else:
-            force, moment = cross(link.axis, first_moment), inertia @ link.axis
+            force = cross(link.axis, first_moment)
+            moment = inertia @ link.axis
         matrix[i][i] = add(_along_joint(link, force, moment), link.armature)
         for j in range(i, 0, -1):
             force, moment = _to_parent(pose.rotation[j], pose.offset[j], force, moment)
@@ -210,7 +235,9 @@ def cholesky(matrix: SquareMatrix) -> Factor:
 
 
 def solve_lower(factor: Factor, b: Sequence[Scalar]) -> list[Scalar]:
-    """L^-1 b for the factor L of `cholesky`."""
+    """L^-1 b for the factor L of `cholesky`. It is half of the solution M^-1 b = L^-T L^-1 b, and
+    the product of two of them is one with M^-1: (L^-1 a).(L^-1 b) = a.M^-1 b. Names with `half`
+    hold them."""
     x: list[Scalar] = []
     for row, inverse, entry in zip(*factor, b, strict=True):
         x.append(mul(sub(entry, dot(row[: len(x)], x)), inverse))

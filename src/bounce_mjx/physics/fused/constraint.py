@@ -1,4 +1,4 @@
-"""Effect of the contacts, and of the joints' dry friction, on the arm and the balls.
+"""Effects of the contacts, and of the joints' dry friction, on the arm and the balls.
 
 Each contact has one row of the Jacobian along its normal, and two more along its tangents if it has
 sliding friction. Source: MuJoCo's documentation, "Computation" (constraint model, reference
@@ -11,8 +11,18 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from bounce_mjx.physics.fused import chain, joint_friction
-from bounce_mjx.physics.fused import contact as geometry
 from bounce_mjx.physics.fused.ball import Ball
+from bounce_mjx.physics.fused.contact import (
+    Contact,
+    ContactModel,
+    impedance_at,
+    relative,
+    shared_balls,
+    side,
+    sphere_box,
+    sphere_sphere,
+    tangents,
+)
 from bounce_mjx.physics.fused.friction import coupled_forces, pyramid_force
 from bounce_mjx.physics.fused.model import FusedModel
 from bounce_mjx.physics.fused.normals import normal_forces
@@ -21,11 +31,11 @@ from bounce_mjx.physics.scalars import ZERO3, Scalar, Vec, add, dot, mul
 Scalars = tuple[Scalar, ...]
 
 
-class ConstraintForces(NamedTuple):
+class ConstraintEffects(NamedTuple):
     """What the contacts and dry friction do."""
 
     joint_force: list[Scalar]
-    """Forces [n] at the joints, N m or N."""
+    """Forces [n] at the joints, N m or N: MuJoCo's `qfrc_constraint`."""
     ball_accelerations: list[Vec]
     """Acceleration of each ball in the world, m/s^2."""
     ball_angular_accelerations: list[Vec]
@@ -36,7 +46,7 @@ class Row(NamedTuple):
     """A row of the contacts' Jacobian: along a normal, or along a tangent of a contact with
     friction."""
 
-    contact: geometry.ContactModel
+    contact: ContactModel
     axis: Vec
     """Unit vector in the world."""
     torques: dict[int, Vec]
@@ -44,9 +54,9 @@ class Row(NamedTuple):
     touch get the same torque: force and lever change sign from one to the other."""
     joints: list[Scalar]
     """Entries [n] of the joints."""
-    reference: Scalar
-    """Position part of the reference acceleration's negative, m/s^2: stiffness, impedance and
-    (negative) distance along the normal; 0 along a tangent."""
+    position_reference: Scalar
+    """Share of the position in -aref = b v + k d(r) r, m/s^2: k d(r) r with the distance r along
+    the normal, 0 along a tangent."""
 
 
 def fwd_constraint(
@@ -58,7 +68,7 @@ def fwd_constraint(
     balls: Sequence[Ball],
     free_accelerations: Sequence[Vec],
     keep: Callable[[Any], Any],
-) -> ConstraintForces:
+) -> ConstraintEffects:
     """Forces of the contacts and of dry friction.
 
     Args:
@@ -70,80 +80,82 @@ def fwd_constraint(
     """
     contacts = [keep(contact) for contact in _contacts(model, pose, balls)]
     rows: list[Row] = []
-    softnesses = []
+    regularisers = []
     for pair, contact in zip(model.contacts, contacts, strict=True):
-        impedance = geometry.impedance(pair, contact.distance)
-        rows += _contact_rows(model, pose, pair, contact, impedance, balls, keep)
-        softnesses.append(softness(pair, impedance))
+        impedance = impedance_at(pair, contact.distance)
+        rows.extend(_contact_rows(model, pose, pair, contact, impedance, balls, keep))
+        regularisers.append(normal_regulariser(pair, impedance))
 
     half_rows = [chain.solve_lower(mass_factor, row.joints) for row in rows]
     half_rows, half_acceleration = keep((half_rows, list(half_acceleration)))
-    matrix = _inverse_inertia(model, rows, half_rows)
-    offsets = []
+    contact_matrix = _inverse_inertia(model, rows, half_rows)
+    contact_offsets = []
     for row, half_row in zip(rows, half_rows, strict=True):
+        # J a0, then -aref.
         free_acceleration = add(
-            row.axis @ geometry.relative(row.contact, free_accelerations),
+            row.axis @ relative(row.contact, free_accelerations),
             dot(half_row, half_acceleration),
         )
         speed = _speed(row, balls, joint_velocity)
         damped = add(free_acceleration, mul(row.contact.damping, speed))
-        offsets.append(add(damped, row.reference))
-    matrix, offsets = keep((matrix, tuple(offsets)))
+        contact_offsets.append(add(damped, row.position_reference))
+    contact_matrix, contact_offsets = keep((contact_matrix, tuple(contact_offsets)))
     is_touching = [contact.distance < 0.0 for contact in contacts]
 
     def contact_forces(matrix: Scalars, offsets: Scalars) -> Scalars:
-        first, *others = model.contacts
-        if first.friction is None:
-            return normal_forces(is_touching, matrix, offsets, softnesses)
-        if others:
-            return coupled_forces(model.contacts, is_touching, matrix, offsets, softnesses)
-        force = pyramid_force(first, matrix, offsets, softnesses[0])
+        if model.contacts[0].friction is None:
+            return normal_forces(is_touching, matrix, offsets, regularisers)
+        if len(model.contacts) > 1:
+            return coupled_forces(model.contacts, is_touching, matrix, offsets, regularisers)
+        force = pyramid_force(model.contacts[0], matrix, offsets, regularisers[0])
         return tuple(jnp.where(is_touching[0], component, 0.0) for component in force)
 
-    forces, dry_friction = joint_friction.contact_and_friction(
-        model.links,
-        mass_factor,
-        joint_velocity,
-        half_acceleration,
-        half_rows,
-        matrix,
-        offsets,
-        contact_forces,
+    forces, dry_friction = joint_friction.contact_and_dry_friction(
+        links=model.links,
+        mass_factor=mass_factor,
+        joint_velocity=joint_velocity,
+        half_acceleration=half_acceleration,
+        half_rows=half_rows,
+        contact_matrix=contact_matrix,
+        contact_offsets=contact_offsets,
+        contact_forces=contact_forces,
     )
     forces = keep(forces)
-    joint_force = []
-    for joint, friction in enumerate(dry_friction):
-        column = [row.joints[joint] for row in rows]
-        joint_force.append(add(dot(column, forces), friction))
     accelerations, angular_accelerations = _ball_accelerations(model, rows, forces)
-    return ConstraintForces(joint_force, accelerations, angular_accelerations)
+    return ConstraintEffects(
+        joint_force=_joint_forces(rows, forces, dry_friction),
+        ball_accelerations=accelerations,
+        ball_angular_accelerations=angular_accelerations,
+    )
 
 
-def paddle_origin(model: FusedModel, pose: chain.Pose) -> Vec:
+def paddle_centre(model: FusedModel, pose: chain.Pose) -> Vec:
     """Centre of the paddle in the world, m."""
-    return pose.world_origin[-1] + pose.world_rotation[-1] @ model.paddle_origin
+    return pose.world_origin[-1] + pose.world_rotation[-1] @ model.paddle.origin
 
 
-def softness(pair: geometry.ContactModel, impedance: Scalar) -> Scalar:
+def normal_regulariser(pair: ContactModel, impedance: Scalar) -> Scalar:
     """Regulariser R of the normal force without friction, 1/kg: (1 - d) / d times the approximate
     diagonal of J M^-1 J^T, which MuJoCo takes at the reference pose."""
     return (1.0 - impedance) / impedance * add(*pair.inverse_weights)
 
 
-def _contacts(model: FusedModel, pose: chain.Pose, balls: Sequence[Ball]) -> list[geometry.Contact]:
+def _contacts(model: FusedModel, pose: chain.Pose, balls: Sequence[Ball]) -> list[Contact]:
     """Geometry of each of `FusedModel.contacts`."""
-    origin = paddle_origin(model, pose)
-    rotation = pose.world_rotation[-1] @ model.paddle_rotation
+    origin = paddle_centre(model, pose)
+    rotation = pose.world_rotation[-1] @ model.paddle.rotation
     contacts = []
     for pair in model.contacts:
-        centres = [balls[i].position for i in pair.balls]
-        radii = [model.balls[i].radius for i in pair.balls]
+        last = pair.balls[-1]
+        radius = model.balls[last].radius
+        centre = balls[last].position
         if len(pair.balls) == 1:
-            contact = geometry.sphere_box(
-                *radii, *centres, model.paddle_half_size, origin, rotation
-            )
+            contact = sphere_box(radius, centre, model.paddle_half_size, origin, rotation)
         else:
-            contact = geometry.sphere_sphere(*radii, *centres)
+            first = pair.balls[0]
+            contact = sphere_sphere(
+                model.balls[first].radius, radius, balls[first].position, centre
+            )
         contacts.append(contact)
     return contacts
 
@@ -151,41 +163,46 @@ def _contacts(model: FusedModel, pose: chain.Pose, balls: Sequence[Ball]) -> lis
 def _contact_rows(
     model: FusedModel,
     pose: chain.Pose,
-    pair: geometry.ContactModel,
-    contact: geometry.Contact,
+    pair: ContactModel,
+    contact: Contact,
     impedance: Scalar,
     balls: Sequence[Ball],
     keep: Callable[[Any], Any],
 ) -> list[Row]:
     """The rows of a contact: the normal, and with friction the first and second tangent."""
     normal = contact.normal
-    first_ball = pair.balls[0]
-    # A force along the normal has the same torque at the contact point and at the ball's centre.
-    point = balls[first_ball].position
-    reference = mul(mul(pair.stiffness, impedance), contact.distance)
+    # Where the force acts on the paddle; two balls that touch need no point. A force along the
+    # normal has the same torque at the contact point and at the ball's centre.
+    last_ball = pair.balls[-1]
+    point = balls[last_ball].position
     axes = [normal]
     torques: list[dict[int, Vec]] = [{}]
-    references = [reference]
+    position_references = [mul(mul(pair.stiffness, impedance), contact.distance)]
     if pair.friction is not None:
-        first_tangent, second_tangent = keep(geometry.tangents(normal))
-        # From the contact point, midway between the surfaces, to each ball's centre.
-        levers = {i: model.balls[i].radius + 0.5 * contact.distance for i in pair.balls}
+        first_tangent, second_tangent = keep(tangents(normal))
         axes += [first_tangent, second_tangent]
-        torques.append({i: second_tangent * -lever for i, lever in levers.items()})
-        torques.append({i: first_tangent * lever for i, lever in levers.items()})
-        references += [0.0, 0.0]
-        point = point - normal * levers[first_ball]
+        first_torques = {}
+        second_torques = {}
+        for i in pair.balls:
+            # From the contact point, midway between the surfaces, to the ball's centre.
+            lever = model.balls[i].radius + 0.5 * contact.distance
+            first_torques[i] = second_tangent * -lever
+            second_torques[i] = first_tangent * lever
+            if i == last_ball:
+                point = point - normal * lever
+        torques += [first_torques, second_torques]
+        position_references += [0.0, 0.0]
     joints = _joint_entries(model, pose, pair, axes, point, keep)
     rows = []
     for k, axis in enumerate(axes):
-        rows.append(Row(pair, axis, torques[k], joints[k], references[k]))
+        rows.append(Row(pair, axis, torques[k], joints[k], position_references[k]))
     return rows
 
 
 def _joint_entries(
     model: FusedModel,
     pose: chain.Pose,
-    pair: geometry.ContactModel,
+    pair: ContactModel,
     axes: Sequence[Vec],
     point: Vec,
     keep: Callable[[Any], Any],
@@ -218,21 +235,34 @@ def _inverse_inertia_by_balls(model: FusedModel, a: Row, b: Row) -> Scalar:
     """Share of the balls in an entry of J M^-1 J^T, 1/kg."""
     share: Scalar = 0.0
     if a.contact is b.contact and a is not b:
+        # The axes of one contact's rows are orthogonal, and so are their torques.
         return share
-    for i, sign in geometry.shared_balls(a.contact, b.contact):
-        along = 1.0 if a is b else a.axis @ b.axis
-        share = add(share, mul(along, sign / model.balls[i].mass))
+    for i, sign in shared_balls(a.contact, b.contact):
+        product_of_axes = 1.0 if a is b else a.axis @ b.axis
+        share = add(share, mul(product_of_axes, sign / model.balls[i].mass))
         if a.torques and b.torques:
-            share = add(share, a.torques[i] @ b.torques[i] / model.balls[i].inertia)
+            product_of_torques = a.torques[i] @ b.torques[i]
+            share = add(share, product_of_torques / model.balls[i].inertia)
     return share
 
 
 def _speed(row: Row, balls: Sequence[Ball], joint_velocity: Sequence[Scalar]) -> Scalar:
     """Relative velocity of a contact along a row, m/s: J times the velocities."""
-    speed = row.axis @ geometry.relative(row.contact, [ball.velocity for ball in balls])
+    speed = row.axis @ relative(row.contact, [ball.velocity for ball in balls])
     for i, torque in row.torques.items():
         speed = add(speed, torque @ balls[i].turning.spin)
     return add(speed, dot(row.joints, joint_velocity))
+
+
+def _joint_forces(
+    rows: Sequence[Row], forces: Sequence[Scalar], dry_friction: Sequence[Scalar]
+) -> list[Scalar]:
+    """Forces [n] at the joints: J^T times the contacts' forces, and dry friction."""
+    joint_forces = []
+    for joint, friction in enumerate(dry_friction):
+        column = [row.joints[joint] for row in rows]
+        joint_forces.append(add(dot(column, forces), friction))
+    return joint_forces
 
 
 def _ball_accelerations(
@@ -240,14 +270,14 @@ def _ball_accelerations(
 ) -> tuple[list[Vec], list[Vec]]:
     """Accelerations and angular accelerations of the balls by the contacts' forces.
 
-    Here a contact changes a ball's spin: a force along a tangent has a torque (`Row.torques`), and
-    its angular acceleration is that over the ball's inertia. A force along a normal has none.
+    A force along a tangent has a torque (`Row.torques`), and its angular acceleration is that over
+    the ball's inertia; `ball.turn` changes the spin by it. A force along a normal has no torque.
     """
     accelerations = [ZERO3] * len(model.balls)
     angular_accelerations = [ZERO3] * len(model.balls)
     for row, force in zip(rows, forces, strict=True):
         for i in row.contact.balls:
-            along_axis = mul(force, geometry.side(row.contact, i) / model.balls[i].mass)
+            along_axis = mul(force, side(row.contact, i) / model.balls[i].mass)
             accelerations[i] = accelerations[i] + row.axis * along_axis
         for i, torque in row.torques.items():
             along_torque = mul(force, 1.0 / model.balls[i].inertia)

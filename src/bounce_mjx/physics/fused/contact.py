@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from bounce_mjx.physics.scalars import Mat, Scalar, Vec, cross, dot
+from bounce_mjx.physics.scalars import Mat, Scalar, Vec, add, cross, dot
 
 # MuJoCo's mjMINVAL: a centre closer to the box counts as inside it.
 _MIN_DISTANCE = 1e-15
@@ -27,8 +27,9 @@ class ContactModel:
     """k of the reference acceleration, 1/s^2."""
     damping: Scalar
     """b of the reference acceleration, 1/s."""
-    solimp: tuple[float, float, float, float, float]
-    """dmin, dmax, width (m), midpoint, power of the impedance."""
+    solimp: tuple[float, float, float, float, float | int]
+    """dmin, dmax, width (m), midpoint, power of the impedance; the power is an int where it is
+    whole, as a product costs less than a power."""
     inverse_weights: tuple[Scalar, Scalar]
     """Translational inverse inertia at the reference pose, 1/kg: of the paddle's body or the first
     ball, and of the last ball."""
@@ -53,13 +54,16 @@ def side(model: ContactModel, ball: int) -> float:
 
 
 def relative(model: ContactModel, vectors: Sequence[Vec]) -> Vec:
-    """A vector of the last ball less that of the first one, or less nothing, at a contact.
+    """The vector of the ball at a contact with the paddle; of two balls, the last one's less the
+    first one's.
 
     Args:
       vectors: one of each ball.
     """
-    first, *last = (vectors[i] for i in model.balls)
-    return last[0] - first if last else first
+    last = vectors[model.balls[-1]]
+    if len(model.balls) == 1:
+        return last
+    return last - vectors[model.balls[0]]
 
 
 def shared_balls(a: ContactModel, b: ContactModel) -> list[tuple[int, float]]:
@@ -79,25 +83,27 @@ def sphere_box(
     Args:
       half: half sizes of the box, m.
     """
-    local = box_rotation.T @ (centre - box_origin)
-    offset = tuple(x - jnp.clip(x, -s, s) for x, s in zip(local, half, strict=True))
-    squared = dot(offset, offset)
-    outside = squared > _MIN_DISTANCE**2
-    inverse = jax.lax.rsqrt(jnp.where(outside, squared, 1.0))
+    centre_in_box = box_rotation.T @ (centre - box_origin)
+    from_surface = []
+    depth = []
+    for x, half_size in zip(centre_in_box, half, strict=True):
+        from_surface.append(x - jnp.clip(x, -half_size, half_size))
+        depth.append(half_size - jnp.abs(x))
+    squared = dot(from_surface, from_surface)
+    is_outside = squared > _MIN_DISTANCE**2
+    inverse = jax.lax.rsqrt(jnp.where(is_outside, squared, 1.0))
 
     # MuJoCo takes the first of equally near faces, in the order -x, +x, -y, +y, -z, +z.
-    depth = tuple(s - jnp.abs(x) for x, s in zip(local, half, strict=True))
     x_nearest = (depth[0] <= depth[1]) & (depth[0] <= depth[2])
     y_nearest = ~x_nearest & (depth[1] <= depth[2])
-    nearest = (x_nearest, y_nearest, ~(x_nearest | y_nearest))
-    face = tuple(
-        jnp.where(near, jnp.where(x > 0.0, 1.0, -1.0), 0.0)
-        for near, x in zip(nearest, local, strict=True)
-    )
+    z_nearest = ~(x_nearest | y_nearest)
     face_depth = jnp.minimum(jnp.minimum(depth[0], depth[1]), depth[2])
 
-    normal = tuple(jnp.where(outside, x * inverse, f) for x, f in zip(offset, face, strict=True))
-    distance = jnp.where(outside, squared * inverse, -face_depth) - radius
+    normal = []
+    for i, is_nearest in enumerate((x_nearest, y_nearest, z_nearest)):
+        face_normal = jnp.where(is_nearest, jnp.where(centre_in_box[i] > 0.0, 1.0, -1.0), 0.0)
+        normal.append(jnp.where(is_outside, from_surface[i] * inverse, face_normal))
+    distance = jnp.where(is_outside, squared * inverse, -face_depth) - radius
     return Contact(distance, box_rotation @ normal)
 
 
@@ -105,16 +111,17 @@ def sphere_sphere(first_radius: Scalar, second_radius: Scalar, first: Vec, secon
     """Contact of two spheres with these centres."""
     offset = second - first
     squared = offset @ offset
-    apart = squared > _MIN_DISTANCE**2
-    inverse = jax.lax.rsqrt(jnp.where(apart, squared, 1.0))
-    normal = Vec(
-        jnp.where(apart, x * inverse, axis) for x, axis in zip(offset, (1.0, 0.0, 0.0), strict=True)
-    )
-    distance = jnp.where(apart, squared * inverse, 0.0) - (first_radius + second_radius)
-    return Contact(distance, normal)
+    is_apart = squared > _MIN_DISTANCE**2
+    inverse = jax.lax.rsqrt(jnp.where(is_apart, squared, 1.0))
+    # The normal of two spheres with one centre is MuJoCo's: the axis x.
+    normal = []
+    for x, axis_x in zip(offset, (1.0, 0.0, 0.0), strict=True):
+        normal.append(jnp.where(is_apart, x * inverse, axis_x))
+    between_centres = jnp.where(is_apart, squared * inverse, 0.0)
+    return Contact(between_centres - add(first_radius, second_radius), Vec(normal))
 
 
-def impedance(model: ContactModel, distance: jax.Array) -> jax.Array:
+def impedance_at(model: ContactModel, distance: jax.Array) -> jax.Array:
     """d(r) of MuJoCo's solimp at the penetration r = |distance|, in (0, 1)."""
     dmin, dmax, width, midpoint, power = model.solimp
     x = jnp.clip(jnp.abs(distance) / width, 0.0, 1.0)
@@ -134,6 +141,7 @@ def tangents(normal: Vec) -> tuple[Vec, Vec]:
     from_y = jnp.abs(y) < 0.5
     along = jnp.where(from_y, y, z)
     inverse = jax.lax.rsqrt(1.0 - along * along)
-    ends = (jnp.where(from_y, 1.0, 0.0), jnp.where(from_y, 0.0, 1.0))
-    first = Vec((-x * along, ends[0] - y * along, ends[1] - z * along)) * inverse
+    start_y = jnp.where(from_y, 1.0, 0.0)
+    start_z = jnp.where(from_y, 0.0, 1.0)
+    first = Vec((-x * along, start_y - y * along, start_z - z * along)) * inverse
     return first, cross(normal, first)

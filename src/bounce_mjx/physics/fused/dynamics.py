@@ -16,7 +16,7 @@ from bounce_mjx.gpu.elementwise import elementwise
 from bounce_mjx.physics.control import Control, servo_target
 from bounce_mjx.physics.fused import chain
 from bounce_mjx.physics.fused.ball import Ball, read_ball, spin_in_ball, turn
-from bounce_mjx.physics.fused.constraint import paddle_origin
+from bounce_mjx.physics.fused.constraint import paddle_centre
 from bounce_mjx.physics.fused.forward import Motion, substep
 from bounce_mjx.physics.fused.model import FusedModel, read_model
 from bounce_mjx.physics.parameters import PhysicsParameters, PhysicsState
@@ -33,9 +33,9 @@ def step(
     """Advances one environment by `num_substeps` physics steps.
 
     Given parameters are inputs of the program; the others fold into it as constants. The loop
-    carries the coordinates as scalars. Without friction the contact's force goes through the ball's
-    centre and the spin stays constant, so one rotation over the whole interval updates the
-    orientation; with friction, `constraint._ball_accelerations` changes the spin in each step.
+    carries the coordinates as scalars. Without sliding friction a contact's force goes through the
+    ball's centre and the spin stays constant, so one rotation over the whole interval updates the
+    orientation; with it, `ball.turn` changes the spin in each physics step.
 
     Args:
       model: from `read_model`.
@@ -53,10 +53,13 @@ def step(
     if control.ball_push is not None:
         balls = _pushed(balls, control.ball_push)
     spins_change = _has_sliding_friction(model, parameters)
+    moving_balls = balls
+    if not spins_change:
+        moving_balls = [ball._replace(turning=None) for ball in balls]
     start = Motion(
         q=Vec(qpos[i] for i in addresses.arm_qpos),
         v=Vec(qvel[i] for i in addresses.arm_qvel),
-        balls=tuple(ball if spins_change else ball._replace(turning=None) for ball in balls),
+        balls=tuple(moving_balls),
     )
     end = _run(model, parameters, control, start, num_substeps)
 
@@ -75,7 +78,8 @@ def step(
 
 def paddle_position(model: FusedModel, parameters: PhysicsParameters, qpos: jax.Array) -> jax.Array:
     """World position [3] (m) of the paddle's centre at qpos [nq]."""
-    # The others would only be inputs of the program without use.
+    # What moves the centre; a turn of the paddle (`geom_quat`) does not. The other parameters would
+    # only be inputs of the program without use.
     fields = ("body_pos[", "geom_pos[", "qpos0[")
     entries = {}
     for name, value in (parameters.entries or {}).items():
@@ -92,6 +96,7 @@ def paddle_position(model: FusedModel, parameters: PhysicsParameters, qpos: jax.
 
 def _has_sliding_friction(model: FusedModel, parameters: PhysicsParameters) -> bool:
     """Whether a contact of this environment can have sliding friction."""
+    # `support.unsupported_friction` lets all pairs have it or none.
     if model.contacts[0].friction is not None or parameters.contact_friction is not None:
         return True
     return any(name.startswith("pair_friction[") for name in parameters.entries or {})
@@ -157,7 +162,7 @@ def _substeps(
     long function once for all programs; a trace takes some tenths of a second.
 
     Args:
-      model: of the worlds, which the parameters change.
+      model: of all environments, whose parameters change it.
       motion_structure: of the first arguments, a `Motion`.
       input_structure: of the others, a `Control` and the `PhysicsParameters`.
       num_substeps: number of physics steps.
@@ -167,10 +172,10 @@ def _substeps(
     def substeps(*scalars: Scalar) -> tuple[Scalar, ...]:
         motion = motion_structure.unflatten(scalars[:num_coordinates])
         control, parameters = input_structure.unflatten(scalars[num_coordinates:])
-        model_of_world = read_model(model.mj_model, parameters, model.addresses)
+        environment_model = read_model(model.mj_model, parameters, model.addresses)
 
         def one_step(i: jax.Array, motion: Motion) -> Motion:
-            return substep(model_of_world, motion, _targets(control, i), control.air_drag)
+            return substep(environment_model, motion, _targets(control, i), control.air_drag)
 
         motion = jax.lax.fori_loop(0, num_substeps, one_step, motion)
         return tuple(jax.tree.leaves(motion))
@@ -184,16 +189,23 @@ def _targets(control: Control, step: jax.Array) -> tuple[Scalar, ...]:
         return control.ctrl
     step = jax.lax.convert_element_type(step, control.ctrl[0].dtype)
 
-    def is_of_servos(field: Any) -> bool:
-        # Not a NamedTuple such as Control itself.
+    targets = []
+    for i in range(len(control.ctrl)):
+        targets.append(servo_target(_of_servo(control, i), step))
+    return tuple(targets)
+
+
+def _of_servo(control: Control, i: int) -> Control:
+    """The control of servo i alone: its number of each field that has one for every servo."""
+
+    def has_one_for_each(field: Any) -> bool:
+        # A NamedTuple such as `Control` itself is no such field.
         return type(field) is tuple
 
-    def of_servo(i: int) -> Control:
-        return jax.tree.map(
-            lambda field: field[i] if is_of_servos(field) else field, control, is_leaf=is_of_servos
-        )
+    def number(field: Any) -> Scalar:
+        return field[i] if has_one_for_each(field) else field
 
-    return tuple(servo_target(of_servo(i), step) for i in range(len(control.ctrl)))
+    return jax.tree.map(number, control, is_leaf=has_one_for_each)
 
 
 @functools.lru_cache(maxsize=16)
@@ -206,8 +218,8 @@ def _paddle_position(
 
     def position(*scalars: Scalar) -> tuple[Scalar, ...]:
         parameters = structure.unflatten(scalars[num_joints:])
-        model_of_world = read_model(model.mj_model, parameters, model.addresses)
-        pose = chain.forward_kinematics(model_of_world.links, scalars[:num_joints])
-        return tuple(paddle_origin(model_of_world, pose))
+        environment_model = read_model(model.mj_model, parameters, model.addresses)
+        pose = chain.forward_kinematics(environment_model.links, scalars[:num_joints])
+        return tuple(paddle_centre(environment_model, pose))
 
     return jax.jit(position, inline=True)

@@ -4,13 +4,15 @@ Whoever knows `mj_step` knows this file:
 
     fwd_position      poses and mass matrix
     fwd_velocity      bias and passive forces
-    fwd_actuation     forces of the servos
-    fwd_acceleration  what moves without constraints
-    fwd_constraint    contacts and dry friction (`constraint.py`)
-    integrate         the next state
+    fwd_actuation     forces of the servos and of gravity compensation
+    fwd_acceleration  what moves without constraints, the drag of the air included
+    fwd_constraint    all about contacts and dry friction (`constraint.py`): collision, Jacobian,
+                      reference acceleration and forces; MuJoCo has the first three in its first
+                      two stages
+    integrate         the next state: MuJoCo's `mj_implicit` or `mj_Euler`
 
-Source: MuJoCo's documentation, "Computation" (simulation pipeline), and the stages of the same
-names in `engine_forward.c` and MJX's `forward.py`.
+Source: MuJoCo's documentation, "Computation" (simulation pipeline), and `engine_forward.c`, whose
+functions `mj_fwdPosition` to `mj_fwdConstraint` gave the first five their names.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,7 +22,7 @@ import jax.numpy as jnp
 
 from bounce_mjx.physics.fused import chain, joint_friction
 from bounce_mjx.physics.fused.ball import Ball, free_acceleration, move_ball
-from bounce_mjx.physics.fused.constraint import ConstraintForces, fwd_constraint
+from bounce_mjx.physics.fused.constraint import ConstraintEffects, fwd_constraint
 from bounce_mjx.physics.fused.model import FusedModel, Servo
 from bounce_mjx.physics.scalars import Scalar, Vec, add, mul, not_inlined, sub
 
@@ -53,17 +55,16 @@ class Velocity(NamedTuple):
     """Joint forces that follow from positions and velocities, N m or N."""
 
     bias: Sequence[Scalar]
-    """Gravity, Coriolis and centrifugal forces [n], which an acceleration of 0 has to balance."""
-    spring: Sequence[Scalar]
-    """Forces [n] of the joints' springs; they act against the displacement."""
-    damper: Sequence[Scalar]
-    """Viscous forces [n] of the joints; they act against the velocity."""
+    """Forces [n] that keep the joints from accelerating against gravity, Coriolis and centrifugal
+    effects: MuJoCo's `qfrc_bias`."""
+    spring_and_damper: Sequence[Scalar]
+    """Forces [n] of the joints' springs and dampers: MuJoCo's `qfrc_spring` + `qfrc_damper`."""
     gravity_compensation: Sequence[Scalar]
-    """Forces [n] that carry the weight of the bodies with `gravcomp`."""
+    """Forces [n] that carry the weight of the bodies with `gravcomp`: `qfrc_gravcomp`."""
 
 
 class Actuation(NamedTuple):
-    """Forces of the servos."""
+    """What acts on the joints beside bias, springs and dampers."""
 
     force: list[Scalar]
     """Forces [n] of the servos and of gravity compensation, N m or N."""
@@ -77,7 +78,8 @@ class Smooth(NamedTuple):
     joint_force: list[Scalar]
     """Forces [n] at the joints, N m or N: MuJoCo's `qfrc_smooth`."""
     half_acceleration: list[Scalar]
-    """L^-1 times `joint_force` for the Cholesky factor L of the mass matrix."""
+    """L^-1 times `joint_force` for the Cholesky factor L of the mass matrix: the first half of the
+    solution M^-1 = L^-T L^-1 for MuJoCo's `qacc_smooth`, whose second half no stage needs."""
     ball_accelerations: list[Vec]
     """Acceleration of each ball, m/s^2."""
 
@@ -98,18 +100,19 @@ def substep(
     smooth = fwd_acceleration(model, motion, position, velocity, actuation, air_drag)
     constraint = fwd_constraint(
         model,
-        position.pose,
-        position.mass_factor,
-        motion.v,
-        smooth.half_acceleration,
-        motion.balls,
-        smooth.ball_accelerations,
-        keep,
+        pose=position.pose,
+        mass_factor=position.mass_factor,
+        joint_velocity=motion.v,
+        half_acceleration=smooth.half_acceleration,
+        balls=motion.balls,
+        free_accelerations=smooth.ball_accelerations,
+        keep=keep,
     )
     return integrate(model, motion, position, actuation, smooth, constraint, keep)
 
 
 def _keep(model: FusedModel, motion: Motion) -> Keep:
+    # `dynamics.step` gives the balls their spin where a contact may have sliding friction.
     has_sliding_friction = motion.balls[0].turning is not None
     has_dry_friction = any(joint_friction.has_friction(link) for link in model.links)
     if has_sliding_friction or has_dry_friction:
@@ -127,15 +130,13 @@ def fwd_position(model: FusedModel, motion: Motion, keep: Keep) -> Position:
 
 def fwd_velocity(model: FusedModel, motion: Motion, position: Position, keep: Keep) -> Velocity:
     """Bias forces, and the passive forces of springs, dampers and gravity compensation."""
-    springs = []
-    dampers = []
+    springs_and_dampers = []
     for link, q, v in zip(model.links, motion.q, motion.v, strict=True):
-        springs.append(mul(link.stiffness, sub(q, link.spring_position)))
-        dampers.append(mul(link.damping, v))
+        spring = mul(link.stiffness, sub(link.spring_position, q))
+        springs_and_dampers.append(sub(spring, mul(link.damping, v)))
     return Velocity(
         bias=keep(chain.bias_force(model.links, position.pose, motion.v, model.gravity)),
-        spring=springs,
-        damper=dampers,
+        spring_and_damper=springs_and_dampers,
         gravity_compensation=chain.floating_force(model.links, position.pose, model.gravity),
     )
 
@@ -156,15 +157,11 @@ def fwd_actuation(
 
 
 def servo_force(
-    servo: Servo, target: Scalar, q: Scalar, v: Scalar, carried: Scalar
+    servo: Servo, target: Scalar, q: Scalar, v: Scalar, gravity_compensation: Scalar
 ) -> tuple[Scalar, Scalar]:
     """Force of a servo and of gravity compensation at a joint (N m, N) for the servo target, and
-    the servo's derivative with respect to the velocity, which is 0 at the servo's force limit. The
-    limit of the joint does not change MuJoCo's derivative.
-
-    Args:
-      carried: force of the gravity compensation.
-    """
+    the derivative of the servo's force with respect to the velocity, which is 0 at the servo's
+    force limit. The limit of the joint does not change MuJoCo's derivative."""
     if servo.ctrl_range is not None:
         target = jnp.clip(target, *servo.ctrl_range)
     force = servo.gain * target + servo.stiffness * q + servo.damping * v + servo.bias
@@ -174,13 +171,14 @@ def servo_force(
         is_within = (force > least) & (force < most)
         derivative = jnp.where(is_within, derivative, 0.0)
         force = jnp.clip(force, least, most)
-    beside_servo = carried
+    # With `actuatorgravcomp`, the joint's limit holds for the sum; otherwise for the servo alone.
     if servo.carries_weight:
-        force = add(force, carried)
-        beside_servo = 0.0
+        force = add(force, gravity_compensation)
     if servo.joint_range is not None:
         force = jnp.clip(force, *servo.joint_range)
-    return add(force, beside_servo), derivative
+    if not servo.carries_weight:
+        force = add(force, gravity_compensation)
+    return force, derivative
 
 
 def fwd_acceleration(
@@ -194,8 +192,8 @@ def fwd_acceleration(
     """Joint forces without constraints, and the accelerations of the balls in free flight."""
     joint_force = []
     for i, force in enumerate(actuation.force):
-        passive_and_bias = add(velocity.bias[i], velocity.spring[i])
-        joint_force.append(sub(sub(force, velocity.damper[i]), passive_and_bias))
+        applied_and_passive = add(force, velocity.spring_and_damper[i])
+        joint_force.append(sub(applied_and_passive, velocity.bias[i]))
     ball_accelerations = []
     for ball_model, ball in zip(model.balls, motion.balls, strict=True):
         ball_accelerations.append(free_acceleration(ball_model, ball, model.gravity, air_drag))
@@ -212,12 +210,12 @@ def integrate(
     position: Position,
     actuation: Actuation,
     smooth: Smooth,
-    constraint: ConstraintForces,
+    constraint: ConstraintEffects,
     keep: Keep,
 ) -> Motion:
     """The next state: semi-implicit Euler, implicit in the velocity-dependent forces of the joints'
-    dampers and, with the integrator implicitfast, of the servos (MuJoCo's documentation,
-    "Computation", numerical integration)."""
+    dampers (unless Euler's flag `eulerdamp` is off) and, with the integrator implicitfast, of the
+    servos (MuJoCo's documentation, "Computation", numerical integration)."""
     implicit_matrix = [list(row) for row in position.mass_matrix]
     for i, link in enumerate(model.links):
         damping = link.damping if model.implicit_damping else 0.0
@@ -229,8 +227,8 @@ def integrate(
     half_acceleration = chain.solve_lower(implicit_factor, joint_force)
     acceleration = Vec(chain.solve_upper(implicit_factor, half_acceleration))
 
-    v = Vec(motion.v) + acceleration * model.dt
-    q = Vec(motion.q) + v * model.dt
+    v = motion.v + acceleration * model.dt
+    q = motion.q + v * model.dt
     balls = []
     for i, ball in enumerate(motion.balls):
         ball_acceleration = smooth.ball_accelerations[i] + constraint.ball_accelerations[i]

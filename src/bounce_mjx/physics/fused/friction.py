@@ -1,25 +1,26 @@
 """Forces of contacts with sliding friction (`condim="3"`) at one instant, as MuJoCo computes them.
 
-Sources: MuJoCo's documentation, "Computation" (constraint model: friction cones, the dual problem,
-diagonal regulariser), and its source code for the regulariser. The force f of one contact along the
-normal and the two tangents minimises
+The force of a contact, f_n along the normal and f_1, f_2 along the tangents, stays in the pyramid
+|f_1| / mu_1 + |f_2| / mu_2 <= f_n. In units of the cone, x = (f_n, f_1 / mu_1, f_2 / mu_2), these
+are the sums a_1 e_1 + ... + a_4 e_4 of the edges e = (1, +-1, 0), (1, 0, +-1) with coefficients
+a >= 0. In these units, here and in all functions below, the forces x of all contacts minimise
 
-    1/2 f.(J M^-1 J^T + R) f + f.(J a0 - aref)    over the pyramidal friction cone
+    1/2 x.Q x + c.x + (for each contact, R / 2 times the sum of its squared coefficients)
 
-with a0 the acceleration without the contact. In units of the cone, x = (f_n, f_1 / mu_1,
-f_2 / mu_2), it consists of the nonnegative combinations of the four edges (1, +-1, 0), (1, 0, +-1).
+with Q = J M^-1 J^T, which couples the contacts, c = J a0 - aref, and a0 the acceleration without
+the contacts. R regularises the coefficients of a contact's edges; it is no matrix on x.
 
-In these units, the forces x of several contacts minimise
-
-    1/2 x.(Q + R) x + x.c    over the product of the cones
-
-with Q = J M^-1 J^T, which couples the contacts. Under an acceleration y, each contact has the force
-f(y) that minimises 1/2 f.R f + f.y over its cone, so the solution is x = f(c + Q x). MuJoCo's
-Newton method finds it: -f is the gradient of a convex function of y, which is smooth between the
+One contact alone has a closed form (`pyramid_force`). Of several, each has under an acceleration y
+the force x(y) that minimises x.y + R / 2 (a_1^2 + ... + a_4^2): each edge has the coefficient
+a = max(0, -e.y) / R. The solution is x = x(c + Q x). MuJoCo's Newton method finds it
+(`coupled_forces`): -x(y) is the gradient of a convex function of y, which is smooth between the
 zones in which the contact is open, sticks or slips, and a line search keeps the steps across zones
 short enough.
 
 Every state runs the same operations, so that the threads of a GPU kernel do not diverge.
+
+Sources: MuJoCo's documentation, "Computation" (constraint model: friction cones, the dual problem,
+diagonal regulariser), and its source code for the regulariser.
 """
 
 from collections.abc import Sequence
@@ -44,9 +45,9 @@ from bounce_mjx.physics.scalars import (
     zero_like,
 )
 
-# Steps, and steps of the line search in each. Of 180,000 problems of three contacts with the
-# pyramidal cone, with friction from 0.01 to 3 that differs between the tangents and impedances up
-# to 0.99999, all reach rounding error; with 16 and 6 steps, 373 do not.
+# Steps, and steps of the line search in each. No number is proven to suffice: of 180,000 problems
+# of three contacts, with friction from 0.01 to 3 that differs between the tangents and impedances
+# up to 0.99999, all reach rounding error with these; with 16 and 6 steps, 373 do not.
 _NEWTON_STEPS = 24
 _SEARCH_STEPS = 10
 _EDGES = (
@@ -64,17 +65,31 @@ class Cone(NamedTuple):
     is_touching: jax.Array
     """Whether the contact exists."""
     regulariser: Scalar
-    """R of the coefficient of each edge, 1/kg."""
+    """R, 1/kg."""
 
 
-def edge_regulariser(model: ContactModel, softness: Scalar) -> Scalar:
-    """Regulariser of the coefficient of a pyramid's edge, 1/kg.
+class Column(NamedTuple):
+    """A column of the matrix L of `_newton_step`, of which three entries are not 0."""
+
+    start: int
+    """Row of the first entry."""
+    entries: Vec
+    """The edge of a pyramid over the root of R; 0 where its coefficient is 0."""
+
+    def dot(self, vector: Sequence[Scalar]) -> Scalar:
+        """Inner product with a vector [3 k]."""
+        return dot(self.entries, vector[self.start : self.start + 3])
+
+
+def edge_regulariser(model: ContactModel, normal_regulariser: Scalar) -> Scalar:
+    """R of the coefficients of a contact's edges, 1/kg; MuJoCo takes the friction along the first
+    tangent for all four.
 
     Args:
-      softness: regulariser of the normal force without friction, 1/kg.
+      normal_regulariser: that of the normal force without friction, 1/kg.
     """
     squared = mul(model.friction[0], model.friction[0])
-    return 2.0 * (mul(squared, 1.0 / model.impratio) * softness) * add(1.0, squared)
+    return 2.0 * (mul(squared, 1.0 / model.impratio) * normal_regulariser) * add(1.0, squared)
 
 
 class _Pyramid(NamedTuple):
@@ -91,7 +106,7 @@ class _Pyramid(NamedTuple):
     c1: Scalar
     c2: Scalar
     regulariser: Scalar
-    """R of each edge's coefficient, 1/kg."""
+    """R, 1/kg."""
 
 
 class _Candidate(NamedTuple):
@@ -104,7 +119,10 @@ class _Candidate(NamedTuple):
 
 
 def pyramid_force(
-    model: ContactModel, matrix: Sequence[Scalar], offsets: Sequence[Scalar], softness: Scalar
+    model: ContactModel,
+    matrix: Sequence[Scalar],
+    offsets: Sequence[Scalar],
+    normal_regulariser: Scalar,
 ) -> Scalars:
     """Force [normal, first and second tangent] of a contact, N, in closed form.
 
@@ -124,13 +142,15 @@ def pyramid_force(
     Args:
       matrix: J M^-1 J^T, the upper triangle row by row, 1/kg.
       offsets: J a0 - aref, m/s^2.
-      softness: regulariser of the normal force without friction, 1/kg.
+      normal_regulariser: that of the normal force without friction, 1/kg.
     """
     units = (1.0, *model.friction)
-    pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-    q = [mul(entry, mul(units[i], units[j])) for entry, (i, j) in zip(matrix, pairs, strict=True)]
+    places = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+    q = []
+    for entry, (i, j) in zip(matrix, places, strict=True):
+        q.append(mul(entry, mul(units[i], units[j])))
     c = map(mul, offsets, units)
-    problem = _Pyramid(*q, *c, edge_regulariser(model, softness))
+    problem = _Pyramid(*q, *c, edge_regulariser(model, normal_regulariser))
 
     best = _better(_without_first_pair(problem), _with_first_pair(problem))
 
@@ -191,10 +211,14 @@ def _with_first_pair(problem: _Pyramid) -> _Candidate:
 
 
 def _with_one_edge(problem: _Pyramid, sign: jax.Array) -> _Candidate:
-    """One edge of the first pair, (1, sign, 0), is active with the coefficient a, which makes its
-    gradient 0: a = -(g + r0 s2 + r2 t2) / (r0 + rest), where r0 and r2 are the edge's products with
-    the directions of s2 and t2, g that with c, and the denominator e.Q e + R. The coefficient must
-    be positive, and the gradient along the other edge must not be negative."""
+    """One edge of the first pair, e = (1, sign, 0), is active with the coefficient a, which makes
+    its gradient 0:
+
+        (e.Q e + R) a = -(g + r0 s2 + r2 t2)
+
+    with r0 = e.Q (1, 0, 0), r2 = e.Q (0, 0, 1), g = e.c, and e.Q e + R = r0 + rest. The coefficient
+    must be positive, and the gradient along the other edge must not be negative.
+    """
     q00, q01, q02, q11, q12, q22, c0, c1, c2, regulariser = problem
     # The tangent's sign turned, so that the edge is (1, 1, 0).
     signed_q01 = sign * q01
@@ -254,7 +278,7 @@ def coupled_forces(
     is_touching: Sequence[jax.Array],
     matrix: Sequence[Scalar],
     offsets: Sequence[Scalar],
-    softnesses: Sequence[Scalar],
+    normal_regularisers: Sequence[Scalar],
 ) -> Scalars:
     """Forces [3 k] of k contacts (N): normal, first and second tangent of each.
 
@@ -262,19 +286,24 @@ def coupled_forces(
       is_touching: whether each contact exists.
       matrix: J M^-1 J^T, the upper triangle row by row, 1/kg.
       offsets: J a0 - aref, m/s^2.
-      softnesses: regularisers of the normal forces without friction, 1/kg.
+      normal_regularisers: those of the normal forces without friction, 1/kg.
     """
-    units = [unit for model in models for unit in (1.0, *model.friction)]
+    units: list[Scalar] = []
+    for model in models:
+        units.extend((1.0, *model.friction))
     size = len(units)
     upper = upper_rows(matrix, size)
     q: list[list[Scalar]] = []
     for i in range(size):
-        row = [upper[min(i, j)][abs(i - j)] for j in range(size)]
-        q.append([mul(entry, mul(units[i], units[j])) for j, entry in enumerate(row)])
-    c = [mul(offset, unit) for offset, unit in zip(offsets, units, strict=True)]
+        row = []
+        for j in range(size):
+            entry = upper[min(i, j)][abs(i - j)]
+            row.append(mul(entry, mul(units[i], units[j])))
+        q.append(row)
+    c = list(map(mul, offsets, units))
     cones = []
-    for model, touches, softness in zip(models, is_touching, softnesses, strict=True):
-        cones.append(Cone(touches, edge_regulariser(model, softness)))
+    for k, model in enumerate(models):
+        cones.append(Cone(is_touching[k], edge_regulariser(model, normal_regularisers[k])))
     q, c = not_inlined((q, c))
 
     def newton_step(_: jax.Array, x: Scalars) -> Scalars:
@@ -282,7 +311,7 @@ def coupled_forces(
 
     start = tuple(zero_like(entry) for entry in c)
     x = lax.fori_loop(0, _NEWTON_STEPS, newton_step, start)
-    return tuple(mul(entry, unit) for entry, unit in zip(x, units, strict=True))
+    return tuple(map(mul, x, units))
 
 
 def _newton_step(
@@ -290,41 +319,36 @@ def _newton_step(
 ) -> Scalars:
     """Forces after one step of Newton's method with a line search.
 
-    The residual is f(y) - x at the acceleration y = c + Q x. With the derivative -L L^T of f, the
-    step d solves (I + L L^T Q) d = residual. Woodbury's formula leaves a symmetric system in as
+    The residual is x(y) - x at the acceleration y = c + Q x. With the derivative -L L^T of x(y),
+    the step d solves (I + L L^T Q) d = residual. Woodbury's formula leaves a symmetric system in as
     many unknowns z as L has columns:
 
         (I + L^T Q L) z = L^T Q residual,    d = residual - L z
     """
     y = [add(entry, dot(row, x)) for entry, row in zip(c, q, strict=True)]
-    forces, factors = _response(cones, y)
-    residual = [sub(force, entry) for force, entry in zip(forces, x, strict=True)]
+    forces, columns = _response(cones, y)
+    residual = list(map(sub, forces, x))
     q_residual = [dot(row, residual) for row in q]
-    # The columns of L: three entries, of which the first stands in the row `start`.
-    starts, columns = [], []
-    for contact, factor in enumerate(factors):
-        for column in factor:
-            starts.append(3 * contact)
-            columns.append(column)
-    q_columns = []
-    for start, column in zip(starts, columns, strict=True):
-        q_columns.append([dot(row[start : start + 3], column) for row in q])
+
     system = []
     right_hand_side = []
-    for i, (start, column) in enumerate(zip(starts, columns, strict=True)):
-        system_row = [dot(column, q_column[start : start + 3]) for q_column in q_columns]
+    q_columns = []
+    for column in columns:
+        q_columns.append([column.dot(row) for row in q])
+    for i, column in enumerate(columns):
+        system_row = [column.dot(q_column) for q_column in q_columns]
         system_row[i] = add(system_row[i], 1.0)
         system.append(system_row)
-        right_hand_side.append(dot(column, q_residual[start : start + 3]))
+        right_hand_side.append(column.dot(q_residual))
     factor = not_inlined(chain.cholesky(system))
     z = chain.solve_upper(factor, chain.solve_lower(factor, right_hand_side))
 
     step = list(residual)
     y_step = list(q_residual)
-    for start, column, q_column, size in zip(starts, columns, q_columns, z, strict=True):
-        for i in range(3):
-            step[start + i] = sub(step[start + i], mul(column[i], size))
-        y_step = [sub(a, mul(b, size)) for a, b in zip(y_step, q_column, strict=True)]
+    for column, q_column, unknown in zip(columns, q_columns, z, strict=True):
+        for i, entry in enumerate(column.entries, start=column.start):
+            step[i] = sub(step[i], mul(entry, unknown))
+        y_step = [sub(a, mul(b, unknown)) for a, b in zip(y_step, q_column, strict=True)]
     x, y, step, y_step = not_inlined((list(x), y, step, y_step))
     length = _line_search(cones, x, y, step, y_step)
     return tuple(_ahead(x, length, step))
@@ -337,8 +361,9 @@ def _line_search(
     step: list[Scalar],
     y_step: list[Scalar],
 ) -> Scalar:
-    """Length, from 0 to 2, of a step of the forces x and the accelerations y to the minimum of
-    MuJoCo's primal objective along it, where its increasing slope is 0.
+    """Length of a step of the forces x and the accelerations y to the minimum of MuJoCo's primal
+    objective along it, where its increasing slope is 0; 2 where the minimum is further ahead, and
+    the next step goes on from there. Where no zone changes, Newton's own step of 1 is the minimum.
 
     Between its kinks the slope is straight, so Newton's method within a bracket finds its zero
     exactly.
@@ -346,13 +371,12 @@ def _line_search(
 
     def slope(length: Scalar) -> tuple[Scalar, Scalar]:
         """The slope, and its derivative."""
-        forces, factors = _response(cones, _ahead(y, length, y_step))
-        difference = [sub(a, f) for a, f in zip(_ahead(x, length, step), forces, strict=True)]
+        forces, columns = _response(cones, _ahead(y, length, y_step))
+        difference = list(map(sub, _ahead(x, length, step), forces))
         derivative = dot(y_step, step)
-        for k, factor in enumerate(factors):
-            for column in factor:
-                along = dot(column, y_step[3 * k : 3 * k + 3])
-                derivative = add(derivative, mul(along, along))
+        for column in columns:
+            along = column.dot(y_step)
+            derivative = add(derivative, mul(along, along))
         return dot(y_step, difference), derivative
 
     def newton(_: jax.Array, bracket: tuple[Scalar, Scalar, Scalar]) -> tuple[Scalar, ...]:
@@ -375,23 +399,20 @@ def _ahead(start: list[Scalar], length: Scalar, step: list[Scalar]) -> list[Scal
     return [add(a, mul(length, b)) for a, b in zip(start, step, strict=True)]
 
 
-def _response(
-    cones: Sequence[Cone], y: Sequence[Scalar]
-) -> tuple[list[Scalar], list[tuple[Vec, ...]]]:
-    """f(y) [3 k], and for each contact the columns of L, one for each edge of its pyramid."""
+def _response(cones: Sequence[Cone], y: Sequence[Scalar]) -> tuple[list[Scalar], list[Column]]:
+    """x(y) [3 k], and the columns of L: one for each edge of each contact's pyramid."""
     forces: list[Scalar] = []
-    factors = []
+    columns = []
     for contact, cone in enumerate(cones):
-        acceleration = Vec(y[3 * contact : 3 * contact + 3])
+        start = 3 * contact
+        acceleration = Vec(y[start : start + 3])
         root = lax.rsqrt(cone.regulariser)
         force = ZERO3
-        columns = []
         for edge in _EDGES:
             along_edge = edge @ acceleration
             is_active = cone.is_touching & (along_edge < 0.0)
-            column = edge * jnp.where(is_active, root, 0.0)
-            force = force - column * (along_edge * root)
-            columns.append(column)
-        forces += force
-        factors.append(tuple(columns))
-    return forces, factors
+            entries = edge * jnp.where(is_active, root, 0.0)
+            force = force - entries * (along_edge * root)
+            columns.append(Column(start, entries))
+        forces.extend(force)
+    return forces, columns

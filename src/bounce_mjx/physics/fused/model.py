@@ -1,6 +1,7 @@
-"""Model of the fused engine, read from an MJCF in the world of one environment."""
+"""Model of the fused engine, read from an MJCF with the parameters of one environment."""
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -16,6 +17,7 @@ from bounce_mjx.physics.parameters import MODEL_PARAMETERS, PhysicsParameters
 from bounce_mjx.physics.scalars import (
     IDENTITY3,
     ZERO3,
+    ZERO_MATRIX3,
     Mat,
     Scalar,
     Vec,
@@ -40,7 +42,7 @@ from bounce_mjx.robot.model import (
 
 
 class Frame(NamedTuple):
-    """Position (m) and orientation of a body in the frame of its link."""
+    """Position (m) and orientation of one frame in another."""
 
     origin: Vec = ZERO3
     rotation: Mat = IDENTITY3
@@ -89,14 +91,12 @@ class FusedModel:
     dt: float
     """Physics step, s."""
     gravity: Vec
-    """Gravitational acceleration in the world, m/s^2: the MJCF's, or the environment's own."""
+    """Gravitational acceleration in the world's frame, m/s^2."""
     links: tuple[chain.Link, ...]
     servos: tuple[Servo, ...]
     """In the order of the joints."""
-    paddle_origin: Vec
-    """Centre of the paddle in the frame of the last link."""
-    paddle_rotation: Mat
-    """Orientation of the paddle in the frame of the last link."""
+    paddle: Frame
+    """Centre and orientation of the paddle in the frame of the last link."""
     paddle_half_size: Vec
     """Half sizes of the paddle, m."""
     balls: tuple[BallModel, ...]
@@ -104,9 +104,10 @@ class FusedModel:
     """The contact of each ball with the paddle, then those of two balls."""
     addresses: Addresses
     mj_model: mujoco.MjModel = dataclasses.field(repr=False, compare=False)
-    """Source of the model, to be read again in each world."""
+    """Source of the model, to be read again with each environment's parameters."""
     fingerprint: bytes = b""
-    """Hash of the source, so that models of equal sources are equal; empty in a world."""
+    """Hash of the source, so that models of equal sources are equal, as keys of the programs in
+    `dynamics.py`; empty with parameters."""
     implicit_servos: bool = True
     """Whether the integrator is implicit in the servos' damping (implicitfast), or not (Euler)."""
     implicit_damping: bool = True
@@ -118,8 +119,8 @@ def read_model(
     parameters: PhysicsParameters = MODEL_PARAMETERS,
     addresses: Addresses | None = None,
 ) -> FusedModel:
-    """Reads a compiled model that the engine supports (`physics/support.py`), in the world of one
-    environment.
+    """Reads a compiled model that the engine supports (`physics/support.py`), with the parameters
+    of one environment.
 
     Args:
       mj_model: the model.
@@ -137,26 +138,24 @@ def read_model(
     if friction is not None:
         raise UserError(f"the fused physics does not support {friction}; use --physics mjx")
     links, frames = _read_links(model)
-    paddle = _read_paddle(model, frames)
     servos = []
     for actuator, joint in zip(addresses.actuators, addresses.arm_joints, strict=True):
         servos.append(_read_servo(model, actuator, joint))
     is_implicit = mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     eulerdamp = _is_on(mj_model, mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
-    is_world = bool(jax.tree.leaves(parameters))
+    has_parameters = bool(jax.tree.leaves(parameters))
     return FusedModel(
         dt=float(mj_model.opt.timestep),
         gravity=model["opt.gravity", :],
         links=tuple(links),
         servos=tuple(servos),
-        paddle_origin=paddle.origin,
-        paddle_rotation=paddle.rotation,
+        paddle=_read_paddle(model, frames),
         paddle_half_size=model["geom_size", addresses.paddle_geom],
         balls=tuple(_read_ball(model, ball) for ball in addresses.balls),
         contacts=_read_contacts(model),
         addresses=addresses,
         mj_model=mj_model,
-        fingerprint=b"" if is_world else fingerprint(mj_model),
+        fingerprint=b"" if has_parameters else fingerprint(mj_model),
         implicit_servos=is_implicit,
         implicit_damping=is_implicit or eulerdamp,
     )
@@ -164,10 +163,14 @@ def read_model(
 
 def variable_entries(mj_model: mujoco.MjModel, addresses: Addresses) -> tuple[tuple[str, Any], ...]:
     """What may differ between environments: fields of a model, each with the index of the entries
-    that the functions below read. They read the rest of the model as constants."""
+    that the functions below read. They read the rest of the model as constants.
+
+    An entry that is read but missing here is refused; one that is here but not read would be
+    ignored: `test_parameters.py` changes each and looks for its effect.
+    """
     balls = [ball.body for ball in addresses.balls]
     bodies = [body for body in range(1, mj_model.nbody) if mj_model.body_weldid[body] not in balls]
-    links = [body for bodies_of_link in link_bodies(mj_model, addresses) for body in bodies_of_link]
+    links = list(itertools.chain.from_iterable(link_bodies(mj_model, addresses)))
     joints = list(addresses.arm_joints)
     paddle = addresses.paddle_geom
     paddle_body = int(mj_model.geom_bodyid[paddle])
@@ -280,13 +283,15 @@ def _read_joint(model: EditedModel, joint: int, frame: Frame) -> chain.Link:
         zero_position=model["qpos0", position],
         mass=0.0,
         first_moment=ZERO3,
-        inertia=Mat((ZERO3,) * 3),
+        inertia=ZERO_MATRIX3,
         armature=model["dof_armature", dof],
         damping=model["dof_damping", dof],
         stiffness=model["jnt_stiffness", joint] if springs else 0.0,
         spring_position=model["qpos_spring", position],
         frictionloss=model["dof_frictionloss", dof] if dry_friction else 0.0,
-        friction_softness=float((1.0 - dmin) / dmin * mj_model.dof_invweight0[dof]),
+        # At the distance 0, where the impedance is dmin.
+        friction_regulariser=float((1.0 - dmin) / dmin * mj_model.dof_invweight0[dof]),
+        # As in `_read_contact`.
         friction_damping=float(friction_damping / dmax),
     )
 
@@ -344,7 +349,8 @@ def _read_paddle(model: EditedModel, frames: dict[int, Frame]) -> Frame:
 
 
 def _read_ball(model: EditedModel, ball: BallAddresses) -> BallModel:
-    # A ball's own inertia and gravity compensation are no variable entries.
+    # The inertia follows the mass and the radius (`edited.edited`). An entry of the inertia alone,
+    # or of the gravity compensation, is no variable one.
     return BallModel(
         radius=model["geom_size", ball.geom, 0],
         mass=model["body_mass", ball.body],
@@ -404,10 +410,11 @@ def _read_contacts(model: EditedModel) -> tuple[ContactModel, ...]:
         balls = sorted(ball_of_geom[geom] for geom in geoms if geom in ball_of_geom)
         contacts.append(_read_contact(model, pair, tuple(balls)))
 
-    def paddle_first(contact: ContactModel) -> tuple:
+    def order(contact: ContactModel) -> tuple:
+        # Those of one ball are with the paddle.
         return len(contact.balls), contact.balls
 
-    return tuple(sorted(contacts, key=paddle_first))
+    return tuple(sorted(contacts, key=order))
 
 
 def _read_contact(model: EditedModel, pair: int, balls: tuple[int, ...]) -> ContactModel:
@@ -420,7 +427,7 @@ def _read_contact(model: EditedModel, pair: int, balls: tuple[int, ...]) -> Cont
     if power.is_integer():
         power = int(power)
     bodies = [model.addresses.balls[i].body for i in balls]
-    if len(bodies) == 1:
+    if len(balls) == 1:
         bodies.insert(0, mj_model.geom_bodyid[model.addresses.paddle_geom])
     friction = None
     if model["pair_dim", pair] > 1:
@@ -428,7 +435,7 @@ def _read_contact(model: EditedModel, pair: int, balls: tuple[int, ...]) -> Cont
         friction = (maximum(first, MIN_FRICTION), maximum(second, MIN_FRICTION))
     return ContactModel(
         balls=balls,
-        # MuJoCo scales the direct format of a contact's stiffness by the largest impedance.
+        # In both formats of a solref, MuJoCo divides k by dmax^2 and b by dmax.
         stiffness=mul(stiffness, 1.0 / dmax**2),
         damping=mul(damping, 1.0 / dmax),
         solimp=(dmin, dmax, float(solimp[2]), midpoint, power),

@@ -13,7 +13,7 @@ def normal_forces(
     is_touching: Sequence[jax.Array],
     matrix: Sequence[Scalar],
     offsets: Sequence[Scalar],
-    softnesses: Sequence[Scalar],
+    regularisers: Sequence[Scalar],
 ) -> tuple[jax.Array, ...]:
     """Forces (N) along the normals.
 
@@ -21,20 +21,18 @@ def normal_forces(
       is_touching: whether each contact exists.
       matrix: J M^-1 J^T, the upper triangle row by row, 1/kg.
       offsets: J a0 - aref, m/s^2.
-      softnesses: regularisers, 1/kg.
+      regularisers: R of each force, 1/kg.
     """
     rows = upper_rows(matrix, len(is_touching))
-    for row, softness in zip(rows, softnesses, strict=True):
-        row[0] = row[0] + softness
+    for row, regulariser in zip(rows, regularisers, strict=True):
+        row[0] = row[0] + regulariser
     linear = [neg(offset) for offset in offsets]
     if len(is_touching) == 1:
         forces = nonnegative(rows, linear)
     else:
         rows, linear = not_inlined(_with_touching_alone(rows, linear, is_touching))
         forces = not_inlined(nonnegative(rows, linear))
-    return tuple(
-        jnp.where(touches, force, 0.0) for touches, force in zip(is_touching, forces, strict=True)
-    )
+    return tuple(_of_touching(is_touching, forces))
 
 
 def _with_touching_alone(
@@ -47,10 +45,12 @@ def _with_touching_alone(
         for entry, other_touches in zip(off_diagonal, is_touching[i + 1 :], strict=True):
             masked_row.append(jnp.where(is_touching[i] & other_touches, entry, 0.0))
         masked_rows.append(masked_row)
-    masked_linear = [
-        jnp.where(touches, entry, 0.0) for touches, entry in zip(is_touching, linear, strict=True)
-    ]
-    return masked_rows, masked_linear
+    return masked_rows, _of_touching(is_touching, linear)
+
+
+def _of_touching(is_touching: Sequence[jax.Array], values: Sequence[Scalar]) -> list[Scalar]:
+    """A value of each contact, 0 for those that do not touch."""
+    return [jnp.where(touches, x, 0.0) for touches, x in zip(is_touching, values, strict=True)]
 
 
 def nonnegative(rows: list[list[Scalar]], linear: list[Scalar]) -> list[Scalar]:
@@ -68,12 +68,11 @@ def nonnegative(rows: list[list[Scalar]], linear: list[Scalar]) -> list[Scalar]:
 
     ratios = [entry / pivot for entry in first_row]
     reduced_rows = []
-    for i, (row, ratio) in enumerate(zip(other_rows, ratios, strict=True)):
-        pairs = zip(row, first_row[i:], strict=True)
+    reduced_linear = []
+    for i, ratio in enumerate(ratios):
+        pairs = zip(other_rows[i], first_row[i:], strict=True)
         reduced_rows.append([entry - ratio * first_entry for entry, first_entry in pairs])
-    reduced_linear = [
-        entry - ratio * first_linear for entry, ratio in zip(other_linear, ratios, strict=True)
-    ]
+        reduced_linear.append(other_linear[i] - ratio * first_linear)
     with_first = nonnegative(reduced_rows, reduced_linear)
 
     is_pulled = first_linear - dot(first_row, without_first) > 0.0
