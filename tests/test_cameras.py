@@ -172,8 +172,11 @@ def test_the_tracker_follows_a_flight_and_nothing_else() -> None:
         place = start + velocity * time + 0.5 * cameras.GRAVITY * time**2
         fix = tracker.update(scene(place, other, k), time)
         assert np.linalg.norm(fix.position - place) < 2e-3
+    # What looks like it, but where it cannot have flown, is not it: no bounce turns it so far aside.
+    beside = place + np.array([0.085, 0.0, 0.0])
+    assert tracker.update(scene(beside, (), 12), 12 / 120.0) is None
     # Without the ball there is no place, also where both cameras see something of its colour.
-    for k in range(12, 18):
+    for k in range(13, 19):
         assert tracker.update(scene(None, other, k), k / 120.0) is None
 
 
