@@ -58,8 +58,8 @@ _INSIDE = 0.85 * np.sqrt((_SEEDS[:, None] + 0.5) / 25.0)
 _INSIDE = _INSIDE * np.column_stack([np.cos(2.4 * _SEEDS), np.sin(2.4 * _SEEDS)])
 # Distance between a circle's centre and the projection of the triangulated ball, pixels.
 _MAX_REPROJECTION = 3.0
-# Largest change of the ball's velocity at a bounce, m/s, upward and sideways (a paddle that is tilted
-# by 0.2 rad, and its friction), and what is added to the distance from the predicted place, m.
+# Largest change of the ball's velocity at a bounce, m/s, upward and sideways (by friction, and by a
+# paddle that is tilted by 0.2 rad), and what is added to the distance from the predicted place, m.
 _MAX_VELOCITY_CHANGE = 9.0
 _MAX_SIDEWAYS_CHANGE = 2.5
 _PLACE_TOLERANCE = 0.02

@@ -172,7 +172,7 @@ def test_the_tracker_follows_a_flight_and_nothing_else() -> None:
         place = start + velocity * time + 0.5 * cameras.GRAVITY * time**2
         fix = tracker.update(scene(place, other, k), time)
         assert np.linalg.norm(fix.position - place) < 2e-3
-    # What looks like it, but where it cannot have flown, is not it: no bounce turns it so far aside.
+    # What looks like it, but where it cannot have flown, is not it.
     beside = place + np.array([0.085, 0.0, 0.0])
     assert tracker.update(scene(beside, (), 12), 12 / 120.0) is None
     # Without the ball there is no place, also where both cameras see something of its colour.
