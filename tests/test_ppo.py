@@ -18,6 +18,7 @@ from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import judge
 from bounce_mjx.learning import policy, ppo
 from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.metrics import matching_metrics
 from bounce_mjx.learning.ppo import generalized_advantages
 from bounce_mjx.learning.registry import find_algorithm
 from bounce_mjx.learning.statistics import Normalizer, init_normalizer, normalize
@@ -241,6 +242,8 @@ def test_settings_that_no_training_can_have_are_refused():
     with pytest.raises(UserError, match=r"names wrold/\*, which the environment does not have"):
         ppo.PPO(config, TwoStates(1.0), episode_steps=2)
     assert ppo.PPO(two_state_config(critic_metrics=("world/*",)), TwoStates(1.0), 2)
+    with pytest.raises(UserError, match=r"names world/frict\*"):
+        matching_metrics(["world/frict*"], ["n_bounces", "world/restitution"])
     # Limits that would change the rate after one minibatch.
     for rate in (0.02, 1e-6):
         with pytest.raises(ValueError, match=f"learning_rate {rate} is not within min_learning"):
@@ -249,10 +252,10 @@ def test_settings_that_no_training_can_have_are_refused():
 
 
 class Climbing(ppo.PPO):
-    """An optimizer whose updates are to be added."""
+    """An optimizer whose updates are to be added; the first is 0."""
 
     def make_optimizer(self):
-        return optax.adam(1.0)
+        return optax.adam(optax.linear_schedule(0.0, 1.0, 100))
 
 
 class Unmeasured(ppo.PPO):

@@ -1,4 +1,4 @@
-"""The trainer: PPO and what it needs.
+"""The algorithm: PPO and what it needs.
 
     ppo.py         PPO: collect, advantages, update; a subclass may replace each method
     policy.py      the policy, its network and the value network

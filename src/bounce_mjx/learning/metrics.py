@@ -24,7 +24,7 @@ _ENDS = ("non_finite", "too_fast")
 
 
 def matching_metrics(patterns: Sequence[str], known: Iterable[str]) -> tuple[str, ...]:
-    """The known names that match the patterns; a pattern such as world/* matches several, or none
+    """The known names that match the patterns. A pattern such as world/* matches several, and none
     where the world is not sampled.
 
     Raises:
@@ -34,8 +34,7 @@ def matching_metrics(patterns: Sequence[str], known: Iterable[str]) -> tuple[str
     matching = []
     for pattern in patterns:
         matches = fnmatch.filter(known, pattern)
-        may_be_empty = "*" in pattern and pattern.startswith(_WORLD_PREFIXES)
-        if not matches and not may_be_empty:
+        if not matches and not _is_of_a_fixed_world(pattern, known):
             raise UserError(
                 f"critic_metrics names {pattern}, which the environment does not have; choose from "
                 f"{', '.join(known)}"
@@ -43,6 +42,15 @@ def matching_metrics(patterns: Sequence[str], known: Iterable[str]) -> tuple[str
         matching += matches
     # Each name once, in the order of the patterns.
     return tuple(dict.fromkeys(matching))
+
+
+def _is_of_a_fixed_world(pattern: str, known: Sequence[str]) -> bool:
+    """Whether a pattern is of metrics that this environment does not have, as its world is not
+    sampled."""
+    for prefix in _WORLD_PREFIXES:
+        if pattern.startswith(prefix) and "*" in pattern:
+            return not any(name.startswith(prefix) for name in known)
+    return False
 
 
 def step_metrics(result: vector.VectorStep, groups: int, curves: Sequence[Curve]) -> Metrics:

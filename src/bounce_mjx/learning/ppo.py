@@ -213,7 +213,10 @@ class PPO:
     def _check_optimizer(self) -> None:
         """Refuses an optimizer with which a step would climb the loss."""
         gradient = jnp.ones(1)
-        direction, _ = self.optimizer.update(gradient, self.optimizer.init(gradient))
+        state = self.optimizer.init(gradient)
+        # Several, as a schedule may begin with 0.
+        for _ in range(3):
+            direction, state = self.optimizer.update(gradient, state)
         if direction[0] < 0.0:
             raise UserError(
                 f"make_optimizer of {type(self).__name__} turns a gradient around, as optax.adam "
@@ -280,7 +283,7 @@ class PPO:
         if "policy/kl" in minibatch_metrics:
             # How far the whole update has moved the policy: that of the last epoch.
             metrics["policy/kl"] = jnp.mean(minibatch_metrics["policy/kl"][-1])
-        # The rate with which the next update begins.
+        # With the KL rule that with which the next update begins, with a schedule that of this one.
         metrics["policy/learning_rate"] = self.learning_rate(learned.learning_rate, state.iteration)
         metrics["loss/explained_variance"] = 1.0 - jnp.var(advantage) / jnp.var(value_target)
         metrics["fault"] = fault

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 MAX_NORMALIZED = 10.0
 # Added to the variance of every input.
 MIN_VARIANCE = 1e-6
-# An input that never varied has the standard deviation sqrt(MIN_VARIANCE), up to rounding.
+# A constant input has the standard deviation sqrt(MIN_VARIANCE), up to rounding.
 MIN_STD = 1.01 * MIN_VARIANCE**0.5
 
 

@@ -40,7 +40,7 @@ def to_policy(
         between them.
       mean: mean of the observations [N].
       std: what the network's inputs are divided by [N], with any epsilon of the library. A policy
-        clips its inputs to 10 standard deviations, and replaces those that never varied by 0.
+        clips its inputs to 10 standard deviations, and replaces constant ones by 0.
       log_std: logarithm of the action noise [A].
 
     Raises:
