@@ -61,6 +61,7 @@ MISTAKES = (
     ("train --resume latst", "there is no checkpoint folder latst; did you mean latest?"),
     ("eval pretrained --robot ur5e", "give mirror"),
     ("eval --nominal --randomization.air-drag 0 1", "--nominal and --randomization", "omit one"),
+    ("eval catch --target-height 0.5", "--target-height is not a command of the run's task; omit"),
     ("report robust", "the policy robust comes with the package", "give a run's folder"),
     ("plot catch", "the policy catch comes with the package"),
     ("play --nominal", "--nominal of an evaluation", "need --episode"),

@@ -71,7 +71,10 @@ def failures_figure(associations: Sequence[Association]) -> Figure:
             panel.set_xticks(range(len(thirds)), labels, fontsize=7)
             panel.set_title(f"{one.name} (episodes)", fontsize=9)
             panel.set_ylabel("failures, %")
-            panel.set_ylim(bottom=0.0)
+        # One scale, so that the panels can be compared.
+        highest = max(panel.get_ylim()[1] for panel in axes)
+        for panel in axes:
+            panel.set_ylim(0.0, highest)
     return figure
 
 

@@ -28,7 +28,7 @@ def replay_first_and_worst(env: Env, recording: Recording) -> str:
     whole = episode_frames(env, recording, worst)
     steps = round(_EPISODE_SECONDS / env.dt)
     last = jax.tree.map(lambda values: values[-steps:], whole)
-    return replay(env, _beside(first, last), names=["first", f"worst: {worst}"])
+    return replay(env, _beside(first, last), names=["first", "worst"])
 
 
 def worst_episode(recording: Recording) -> int:
