@@ -1,5 +1,6 @@
 """A given physics parameter acts in each engine as in C with an edited model."""
 
+import copy
 import re
 from functools import partial
 
@@ -144,6 +145,16 @@ def test_the_fused_engine_reads_each_entry_that_it_accepts(mj_model):
 def test_an_entry_that_the_fused_engine_ignores_is_refused(mj_model, name):
     with pytest.raises(UserError, match=re.escape(f"cannot vary {name}")):
         read_model(mj_model, PhysicsParameters(entries={name: 3.0}))
+
+
+@pytest.mark.parametrize("name", ("qpos_spring[1]", "jnt_stiffness[1]", "dof_frictionloss[1]"))
+def test_a_number_whose_flag_is_off_is_refused(mj_model, name):
+    model = copy.deepcopy(mj_model)
+    disabled = mujoco.mjtDisableBit.mjDSBL_SPRING | mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
+    model.opt.disableflags |= disabled
+    assert read_model(mj_model, PhysicsParameters(entries={name: 0.1}))
+    with pytest.raises(UserError, match=re.escape(f"cannot vary {name}")):
+        read_model(model, PhysicsParameters(entries={name: 0.1}))
 
 
 @pytest.mark.parametrize("name", ("opt.density", "opt.gravity", "opt.gravity[3]", "friction[0]"))

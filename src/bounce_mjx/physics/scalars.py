@@ -294,8 +294,8 @@ def scalars_of(arrays: Any, dtype: jnp.dtype) -> Any:
 
 
 def zero_like(x: jax.Array) -> jax.Array:
-    """0 as a result of x: a constant would have another layout in a GPU kernel than the results of
-    a loop that starts with it."""
+    """0, computed from x: where a loop starts with it, a constant would have another layout in a
+    GPU kernel than the loop's results."""
     return lax.sub(x, x)
 
 

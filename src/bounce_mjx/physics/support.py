@@ -23,7 +23,7 @@ _HARMLESS = frozenset(
     "equality frictionloss limit spring warmstart filterparent sensor midphase eulerdamp "
     "autoreset nativeccd island multiccd energy fwdinv invdiscrete".split()
 )
-# Fields that must be 0: features that both engines lack, and that one of them lacks.
+# Fields that must be 0, for features that both engines lack; below, those that one of them lacks.
 _BOTH_ZERO = (
     "opt.disableactuator opt.noslip_iterations nplugin jnt_stiffnesspoly dof_dampingpoly "
     "actuator_dyntype actuator_delay actuator_damping actuator_dampingpoly actuator_armature "
@@ -132,6 +132,7 @@ def _fused(m: mujoco.MjModel, addresses: Addresses) -> Iterator[Feature]:
     yield "a paddle that is not a box", m.geom_type[paddle] != mujoco.mjtGeom.mjGEOM_BOX
     are_plain = all(_is_plain(m, ball) for ball in balls)
     yield "a ball that is not one free homogeneous sphere", not are_plain
+    # `check_servos` has seen that each joint has a position servo.
     yield "actuators other than one position servo on each joint", m.nu != len(joints)
     yield (
         "contact pairs other than one of the paddle and each ball, and of two balls",

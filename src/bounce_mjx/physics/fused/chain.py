@@ -227,10 +227,10 @@ def cholesky(matrix: SquareMatrix) -> Factor:
     for j in range(n):
         row = triangle[j][:j]
         pivot = sub(matrix[j][j], dot(row, row))
-        root = 1.0 / math.sqrt(pivot) if is_constant(pivot) else jax.lax.rsqrt(pivot)
-        inverse_diagonal.append(root)
+        inverse_root = 1.0 / math.sqrt(pivot) if is_constant(pivot) else jax.lax.rsqrt(pivot)
+        inverse_diagonal.append(inverse_root)
         for i in range(j + 1, n):
-            triangle[i][j] = mul(sub(matrix[i][j], dot(triangle[i][:j], row)), root)
+            triangle[i][j] = mul(sub(matrix[i][j], dot(triangle[i][:j], row)), inverse_root)
     return triangle, inverse_diagonal
 
 

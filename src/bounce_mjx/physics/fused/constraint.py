@@ -50,8 +50,9 @@ class Row(NamedTuple):
     axis: Vec
     """Unit vector in the world."""
     torques: dict[int, Vec]
-    """Torque on each ball (by its index) from a unit force along a tangent, m. Two balls that
-    touch get the same torque: force and lever change sign from one to the other."""
+    """Torque on each ball (by its index) from a unit force along a tangent, m; none along a
+    normal. Two balls that touch get torques of one direction: force and lever both change sign
+    from one to the other."""
     joints: list[Scalar]
     """Entries [n] of the joints."""
     position_reference: Scalar
@@ -103,6 +104,7 @@ def fwd_constraint(
     is_touching = [contact.distance < 0.0 for contact in contacts]
 
     def contact_forces(matrix: Scalars, offsets: Scalars) -> Scalars:
+        # Either all contacts have friction or none (`dynamics`).
         if model.contacts[0].friction is None:
             return normal_forces(is_touching, matrix, offsets, regularisers)
         if len(model.contacts) > 1:

@@ -74,7 +74,7 @@ def shared_balls(a: ContactModel, b: ContactModel) -> list[tuple[int, float]]:
 def sphere_box(
     radius: Scalar,
     centre: Vec,
-    half: tuple[float, float, float],
+    half: Vec,
     box_origin: Vec,
     box_rotation: Mat,
 ) -> Contact:
@@ -113,7 +113,8 @@ def sphere_sphere(first_radius: Scalar, second_radius: Scalar, first: Vec, secon
     squared = offset @ offset
     is_apart = squared > _MIN_DISTANCE**2
     inverse = jax.lax.rsqrt(jnp.where(is_apart, squared, 1.0))
-    # The normal of two spheres with one centre is MuJoCo's: the axis x.
+    # The normal of two spheres with one centre: the axis x, as in MuJoCo where their z axes are
+    # parallel.
     normal = []
     for x, axis_x in zip(offset, (1.0, 0.0, 0.0), strict=True):
         normal.append(jnp.where(is_apart, x * inverse, axis_x))

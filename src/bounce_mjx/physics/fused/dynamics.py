@@ -32,10 +32,10 @@ def step(
 ) -> PhysicsState:
     """Advances one environment by `num_substeps` physics steps.
 
-    Given parameters are inputs of the program; the others fold into it as constants. The loop
-    carries the coordinates as scalars. Without sliding friction a contact's force goes through the
-    ball's centre and the spin stays constant, so one rotation over the whole interval updates the
-    orientation; with it, `ball.turn` changes the spin in each physics step.
+    Parameters that are not None are inputs of the program; the others fold into it as constants.
+    The loop carries the coordinates as scalars. Without sliding friction a contact's force goes
+    through the ball's centre and the spin stays constant, so one rotation over the whole interval
+    updates the orientation; with it, `ball.turn` changes the spin in each physics step.
 
     Args:
       model: from `read_model`.

@@ -28,7 +28,8 @@ from bounce_mjx.physics.scalars import Scalar, Vec, add, dot, mul, not_inlined, 
 
 Keep = Callable[[Any], Any]
 """`not_inlined` for a long program, in which XLA would compute shared values again and again; the
-identity for a short one."""
+identity for a short one. A solver of several forces is long in any program, and calls `not_inlined`
+itself."""
 
 
 class Motion(NamedTuple):
@@ -60,7 +61,8 @@ class Velocity(NamedTuple):
     spring_and_damper: Sequence[Scalar]
     """Forces [n] of the joints' springs and dampers: MuJoCo's `qfrc_spring` + `qfrc_damper`."""
     gravity_compensation: Sequence[Scalar]
-    """Forces [n] that carry the weight of the bodies with `gravcomp`: `qfrc_gravcomp`."""
+    """Forces [n] that carry the weight of the bodies with `gravcomp`: `qfrc_gravcomp`, which
+    `fwd_actuation` adds."""
 
 
 class Actuation(NamedTuple):
@@ -193,8 +195,8 @@ def fwd_acceleration(
     """Joint forces without constraints, and the accelerations of the balls in free flight."""
     joint_force = []
     for i, force in enumerate(actuation.force):
-        applied_and_passive = add(force, velocity.spring_and_damper[i])
-        joint_force.append(sub(applied_and_passive, velocity.bias[i]))
+        actuation_and_passive = add(force, velocity.spring_and_damper[i])
+        joint_force.append(sub(actuation_and_passive, velocity.bias[i]))
     ball_accelerations = []
     for ball_model, ball in zip(model.balls, motion.balls, strict=True):
         ball_accelerations.append(free_acceleration(ball_model, ball, model.gravity, air_drag))

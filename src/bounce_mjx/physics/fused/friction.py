@@ -134,11 +134,11 @@ def pyramid_force(
         1/2 x.Q x + c.x + h/2 (s1^2 + t1^2 + s2^2 + t2^2),    s1 >= |t1|, s2 >= |t2|
 
     The first pair of edges has four active sets: none, both, the first or the second edge. Each
-    function below assumes one of them, eliminates s1 and t1, which gives a problem of the same form
-    for s2 and t2 alone (`_pair_minimum`), and scores the result. The problem is strictly convex, so
-    exactly one set fits, up to rounding: the one with the highest score. Sums and differences of
-    the coefficients avoid cancellation at small friction, and so do the products that are written
-    out where a difference of two large ones is expected.
+    function below assumes one of them (`_with_one_edge` either edge), eliminates s1 and t1, which
+    gives a problem of the same form for s2 and t2 alone (`_pair_minimum`), and scores the result.
+    The problem is strictly convex, so exactly one set fits, up to rounding: the one with the
+    highest score. Sums and differences of the coefficients avoid cancellation at small friction,
+    and so do the products that are written out where a difference of two large ones is expected.
 
     Args:
       matrix: J M^-1 J^T, the upper triangle row by row, 1/kg.
@@ -407,13 +407,13 @@ def _response(cones: Sequence[Cone], y: Sequence[Scalar]) -> tuple[list[Scalar],
     for contact, cone in enumerate(cones):
         start = 3 * contact
         acceleration = Vec(y[start : start + 3])
-        root = lax.rsqrt(cone.regulariser)
+        inverse_root = lax.rsqrt(cone.regulariser)
         force = ZERO3
         for edge in _EDGES:
             along_edge = edge @ acceleration
             is_active = cone.is_touching & (along_edge < 0.0)
-            entries = edge * jnp.where(is_active, root, 0.0)
-            force = force - entries * (along_edge * root)
+            entries = edge * jnp.where(is_active, inverse_root, 0.0)
+            force = force - entries * (along_edge * inverse_root)
             columns.append(Column(start, entries))
         forces.extend(force)
     return forces, columns

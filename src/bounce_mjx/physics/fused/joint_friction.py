@@ -118,6 +118,7 @@ def contact_and_dry_friction(
                 # with sliding friction are only renewed at the end of a round.
                 offsets = _contact_offsets(problem, friction)
                 contact = contact_forces(problem.contact_matrix, offsets)
+        # The contacts' forces serve the sweeps alone: the elimination finds them anew.
         return not_inlined(_eliminate_sticking(problem, limits, friction, contact_forces))
 
     contact = contact_forces(problem.contact_matrix, problem.contact_offsets)

@@ -53,6 +53,8 @@ class Servo:
     """A servo. On a joint with position q and velocity v it exerts, in N m or N,
 
     gain * ctrl + bias + stiffness * q + damping * v
+
+    As in MuJoCo's `biasprm`, stiffness and damping of a servo that holds are negative: -kp and -kv.
     """
 
     gain: Scalar
@@ -178,6 +180,8 @@ def variable_entries(mj_model: mujoco.MjModel, addresses: Addresses) -> tuple[tu
     servos = list(addresses.actuators)
     limited = [servo for servo in servos if mj_model.actuator_ctrllimited[servo]]
     entries = [(edit.field, edit.index) for edit in edits(mj_model, addresses)]
+    if not _is_on(mj_model, mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS):
+        entries = [entry for entry in entries if entry[0] != "dof_frictionloss"]
     entries += [
         ("body_pos", bodies),
         ("body_mass", links),
@@ -187,13 +191,13 @@ def variable_entries(mj_model: mujoco.MjModel, addresses: Addresses) -> tuple[tu
         # Of five coefficients, MuJoCo too uses the first two with condim="3".
         ("pair_friction", list(range(mj_model.npair))),
         ("qpos0", positions),
-        ("qpos_spring", positions),
         ("actuator_biasprm", (servos, 0)),
         ("actuator_ctrlrange", limited),
     ]
     # Where a flag of the MJCF turns a feature off, its numbers act in no engine.
     if _is_on(mj_model, mujoco.mjtDisableBit.mjDSBL_SPRING):
         entries.append(("jnt_stiffness", joints))
+        entries.append(("qpos_spring", positions))
     if mj_model.ngravcomp:
         entries.append(("body_gravcomp", links))
     return tuple(entries)
