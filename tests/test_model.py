@@ -33,7 +33,7 @@ REFUSED = {
     "servo that never rests": (
         SERVO_2,
         '<position name="act2" joint="Joint2" forcerange="2 10"/>',
-        "the forcerange 2 to 10 on Joint2",
+        "forces of 2 to 10 on Joint2",
     ),
     # A compiler's default, and MuJoCo converts the ranges of limited joints alone.
     "range in degrees": (' angle="radian"', "", "of Joint1 in degrees"),

@@ -107,6 +107,36 @@ def test_a_command_that_the_policy_does_not_see_is_refused() -> None:
         Env(Config())
 
 
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("ball_mass", "a term of the randomisation"), ("joint_angles", "a measurement")],
+)
+def test_a_command_with_the_name_of_something_else_is_refused(name, kind) -> None:
+    class Config(find_task("bounce").Config):
+        @property
+        def commands(self) -> dict[str, task.Command]:
+            return {name: task.Command(0.0, 1.0, hidden=True)}
+
+    with pytest.raises(UserError, match=f"the command {name} has the name of {kind}"):
+        Env(Config())
+
+
+@pytest.mark.parametrize("name", ["too_fast", "world/wind", "reward/height"])
+def test_a_metric_with_a_name_of_the_environment_is_refused(name) -> None:
+    balance = find_task("balance")
+
+    class Named(balance):
+        class Config(balance.Config):
+            pass
+
+        def step(self, state, step):
+            result = super().step(state, step)
+            return result._replace(metrics=result.metrics | {name: 1.0})
+
+    with pytest.raises(UserError, match=f"the metric {name} of the task Named has a name of"):
+        jax.eval_shape(Env(Named.Config()).reset, jax.random.PRNGKey(0))
+
+
 def test_settings_without_a_task_are_refused() -> None:
     with pytest.raises(UserError, match="WorldConfig has the settings of a world without a task"):
         Env(task.WorldConfig())

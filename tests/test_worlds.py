@@ -59,6 +59,13 @@ def test_each_number_of_a_shipped_world_is_sourced_or_assumed(name: str) -> None
             },
             "randomization.warmup_steps is assumed, but is no number to double",
         ),
+        (
+            {
+                "env": {"randomization": {"shares": {"frame_drop": 0.6}, "frame_drop": [0.0, 0.1]}},
+                "assumed": ["randomization.shares.frame_drop"],
+            },
+            "randomization.shares.frame_drop is assumed, but is no number to double",
+        ),
     ],
 )
 def test_a_mistake_is_one_sentence(tmp_path: Path, changes: dict, wrong: str) -> None:

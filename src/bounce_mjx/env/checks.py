@@ -1,6 +1,8 @@
 """What an environment refuses before its first step: settings that its task or its model cannot
 have. Each check raises a `UserError` of one sentence."""
 
+from collections.abc import Iterable
+
 import mujoco
 import numpy as np
 
@@ -8,6 +10,12 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.robot.model import Addresses, joint_names, joint_ranges
 from bounce_mjx.task.task import Task
 from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.randomization import TERMS
+
+ENDS = ("non_finite", "too_fast")
+"""Metrics of the ends of an episode that are no task's."""
+METRIC_PREFIXES = ("reward/", "world/", "true/")
+"""Of the environment's other metrics."""
 
 # Two turns of a joint without a range, rad; or m.
 _MAX_ANGLE = 4.0 * np.pi
@@ -28,8 +36,31 @@ def check_has_task(config: WorldConfig) -> None:
 
 def check_task(config: WorldConfig, task: Task) -> None:
     """Refuses what the task cannot have, whatever the model."""
+    _check_names_of_commands(config)
     _check_commands_are_seen(config)
     _check_num_balls(config, task)
+
+
+def _check_names_of_commands(config: WorldConfig) -> None:
+    """Refuses a command named like a term of the randomisation or a measurement, which would be
+    taken for it."""
+    quantities = config.observation.quantities()
+    for name in config.commands:
+        is_measurement = name in quantities and quantities[name].group != "command"
+        if name in TERMS or is_measurement:
+            kind = "a term of the randomisation" if name in TERMS else "a measurement"
+            raise UserError(f"the command {name} has the name of {kind}; choose another name")
+
+
+def check_metrics(names: Iterable[str], task: Task) -> None:
+    """Refuses metrics of a task's step that the environment has itself."""
+    for name in names:
+        if name in ENDS or name.startswith(METRIC_PREFIXES):
+            raise UserError(
+                f"the metric {name} of the task {type(task).__name__} has a name of the "
+                f"environment's own ({', '.join(ENDS)}, {', '.join(METRIC_PREFIXES)}...); choose "
+                "another name"
+            )
 
 
 def _check_commands_are_seen(config: WorldConfig) -> None:

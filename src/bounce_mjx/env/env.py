@@ -11,8 +11,10 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.env.checks import (
+    ENDS,
     check_has_task,
     check_joint_angles,
+    check_metrics,
     check_start,
     check_task,
 )
@@ -485,8 +487,10 @@ class Env:
             action=state.last_action,
             last_action=state.last_action,
         )
-        names = jax.eval_shape(lambda: _metrics(self.task.step(state.task, step), zero.dtype))
-        metrics = dict.fromkeys([*names, "non_finite", "too_fast"], zero)
+        result = jax.eval_shape(lambda: self.task.step(state.task, step))
+        check_metrics(result.metrics, self.task)
+        rewards = [f"reward/{name}" for name in result.reward]
+        metrics = dict.fromkeys([*rewards, *result.metrics, *ENDS], zero)
         metrics |= self._privileged_metrics(state.world, truth)
         for curve in self.task.curves:
             named = {curve.metric}

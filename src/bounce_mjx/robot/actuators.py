@@ -1,7 +1,7 @@
 """The actuators of a model: which joint each one moves, and whether it is a position servo.
 
 An acting joint of the task has exactly one actuator, a position servo, whose control is the target
-position of the joint. An arm that is adopted may have other ones.
+position of the joint, times the gear. An arm that is adopted may have other ones.
 
 MuJoCo counts actuators (`nactuator`) and controls (`nu`) apart, as a `<pid>` has several controls:
 `actuator_ctrladr` is the first control of each actuator.
@@ -62,7 +62,8 @@ def single_actuators(model: mujoco.MjModel, joints: Collection[int]) -> dict[int
 
 
 def is_position_servo(model: mujoco.MjModel, actuator: int) -> bool:
-    """Whether an actuator's control, or its filtered or integrated one, is a target position.
+    """Whether an actuator's control, or its filtered or integrated one, is a target position, times
+    the gear. `is_direct` tells whether it is the control itself.
 
     MuJoCo's force is gain * control + offset + factor * position + ...; a servo has the gain as its
     stiffness, and no offset.
@@ -74,6 +75,7 @@ def is_position_servo(model: mujoco.MjModel, actuator: int) -> bool:
         model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
         and model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE
         and gain > 0.0
+        and model.actuator_gear[actuator, 0] != 0.0
         and offset == 0.0
         # Otherwise the joint would rest at another position than the control.
         and np.isclose(factor, -gain)

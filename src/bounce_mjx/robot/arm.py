@@ -250,7 +250,7 @@ class _Builder:
         self._freeze_bodies()
         self._freeze_joints(joints, actuators)
         self._strip(joints, loose)
-        self._disable_contacts_and_limits(joints)
+        self._disable_contacts(joints)
         self._attach(scene, holder_name, position, quaternion)
         self._replace_servos(scene, joint_names)
         return Arm(
@@ -546,7 +546,7 @@ class _Builder:
             named = f": {listed(names)}" if any(names) else ""
             self._changes.append(f"{words} ({len(elements)}{named})")
 
-    def _disable_contacts_and_limits(self, joints: list[int]) -> None:
+    def _disable_contacts(self, joints: list[int]) -> None:
         arm_touches = False
         for i, body in enumerate(self._arm.bodies):
             touching = [bool(geom.contype or geom.conaffinity) for geom in body.geoms]

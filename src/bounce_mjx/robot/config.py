@@ -1,4 +1,5 @@
-"""Settings of an adopted arm: the paddle, the ball and the servos that its MJCF lacks."""
+"""Settings of the robot: the adoption of an arm, whose MJCF lacks the paddle and the ball, and the
+limits of any robot."""
 
 import math
 from pathlib import Path
@@ -77,7 +78,8 @@ class LimitsConfig(settings.StrictModel):
 
 
 class RobotConfig(settings.StrictModel):
-    """Adoption of an arm whose MJCF has no paddle and no ball."""
+    """Adoption of an arm whose MJCF has no paddle and no ball; `limits` and
+    `gravity_compensation` are of any robot."""
 
     site: str | None = None
     """Site or body of the arm that holds the paddle; null for an MJCF that is a whole scene."""

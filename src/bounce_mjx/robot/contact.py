@@ -40,7 +40,7 @@ _DROPS = (
 def damping_of_restitution(restitution: jax.Array, stiffness: float) -> jax.Array:
     """Damping [] of a contact, 1/s, that gives a restitution [] at a stiffness (1/s^2):
     2 zeta sqrt(stiffness), with the damping ratio zeta interpolated between drop tests. The
-    restitution is clipped to theirs, 0.40 to 0.993."""
+    restitution is clipped to those of the table, 0 to 0.993."""
     ratios, restitutions = np.array(_DROPS[::-1]).T
     zeta = jnp.interp(restitution, restitutions, ratios)
     return (2.0 * np.sqrt(stiffness) * zeta).astype(jnp.asarray(restitution).dtype)
@@ -48,7 +48,7 @@ def damping_of_restitution(restitution: jax.Array, stiffness: float) -> jax.Arra
 
 def restitution_of_damping(damping: float, stiffness: float) -> np.ndarray:
     """Restitution [] of a contact with a damping (1/s) at a stiffness (1/s^2): the inverse of
-    `damping_of_restitution`, also clipped to 0.40 to 0.993."""
+    `damping_of_restitution`, clipped to the same."""
     ratios, restitutions = np.array(_DROPS).T
     return np.interp(damping / (2.0 * np.sqrt(stiffness)), ratios, restitutions)
 

@@ -24,7 +24,7 @@ from bounce_mjx.robot.config import RobotConfig
 from bounce_mjx.robot.contact import check_step
 from bounce_mjx.robot.names import BALL_BODY_NAME, PADDLE_GEOM_NAME, joint_name
 from bounce_mjx.robot.numbers import check_numbers, physical_fields
-from bounce_mjx.robot.torques import force_ranges, limit_torques
+from bounce_mjx.robot.torques import limit_torques, torque_ranges
 
 
 class BallAddresses(NamedTuple):
@@ -90,8 +90,9 @@ def load_model(
       num_balls: 1 to 3; the balls that the file lacks are copies of its first one.
 
     Raises:
-      UserError: the file is missing, is no MJCF, lacks a name that the task needs, has a joint
-        without a position servo, more balls than `num_balls`, or a number that cannot be simulated;
+      UserError: the file is missing, is no MJCF, lacks a name that the task needs, has a joint with
+        several actuators or one that is no position servo (`check_servos`), a range in degrees that
+        MuJoCo does not convert, more balls than `num_balls`, or a number that cannot be simulated;
         or half a period of a contact has fewer than four physics steps.
     """
     robot = robot or RobotConfig()
@@ -233,7 +234,7 @@ def scatter(rest: np.ndarray, places: Sequence[int], values: jax.Array) -> jax.A
 
 def check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
     """Compares the acting joints' actuators with a position servo, whose control is the target
-    position of its joint, and which exerts no force there.
+    position of its joint, times the gear, and which exerts no force there.
 
     Raises:
       UserError: one is another actuator; the text starts with it.
@@ -249,13 +250,13 @@ def check_servos(mj_model: mujoco.MjModel, addresses: Addresses) -> None:
                 f'<position joint="{name}"/>, without a timeconst (env.randomization.servo_lag '
                 "simulates a lag)"
             )
-    forces = force_ranges(mj_model, addresses.actuators)
-    for joint, low, high in zip(addresses.arm_joints, *forces, strict=True):
+    torques = torque_ranges(mj_model, addresses.arm_joints, addresses.actuators)
+    for joint, low, high in zip(addresses.arm_joints, *torques, strict=True):
         if not low <= 0.0 <= high:
             name = joint_name(mj_model, joint)
             raise UserError(
-                f"the forcerange {low:g} to {high:g} on {name}, so its servo never rests; give a "
-                "range around 0"
+                f"forces of {low:g} to {high:g} on {name} (the forcerange times the gear, within "
+                "the joint's actuatorfrcrange), so its servo never rests; give ranges around 0"
             )
 
 

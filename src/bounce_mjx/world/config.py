@@ -293,7 +293,7 @@ class WorldConfig(RobotSettings):
     @property
     def ball_bounds(self) -> tuple[float, float]:
         """Largest distance of the ball from the robot's base (m), and its largest measured speed
-        (m/s), before an episode ends."""
+        (m/s), that an exported policy takes for possible; no episode of a training ends there."""
         return 3.0, 20.0
 
     @property

@@ -114,6 +114,8 @@ def read_world(path: Path) -> NamedWorld:
 def _can_be_doubled(key: str, value: Any) -> bool:
     """Whether a setting is a number, or several; of the randomisation, a term."""
     group, _, name = key.rpartition(".")
+    if group.startswith("randomization."):
+        return False
     if group == "randomization" and name not in TERMS:
         return False
     for number in np.ravel(np.array(value, object)).tolist():
