@@ -134,7 +134,10 @@ class TrainConfig(StrictModel):
     @pydantic.field_validator("env", mode="before")
     @classmethod
     def _read_env(cls, env: Any, info: pydantic.ValidationInfo) -> Any:
-        if isinstance(env, WorldConfig) or "task" not in info.data:
+        if "task" not in info.data:
+            return env
+        if isinstance(env, WorldConfig):
+            _check_task(env, info.data["task"])
             return env
         return find_task(info.data["task"]).Config.model_validate(env)
 
@@ -146,6 +149,19 @@ class TrainConfig(StrictModel):
         if isinstance(ppo, dict) and is_file(info.data.get("algorithm", PPO_NAME)):
             return {key: ppo[key] for key in ppo if key in PPOConfig.model_fields}
         return ppo
+
+
+def _check_task(env: WorldConfig, name: str) -> None:
+    """A task of a file is not looked for, as its code may not run.
+
+    Raises:
+      ValueError: the settings are those of another task.
+    """
+    if env.task is None or is_file(name) or find_task(name) is env.task:
+        return
+    raise ValueError(
+        f"these are the settings of {env.task.__qualname__}, and task is {name}; leave task out"
+    )
 
 
 def fields_of(
