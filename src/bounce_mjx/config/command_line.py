@@ -138,6 +138,7 @@ def read_flags(
         formatter_class=lambda prog: argparse.HelpFormatter(prog, max_help_position=26, width=100),
     )
     _add_arguments(parser, fields, defaults, shown)
+    # Also --num_envs, --report=true and --report=false.
     words = [re.sub(r"^--[^=]+", lambda flag: flag[0].replace("_", "-"), word) for word in args]
     words = [re.sub(r"^--(.+)=false$", r"--no-\1", word, flags=re.I) for word in words]
     words = [re.sub(r"^(--.+)=true$", r"\1", word, flags=re.I) for word in words]
@@ -180,8 +181,8 @@ def _mark(field: FieldInfo) -> Flag:
 
 def flag_names(fields: Mapping[str, FieldInfo]) -> dict[str, str]:
     """The flag of each setting by its dotted key: --reset.joint-angles of env.reset.joint_angles.
-    Where another setting has that flag, it has the whole key, such as --env.seed, because a task's
-    author may give a setting or a command any name."""
+    Where another setting has that flag, the later one has the whole key, such as --env.seed,
+    because a task's author may give a setting or a command any name."""
     flags, taken = {}, {"--help", "--help-all"}
     # A setting that stands in no group keeps its flag.
     for key in sorted(fields, key=lambda key: "." in key):
@@ -210,6 +211,7 @@ def _add_arguments(
     for key, field in fields.items():
         mark = _mark(field)
         text = " ".join((field.description or "").split()).replace("%", "%%")
+        # A short help has the first sentence only.
         text = text if shown is None else re.split(r"(?<=[\w)])[.;] ", text)[0].rstrip(".")
         if (value := defaults.get(key)) is not False and value not in (None, ()):
             words = " ".join(map(str, value)) if isinstance(value, tuple) else value

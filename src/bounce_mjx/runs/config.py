@@ -125,7 +125,7 @@ class TrainConfig(StrictModel):
     @pydantic.model_validator(mode="before")
     @classmethod
     def _name_task(cls, values: Any) -> Any:
-        """The settings of a task determine it."""
+        """The settings of a task determine its name."""
         env = values.get("env") if isinstance(values, dict) else None
         if isinstance(env, WorldConfig) and env.task is not None and "task" not in values:
             return values | {"task": task_name(env.task)}
@@ -248,7 +248,9 @@ def _task_of_run(name: str, run: Path, given: str | None) -> type[Task]:
     if given is not None:
         if not is_same_code(name, given):
             if not is_file(name):
-                raise UserError(f"{run} has the task {name}, and --task is {given}; leave it out")
+                raise UserError(
+                    f"{run} has the task {name}, and the task asked for is {given}; leave it out"
+                )
             note = f"{given} differs from the task that {run} was trained with, {name}"
             print(f"warning: {note}", file=sys.stderr)
         if is_file(name):

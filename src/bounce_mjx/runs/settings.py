@@ -7,7 +7,7 @@ They are layers, and a later one wins:
     3. what the user's own algorithm changes of PPO's defaults
     4. a preset that the user names, in place of the machine's
     5. --warm-start: the environment and the networks of a policy
-    6. the user's files, each on those before it
+    6. the user's files and further presets, each on those before it
     7. --robot
     8. --world
     9. what the user says: flags of the command, or arguments of `train`
@@ -91,7 +91,7 @@ def stack(choice: Choice, machine: Path | None = None, whole: TrainConfig | None
     """The layers of a choice, without what the user says.
 
     Args:
-      machine: name of the preset for this machine, where JAX's devices may not start yet.
+      machine: the machine's preset; None asks JAX, which starts its devices.
       whole: a config that takes the place of files, and stands alone.
 
     Raises:
@@ -100,6 +100,7 @@ def stack(choice: Choice, machine: Path | None = None, whole: TrainConfig | None
     """
     if choice.resume is not None:
         return _stack_of_run(choice, whole)
+    # The task decides which file a preset's name stands for, so only paths can name it.
     given = [file for file in choice.config if os.path.isfile(file)]
     files = [_layer_of_file(file) for file in given] if whole is None else [_layer_of(whole)]
     policy = _policy(choice, files, whole)
@@ -238,7 +239,7 @@ def _sources_of(layers: Sequence[Layer]) -> str:
 
 def _changed_defaults(algorithm: type[PPOConfig]) -> list[Layer]:
     """What an algorithm of the user's changes of PPO's defaults: it means these values, unlike a
-    preset that was made for PPO."""
+    preset that was made for PPO. They are a layer, so that they lie above the machine's preset."""
     own = {key: algorithm.model_fields[key].default for key in PPOConfig.model_fields}
     known = {key: field.default for key, field in PPOConfig.model_fields.items()}
     changed = {key: value for key, value in own.items() if value != known[key]}
@@ -448,7 +449,8 @@ def _merge(layers: Sequence[Layer]) -> tuple[dict[str, Any], dict[str, str]]:
 
 
 def _source_of(key: str, layers: Sequence[Layer]) -> str:
-    """The last layer that set a key, or one of the settings that a rule of a group joins."""
+    """The last layer that set a key; a guess for a rule that joins several settings of a group: the
+    last layer with any of them."""
     for layer in reversed(layers):
         for other in flat(layer.values):
             if not key or f"{other}.".startswith(f"{key}.") or key.startswith(f"{other}."):
