@@ -259,7 +259,9 @@ def test_a_training_stops_once_its_results_have_a_margin(tmp_path: Path) -> None
     # Results are not needed to resume.
     (run / "results.json").write_text("damaged")
     layers = stack(Choice(resume=run))
-    assert not layers.config({"total_steps": 10**6}).stop_when_solved
+    going_on = layers.config({"total_steps": 10**6})
+    assert not going_on.stop_when_solved
+    assert going_on.sources["stop_when_solved"] == going_on.sources["total_steps"] == "train"
     assert layers.config().stop_when_solved
     assert latest_checkpoint(run).steps == 192
     train(tmp_path, RETURNS, run, margins=margins, said=(shown := io.StringIO()))

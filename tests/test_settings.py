@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -233,6 +234,80 @@ def test_a_mistake_names_the_layer_that_has_it(folder: Path, refused) -> None:
     refused("train --config a.yaml --config b.yaml", "error: a.yaml: ppo: num_minibatches 7")
     refused("train --config b.yaml --num-minibatches 7", "(see bounce-mjx train --help)")
     refused("train --config b.yaml --seed -1", "--seed is -1", "(see bounce-mjx train --help)")
+    (folder / "c.yaml").write_text("ppo: {num_envs: 0}")
+    refused("train --config c.yaml --seed 1", "error: c.yaml: ppo.num_envs is 0, but")
+
+
+@pytest.mark.parametrize("key", ["on", "1", "null", "0.5"])
+def test_a_key_that_is_no_text_is_refused(key: str, folder: Path, refused) -> None:
+    """YAML reads on as true."""
+    (folder / "my.yaml").write_text(f"seed: 1\nppo: {{num_envs: 64,\n  {key}: 1}}")
+    refused("train --config my.yaml", f"the key {key} in line 3 is no text to YAML")
+    with pytest.raises(UserError, match="unknown key"):
+        python(ppo={yaml.safe_load(key): 1})
+
+
+def test_a_mapping_on_the_command_line_is_whole(folder: Path, refused) -> None:
+    """No word vanishes, and None ends the mapping of a layer below."""
+    config = read_command("--config robust_small --randomization.shares None".split()).config
+    assert config.env.randomization.shares is None
+    assert config.sources["env.randomization.shares"] == "flags"
+    for shares in ("", "restitution", "restitution 0.5 gravity"):
+        refused(f"train --randomization.shares {shares}", "--randomization.shares needs pairs")
+    refused("train --randomization.shares gravity 0.5 gravity 1", "has a name twice")
+
+
+def test_the_source_is_what_set_the_value_that_counts(folder: Path) -> None:
+    """A policy brings its task; a world ends a curriculum that it has no use for."""
+    config = read_command("--config finetune --warm-start track".split()).config
+    assert (config.task, config.sources["task"]) == ("track", "the warm start track")
+    config = read_command("--warm-start track --task track".split()).config
+    assert config.sources["task"] == "flags"
+    (folder / "world.yaml").write_text(
+        "env: {randomization: {command_interval: [2.0, 4.0]}}\nsources: {randomization: A test.}"
+    )
+    config = read_command("--config transfer --world world.yaml".split()).config
+    for key in ("share", "warmup_steps"):
+        default = type(config.env.randomization).model_fields[key].default
+        assert getattr(config.env.randomization, key) == default
+        assert config.sources[f"env.randomization.{key}"] == "default"
+
+
+def test_a_config_that_disagrees_with_itself_is_refused(folder: Path) -> None:
+    """It would train PPO with the settings of another algorithm, or a task with another's."""
+    (folder / "own.py").write_text(OWN)
+    ppo = stack(Choice(algorithm="own.py:Own")).algorithm()
+    whole = TrainConfig(algorithm="own.py:Own", ppo=ppo)
+    assert python(config=whole).ppo == ppo
+    for algorithm, settings_of_other in (("ppo", ppo), ("own.py:Own", TrainConfig().ppo)):
+        mixed = TrainConfig(algorithm=algorithm, ppo=settings_of_other)
+        with pytest.raises(UserError, match="name the algorithm that has them"):
+            bounce_mjx.train(config=mixed, quiet=True)
+    with pytest.raises(ValueError, match="these are the settings of Bounce, and task is track"):
+        TrainConfig(task="track", env=TrainConfig().env)
+
+
+def test_a_run_of_another_algorithm_is_refused_as_such(folder: Path, refused) -> None:
+    """Its settings are no settings of the algorithm that the user names: the run is not damaged."""
+    (folder / "own.py").write_text(OWN)
+    (folder / "other.py").write_text(OWN.replace("own_cost", "other_cost"))
+    own = stack(Choice(algorithm="own.py:Own")).config({"log_dir": folder / "runs"})
+    run = create_run(own)
+    line, refusal = f"train --resume {run}", "--resume cannot change the algorithm"
+    refused(f"{line} --algorithm other.py:Own", refusal)
+    refused(f"{line} --algorithm ppo", refusal)
+    refused(f"{line} --task catch", "--resume cannot change the task")
+
+
+def test_the_printed_config_is_a_config_where_a_run_is_chosen(folder: Path, capsys) -> None:
+    """What latest stands for is said as a training begins, and not in the config."""
+    policy = pretrained_checkpoint("robust_small")
+    shutil.copytree(policy.run, folder / "runs/2026-01-01")
+    line = "--warm-start latest --log-dir runs".split()
+    main(["train", *line, "--print-config"])
+    (folder / "again.yaml").write_text(capsys.readouterr().out)
+    assert "using the newest run: runs/2026-01-01" in read_command(line).layers.notes[0]
+    assert read_command(["--config", "again.yaml"]).config.ppo.hidden_layers == (128, 128)
 
 
 def test_the_printed_config_is_a_config_and_says_its_sources(folder: Path) -> None:

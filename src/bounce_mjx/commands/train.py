@@ -16,8 +16,10 @@ def main(args: Sequence[str]) -> None:
     command = read_command(args, default_preset(has_plugin()))
     flags = command.flags
     if flags.print_config:
-        # Asks JAX for its devices where the preset depends on them.
-        config = read_command(args).config
+        # The preset was chosen by JAX's plugins alone.
+        if has_plugin() != has_accelerator():
+            command = read_command(args)
+        config = command.config
         print(dump_with_sources(config.model_dump(mode="json"), config.sources), end="")
         return
     import jax

@@ -138,6 +138,7 @@ def read_flags(
         formatter_class=lambda prog: argparse.HelpFormatter(prog, max_help_position=26, width=100),
     )
     _add_arguments(parser, fields, defaults, shown)
+    # Also --num_envs, --report=true and --report=false.
     words = [re.sub(r"^--[^=]+", lambda flag: flag[0].replace("_", "-"), word) for word in args]
     words = [re.sub(r"^--(.+)=false$", r"--no-\1", word, flags=re.I) for word in words]
     words = [re.sub(r"^(--.+)=true$", r"\1", word, flags=re.I) for word in words]
@@ -146,7 +147,27 @@ def read_flags(
         flag = unknown[0].partition("=")[0]
         advice = "; ".join(filter(None, [unknown[0], suggest(flag, flags_of(fields))]))
         parser.error(f"unknown argument {advice}")
-    return {key: _plain(fields[key].annotation, value) for key, value in vars(given).items()}
+    values = {}
+    for key, value in vars(given).items():
+        values[key] = _plain(fields[key].annotation, value)
+        if isinstance(values[key], list) and dict in types_in(fields[key].annotation):
+            values[key] = _pairs(values[key], flag_names(fields)[key], parser)
+    return values
+
+
+def _pairs(words: list[str | None], flag: str, parser: "_Parser") -> dict[str | None, str | None]:
+    """The mapping that the words of a flag stand for: a name, its value, a name, its value.
+
+    Raises:
+      UserError: there is none, a name lacks its value, or a name appears twice.
+    """
+    names, values = words[::2], words[1::2]
+    if not words or len(names) != len(values):
+        parser.error(f"{flag} needs pairs of a name and its value, such as NAME 0.5")
+    pairs = dict(zip(names, values, strict=True))
+    if len(pairs) != len(names):
+        parser.error(f"{flag} has a name twice; leave one out")
+    return pairs
 
 
 class _Parser(argparse.ArgumentParser):
@@ -160,8 +181,8 @@ def _mark(field: FieldInfo) -> Flag:
 
 def flag_names(fields: Mapping[str, FieldInfo]) -> dict[str, str]:
     """The flag of each setting by its dotted key: --reset.joint-angles of env.reset.joint_angles.
-    Where another setting has that flag, it has the whole key, such as --env.seed, because a task's
-    author may give a setting or a command any name."""
+    Where another setting has that flag, the later one has the whole key, such as --env.seed,
+    because a task's author may give a setting or a command any name."""
     flags, taken = {}, {"--help", "--help-all"}
     # A setting that stands in no group keeps its flag.
     for key in sorted(fields, key=lambda key: "." in key):
@@ -190,6 +211,7 @@ def _add_arguments(
     for key, field in fields.items():
         mark = _mark(field)
         text = " ".join((field.description or "").split()).replace("%", "%%")
+        # A short help has the first sentence only.
         text = text if shown is None else re.split(r"(?<=[\w)])[.;] ", text)[0].rstrip(".")
         if (value := defaults.get(key)) is not False and value not in (None, ()):
             words = " ".join(map(str, value)) if isinstance(value, tuple) else value
@@ -219,8 +241,8 @@ def _is_list(kind: Any) -> bool:
 
 
 def _plain(kind: Any, given: bool | str | list[str]) -> Any:
-    """The words of a setting as pydantic reads them. A list may also have commas, except where a
-    file's name may."""
+    """The words of a setting as pydantic reads them; those of a mapping as a list, or None. A list
+    may also have commas, except where a file's name may."""
     if isinstance(given, bool):
         return given
     kinds = set(types_in(kind))
@@ -229,8 +251,6 @@ def _plain(kind: Any, given: bool | str | list[str]) -> Any:
         for word in ([given] if isinstance(given, str) else given)
         for part in (word.split(",") if _is_list(kind) and Path not in kinds else [word])
     ]
-    if dict in kinds:
-        return dict(zip(parts[::2], parts[1::2], strict=False))
     return parts if _is_list(kind) and parts != [None] else parts[0]
 
 

@@ -13,10 +13,13 @@ from bounce_mjx.errors import UserError, shorten
 # A config has at most a thousand values.
 _MAX_VALUES = 20_000
 
+# Text, and the key << that joins mappings.
+_KEY_TAGS = ("tag:yaml.org,2002:str", "tag:yaml.org,2002:merge")
+
 
 class _Loader(yaml.SafeLoader):
-    """Refuses YAML in which a key appears twice, of which the last would count, and YAML that has
-    very many values, also by aliases of aliases."""
+    """Refuses YAML in which a key appears twice, of which the last would count, or is no text, and
+    YAML that has very many values, also by aliases of aliases."""
 
     def __init__(self, stream: str):
         super().__init__(stream)
@@ -42,6 +45,13 @@ class _Loader(yaml.SafeLoader):
                 lines = f"{other.start_mark.line + 1} and {key.start_mark.line + 1}"
                 raise yaml.YAMLError(
                     f"the key {key.value} appears twice, in lines {lines}; join the two"
+                )
+            # YAML reads on, yes and 1 as true, true and a number.
+            if key.tag not in _KEY_TAGS:
+                line = key.start_mark.line + 1
+                raise yaml.YAMLError(
+                    f"the key {shorten(str(key.value))} in line {line} is no text to YAML; "
+                    "correct it, or put it in quotes"
                 )
         return node
 
@@ -73,7 +83,7 @@ def read_mapping(path: Path, kind: str, example: str) -> dict[str, Any]:
 
 
 def dump_config(config: StrictModel) -> str:
-    """The whole config as YAML, for `read_preset`."""
+    """The whole config as YAML, for `load_run_config` and --config."""
     return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
 
 
@@ -108,6 +118,7 @@ def flat(plain: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """The values of nested mappings by their dotted names."""
     values = {}
     for key, value in plain.items():
-        name = prefix + key
+        # A key from Python may be no text; validation then refuses it.
+        name = f"{prefix}{key}"
         values |= flat(value, f"{name}.") if isinstance(value, dict) else {name: value}
     return values

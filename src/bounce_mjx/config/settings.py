@@ -60,8 +60,8 @@ def whole_number(value: Any) -> Any:
     integer; any other value is returned unchanged. YAML reads 1e6 as a string, because its numbers
     with an exponent need a decimal point.
     """
-    is_scientific = r"[+-]?[\d_]*\d(\.\d*)?[eE][+-]?\d+"
-    return float(value) if re.fullmatch(is_scientific, str(value)) else value
+    scientific = r"[+-]?[\d_]*\d(\.\d*)?[eE][+-]?\d+"
+    return float(value) if re.fullmatch(scientific, str(value)) else value
 
 
 _WholeNumber = pydantic.BeforeValidator(whole_number)
@@ -114,7 +114,7 @@ class Layer(NamedTuple):
     """Nested, with the keys of a larger config."""
     is_world: bool = False
     """Whether it brings the whole randomisation: what a preset's curriculum says of other terms
-    then ends."""
+    then ends, see `without_idle_curriculum`."""
 
 
 def types_in(kind: Any) -> Iterator[Any]:

@@ -125,7 +125,7 @@ class TrainConfig(StrictModel):
     @pydantic.model_validator(mode="before")
     @classmethod
     def _name_task(cls, values: Any) -> Any:
-        """The settings of a task determine it."""
+        """The settings of a task determine its name."""
         env = values.get("env") if isinstance(values, dict) else None
         if isinstance(env, WorldConfig) and env.task is not None and "task" not in values:
             return values | {"task": task_name(env.task)}
@@ -134,7 +134,10 @@ class TrainConfig(StrictModel):
     @pydantic.field_validator("env", mode="before")
     @classmethod
     def _read_env(cls, env: Any, info: pydantic.ValidationInfo) -> Any:
-        if isinstance(env, WorldConfig) or "task" not in info.data:
+        if "task" not in info.data:
+            return env
+        if isinstance(env, WorldConfig):
+            _check_task(env, info.data["task"])
             return env
         return find_task(info.data["task"]).Config.model_validate(env)
 
@@ -146,6 +149,19 @@ class TrainConfig(StrictModel):
         if isinstance(ppo, dict) and is_file(info.data.get("algorithm", PPO_NAME)):
             return {key: ppo[key] for key in ppo if key in PPOConfig.model_fields}
         return ppo
+
+
+def _check_task(env: WorldConfig, name: str) -> None:
+    """A task of a file is not looked for, as its code may not run.
+
+    Raises:
+      ValueError: the settings are those of another task.
+    """
+    if env.task is None or is_file(name) or find_task(name) is env.task:
+        return
+    raise ValueError(
+        f"these are the settings of {env.task.__qualname__}, and task is {name}; leave task out"
+    )
 
 
 def fields_of(
@@ -232,7 +248,9 @@ def _task_of_run(name: str, run: Path, given: str | None) -> type[Task]:
     if given is not None:
         if not is_same_code(name, given):
             if not is_file(name):
-                raise UserError(f"{run} has the task {name}, and --task is {given}; leave it out")
+                raise UserError(
+                    f"{run} has the task {name}, and the task asked for is {given}; leave it out"
+                )
             note = f"{given} differs from the task that {run} was trained with, {name}"
             print(f"warning: {note}", file=sys.stderr)
         if is_file(name):

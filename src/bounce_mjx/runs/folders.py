@@ -297,7 +297,16 @@ def pretrained_checkpoint(name: str = PRETRAINED) -> Checkpoint:
 
 
 def choose_checkpoint(path: Path | None, log_dir: Path) -> Checkpoint:
-    """Checkpoint to show or to evaluate; prints the choice if the user made none.
+    """Checkpoint to show or to evaluate; prints the choice if the user made none: see
+    `find_choice`."""
+    checkpoint, choice = find_choice(path, log_dir)
+    if choice is not None:
+        print(choice)
+    return checkpoint
+
+
+def find_choice(path: Path | None, log_dir: Path) -> tuple[Checkpoint, str | None]:
+    """Checkpoint that a path stands for, and a line about the choice if the user made none.
 
     Args:
       path: see `find_checkpoint`; or `LATEST` or a name in `POLICIES`, unless there is a folder
@@ -305,7 +314,7 @@ def choose_checkpoint(path: Path | None, log_dir: Path) -> Checkpoint:
         whose default folder of runs is empty.
     """
     if policy_folder(path):
-        return pretrained_checkpoint(str(path))
+        return pretrained_checkpoint(str(path)), None
     try:
         run = named_run(path, log_dir)
     except UserError:
@@ -313,15 +322,16 @@ def choose_checkpoint(path: Path | None, log_dir: Path) -> Checkpoint:
         folders = {runs_folder(find_task(task)): policy for task, policy in policies.items()}
         if path is not None or log_dir not in folders:
             raise
-        print(f"no run in {log_dir}: using the policy that comes with the package")
-        return pretrained_checkpoint(folders[log_dir])
+        choice = f"no run in {log_dir}: using the policy that comes with the package"
+        return pretrained_checkpoint(folders[log_dir]), choice
     if not os.path.isdir(run) and (near := suggest(str(path), POLICIES)):
         raise UserError(f"there is no checkpoint folder and no policy {path}; {near}")
+    choice = None
     if run != path:
         results = load_results(_best_seed(run))
         known = results.best.summary if results else "not evaluated"
-        print(f"using the newest run: {run} ({known})")
-    return find_checkpoint(run)
+        choice = f"using the newest run: {run} ({known})"
+    return find_checkpoint(run), choice
 
 
 def stored_checkpoints(run: Path) -> list[Checkpoint]:

@@ -49,12 +49,13 @@ def preset_files(config: Sequence[Path], task: str, machine: Path | None = None)
     Args:
       config: YAML files, or names of files in configs/. A task may have its own preset of a name,
         in the folder of configs/ that has the task's name.
-      machine: name of the preset for this machine, where JAX's devices may not start yet.
+      machine: the machine's preset; None asks JAX, which starts its devices.
 
     Raises:
       UserError: a file is missing or invalid, or names a base that is not used.
     """
     of_task = f"{PRESETS}/{task}"
+    # The task's own first.
     files = [named_file(named_file(file, of_task), PRESETS, "preset") for file in config]
     bases = {file: values[BASE] for file in files if BASE in (values := read_config_file(file))}
     for file in files[1:]:
@@ -110,8 +111,8 @@ def shown_file(file: Path) -> str:
 def read_config_file(
     path: Path, kind: str = "config file", example: str = _EXAMPLE
 ) -> dict[str, Any]:
-    """The values of a config file (`read_mapping`), with absolute paths of the MJCF file and of the
-    files of the task and the algorithm, which start at the folder of the file."""
+    """The values of a config file (`read_mapping`). The files of the task and the algorithm have
+    absolute paths; the MJCF file starts, as they do, at the folder of the file."""
     values = present_settings(read_mapping(path, kind, example))
     for key in {"task", "algorithm"} & values.keys():
         name = str(values[key])

@@ -7,7 +7,7 @@ They are layers, and a later one wins:
     3. what the user's own algorithm changes of PPO's defaults
     4. a preset that the user names, in place of the machine's
     5. --warm-start: the environment and the networks of a policy
-    6. the user's files, each on those before it
+    6. the user's files and further presets, each on those before it
     7. --robot
     8. --world
     9. what the user says: flags of the command, or arguments of `train`
@@ -38,6 +38,7 @@ from bounce_mjx.learning.config import PPO_NAME, PPOConfig
 from bounce_mjx.learning.registry import find_algorithm
 from bounce_mjx.resources import policy_folder
 from bounce_mjx.runs.config import (
+    CONFIG_FILE,
     TrainConfig,
     fields_of,
     load_run_config,
@@ -90,7 +91,7 @@ def stack(choice: Choice, machine: Path | None = None, whole: TrainConfig | None
     """The layers of a choice, without what the user says.
 
     Args:
-      machine: name of the preset for this machine, where JAX's devices may not start yet.
+      machine: the machine's preset; None asks JAX, which starts its devices.
       whole: a config that takes the place of files, and stands alone.
 
     Raises:
@@ -99,6 +100,7 @@ def stack(choice: Choice, machine: Path | None = None, whole: TrainConfig | None
     """
     if choice.resume is not None:
         return _stack_of_run(choice, whole)
+    # The task decides which file a preset's name stands for, so only paths can name it.
     given = [file for file in choice.config if os.path.isfile(file)]
     files = [_layer_of_file(file) for file in given] if whole is None else [_layer_of(whole)]
     policy = _policy(choice, files, whole)
@@ -112,6 +114,7 @@ def stack(choice: Choice, machine: Path | None = None, whole: TrainConfig | None
     algorithm_name, algorithm = _algorithm(choice, [*machines, *named, *files], whole)
     changed = _changed_defaults(algorithm)
     start = [] if policy is None else [policy.layer(is_in_world=choice.world is not None)]
+    chosen = () if policy is None else policy.notes
     trained = None if policy is None else policy.config.env
     robot, world = robot_and_world(choice.robot, choice.world, task, trained)
     decided = {"task": task_name, "algorithm": algorithm_name}
@@ -122,7 +125,7 @@ def stack(choice: Choice, machine: Path | None = None, whole: TrainConfig | None
         algorithm=algorithm,
         layers=(*machines, *changed, *named, *start, *files, *robot, *world),
         decided=decided,
-        notes=(*_notes(changed, named, "ppo."), *_notes(named, start, "env.")),
+        notes=(*chosen, *_notes(changed, named, "ppo."), *_notes(named, start, "env.")),
     )
 
 
@@ -137,14 +140,16 @@ def _stack_of_run(choice: Choice, whole: TrainConfig | None) -> "Stack":
     log_dir = choice.log_dir or runs_folder(find_task(choice.task or DEFAULT))
     resume = named_run(choice.resume, log_dir)
     run = find_run(resume)
-    config = load_run_config(run, choice.task, choice.algorithm)
+    # First, since the run's settings are no settings of another task or algorithm.
+    stored = {"task": DEFAULT, "algorithm": PPO_NAME} | read_config_file(run / CONFIG_FILE)
     for key in ("task", "algorithm"):
-        given, own = getattr(choice, key), getattr(config, key)
-        if given is not None and not is_same_code(own, given):
+        asked = getattr(choice, key)
+        if asked is not None and not is_same_code(stored[key], asked):
             raise UserError(
-                f"--resume cannot change the {key}, and {given} differs from {own}; restore "
-                "it, name the run's copy, or start a new run"
+                f"--resume cannot change the {key}, and {asked} differs from {stored[key]}; "
+                "restore it, name the run's copy, or start a new run"
             )
+    config = load_run_config(run, choice.task, choice.algorithm)
     if is_file(config.algorithm) and choice.algorithm is None:
         raise unnamed_code(f"the run {run}", "algorithm", config.algorithm)
     return Stack(
@@ -209,12 +214,23 @@ def _algorithm(
       UserError: there is none, or it is a file that the user has not named.
     """
     if whole is not None and choice.algorithm is None:
+        settings = _settings_of(whole.algorithm)
+        # Code that was imported otherwise has another class of the same name.
+        if settings.__qualname__ != type(whole.ppo).__qualname__:
+            raise UserError(
+                f"the config's ppo is {type(whole.ppo).__qualname__}, and its algorithm "
+                f"{whole.algorithm} has {settings.__qualname__}; name the algorithm that has them"
+            )
         return whole.algorithm, type(whole.ppo)
     name = choice.algorithm or _last(layers, "algorithm") or PPO_NAME
     if choice.algorithm is None and is_file(name):
         raise unnamed_code(_sources_of(layers), "algorithm", name)
-    # Without the import of JAX.
-    return name, PPOConfig if name == PPO_NAME else find_algorithm(name).Config
+    return name, _settings_of(name)
+
+
+def _settings_of(algorithm: str) -> type[PPOConfig]:
+    """The settings of an algorithm by its name; PPO's without the import of JAX."""
+    return PPOConfig if algorithm == PPO_NAME else find_algorithm(algorithm).Config
 
 
 def _sources_of(layers: Sequence[Layer]) -> str:
@@ -223,7 +239,7 @@ def _sources_of(layers: Sequence[Layer]) -> str:
 
 def _changed_defaults(algorithm: type[PPOConfig]) -> list[Layer]:
     """What an algorithm of the user's changes of PPO's defaults: it means these values, unlike a
-    preset that was made for PPO."""
+    preset that was made for PPO. They are a layer, so that they lie above the machine's preset."""
     own = {key: algorithm.model_fields[key].default for key in PPOConfig.model_fields}
     known = {key: field.default for key, field in PPOConfig.model_fields.items()}
     changed = {key: value for key, value in own.items() if value != known[key]}
@@ -254,16 +270,19 @@ class _Policy(NamedTuple):
     """Its name, or its checkpoint's folder."""
     config: TrainConfig
     """The config of its run."""
+    notes: tuple[str, ...]
+    """Which run latest stands for."""
 
     def layer(self, is_in_world: bool) -> Layer:
-        """Its environment and its networks. A named world replaces the randomisation."""
+        """Its task, environment and networks. A named world replaces the randomisation."""
         from bounce_mjx.runs.checkpoints import NETWORK_KEYS
 
         env = self.config.env.model_dump()
         if is_in_world:
             del env["randomization"]
         networks = self.config.ppo.model_dump(include={*NETWORK_KEYS, "critic_metrics"})
-        return Layer(f"the warm start {self.start}", {"env": env, "ppo": networks})
+        values = {"task": self.config.task, "env": env, "ppo": networks}
+        return Layer(f"the warm start {self.start}", values)
 
 
 def _policy(choice: Choice, files: Sequence[Layer], whole: TrainConfig | None) -> _Policy | None:
@@ -281,7 +300,7 @@ def _policy(choice: Choice, files: Sequence[Layer], whole: TrainConfig | None) -
         return None
     if choice.robot:
         raise UserError("--warm-start and --robot cannot be combined; leave --robot out")
-    from bounce_mjx.runs.folders import choose_checkpoint, runs_in
+    from bounce_mjx.runs.folders import find_choice, runs_in
 
     task = choice.task or _last(files, "task")
     if choice.task is None and task is not None and is_file(task) and whole is None:
@@ -289,9 +308,10 @@ def _policy(choice: Choice, files: Sequence[Layer], whole: TrainConfig | None) -
     log_dir = choice.log_dir or _last(files, "log_dir")
     if log_dir is None or not runs_in(Path(log_dir)):
         log_dir = runs_folder(whole.env.task if whole else find_task(task or DEFAULT))
-    checkpoint = choose_checkpoint(Path(path), Path(log_dir))
+    checkpoint, choice = find_choice(Path(path), Path(log_dir))
     config = load_run_config(checkpoint.run, task)
-    return _Policy(Path(path) if policy_folder(path) else checkpoint.folder, config)
+    start = Path(path) if policy_folder(path) else checkpoint.folder
+    return _Policy(start, config, () if choice is None else (choice,))
 
 
 # Merging and validating -------------------------------------------------------------------------
@@ -308,7 +328,8 @@ class Stack:
     decided: dict[str, Any]
     """Values that no layer changes any more, such as the checkpoint that a warm start found."""
     notes: tuple[str, ...] = ()
-    """Where a layer wins over another one that a user may have expected to win."""
+    """Which run latest stands for, and where a layer wins over another one that a user may have
+    expected to win."""
     resume: Path | None = None
     """The resumed run's folder, or a checkpoint in it."""
     resumed: TrainConfig | None = None
@@ -343,21 +364,23 @@ class Stack:
             run. The error names the layer that set it.
         """
         user = Layer(PYTHON if flags is None else FLAGS, self._nested(said or {}))
-        layers = [*self.layers, *self._go_on(user), user]
+        above = [*self._go_on(user), user]
+        layers = [*self.layers, *above]
         values, sources = _merge(layers)
         values = merged(values, self.decided)
         try:
             config = self._validated(values)
         except _Mistake as mistake:
             source = _source_of(mistake.key, layers)
-            text = describe(mistake.error, self.fields, flags or {}, mistake.group)
             if flags is not None and source == FLAGS:
+                text = describe(mistake.error, self.fields, flags, mistake.group)
                 raise UserError(f"{text} (see {prog} --help)") from mistake.error
+            text = describe(mistake.error, self.fields, group=mistake.group)
             raise UserError(f"{shorten(source)}: {text}") from mistake.error
         if self.resumed is not None:
             _check_resumable(self.resumed, config)
-            own = dict.fromkeys(flat(user.values), user.source)
-            sources = self.resumed.sources | own
+            _, changed = _merge(above)
+            sources = self.resumed.sources | changed
         config.set_sources(sources)
         return config
 
@@ -420,11 +443,14 @@ def _merge(layers: Sequence[Layer]) -> tuple[dict[str, Any], dict[str, str]]:
             randomization = without_idle_curriculum(values["env"]["randomization"])
             values["env"] = values["env"] | {"randomization": randomization}
         sources |= dict.fromkeys(flat(layer.values), layer.source)
-    return values, sources
+    # A later layer may end a value, or replace a mapping by None.
+    remaining = flat(values)
+    return values, {key: source for key, source in sources.items() if key in remaining}
 
 
 def _source_of(key: str, layers: Sequence[Layer]) -> str:
-    """The last layer that set a key, or one of the settings that a rule of a group joins."""
+    """The last layer that set a key; a guess for a rule that joins several settings of a group: the
+    last layer with any of them."""
     for layer in reversed(layers):
         for other in flat(layer.values):
             if not key or f"{other}.".startswith(f"{key}.") or key.startswith(f"{other}."):

@@ -23,7 +23,7 @@ _SHORT_HELP = (
 
 
 class TrainFlags(Choice):
-    """The flags of the command that are no keys of the config."""
+    """The flags that decide which layers there are, and those beside the keys of the config."""
 
     print_config: bool = False
     """Print the config, with the layer that sets each value, and train nothing."""
@@ -78,7 +78,7 @@ def read_command(args: Sequence[str], machine: Path | None = None) -> TrainComma
     """Reads a command line: first the flags that decide which others there are, then all.
 
     Args:
-      machine: name of the preset for this machine, where JAX's devices may not start yet.
+      machine: the machine's preset; None asks JAX, which starts its devices.
 
     Raises:
       UserError: a flag or a file is wrong, or a flag changes a key of the resumed run that must
@@ -93,6 +93,7 @@ def read_command(args: Sequence[str], machine: Path | None = None) -> TrainComma
         defaults = flat(TrainFlags().model_dump()) | flat(layers.config().model_dump())
         about = "--help-all lists every flag; each key of the config is one."
         options = {} if "--help-all" in helps else {"shown": _SHORT_HELP, "epilog": about}
+        # Prints, and exits.
         read_flags(fields, ["--help"], prog=PROG, description=ABOUT, defaults=defaults, **options)
     given = read_flags(fields, words, prog=PROG, description=ABOUT, defaults={})
     names = flag_names(fields)
