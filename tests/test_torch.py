@@ -209,6 +209,13 @@ def test_rsl_rl_gets_time_outs_and_terminal_observations(env):
     torch.testing.assert_close(terminal[:, 28], before[:, 28])
     assert torch.equal(terminal[1:], after["policy"][1:])
     assert terminal[0, 28] != after["policy"][0, 28]
+    # A fall is no time-out. It takes longer than an episode here.
+    vec_env.episode_length_buf = torch.full((NUM_ENVS,), -1000)
+    has_fallen = torch.zeros(NUM_ENVS, dtype=torch.bool)
+    for actions in random_actions(200):
+        _, _, dones, extras = vec_env.step(actions)
+        has_fallen |= dones.bool() & ~extras["time_outs"].bool()
+    assert has_fallen.any()
 
 
 def test_rsl_rl_scripts_find_what_they_touch(env):
