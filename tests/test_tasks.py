@@ -121,7 +121,7 @@ def test_a_command_with_the_name_of_something_else_is_refused(name, kind) -> Non
         Env(Config())
 
 
-@pytest.mark.parametrize("name", ["too_fast", "world/wind", "reward/height"])
+@pytest.mark.parametrize("name", ["too_fast", "world/wind", "reward/height", "steps"])
 def test_a_metric_with_a_name_of_the_environment_is_refused(name) -> None:
     balance = find_task("balance")
 
@@ -135,6 +135,20 @@ def test_a_metric_with_a_name_of_the_environment_is_refused(name) -> None:
 
     with pytest.raises(UserError, match=f"the metric {name} of the task Named has a name of"):
         jax.eval_shape(Env(Named.Config()).reset, jax.random.PRNGKey(0))
+
+
+def test_two_curves_with_one_tag_are_refused() -> None:
+    balance = find_task("balance")
+
+    class Twice(balance):
+        class Config(balance.Config):
+            pass
+
+        curves = (*balance.curves, balance.curves[0])
+
+    tag = balance.curves[0].tag
+    with pytest.raises(UserError, match=f"the tag {tag} of a curve of the task Twice is taken"):
+        jax.eval_shape(Env(Twice.Config()).reset, jax.random.PRNGKey(0))
 
 
 def test_settings_without_a_task_are_refused() -> None:

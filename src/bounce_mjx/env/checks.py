@@ -14,8 +14,12 @@ from bounce_mjx.world.randomization import TERMS
 
 ENDS = ("non_finite", "too_fast")
 """Metrics of the ends of an episode that are no task's."""
-METRIC_PREFIXES = ("reward/", "world/", "true/")
+METRIC_PREFIXES = ("reward", "world/", "true/")
 """Of the environment's other metrics."""
+_TAKEN_METRICS = (*ENDS, "steps", "episodes")
+"""Names that a task's metrics cannot have; the last two are what a curve may be over."""
+_TAKEN_TAGS = ("reward", "steps", "ended", "return", "length")
+"""Tags that a curve cannot have: the sums behind the curves that every training has."""
 
 # Two turns of a joint without a range, rad; or m.
 _MAX_ANGLE = 4.0 * np.pi
@@ -55,12 +59,24 @@ def _check_names_of_commands(config: WorldConfig) -> None:
 def check_metrics(names: Iterable[str], task: Task) -> None:
     """Refuses metrics of a task's step that the environment has itself."""
     for name in names:
-        if name in ENDS or name.startswith(METRIC_PREFIXES):
+        if name in _TAKEN_METRICS or name.startswith(METRIC_PREFIXES):
             raise UserError(
                 f"the metric {name} of the task {type(task).__name__} has a name of the "
-                f"environment's own ({', '.join(ENDS)}, {', '.join(METRIC_PREFIXES)}...); choose "
-                "another name"
+                f"environment's own ({', '.join(_TAKEN_METRICS)}, or one that begins with "
+                f"{', '.join(METRIC_PREFIXES)}); choose another name"
             )
+
+
+def check_tags(task: Task) -> None:
+    """Refuses curves that would be drawn as one."""
+    taken = set(_TAKEN_TAGS)
+    for curve in task.curves:
+        if curve.tag in taken:
+            raise UserError(
+                f"the tag {curve.tag} of a curve of the task {type(task).__name__} is taken; "
+                "choose another one"
+            )
+        taken.add(curve.tag)
 
 
 def _check_commands_are_seen(config: WorldConfig) -> None:

@@ -16,6 +16,7 @@ from bounce_mjx.env.checks import (
     check_joint_angles,
     check_metrics,
     check_start,
+    check_tags,
     check_task,
 )
 from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, edited_model
@@ -489,6 +490,7 @@ class Env:
         )
         result = jax.eval_shape(lambda: self.task.step(state.task, step))
         check_metrics(result.metrics, self.task)
+        check_tags(self.task)
         rewards = [f"reward/{name}" for name in result.reward]
         metrics = dict.fromkeys([*rewards, *result.metrics, *ENDS], zero)
         metrics |= self._privileged_metrics(state.world, truth)

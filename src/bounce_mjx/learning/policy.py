@@ -1,7 +1,7 @@
 """The policy, its network and the value network: multilayer perceptrons with orthogonal weights.
 
-A policy's file stores the parameters under the names of the modules `MLP` and `PolicyNetwork`, so
-these names must not change.
+A policy's file stores the parameters under the names of the modules and layers within the network
+(MLP_0, hidden_0, Dense_0, std_logparam), so these must not change.
 """
 
 import functools

@@ -42,7 +42,7 @@ class RunningStatistics(NamedTuple):
 
 
 def init_normalizer(size: int) -> Normalizer:
-    """The normaliser [size] that changes nothing."""
+    """The normaliser [size] that changes nothing but what is clipped."""
     return Normalizer(mean=jnp.zeros(size, jnp.float32), std=jnp.ones(size, jnp.float32))
 
 

@@ -172,7 +172,7 @@ class Task:
     """Name of the folder of its runs in runs/; by default, the class's name in lower case."""
     curves: ClassVar[tuple[Curve, ...]] = ()
     """What a training logs and a report draws of the metrics; the first is the progress line's. A
-    metric without one is logged as its mean over the steps."""
+    metric that no curve shows or is over is logged as its mean over the steps."""
     num_balls: ClassVar[tuple[int, ...]] = (1,)
     """Numbers of balls (`WorldConfig.num_balls`) that it takes."""
     num_draws: ClassVar[int] = 0
