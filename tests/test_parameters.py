@@ -147,11 +147,10 @@ def test_an_entry_that_the_fused_engine_ignores_is_refused(mj_model, name):
         read_model(mj_model, PhysicsParameters(entries={name: 3.0}))
 
 
-@pytest.mark.parametrize("name", ("qpos_spring[1]", "jnt_stiffness[1]", "dof_frictionloss[1]"))
+@pytest.mark.parametrize("name", ("qpos_spring[1]", "jnt_stiffness[1]"))
 def test_a_number_whose_flag_is_off_is_refused(mj_model, name):
     model = copy.deepcopy(mj_model)
-    disabled = mujoco.mjtDisableBit.mjDSBL_SPRING | mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
-    model.opt.disableflags |= disabled
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SPRING
     assert read_model(mj_model, PhysicsParameters(entries={name: 0.1}))
     with pytest.raises(UserError, match=re.escape(f"cannot vary {name}")):
         read_model(model, PhysicsParameters(entries={name: 0.1}))

@@ -180,8 +180,6 @@ def variable_entries(mj_model: mujoco.MjModel, addresses: Addresses) -> tuple[tu
     servos = list(addresses.actuators)
     limited = [servo for servo in servos if mj_model.actuator_ctrllimited[servo]]
     entries = [(edit.field, edit.index) for edit in edits(mj_model, addresses)]
-    if not _is_on(mj_model, mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS):
-        entries = [entry for entry in entries if entry[0] != "dof_frictionloss"]
     entries += [
         ("body_pos", bodies),
         ("body_mass", links),
@@ -194,7 +192,8 @@ def variable_entries(mj_model: mujoco.MjModel, addresses: Addresses) -> tuple[tu
         ("actuator_biasprm", (servos, 0)),
         ("actuator_ctrlrange", limited),
     ]
-    # Where a flag of the MJCF turns a feature off, its numbers act in no engine.
+    # Where a flag of the MJCF turns a feature off, its numbers act in no engine. The named parameter
+    # `frictionloss` may be given all the same, as in MuJoCo.
     if _is_on(mj_model, mujoco.mjtDisableBit.mjDSBL_SPRING):
         entries.append(("jnt_stiffness", joints))
         entries.append(("qpos_spring", positions))
