@@ -192,7 +192,7 @@ def variable_entries(mj_model: mujoco.MjModel, addresses: Addresses) -> tuple[tu
         ("actuator_biasprm", (servos, 0)),
         ("actuator_ctrlrange", limited),
     ]
-    # Where a flag of the MJCF turns a feature off, its numbers act in no engine. The named parameter
+    # Where a flag of the MJCF turns a feature off, its numbers act in no engine. The parameter
     # `frictionloss` may be given all the same, as in MuJoCo.
     if _is_on(mj_model, mujoco.mjtDisableBit.mjDSBL_SPRING):
         entries.append(("jnt_stiffness", joints))
