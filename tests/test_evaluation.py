@@ -29,6 +29,7 @@ from bounce_mjx.learning.policy import networks_of
 from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.physics import PhysicsParameters
 from bounce_mjx.reports.tables import details_line, seeds_table
+from bounce_mjx.resources import TASK_POLICIES
 from bounce_mjx.task import Tally, share_of_episodes
 from bounce_mjx.task.registry import find_task
 
@@ -439,3 +440,14 @@ def test_another_task_is_counted_and_judged_by_itself(dribbling):
 def test_a_result_may_not_have_the_name_of_a_records_own_key(name: str) -> None:
     with pytest.raises(UserError, match=f"has the name '{name}', .*; choose another name"):
         share_of_episodes(name, "episodes", np.ones(3, bool), 0.9)
+
+
+@pytest.mark.parametrize("name", ["bounce", *TASK_POLICIES])
+def test_each_task_judges_what_an_evaluation_gives_it(name) -> None:
+    """Two episodes that lasted and in which nothing happened."""
+    env = Env(find_task(name).Config())
+    keys = jax.random.split(jax.random.PRNGKey(0), 2)
+    shapes = jax.eval_shape(jax.vmap(env.reset, out_axes=-1), keys)
+    states = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    report = judge(env, empty_statistics(env, states))
+    assert report.results and report.details["episodes"] == 2.0

@@ -100,8 +100,8 @@ def main(args: Sequence[str]) -> None:
         write_output(out / name, content)
     print(*(out / name for name in files), sep="\n")
     lost = [outcome for outcome in outcomes if outcome.lost and outcome.physics != "mujoco"]
-    # Films are of the whole suite's programs.
-    if lost and not command.assumed:
+    # Films are of the whole suite's programs, on the config's engine.
+    if lost and not command.assumed and command.physics == "config":
         worst = min(lost, key=lambda outcome: outcome.lasted)
         film = "--condition", worst.label, "--episode", str(worst.lost[0])
         print(f"film of a lost ball: {film_command(args, ('--out=', '--physics='), *film)}")

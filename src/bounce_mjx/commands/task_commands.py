@@ -76,7 +76,7 @@ def _fields_of(task: str | None) -> dict[str, FieldInfo]:
     for name, command in commands.items():
         flag = Flag(metavar="|".join(command.names) or command.unit.upper() or "FLOAT")
         field = FieldInfo.from_annotation(Annotated[str, flag])
-        field.description = "Command of the task, if the run's has it."
+        field.description = "Command of the task, if the run's task has it."
         fields[_GROUP + name] = field
     return fields
 

@@ -23,7 +23,7 @@ _NUM_THREADS = os.cpu_count() or 1
 
 
 def make_mujoco_evaluator(env: Env, actor: Actor, episodes: int, recorded: int = 0) -> Evaluator:
-    """Like `evaluation.make_evaluator`, with `mj_step` (float64) in place of the env's engine.
+    """Like `episodes.make_evaluator`, with `mj_step` (float64) in place of the env's engine.
 
     Each episode is simulated in the world that its reset drew.
     """

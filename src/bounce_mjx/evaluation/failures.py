@@ -57,7 +57,7 @@ class Association(NamedTuple):
 
     @property
     def is_clear(self) -> bool:
-        """Whether the intervals of the thirds that fail the most and the least are apart."""
+        """Whether the intervals of two thirds are apart."""
         highest = max(third.interval[0] for third in self.thirds)
         return highest > min(third.interval[1] for third in self.thirds)
 
@@ -105,7 +105,7 @@ def _cause(ended_by: dict[str, np.ndarray], index: int) -> str:
 
 def associations(statistics: Statistics, failures: list[Failure]) -> list[Association]:
     """The share of failures by third of the range of each command and each entry of each term; the
-    largest difference first."""
+    clear ones first, then the largest difference."""
     s = jax.tree.map(np.asarray, statistics)
     has_failed = np.zeros(len(s.running), bool)
     has_failed[[failure.episode for failure in failures]] = True

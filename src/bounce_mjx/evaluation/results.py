@@ -51,7 +51,7 @@ class Report:
     @property
     def score(self) -> tuple[bool, int, float, float]:
         """Sort key of quality: a full evaluation ranks above a screening, then the number of
-        results met counts, then the smallest margin, then the mean return."""
+        results not missed counts, then the smallest margin, then the mean return."""
         met = sum(result.passed is not False for result in self.results)
         return not self.screening, met, self.margin, self.details["mean_return"]
 
@@ -79,7 +79,12 @@ def judge(
     """
     s = jax.tree.map(lambda x: jax.device_get(x).astype(float), statistics)
     trained = {name: (c.low, c.high) for name, c in env.config.commands.items()}
-    episodes = Episodes(s.tally.sums, s.tally.maxima, s.running, trained | (commands or {}))
+    episodes = Episodes(
+        sums=s.tally.sums,
+        maxima=s.tally.maxima,
+        lasted=s.running.astype(bool),
+        commands=trained | (commands or {}),
+    )
     details = {
         "episodes": float(len(s.running)),
         **env.task.details(episodes),
