@@ -416,6 +416,7 @@ def _posed(
         data.joint(name).qpos = angle
     mujoco.mj_forward(model, data)
     paddle = model.geom("blocker").id
+    # Without a ball it is above what the cameras see, where the floor cannot hide it either.
     place = np.array([0.0, 0.0, 5.0])
     if beside is not None:
         frame = data.geom_xmat[paddle].reshape(3, 3)

@@ -63,26 +63,26 @@ def test_compiled_programs_are_kept(has_home: bool, tmp_path: Path, monkeypatch)
     assert used == (str(tmp_path / "bounce_mjx/jax") if has_home else None)
 
 
+def shipped_model(path: Path, text: str, changed: str) -> Path:
+    """Writes the shipped model with another text in it to a path."""
+    model = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
+    assert text in model
+    path.write_text(model.replace(text, changed), encoding="utf-8")
+    return path
+
+
 @pytest.fixture(scope="module")
 def rk4(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The shipped model with an integrator that only MJX has."""
     path = tmp_path_factory.mktemp("model") / "rk4.xml"
-    text = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
-    changed = text.replace('integrator="implicitfast"', 'integrator="RK4"')
-    assert changed != text
-    path.write_text(changed, encoding="utf-8")
-    return path
+    return shipped_model(path, 'integrator="implicitfast"', 'integrator="RK4"')
 
 
 @pytest.fixture(scope="module")
 def elliptic(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The shipped model with elliptic cones of friction, which its frictionless contact ignores."""
     path = tmp_path_factory.mktemp("model") / "elliptic.xml"
-    text = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
-    changed = text.replace('cone="pyramidal"', 'cone="elliptic"')
-    assert changed != text
-    path.write_text(changed, encoding="utf-8")
-    return path
+    return shipped_model(path, 'cone="pyramidal"', 'cone="elliptic"')
 
 
 @pytest.mark.parametrize(

@@ -121,7 +121,8 @@ def film_command(args: Sequence[str], omitted: Sequence[str], *film: str) -> str
       omitted: its flags that `play` lacks; a name that ends with = has a value.
       film: the flags of the episode.
     """
-    kept, words = [], iter(args)
+    kept = []
+    words = iter(args)
     for word in words:
         if f"{word}=" in omitted:
             next(words, None)

@@ -13,8 +13,12 @@ from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import TERMS
 
 ENDS = ("non_finite", "too_fast")
-"""Metrics of the ends of an episode that are no task's."""
-METRIC_PREFIXES = ("reward", "world/", "true/")
+"""Metrics of the ends of an episode that are no task's; an environment of another kind may lack
+them."""
+WORLD_PREFIXES = ("world/", "true/")
+"""Of the metrics that an environment has only where its world is sampled, or its measurements are
+noisy."""
+METRIC_PREFIXES = ("reward", *WORLD_PREFIXES)
 """Of the environment's other metrics."""
 _TAKEN_METRICS = (*ENDS, "steps", "episodes")
 """Names that a task's metrics cannot have; the last two are what a curve may be over."""

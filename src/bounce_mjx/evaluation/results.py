@@ -82,7 +82,7 @@ def judge(
     episodes = Episodes(
         sums=s.tally.sums,
         maxima=s.tally.maxima,
-        lasted=s.running.astype(bool),
+        lasted=jax.device_get(statistics.running),
         commands=trained | (commands or {}),
     )
     details = {

@@ -8,13 +8,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from bounce_mjx.env.checks import ENDS
 from bounce_mjx.env.env import Env, State
 from bounce_mjx.task.task import Moment, Recording, Tally
 
 RECORDED_EPISODES = 32
-
-ENDS = ("too_fast", "non_finite")
-"""Metrics of the world that end an episode."""
 
 
 class Statistics(NamedTuple):

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from bounce_mjx.env import vector
+from bounce_mjx.env.checks import ENDS, METRIC_PREFIXES, WORLD_PREFIXES
 from bounce_mjx.errors import UserError
 from bounce_mjx.task import Curve
 
@@ -14,13 +15,6 @@ Metrics = dict[str, jax.Array]
 
 # Prefix of a curve's denominator: the sum of what the curve is the mean over.
 _OVER = "over/"
-# Metrics that an environment has only where its world is sampled, or its measurements are noisy.
-_WORLD_PREFIXES = ("world/", "true/")
-# What is no curve of its own: rewards are logged for each step, and the world is for a critic.
-_PREFIXES_WITHOUT_CURVE = ("reward", *_WORLD_PREFIXES)
-
-# Ends of an episode that are no task's, by their metrics, which another environment may lack.
-_ENDS = ("non_finite", "too_fast")
 
 
 def matching_metrics(patterns: Sequence[str], known: Iterable[str]) -> tuple[str, ...]:
@@ -47,7 +41,7 @@ def matching_metrics(patterns: Sequence[str], known: Iterable[str]) -> tuple[str
 def _is_of_a_fixed_world(pattern: str, known: Sequence[str]) -> bool:
     """Whether a pattern is of metrics that this environment does not have, as its world is not
     sampled."""
-    for prefix in _WORLD_PREFIXES:
+    for prefix in WORLD_PREFIXES:
         if pattern.startswith(prefix) and "*" in pattern:
             return not any(name.startswith(prefix) for name in known)
     return False
@@ -72,7 +66,7 @@ def step_metrics(result: vector.VectorStep, groups: int, curves: Sequence[Curve]
     values["ended"] = ended
     values["return"] = jnp.where(ended, result.episode_return, 0.0)
     values["length"] = jnp.where(ended, result.episode_length, 0)
-    for name in _ENDS:
+    for name in ENDS:
         if name in result.metrics:
             values[f"task/{name}"] = result.metrics[name]
 
@@ -94,11 +88,11 @@ def _other_curves(metrics: Metrics, curves: Sequence[Curve]) -> list[Curve]:
     """For each other metric of the task, its mean over the steps: for those that no curve shows or
     is over, but for the ends of an episode."""
     named = {curve.metric for curve in curves} | {curve.over for curve in curves}
-    known = named.union(_ENDS)
+    known = named.union(ENDS)
     return [
         Curve(f"task/{name}", name, over="steps")
         for name in metrics
-        if name not in known and not name.startswith(_PREFIXES_WITHOUT_CURVE)
+        if name not in known and not name.startswith(METRIC_PREFIXES)
     ]
 
 
@@ -117,7 +111,7 @@ def rollout_metrics(steps: Metrics) -> Metrics:
             metrics[name] = value / total[_OVER + name]
         elif name.startswith("reward"):
             metrics[name] = value / total["steps"]
-    for end in _ENDS:
+    for end in ENDS:
         if f"task/{end}" in total:
             metrics[f"task/{end}"] = total[f"task/{end}"]
     return metrics

@@ -308,10 +308,10 @@ def _policy(choice: Choice, files: Sequence[Layer], whole: TrainConfig | None) -
     log_dir = choice.log_dir or _last(files, "log_dir")
     if log_dir is None or not runs_in(Path(log_dir)):
         log_dir = runs_folder(whole.env.task if whole else find_task(task or DEFAULT))
-    checkpoint, choice = find_choice(Path(path), Path(log_dir))
+    checkpoint, note = find_choice(Path(path), Path(log_dir))
     config = load_run_config(checkpoint.run, task)
     start = Path(path) if policy_folder(path) else checkpoint.folder
-    return _Policy(start, config, () if choice is None else (choice,))
+    return _Policy(start, config, () if note is None else (note,))
 
 
 # Merging and validating -------------------------------------------------------------------------
