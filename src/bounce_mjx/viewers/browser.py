@@ -97,9 +97,11 @@ def run_page(
             scene.show(controls.num_shown)
         plots.history.extend(frames)
         scene.update(frames or [simulation.frame])
-        if frames and time.monotonic() >= next_plot:
-            plots.update()
+        if time.monotonic() >= next_plot:
+            # Also in a pause, in which a user may reset, or let a value be sampled again.
             controls.show_values()
+            if frames:
+                plots.update()
             next_plot = time.monotonic() + 1.0 / _PLOT_RATE
     server.flush()
 

@@ -37,11 +37,16 @@ class _Setting:
         self._handle, self.sampled, self._names = handle, sampled, list(names)
         self._shown: float | None = None
         handle.on_update(self._take)
+        sampled.on_update(self._forget)
 
     def _take(self, event: viser.GuiEvent) -> None:
         """What a user sets is not sampled; what `show` sets is."""
         if event.client is not None:
             self.sampled.value = False
+
+    def _forget(self, _: object) -> None:
+        """Once the value is sampled again, the slider shows the user's until `show` sets it."""
+        self._shown = None
 
     @property
     def value(self) -> float:
@@ -177,19 +182,27 @@ class Controls:
 
     def _keys(self) -> list[tuple[str, str, Callable[[viser.CommandEvent], None]]]:
         """What each key does, the key, and the function of its event."""
-        name = next(map(words, self._commands), None)
-        return [
+        keys = [
             ("pause", "space", self._pause),
             ("reset", "R", self._reset),
-            *([] if name is None else [(f"{name} up", "T", lambda _: self._move(1.0))]),
-            *([] if name is None else [(f"{name} down", "G", lambda _: self._move(-1.0))]),
             ("faster", "M", lambda _: self._accelerate(_SPEED_STEP)),
             ("slower", "N", lambda _: self._accelerate(-_SPEED_STEP)),
+        ]
+        if self._is_film:
+            return keys
+        if self._commands:
+            name = words(next(iter(self._commands)))
+            keys += [
+                (f"{name} up", "T", lambda _: self._move(1.0)),
+                (f"{name} down", "G", lambda _: self._move(-1.0)),
+            ]
+        keys += [
             ("push the ball up", "I", lambda event: self._push("up", event)),
             ("push the ball back", "K", lambda event: self._push("back", event)),
             ("push the ball left", "J", lambda event: self._push("left", event)),
             ("push the ball right", "L", lambda event: self._push("right", event)),
         ]
+        return keys
 
     def _pause(self, _: object) -> None:
         self._paused.value = not self._paused.value
@@ -203,7 +216,8 @@ class Controls:
         setting.move(steps * self._simulation.env.config.commands[name].step)
 
     def _accelerate(self, change: float) -> None:
-        self._speed.value = float(np.clip(round(self._speed.value + change, 1), *_SPEED_RANGE))
+        speed = round(_clip(self._speed) + change, 1)
+        self._speed.value = float(np.clip(speed, *_SPEED_RANGE))
 
     def _push(self, towards: str, event: viser.GuiEvent | viser.CommandEvent) -> None:
         """Requests a push of the ball in a direction as the event's page sees it."""

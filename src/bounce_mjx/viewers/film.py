@@ -43,7 +43,7 @@ class FilmPlayer(Simulation):
     @property
     def sliders(self) -> tuple[WorldSlider, ...]:
         """Sliders of the terms that the world of the episode can have."""
-        return sliders_for(with_sliders(self.env.config).randomization)
+        return sliders_for(with_sliders(self.env.config))
 
     @property
     def world_values(self) -> dict[str, np.ndarray]:
@@ -73,7 +73,7 @@ class FilmPlayer(Simulation):
 
     def record(self, seconds: float | None = None) -> EnvFrame:
         """The frames of the whole episode, or of its first seconds."""
-        count = None if seconds is None else max(2, round(seconds / self.env.dt) + 1)
+        count = None if seconds is None else round(seconds / self.env.dt) + 1
         return jax.tree.map(lambda values: values[:count], self.frames)
 
 

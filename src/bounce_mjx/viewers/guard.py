@@ -166,10 +166,21 @@ def _is_valid(data: str | bytes) -> bool:
             case {"type": "CommandTriggerMessage", "uuid": str(), **others}:
                 return not others
             case {"type": "GuiUpdateMessage", "uuid": str(), "updates": {"value": value, **others}}:
-                # viser would read a number from a text.
-                is_word = isinstance(value, str) and value.replace(" ", "").isalpha()
-                return not others and (is_word or abs(value) <= _MAX_NUMBER)
+                if isinstance(value, str):
+                    is_allowed = not _is_number(value)
+                else:
+                    is_allowed = abs(value) <= _MAX_NUMBER
+                return is_allowed and not others
     return False
+
+
+def _is_number(text: str) -> bool:
+    """Whether viser would read a number, of any size, or a NaN from a text."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _host_name(url: str) -> str:

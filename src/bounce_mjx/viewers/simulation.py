@@ -151,7 +151,7 @@ class Simulation:
     @property
     def sliders(self) -> tuple[WorldSlider, ...]:
         """Sliders of the terms that can be moved."""
-        return sliders_for(self.env.config.randomization)
+        return sliders_for(self.env.config)
 
     def world_value(self, term: str) -> float:
         """The first entry of a term of the world in the first environment."""
@@ -164,7 +164,8 @@ class Simulation:
             other.reset()
 
     def push(self, velocity: tuple[float, float, float]) -> None:
-        """Adds a velocity (m/s) to every ball at the start of the next step."""
+        """Adds a velocity (m/s) to every ball at the start of the next step; to be called between
+        two steps."""
         self._push = self._push + np.asarray(velocity, np.float32)
 
     def step(self) -> EnvFrame:
@@ -174,7 +175,6 @@ class Simulation:
             other.push(self._push)
             other.step()
         inputs = self._inputs()
-        # Before the program runs, so that a push of another thread meanwhile acts on the next step.
         self._push = np.zeros(3, np.float32)
         self._key, self._states, self._steps, frame = self._step_program(*inputs)
         self._frame = jax.device_get(frame)
@@ -267,10 +267,12 @@ def resample(recording: EnvFrame, dt: float, fps: float) -> EnvFrame:
       fps: desired frames per second.
 
     Returns:
-      The frames at 0, 1/fps, 2/fps, ... s, as long as the recording lasts: [F, N, ...].
+      The frames at 0, 1/fps, 2/fps, ... s, as long as the recording lasts, at least the first:
+      [F, N, ...].
     """
     last = len(recording.time) - 1
-    steps = np.arange(int(last * dt * fps + 1e-6)) / (fps * dt)
+    num_frames = max(1, int(last * dt * fps + 1e-6))
+    steps = np.arange(num_frames) / (fps * dt)
     before = np.minimum(steps.astype(int), last)
     after = np.minimum(before + 1, last)
     fraction = (steps - before)[:, None] * ~recording.over[before]
