@@ -26,7 +26,8 @@ _SAMPLED = "sampled at each reset"
 
 
 class _Setting:
-    """A slider, or a choice by names, for a value that is sampled as long as `sampled` is on."""
+    """A slider, or a choice by names, for a value that is sampled as long as `sampled` is on: a
+    command has a checkbox of its own, and all terms of the world have one."""
 
     def __init__(
         self,
@@ -34,7 +35,9 @@ class _Setting:
         sampled: viser.GuiCheckboxHandle,
         names: Sequence[str] = (),
     ):
-        self._handle, self.sampled, self._names = handle, sampled, list(names)
+        self.sampled = sampled
+        self._handle = handle
+        self._names = list(names)
         self._shown: float | None = None
         handle.on_update(self._take)
         sampled.on_update(self._forget)
@@ -131,9 +134,14 @@ class Controls:
             if command.names:
                 handle = gui.add_dropdown(short, command.names, disabled=self._is_film)
             else:
-                low, high = min(start, *ends), max(start, *ends)
-                step = command.step / _STEPS_PER_KEY
-                handle = gui.add_slider(short, low, high, step, start, disabled=self._is_film)
+                handle = gui.add_slider(
+                    short,
+                    min(start, *ends),
+                    max(start, *ends),
+                    command.step / _STEPS_PER_KEY,
+                    start,
+                    disabled=self._is_film,
+                )
         setting = _Setting(handle, sampled, command.names)
         if command.names:
             setting.show(start)

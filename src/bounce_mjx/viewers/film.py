@@ -1,4 +1,4 @@
-"""An episode of an evaluation in the viewers, as it was."""
+"""An episode of an evaluation in the viewers, as it was: bit for bit on a CPU."""
 
 from collections.abc import Callable, Sequence
 
@@ -22,8 +22,11 @@ class FilmPlayer(Simulation):
 
     def __init__(self, film: Film):
         """Compiles nothing."""
-        self.env, self.policy = film.env, None
-        self.command, self.world, self.others = {}, None, ()
+        self.env = film.env
+        self.policy = None
+        self.command = {}
+        self.world = None
+        self.others = ()
         self._world = {name: np.asarray(value)[0] for name, value in film.statistics.world.items()}
         self.frames = episode_frames(film.env, film.recording)
         """Every frame of the episode [T, 1, ...]."""

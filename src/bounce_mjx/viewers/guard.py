@@ -128,7 +128,8 @@ def _make_rule(host: str, allowed: Collection[str]) -> Callable[[Headers], bool]
     names = proxies | {"localhost", host.lower(), socket.gethostname().lower()}
 
     def is_name(name: str) -> bool:
-        """Whether the page may be opened at a name. No website can let an address point here."""
+        """Whether the page may be opened at a name, or at any address: a website can let its own
+        name point to this machine, but no address."""
         with contextlib.suppress(ValueError):
             return bool(ipaddress.ip_address(name))
         return name in names

@@ -17,6 +17,7 @@ from bounce_mjx.world.randomization import TERMS, Ranges, World
 _PICTURES_PER_SECOND = 50.0
 # If a simulation falls behind the clock by more than this, it slows down instead of catching up, s.
 _MAX_LAG = 0.1
+_RECORDED_SECONDS = 10.0
 
 Controller = Callable[[Policy | None, State, jax.Array], jax.Array]
 """A controller of N environments: (policy, if it has one; states, batch last; key, which is
@@ -171,7 +172,8 @@ class Simulation:
     def step(self) -> EnvFrame:
         """Advances one control step."""
         for other in self.others:
-            other.command, other.world = self.command, self.world
+            other.command = self.command
+            other.world = self.world
             other.push(self._push)
             other.step()
         inputs = self._inputs()
@@ -182,8 +184,9 @@ class Simulation:
             self._reset(self._frame.over)
         return self.frame
 
-    def record(self, seconds: float) -> EnvFrame:
-        """The current frame and the frames of the following `seconds`."""
+    def record(self, seconds: float | None = None) -> EnvFrame:
+        """The current frame and the frames of the following seconds, 10 by default."""
+        seconds = _RECORDED_SECONDS if seconds is None else seconds
         frames = [self.frame]
         frames += [self.step() for _ in range(round(seconds / self.env.dt))]
         return jax.tree.map(lambda *values: np.stack(values), *frames)
@@ -195,10 +198,16 @@ class Simulation:
         world = {}
         for name in config.randomization.terms:
             if name in self.env.nominals:
-                shape, nominal = TERMS[name].shape(self.env.action_size), self.env.nominals[name]
-                entries = np.nan if self.world is None else self.world.get(name, nominal)
+                shape = TERMS[name].shape(self.env.action_size)
+                entries = self._entries(name)
                 world[name] = np.full(shape or 1, entries, np.float32).reshape(shape)
         return self.policy, self._key, self._states, self._steps, command, self._push, world
+
+    def _entries(self, term: str) -> np.ndarray | Sequence[float] | float:
+        """Entries of a term of the world that are set; nan where it is sampled."""
+        if self.world is None:
+            return np.nan
+        return self.world.get(term, self.env.nominals[term])
 
     def _reset(self, over: np.ndarray) -> EnvFrame:
         """Starts a new episode in some environments [N]; the frame of all."""
@@ -246,12 +255,15 @@ def in_real_time(
     """
     dt = simulation.env.dt
     left = float("inf") if seconds is None else round(seconds / dt)
-    owed, last = 0.0, time.monotonic()
+    owed = 0.0
+    last = time.monotonic()
     while left > 0:
         now = time.monotonic()
         owed += speed() * min(now - last, _MAX_LAG) / dt
-        due, last = min(int(owed), left), now
-        owed, left = owed - due, left - due
+        due = min(int(owed), left)
+        owed -= due
+        left -= due
+        last = now
         yield [simulation.step() for _ in range(due)]
         time.sleep(1.0 / _PICTURES_PER_SECOND)
 

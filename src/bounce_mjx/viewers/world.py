@@ -20,7 +20,8 @@ class WorldSlider(NamedTuple):
     scale: float = 1.0
     """Factor from the slider's unit to the term's."""
     nominal: float = 0.0
-    """Position without effect on the project's own model, in the slider's unit."""
+    """Position without effect, in the slider's unit; of the restitution, on the project's own
+    model."""
 
     @property
     def span(self) -> tuple[float, float]:
@@ -50,7 +51,8 @@ def _sliders_of(config: WorldConfig) -> tuple[WorldSlider, ...]:
 
 
 def with_sliders(config: WorldConfig) -> WorldConfig:
-    """The config with the sliders' terms active, in ranges that contain the sliders' and its own."""
+    """The config with the sliders' terms active, in ranges that contain the sliders' and its
+    own."""
     spans = {}
     for slider in _sliders_of(config):
         own = entries(getattr(config.randomization, slider.term) or slider.span)
