@@ -404,14 +404,15 @@ class Stack:
         if self.resume is None or "total_steps" not in user.values:
             return []
         from bounce_mjx.runs.folders import find_run, latest_checkpoint
-        from bounce_mjx.runs.progress import Progress
+        from bounce_mjx.runs.progress import Progress, are_solved
         from bounce_mjx.runs.records import verify
 
         checkpoint = latest_checkpoint(find_run(self.resume), self.resume)
         progress = verify(checkpoint).progress
         seeds = [Progress.model_validate(seed) for seed in progress.get("seeds", [progress])]
-        solved = all(seed.solved for seed in seeds)
-        return [Layer(user.source, {"stop_when_solved": False})] if solved else []
+        if are_solved(seeds):
+            return [Layer(user.source, {"stop_when_solved": False})]
+        return []
 
     def _validated(self, values: dict[str, Any]) -> TrainConfig:
         groups = {"env": self.task.Config, "ppo": self.algorithm}

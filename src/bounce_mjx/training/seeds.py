@@ -1,15 +1,15 @@
 """The seeds of a training run, and what each has reached."""
 
-import contextlib
 import dataclasses
 from pathlib import Path
 
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import warn_once
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.runs import checkpoints, folders
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.progress import Progress
+from bounce_mjx.runs.records import Checkpoint, DamagedCheckpoint
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,16 +67,32 @@ class SeedRun:
         if has_failed:
             self._take_best(self.saved)
 
-    def recall_best(self, place: Path | None) -> None:
-        """Takes for the best what the best intact checkpoint in a folder of the run says."""
+    def recall_best(self, newest: Checkpoint | None) -> None:
+        """Takes for the best what the best intact checkpoint of the run says. Where there is none,
+        a warning names the damaged one.
+
+        Args:
+          newest: the newest checkpoint that counts; None if all do.
+
+        Raises:
+          UserError: the checkpoint's config is not that of the seed's folder.
+        """
         self.saved = None
-        with contextlib.suppress(UserError):
-            checkpoint = folders.best_checkpoint(self.run, place)
-            record = checkpoints.read_record(checkpoint)
-            if record.report is not None:
-                policy = checkpoints.read_policy(checkpoint, self.config)
-                self.saved = Best(policy, record.report, record.steps, checkpoint.steps)
+        # A seed may have diverged before its first evaluation.
+        if folders.stored_checkpoints(self.run):
+            try:
+                self.saved = self._read_best(folders.best_checkpoint(self.run, newest=newest))
+            except DamagedCheckpoint as error:
+                warn_once(f"{error.damage}; another policy takes its place")
         self._take_best(self.saved)
+
+    def _read_best(self, checkpoint: Checkpoint) -> Best | None:
+        """The policy of a checkpoint with its evaluation; None if it has none."""
+        record = checkpoints.read_record(checkpoint)
+        if record.report is None:
+            return None
+        policy = checkpoints.read_policy(checkpoint, self.config)
+        return Best(policy, record.report, record.steps, checkpoint.steps)
 
     def _take_best(self, best: Best | None) -> None:
         self.best = best
