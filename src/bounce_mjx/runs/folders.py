@@ -6,12 +6,14 @@
         task/, algorithm/               copies of the files of own ones
         events.out.tfevents.*           TensorBoard scalars
         results.json                    all evaluations, and the time of each activity
-        checkpoints/<steps>/            of the newest state, and of the one with the best evaluation
+        checkpoints/<number>/           of the newest state, and of the one with the best evaluation
             policy/                     the policy's arrays
             training/                   the training state's arrays; optional
             networks/                   both networks, for another training; optional
             record/                     the steps, the config, the evaluations so far and its own
             manifest.json               size and SHA-256 of every other file
+
+A checkpoint's number is that of the steps trained; see `Checkpoint`.
 
 A run with several seeds has one folder per seed, such as seed_003/, with the layout of a run with
 one seed; the run's own checkpoints/ holds the state of all seeds.
@@ -239,7 +241,7 @@ def latest_checkpoint(run: Path, place: Path | None = None) -> Checkpoint:
     Args:
       place: folder of the run in which it lies; that of a checkpoint finds this one.
     """
-    return max(_intact_checkpoints(run, place), key=lambda checkpoint: checkpoint.steps)
+    return max(_intact_checkpoints(run, place), key=lambda checkpoint: checkpoint.number)
 
 
 def best_checkpoint(
@@ -258,7 +260,7 @@ def best_checkpoint(
         record = records[checkpoint]
         score = record.report.score if record and record.report else ()
         # Version 0.1.0 wrote no evaluation of a policy that it shipped.
-        return score, checkpoint.folder.parent.name == earlier.BEST, checkpoint.steps
+        return score, checkpoint.folder.parent.name == earlier.BEST, checkpoint.number
 
     return max(records, key=quality)
 
@@ -274,7 +276,7 @@ def _intact_checkpoints(
     """
     stored = _checkpoints_in(run, place or run)
     if newest is not None:
-        stored = [checkpoint for checkpoint in stored if checkpoint.steps <= newest.steps]
+        stored = [checkpoint for checkpoint in stored if checkpoint.number <= newest.number]
     if len(stored) == 1:
         return {stored[0]: None}
     intact, damaged = {}, []

@@ -54,8 +54,8 @@ class Progress(pydantic.BaseModel):
         """Whether the state after this number of steps was evaluated."""
         return any(evaluation["steps"] == steps for evaluation in self.evaluations)
 
-    def improves(self, report: Report, steps: int, seconds: float) -> bool:
-        """Adds an evaluation; returns whether it is the best so far.
+    def add(self, report: Report, steps: int, seconds: float) -> bool:
+        """Adds an evaluation; returns whether it is the best so far. Of equal ones the newest is.
 
         Args:
           seconds: see `solved_seconds`.
@@ -64,12 +64,14 @@ class Progress(pydantic.BaseModel):
         about = {"steps": steps, "passed": report.passed, "screening": report.screening}
         self.evaluations.append(about | values)
         if report.passed and self.solved_steps is None:
-            self.solved_steps, self.solved_seconds = steps, seconds
+            self.solved_steps = steps
+            self.solved_seconds = seconds
         if report.passed_with_margin and self.margin_steps is None:
             self.margin_steps = steps
         if self.best is not None and report.score < self.best.score:
             return False
-        self.best, self.best_steps = report, steps
+        self.best = report
+        self.best_steps = steps
         return True
 
 

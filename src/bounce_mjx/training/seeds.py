@@ -41,18 +41,20 @@ class SeedRun:
     """The best policy of those that were saved."""
 
     @property
-    def is_best(self) -> bool:
-        """Whether the current policy is the best one, and is not saved yet."""
+    def has_unsaved_best(self) -> bool:
+        """True from an evaluation of the current policy that is the best one to the end of its
+        save, which starts before the training goes on."""
         return self.best is not self.saved
 
     def add_report(self, report: Report, policy: Policy, steps: int, seconds: float) -> None:
         """Adds the evaluation of the current policy.
 
         Args:
-          seconds: see `Progress.improves`.
+          seconds: see `Progress.add`.
         """
         self.report = report
-        if self.progress.improves(report, steps, seconds):
+        is_best = self.progress.add(report, steps, seconds)
+        if is_best:
             self.best = Best(policy, report, steps)
 
     def end_save(self, number: int | None, has_failed: bool) -> None:
@@ -62,7 +64,7 @@ class SeedRun:
           number: that of the seed's checkpoint, if one was written.
           has_failed: whether something could not be written.
         """
-        if number is not None and self.is_best:
+        if number is not None and self.has_unsaved_best:
             self.saved = self.best = dataclasses.replace(self.best, number=number)
         if has_failed:
             self._take_best(self.saved)
@@ -92,9 +94,9 @@ class SeedRun:
         if record.report is None:
             return None
         policy = checkpoints.read_policy(checkpoint, self.config)
-        return Best(policy, record.report, record.steps, checkpoint.steps)
+        return Best(policy, record.report, record.steps, checkpoint.number)
 
     def _take_best(self, best: Best | None) -> None:
         self.best = best
-        self.progress.best = best and best.report
-        self.progress.best_steps = best.steps if best else 0
+        self.progress.best = None if best is None else best.report
+        self.progress.best_steps = 0 if best is None else best.steps
