@@ -574,7 +574,7 @@ def test_a_callback_ends_a_training_on_several_hosts_after_a_block_or_an_evaluat
         assert run == same
         return run
 
-    run = train_on_both(tmp_path / "evaluation", lambda event: event.report is None)
+    run = train_on_both(tmp_path / "evaluation", lambda event: np.bool_(event.report is None))
     assert evaluated_steps(run) == [64]
     run = train_on_both(tmp_path / "block", lambda event: event.report is not None)
     assert evaluated_steps(run) == [64]

@@ -109,7 +109,7 @@ def read_training(checkpoint: Checkpoint, template: Any) -> tuple[Any, Record]:
       template: shapes and dtypes of the state, as from `jax.eval_shape`.
     """
     if not (checkpoint.folder / TRAINING).is_dir() or checkpoint.is_old:
-        raise UserError(f"{checkpoint.folder} has no state of this version; use --warm-start")
+        raise UserError(f"{checkpoint.folder} has no state to continue from; use --warm-start")
     record = read_record(checkpoint)
     return _read_arrays(checkpoint, TRAINING, template), record
 

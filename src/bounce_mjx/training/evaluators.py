@@ -50,8 +50,8 @@ class Evaluators:
         self._replicated = NamedSharding(mesh, PartitionSpec())
         self._chunk = min(config.screening_episodes or config.eval_episodes, config.eval_episodes)
         # On a CPU a chunk uses one core, and XLA runs the programs that one thread starts one after
-        # another. MJX calls LAPACK, and in jaxlib two batched calls of it may wait for each other
-        # for ever.
+        # another, so each core has a thread. MJX has one: it calls LAPACK, and in jaxlib two
+        # batched calls of it may wait for each other for ever.
         on_cpu = mesh.size == 1 and mesh.devices.flat[0].platform == "cpu"
         self._threads = os.cpu_count() if on_cpu and env.engine.name == "fused" else 1
         self._program = pool.submit(self._lower().compile)

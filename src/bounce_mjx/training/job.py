@@ -184,7 +184,8 @@ class Job:
     is_new: bool
     """Whether the run is not resumed."""
     networks: Any
-    """Those of a warm start, which the trainer starts with; None without one."""
+    """Parameters of both networks of a warm start and the statistics of their inputs, as from
+    `checkpoints.read_start`; None without one."""
     console: Console
     callbacks: list[Any]
     pool: concurrent.futures.Executor
@@ -194,14 +195,14 @@ class Job:
 
     steps: int = 0
     """Environment steps of each seed so far."""
-    is_saved: bool = True
-    """Whether the current state needs no save any more."""
+    needs_save: bool = False
+    """Whether the current state is still to be saved."""
     is_ended: bool = False
     """Whether a callback has ended the training."""
     state: Any = None
     """State from which the resumed run starts."""
     snapshot: Snapshot | None = None
-    """The current state, once it was asked for."""
+    """The current state, once it was asked for; the next block drops it."""
     seeds: list[SeedRun] = dataclasses.field(init=False)
     saver: Saver = dataclasses.field(init=False)
     evaluators: Evaluators = dataclasses.field(init=False)
@@ -345,22 +346,23 @@ class Job:
         judged = [event.report for event in told]
         self.say(events.evaluation_line(self.config.num_seeds, self.steps, judged))
         self.tell(told)
-        self.is_saved = False
+        self.needs_save = True
         if is_first:
+            # Until now, programs were compiled beside the training.
             self.clock.restart_estimate(self.steps)
 
     def save_is_due(self) -> bool:
         """Whether the current state is to be saved: after each evaluation, and where `save_every`
         asks for it."""
         is_asked_for = self.save_steps is not None and self.steps % self.save_steps == 0
-        return not self.is_saved and (is_asked_for or self.is_evaluated())
+        return self.needs_save and (is_asked_for or self.is_evaluated())
 
     def save(self) -> None:
         """Starts to save the state, and with several seeds the policies that are the best of their
         seed."""
         self.saver.end()
         self.saver.start(self.take_snapshot(), self.steps, self.about())
-        self.is_saved = True
+        self.needs_save = False
         self.clock.lap("save")
 
     def is_stopping(self) -> bool:
@@ -387,7 +389,7 @@ class Job:
         if self.steps == 0 and (wrong := faults.first_block_fault(metrics, self.config)):
             raise UserError(f"these settings cannot be trained: {wrong}")
         self.steps += self.block_steps
-        self.is_saved = False
+        self.needs_save = True
         for seed in self.seeds:
             seed.report = None
         return metrics, seconds
@@ -419,18 +421,21 @@ class Job:
           Interrupted: it was requested before there was anything to save.
           UserError: the state could not be saved.
         """
-        stopping, where = self.is_stopping(), ""
+        stopping = self.is_stopping()
+        where = ""
         if self.is_finished() and not stopping:
             self.say(self.why_it_ends())
         # The policy of a warm start is saved once it is evaluated.
-        if stopping and self.is_new and self.steps == 0 and not self.is_evaluated():
+        has_nothing = self.is_new and self.steps == 0 and not self.is_evaluated()
+        if stopping and has_nothing:
             jax.distributed.shutdown()
             raise Interrupted
-        if not self.is_saved:
+        if self.needs_save:
             self.save()
         self.end_last_save()
         if not stopping and not self.evaluate_best():
-            stopping, where = True, ", before the final evaluation"
+            stopping = True
+            where = ", before the final evaluation"
         jax.distributed.shutdown()
         if stopping:
             raise TrainingStopped(f"stopped after {self.steps:,} steps{where}; {self.go_on}")
@@ -440,7 +445,7 @@ class Job:
         stop was requested meanwhile."""
         # A seed that diverged before its first evaluation has no best policy; another seed's policy
         # takes its place in the batch.
-        other = next(seed.best.policy for seed in self.seeds if seed.best)
+        other = next(seed.best.policy for seed in self.healthy())
         policies = [seed.best.policy if seed.best else other for seed in self.seeds]
         reports = self.wait_for_reports(self.evaluators.final, policies)
         if reports is None:
@@ -515,12 +520,13 @@ class Job:
         return self.snapshot
 
     def time_left(self) -> float | None:
-        """Estimated time to the last step, s. None after the first block, meanwhile other programs
-        are still compiled."""
-        if "train" in self.clock.seconds:
-            return self.clock.left(self.steps, self.config.total_steps)
-        self.clock.restart_estimate(self.steps)
-        return None
+        """Estimated time to the last step, s. None after the first block of this process, during
+        which other programs are still compiled."""
+        is_first_block = "train" not in self.clock.seconds
+        if is_first_block:
+            self.clock.restart_estimate(self.steps)
+            return None
+        return self.clock.left(self.steps, self.config.total_steps)
 
     def about(self, fresh_resets: bool = False) -> dict[str, Any]:
         """What the results say of the training, see `Results`."""
@@ -552,8 +558,11 @@ class Job:
         """Tells the callbacks the events of the seeds. On several hosts, every process learns
         whether a callback has ended the training."""
         for event in told:
-            answers = [callback(event) for callback in self.callbacks]
-            self.is_ended |= any(answer is False for answer in answers)
+            for callback in self.callbacks:
+                answer = callback(event)
+                # A comparison of NumPy's numbers has its own False.
+                if isinstance(answer, bool | np.bool_) and not answer:
+                    self.is_ended = True
         self.is_ended = hosts.any_of(self.is_ended)
 
     @property
