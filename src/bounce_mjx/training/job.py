@@ -347,6 +347,8 @@ class Job:
         self.say(events.evaluation_line(self.config.num_seeds, self.steps, judged))
         self.tell(told)
         self.needs_save = True
+        # With the callbacks, such as a video.
+        self.clock.lap("evaluate")
         if is_first:
             # Until now, programs were compiled beside the training.
             self.clock.restart_estimate(self.steps)
