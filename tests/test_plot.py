@@ -210,18 +210,38 @@ def test_hits_beside_the_paddle_are_drawn(env: BounceBall) -> None:
         assert min(left, right) < y < max(left, right) and min(top, bottom) < x < max(top, bottom)
 
 
-def test_plot_of_several_runs(trained: Path, tmp_path: Path) -> None:
+@pytest.fixture
+def own_plots(monkeypatch):
+    """Registers a plot for each of some titles, named own_0, own_1, ..."""
+    monkeypatch.setattr(figures, "RUN_PLOTS", dict(figures.RUN_PLOTS))
+
+    def register(*titles: str) -> None:
+        for i, title in enumerate(titles):
+            figures.run_plot(f"own_{i}", title)(lambda groups, columns=1: Figure((1.0, 1.0)))
+
+    return register
+
+
+@pytest.mark.parametrize("name", ["curves", "rewards", "evaluation"])
+def test_no_plot_takes_the_place_of_one_of_the_package(name: str) -> None:
+    with pytest.raises(UserError, match=f"'{name}' has the name of .*; choose another name"):
+        figures.run_plot(name, "Mine")
+
+
+def test_plot_of_several_runs(trained: Path, tmp_path: Path, own_plots) -> None:
     other = shutil.copytree(trained, tmp_path / "other")
     save_config(other, read_preset(trained / "config.yaml").model_copy(update={"seed": 1}))
     (tmp_path / "p").mkdir()
     (tmp_path / "mine").write_text("mine")
     (tmp_path / "p/curves.svg").symlink_to(tmp_path / "mine")
+    own_plots("Mine", "Mine")
     plot_command.main([str(trained), str(other), "--formats", "svg", "--out", str(tmp_path / "p")])
-    assert {path.name for path in (tmp_path / "p").iterdir()} == {"curves.svg", "rewards.svg"}
+    names = {"curves.svg", "rewards.svg", "own_0.svg", "own_1.svg"}
+    assert {path.name for path in (tmp_path / "p").iterdir()} == names
     assert (tmp_path / "mine").read_text() == "mine"
 
 
-def check_report(run: Path) -> str:
+def check_report(run: Path, own_plots: int = 0) -> str:
     """The text of a report, after checking that the page is complete and needs no other file."""
     page = (run / "report.html").read_text(encoding="utf-8")
     sources = re.findall(r'(?:src|href)="([^"]*)"', page)
@@ -230,7 +250,7 @@ def check_report(run: Path) -> str:
         replays[0].partition(",")[2]
     )
     # Curves, the best checkpoint, and a panel for each reward term.
-    assert len(sources) - len(replays) == 2 + len(TERMS)
+    assert len(sources) - len(replays) == 2 + own_plots + len(TERMS)
     for source in set(sources) - set(replays):
         kind, _, data = source.partition(",")
         assert kind == "data:image/svg+xml;base64"
@@ -270,13 +290,15 @@ def test_training_leaves_a_report(trained: Path) -> None:
 
 
 @pytest.mark.slow
-def test_report_is_drawn_again(trained: Path, tmp_path: Path, capsys) -> None:
+def test_report_is_drawn_again(trained: Path, tmp_path: Path, own_plots, capsys) -> None:
+    """With each plot of the user's code, also of one title."""
     run, other = shutil.copytree(trained, tmp_path / "run"), tmp_path / "other"
     other.write_text("mine")
     (run / "report.html").unlink()
     (run / "report.html").symlink_to(other)
+    own_plots("Mine", "Mine", "The best checkpoint")
     report_command.main([str(run)])
-    check_report(run)
+    check_report(run, own_plots=3)
     assert other.read_text() == "mine"
     page = (run / "report.html").read_text("utf-8")
     assert "Peitian AIR4-560" in page and "MuJoCo 3." in page

@@ -1,6 +1,6 @@
 """Figures of a training run and of an evaluation, drawn with matplotlib.
 
-They do not use pyplot, so they need no display and can be drawn in several threads.
+They do not use pyplot, so they need no display.
 """
 
 import functools
@@ -18,6 +18,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from bounce_mjx.env.env import Env
+from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.statistics import paddle_points
 from bounce_mjx.reports.curves import Group, mean_and_band
 from bounce_mjx.task.task import Curve, Histogram, Hits, Recording
@@ -50,32 +51,19 @@ style = functools.partial(matplotlib.rc_context, _STYLE)
 """The look of all figures, around what draws them."""
 
 
+Draw = Callable[..., Figure]
+"""Draws groups of runs (`curves.Group`). Its argument `columns`, which has a default, is the most
+panels side by side."""
+
+
 class RunPlot(NamedTuple):
     """A plot of trainings."""
 
     title: str | None
-    """Heading in the report; None for a plot that it shows in its own way."""
-    draw: Callable[..., Figure]
-    """A function of groups of runs (`curves.Group`) and `columns`, the most panels side by side."""
+    """Heading in the report; None for a plot that `bounce-mjx plot` alone draws."""
+    draw: Draw
 
 
-Draw = Callable[..., Figure]
-
-RUN_PLOTS: dict[str, RunPlot] = {}
-"""The plots that `bounce-mjx plot` and the report draw, by the names of their files."""
-
-
-def run_plot(name: str, title: str | None) -> Callable[[Draw], Draw]:
-    """Registers a function as a `RunPlot`."""
-
-    def register(draw: Draw) -> Draw:
-        RUN_PLOTS[name] = RunPlot(title, style()(draw))
-        return draw
-
-    return register
-
-
-@run_plot("curves", "Learning curves")
 @style()
 def curves_figure(groups: Sequence[Group], columns: int = 3) -> Figure:
     """The return and the curves of the task over the training, with points for evaluations.
@@ -93,7 +81,6 @@ def curves_figure(groups: Sequence[Group], columns: int = 3) -> Figure:
     return figure
 
 
-@run_plot("rewards", title=None)
 @style()
 def rewards_figure(groups: Sequence[Group], columns: int = 5) -> Figure:
     """The weighted reward terms over the training, at most `columns` panels side by side."""
@@ -101,6 +88,37 @@ def rewards_figure(groups: Sequence[Group], columns: int = 5) -> Figure:
     title = "weighted reward terms over environment steps,\nmean of a control step"
     figure.suptitle(title, fontsize=10)
     return figure
+
+
+RUN_PLOTS = {
+    "curves": RunPlot("Learning curves", curves_figure),
+    # The report has `reward_panels`, as many side by side as there is room for.
+    "rewards": RunPlot(None, rewards_figure),
+}
+"""The plots that `bounce-mjx plot` and the report draw, by the names of their files."""
+
+EVALUATION = "evaluation"
+"""Name of the file of `evaluation_figure`."""
+
+_TAKEN_NAMES = frozenset((*RUN_PLOTS, EVALUATION))
+
+
+def run_plot(name: str, title: str | None) -> Callable[[Draw], Draw]:
+    """Registers a function as a `RunPlot`, in place of one that was registered with this name.
+
+    Raises:
+      UserError: the name is that of a picture of the package.
+    """
+    if name in _TAKEN_NAMES:
+        raise UserError(
+            f"the plot {name!r} has the name of a picture of the package; choose another name"
+        )
+
+    def register(draw: Draw) -> Draw:
+        RUN_PLOTS[name] = RunPlot(title, style()(draw))
+        return draw
+
+    return register
 
 
 @style()
