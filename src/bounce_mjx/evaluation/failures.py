@@ -11,7 +11,7 @@ from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.config import command_ranges
 from bounce_mjx.evaluation.episodes import make_filmer
 from bounce_mjx.evaluation.policy_evaluation import Conditions
-from bounce_mjx.evaluation.results import episodes_of
+from bounce_mjx.evaluation.results import episodes_of, is_share
 from bounce_mjx.evaluation.statistics import Statistics
 from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.task.task import Recording
@@ -79,7 +79,7 @@ def failures_of(conditions: Conditions, statistics: Statistics) -> list[Failure]
         alone = jax.tree.map(lambda figure, i=i: figure[i : i + 1], s)
         results = env.task.results(episodes_of(alone, commands))
         # A mean over all episodes says nothing of one of them.
-        shares = [result for result in results if result.measured.endswith("%")]
+        shares = [result for result in results if is_share(result.measured)]
         failed = [result.name for result in shares if result.passed is False]
         if not s.running[i]:
             failed.insert(0, _cause(s.ended_by, i))

@@ -67,6 +67,12 @@ class Report:
         }
 
 
+def is_share(measured: str) -> bool:
+    """Whether a result is a share of episodes, steps or events, from what it measures
+    (`Result.measured`)."""
+    return measured.endswith("%")
+
+
 def episodes_of(statistics: Statistics, commands: dict[str, tuple[float, float]]) -> Episodes:
     """Statistics of E episodes as a task judges them: NumPy arrays, the figures in float64.
 

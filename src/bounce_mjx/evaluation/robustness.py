@@ -18,7 +18,7 @@ from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
 from bounce_mjx.evaluation.config import EvaluationOptions, Physics, command_ranges, on_engine
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.policy_evaluation import Conditions, InEvaluation
-from bounce_mjx.evaluation.results import judge
+from bounce_mjx.evaluation.results import is_share, judge
 from bounce_mjx.evaluation.statistics import Statistics
 from bounce_mjx.evaluation.suite import Condition, condition_label
 from bounce_mjx.learning.policy import Actor, Policy
@@ -102,7 +102,7 @@ class RobustnessReport(pydantic.BaseModel):
         shares = [
             value
             for name, value in outcome.values.items()
-            if value is not None and self.measured.get(name, "").endswith("%")
+            if value is not None and is_share(self.measured.get(name, ""))
         ]
         return min(shares, default=100.0 * outcome.lasted) / 100.0
 

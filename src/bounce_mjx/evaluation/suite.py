@@ -108,7 +108,12 @@ class Condition(NamedTuple):
 
 def condition_label(perturbation: str, strength: float | None, unit: str) -> str:
     """A perturbation and its strength in words."""
-    return perturbation if strength is None else f"{perturbation} {strength:g} {unit}".rstrip()
+    return f"{perturbation} {strength_text(strength, unit)}".rstrip()
+
+
+def strength_text(strength: float | None, unit: str) -> str:
+    """A strength with its unit; empty for a perturbation without strengths."""
+    return "" if strength is None else f"{strength:g} {unit}".rstrip()
 
 
 def read_suite(path: Path) -> Suite:
@@ -157,8 +162,10 @@ def load_suite(
         if perturbation.trained_ranges and not trained.randomization.terms:
             continue
         for strength in perturbation.strengths or (None,):
-            place = source if strength is None else f"{source} at {strength:g} {perturbation.unit}"
-            conditions.append(_condition(perturbation, strength, trained, world, place.rstrip()))
+            place = source
+            if strength is not None:
+                place += f" at {strength_text(strength, perturbation.unit)}"
+            conditions.append(_condition(perturbation, strength, trained, world, place))
     return conditions
 
 
