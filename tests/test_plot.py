@@ -10,6 +10,8 @@ import time
 import xml.etree.ElementTree
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import yaml
@@ -21,7 +23,9 @@ from bounce_mjx import BounceBall
 from bounce_mjx.commands import plot as plot_command
 from bounce_mjx.commands import report as report_command
 from bounce_mjx.commands import train as train_command
+from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation.statistics import empty_recording
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.reports import figures
 from bounce_mjx.reports import page as report_page
@@ -40,6 +44,7 @@ from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.task import Curve, term_names
 from bounce_mjx.task.bounce import Bounce, BounceReward
+from bounce_mjx.task.registry import find_task
 from bounce_mjx.task.task import Hits
 from bounce_mjx.training.events import Event
 from bounce_mjx.training.log import TensorBoardLog
@@ -190,13 +195,30 @@ def test_a_panel_has_a_point_for_each_evaluation_and_steps_in_millions() -> None
         "episode/return": LoggedCurve(steps, np.array([1.0, 2.0, 3.0])),
         "results/mean_return": LoggedCurve(steps[1:], np.array([7.0, 9.0])),
     }
-    axes = curves_figure([Group("one run", [RunCurves(Path("run"), curves, 4_000_000)])]).axes[0]
+    task_curves = (Curve("task/height", "", title="without a point yet"),)
+    group = Group("one run", [RunCurves(Path("run"), curves, 4_000_000)], task_curves)
+    axes, empty = curves_figure([group]).axes
+    assert empty.get_xlim() == axes.get_xlim()
     (points,) = [line for line in axes.lines if line.get_label() == "evaluation, without noise"]
     assert (points.get_marker(), points.get_linestyle()) == ("o", "None")
     assert points.get_xydata().tolist() == [[2e6, 7.0], [4e6, 9.0]]
     (met,) = [line for line in axes.lines if line.get_label() == "all results met"]
     assert set(met.get_xdata()) == {4_000_000}
     assert [axes.xaxis.get_major_formatter()(x) for x in (0, 5e5, 2e6)] == ["0", "500k", "2M"]
+
+
+def test_each_ball_is_drawn_and_the_legend_has_one_word_for_all() -> None:
+    """Juggling, before the first step."""
+    env = Env(find_task("juggle").Config())
+    keys = jax.random.split(jax.random.PRNGKey(0), 1)
+    shapes = jax.eval_shape(jax.vmap(env.reset, out_axes=-1), keys)
+    states = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    recording = empty_recording(env, states, 1)
+    recording = recording._replace(running=jnp.ones_like(recording.running))
+    axes = figures.evaluation_figure(env, recording).axes[0]
+    labels = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert labels[-2:] == ["balls", "paddle"] and labels.count("balls") == 1
+    assert len(axes.lines) == len(labels) + 1
 
 
 def test_hits_beside_the_paddle_are_drawn(env: BounceBall) -> None:
