@@ -1,7 +1,7 @@
 """The actuators of a model: which joint each one moves, and whether it is a position servo.
 
 An acting joint of the task has exactly one actuator, a position servo, whose control is the target
-position of the joint, times the gear. An arm that is adopted may have other ones.
+position of the joint, times the gear. An arm that is adopted may have other ones, such as motors.
 
 MuJoCo counts actuators (`nactuator`) and controls (`nu`) apart, as a `<pid>` has several controls:
 `actuator_ctrladr` is the first control of each actuator.
@@ -18,6 +18,12 @@ from bounce_mjx.robot.names import joint_name
 
 ACTING_KINDS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 """Joints of one number, which a position servo can move."""
+_DELAYS = (
+    mujoco.mjtDyn.mjDYN_NONE,
+    mujoco.mjtDyn.mjDYN_FILTER,
+    mujoco.mjtDyn.mjDYN_FILTEREXACT,
+)
+"""Of an actuator whose activation never leaves the range of its control."""
 JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 """Of an actuator that drives a joint; for a hinge or a slide, both are the same."""
 
@@ -45,7 +51,7 @@ def joint_actuators(model: mujoco.MjModel) -> dict[int, list[int]]:
 
 
 def single_actuators(model: mujoco.MjModel, joints: Collection[int]) -> dict[int, int]:
-    """The actuator of each of some joints that has one, in the model's order.
+    """The actuators of those of some joints that have one, by joint, in the model's order.
 
     Raises:
       UserError: a joint has several; the text starts with what is wrong.
@@ -62,8 +68,9 @@ def single_actuators(model: mujoco.MjModel, joints: Collection[int]) -> dict[int
 
 
 def is_position_servo(model: mujoco.MjModel, actuator: int) -> bool:
-    """Whether an actuator's control, or its filtered or integrated one, is a target position, times
-    the gear. `is_direct` tells whether it is the control itself.
+    """Whether an actuator acts as a position servo, whose target is a joint position times the
+    gear. `is_direct` tells whether the target is the control itself, not a filtered or an
+    integrated one.
 
     MuJoCo's force is gain * control + offset + factor * position + ...; a servo has the gain as its
     stiffness, and no offset.
@@ -129,12 +136,24 @@ class _ForceRange(NamedTuple):
 
 
 def _force_limit(model: mujoco.MjModel, joint: int, actuator: int) -> float | None:
-    """Largest force of a joint's actuator, N m or N; None for no limit: by the force range, by the
-    control range of a plain motor, or by the joint's own limit."""
+    """Largest force of a joint's actuator in both directions, N m or N; None for no limit: by the
+    force range, by the range of a motor's control or activation, or by the joint's own limit. Of a
+    servo it is that of `torques.largest_torques`.
+
+    Raises:
+      UserError: the actuator pushes one way only, or not at all.
+    """
+    _check_pushes(model, joint, actuator)
     gear = float(model.actuator_gear[actuator, 0])
     gain = float(model.actuator_gainprm[actuator, 0])
     control = model.actuator_ctrladr[actuator]
-    is_motor = model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_NONE
+    dynamics = int(model.actuator_dyntype[actuator])
+    # The force of a motor is its gain times its activation, which may be the control itself.
+    is_motor = (
+        model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
+        and model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_NONE
+    )
+    has_activation = dynamics != mujoco.mjtDyn.mjDYN_NONE
     ranges = (
         _ForceRange(
             name="forcerange",
@@ -144,8 +163,16 @@ def _force_limit(model: mujoco.MjModel, joint: int, actuator: int) -> float | No
         ),
         _ForceRange(
             name="ctrlrange",
-            is_limited=bool(is_motor and model.actuator_ctrllimited[control]),
+            is_limited=bool(
+                is_motor and dynamics in _DELAYS and model.actuator_ctrllimited[control]
+            ),
             range=model.actuator_ctrlrange[control],
+            factor=gear * gain,
+        ),
+        _ForceRange(
+            name="actrange",
+            is_limited=bool(is_motor and has_activation and model.actuator_actlimited[actuator]),
+            range=model.actuator_actrange[actuator],
             factor=gear * gain,
         ),
         _ForceRange(
@@ -170,3 +197,20 @@ def _force_limit(model: mujoco.MjModel, joint: int, actuator: int) -> float | No
         limits.append(min(-low, high) * abs(force_range.factor))
     limit = min(limits, default=np.inf)
     return limit if np.isfinite(limit) else None
+
+
+def _check_pushes(model: mujoco.MjModel, joint: int, actuator: int) -> None:
+    """Refuses a muscle, which only pulls, and a damper, which only brakes."""
+    gain_type = model.actuator_gaintype[actuator]
+    offset_and_stiffness = model.actuator_gainprm[actuator, :2]
+    is_affine = gain_type == mujoco.mjtGain.mjGAIN_AFFINE
+    if gain_type == mujoco.mjtGain.mjGAIN_MUSCLE:
+        kind = "muscle"
+    elif is_affine and not np.any(offset_and_stiffness):
+        kind = "damper"
+    else:
+        return
+    raise UserError(
+        f"a {kind} on {joint_name(model, joint)}, which cannot push both ways; drive the joint by "
+        "a <position> or <motor> with a force limit"
+    )

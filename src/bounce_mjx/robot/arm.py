@@ -39,8 +39,10 @@ MIN_JOINTS = 3
 
 BODY_FIELDS = ("body_pos", "body_quat", "body_ipos", "body_iquat", "body_mass", "body_inertia")
 JOINT_FIELDS = ("jnt_pos", "jnt_axis")
-# Viewers show the groups 0 to 2.
+# Viewers show the groups 0 to 2. Where a link has a picture, this is the group of the shapes that
+# touch, and of no other shape of an adopted arm.
 HIDDEN_GROUP = 3
+_ALSO_HIDDEN_GROUP = 4
 # Smallest change of a joint's range that is reported, rad or m.
 _NARROWER = 1e-3
 _HANDLE_RADIUS = 0.011
@@ -242,14 +244,14 @@ class _Builder:
         actuators = self._actuators(joints)
         settings = tuple(servo_settings(model, joint, actuators[joint]) for joint in joints)
         loose = self._loose_bodies(chain, joints)
-        self._check_couplings(joints, loose)
+        couplings = self._couplings_with_loose(joints, loose)
         file_numbers = self._numbers_in_file(joints, loose)
         scene = read_spec(resource_path("mjcf/scene.xml"))
         self._rename(scene, holder)
         holder_name, joint_names = self._bind_names(holder, joints, actuators)
         self._freeze_bodies()
         self._freeze_joints(joints, actuators)
-        self._strip(joints, loose)
+        self._strip(joints, loose, couplings)
         self._disable_contacts(joints)
         self._attach(scene, holder_name, position, quaternion)
         self._replace_servos(scene, joint_names)
@@ -365,23 +367,31 @@ class _Builder:
                 f"{arm_joints}; give an MJCF with nothing but one arm on a fixed base"
             )
 
-    def _check_couplings(self, joints: list[int], loose: list[int]) -> None:
-        """Refuses an equality constraint or a tendon that acts on the arm. What has an end on a
-        loose body, such as a gripper's tendon, goes with it."""
+    def _couplings_with_loose(self, joints: list[int], loose: list[int]) -> list[str]:
+        """The equality constraints and tendons between the arm and a loose body, in words: they go
+        with that body, such as a gripper's tendon or a mocap body's weld.
+
+        Raises:
+          UserError: one couples the arm otherwise: with itself, or with the world, from which a rod
+            of a linkage hangs.
+        """
         model = self._model
         couplings = []
         for constraint, equality in enumerate(self._arm.equalities):
-            ends = _ends_of_constraint(model, constraint)
-            if ends is None or _acts_on_arm(model, ends, joints, loose):
-                couplings.append(_constraint_words(equality))
+            couplings.append((_constraint_words(equality), _ends_of_constraint(model, constraint)))
         for tendon in range(model.ntendon):
-            if _acts_on_arm(model, _ends_of_tendon(model, tendon), joints, loose):
-                couplings.append(_tendon_words(model, tendon))
-        if couplings:
-            raise UserError(
-                f"the {couplings[0]} on the arm, so it is not a serial chain; remove it, or give a "
-                "serial arm"
-            )
+            couplings.append((_tendon_words(model, tendon), _ends_of_tendon(model, tendon)))
+        with_loose = []
+        for words, ends in couplings:
+            if ends is not None and not _acts_on_arm(model, ends, joints, loose):
+                continue
+            if ends is None or not _lets_go(model, ends, joints, loose):
+                raise UserError(
+                    f"the {words} on the arm, so it is not a serial chain; remove it, or give a "
+                    "serial arm"
+                )
+            with_loose.append(words)
+        return with_loose
 
     def _numbers_in_file(self, joints: list[int], loose: list[int]) -> dict[str, np.ndarray]:
         """`Arm.file_numbers`."""
@@ -510,7 +520,7 @@ class _Builder:
             return 0.0, 0.0
         return reached_low, reached_high
 
-    def _strip(self, joints: list[int], loose: list[int]) -> None:
+    def _strip(self, joints: list[int], loose: list[int], couplings: list[str]) -> None:
         """Removes all but the arm; without its free joint, a base is fixed."""
         arm = self._arm
         model = self._model
@@ -525,6 +535,8 @@ class _Builder:
                 idle.append(spec_joint)
         # MuJoCo deletes a body with what refers to it, such as a gripper's tendons.
         self._remove("removed the grippers and loose objects", [bodies[body] for body in loose])
+        if couplings:
+            self._changes.append(f"removed what couples the arm with these: {', '.join(couplings)}")
         self._remove("fixed the joints that do not act", idle)
         others = [*arm.keys, *arm.sensors, *arm.pairs, *arm.excludes, *arm.lights, *arm.cameras]
         others += arm.equalities
@@ -556,6 +568,8 @@ class _Builder:
                 # the world, such as a table, is shown as it is.
                 if touches and i > 0 and not all(touching):
                     geom.group = HIDDEN_GROUP
+                elif geom.group == HIDDEN_GROUP:
+                    geom.group = _ALSO_HIDDEN_GROUP
                 geom.contype = 0
                 geom.conaffinity = 0
         if arm_touches:
@@ -746,19 +760,40 @@ def _ends_of_tendon(model: mujoco.MjModel, tendon: int) -> list[_End]:
 def _acts_on_arm(
     model: mujoco.MjModel, ends: list[_End], joints: list[int], loose: list[int]
 ) -> bool:
-    """Whether what has these ends acts on an acting joint, or on a body that one moves; not where
-    it has an end on a loose body."""
-    if any(is_below(model, _body_of(model, end), loose) for end in ends):
-        return False
+    """Whether what has these ends acts on an acting joint, or on a body of the arm that one
+    moves."""
     moved = model.jnt_bodyid[joints].tolist()
     for end in ends:
+        body = _body_of(model, end)
         if end.kind == mujoco.mjtObj.mjOBJ_JOINT:
             acts = end.index in joints
         else:
-            acts = is_below(model, _body_of(model, end), moved)
+            acts = is_below(model, body, moved) and not is_below(model, body, loose)
         if acts:
             return True
     return False
+
+
+def _lets_go(model: mujoco.MjModel, ends: list[_End], joints: list[int], loose: list[int]) -> bool:
+    """Whether what has these ends goes with the loose bodies of them: some are loose, and each of
+    those is a gripper's, a mocap body, or free in the world."""
+    moved = model.jnt_bodyid[joints].tolist()
+    bodies = [_body_of(model, end) for end in ends]
+    loose_ends = [body for body in bodies if is_below(model, body, loose)]
+    for body in loose_ends:
+        is_of_gripper = is_below(model, body, moved)
+        if not is_of_gripper and _hangs(model, body):
+            return False
+    return bool(loose_ends)
+
+
+def _hangs(model: mujoco.MjModel, body: int) -> bool:
+    """Whether a body is held by the world: it is below no free and no mocap body."""
+    root = model.body_rootid[body]
+    joint = model.body_jntadr[root]
+    is_free = joint >= 0 and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE
+    is_mocap = model.body_mocapid[root] >= 0
+    return not is_free and not is_mocap
 
 
 def _body_of(model: mujoco.MjModel, end: _End) -> int:
