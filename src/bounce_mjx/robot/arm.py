@@ -1,6 +1,6 @@
-"""Adoption of an arm: from any MJCF with a serial arm in it to the task's scene, with MjSpec.
+"""An arm's MJCF in the task's scene, with MjSpec; `adopt.py` searches its settings.
 
-Every change by which the arm moves otherwise than in the user's file is collected as one sentence.
+Every change by which the arm moves otherwise than in the user's file is collected (`Arm.changes`).
 """
 
 import contextlib
@@ -78,7 +78,7 @@ class Arm(NamedTuple):
     actuators: tuple[ServoSettings, ...]
     """The file's own actuator of each acting joint, a servo or another one."""
     changes: tuple[str, ...]
-    """Changes to the user's model, one sentence each."""
+    """Changes to the user's model, a phrase each."""
     narrowed: tuple[str, ...]
     """The joints whose range a servo's ctrlrange narrows, in words."""
     file_numbers: dict[str, np.ndarray]
@@ -141,11 +141,11 @@ def build_arm(path: Path, config: RobotConfig) -> Arm:
     Raises:
       UserError: the file does not compile, or holds no arm that can do the task.
     """
-    arm = read_spec(path)
-    model = compile_spec(arm, path)
+    spec = read_spec(path)
+    model = compile_spec(spec, path)
     check_numbers(model)
     with _compiling(path):
-        return _Builder(arm, model, config).build()
+        return _Builder(spec, model, config).build()
 
 
 def read_spec(path: Path) -> mujoco.MjSpec:
@@ -225,12 +225,13 @@ def _other_sites(model: mujoco.MjModel) -> str:
 class _Builder:
     """The steps of one adoption.
 
-    `_model` is the user's file as MuJoCo compiles it. Its ids are places in the lists of the spec
-    `_arm` until the first element is deleted, in `_strip`.
+    `_spec` is the user's file, and `_model` as MuJoCo compiles it. The model's ids are places in
+    the lists of the spec until the first element is deleted, in `_strip`: what compiling fuses, it
+    also takes out of the spec.
     """
 
-    def __init__(self, arm: mujoco.MjSpec, model: mujoco.MjModel, config: RobotConfig):
-        self._arm = arm
+    def __init__(self, spec: mujoco.MjSpec, model: mujoco.MjModel, config: RobotConfig):
+        self._spec = spec
         self._model = model
         self._config = config
         self._changes: list[str] = []
@@ -377,7 +378,7 @@ class _Builder:
         """
         model = self._model
         couplings = []
-        for constraint, equality in enumerate(self._arm.equalities):
+        for constraint, equality in enumerate(self._spec.equalities):
             couplings.append((_constraint_words(equality), _ends_of_constraint(model, constraint)))
         for tendon in range(model.ntendon):
             couplings.append((_tendon_words(model, tendon), _ends_of_tendon(model, tendon)))
@@ -405,28 +406,28 @@ class _Builder:
     def _rename(self, scene: mujoco.MjSpec, holder: int) -> None:
         """Gives the arm's parts names that the task's scene does not use, and the body that holds
         the paddle a name."""
-        arm = self._arm
+        spec = self._spec
         # Each access to a list of a spec walks through the whole spec.
-        bodies = list(arm.bodies)
+        bodies = list(spec.bodies)
         if not bodies[holder].name:
             bodies[holder].name = _free_name("end_effector", bodies)
         renamed = _rename_beside(bodies[1:], scene.bodies, PADDLE_BODY_NAME)
-        renamed += _rename_beside(list(arm.joints), scene.joints)
-        renamed += _rename_beside(list(arm.geoms), scene.geoms, PADDLE_GEOM_NAME)
+        renamed += _rename_beside(list(spec.joints), scene.joints)
+        renamed += _rename_beside(list(spec.geoms), scene.geoms, PADDLE_GEOM_NAME)
         if renamed:
             self._changes.append(f"renamed what the scene has too: {listed(renamed, most=20)}")
 
     def _bind_names(
         self, holder: int, joints: list[int], actuators: dict[int, int]
     ) -> tuple[str, tuple[str, ...]]:
-        """The names of the body that holds the paddle, and of the acting joints, by which their
-        actuators find them."""
-        spec_joints = list(self._arm.joints)
-        spec_actuators = list(self._arm.actuators)
+        """Binds the actuators to the joints' new names; returns the names of the body that holds
+        the paddle, and of the acting joints."""
+        spec_joints = list(self._spec.joints)
+        spec_actuators = list(self._spec.actuators)
         for joint in joints:
             spec_actuators[actuators[joint]].target = spec_joints[joint].name
         names = tuple(spec_joints[joint].name for joint in joints)
-        return list(self._arm.bodies)[holder].name, names
+        return list(self._spec.bodies)[holder].name, names
 
     def _freeze_bodies(self) -> None:
         """Gives the bodies of the spec the numbers of the compiled model.
@@ -434,8 +435,8 @@ class _Builder:
         MuJoCo's compiler computes them from the whole file, with its units and settings. Compiled
         again in another scene, without its limits and with fewer parts, they would be others.
         """
-        compiler = self._arm.compiler
-        for i, body in enumerate(list(self._arm.bodies)[1:], start=1):
+        compiler = self._spec.compiler
+        for i, body in enumerate(list(self._spec.bodies)[1:], start=1):
             body.explicitinertial = True
             for field in BODY_FIELDS:
                 setattr(body, field.removeprefix("body_"), getattr(self._model, field)[i])
@@ -453,10 +454,11 @@ class _Builder:
 
     def _freeze_joints(self, joints: list[int], actuators: dict[int, int]) -> None:
         """Gives the acting joints and their actuators those numbers of the compiled model that
-        would change in the scene, as `_freeze_bodies`, and the joints the ranges that their servos
-        reach. MuJoCo computes the others (pos, axis, ref, springref) as in the file."""
-        spec_joints = list(self._arm.joints)
-        spec_actuators = list(self._arm.actuators)
+        would change in the scene, as `_freeze_bodies`, and the joints the ranges that the file's
+        servos reach: also where other servos replace these, as the robot's controller has that
+        range. MuJoCo computes the others (pos, axis, ref, springref) as in the file."""
+        spec_joints = list(self._spec.joints)
+        spec_actuators = list(self._spec.actuators)
         for joint in joints:
             actuator = actuators[joint]
             self._freeze_joint(spec_joints[joint], joint, actuator)
@@ -516,17 +518,18 @@ class _Builder:
             self._narrowed.append(
                 f"{name} from {low:.4g} to {high:.4g} to {reached_low:.4g} to {reached_high:.4g}"
             )
+        # Both ends are infinite, or none.
         if np.isinf(reached_high):
             return 0.0, 0.0
         return reached_low, reached_high
 
     def _strip(self, joints: list[int], loose: list[int], couplings: list[str]) -> None:
         """Removes all but the arm; without its free joint, a base is fixed."""
-        arm = self._arm
+        spec = self._spec
         model = self._model
         # From here on, ids of the model are no places in the spec's lists any more.
-        bodies = list(arm.bodies)
-        spec_joints = list(arm.joints)
+        bodies = list(spec.bodies)
+        spec_joints = list(spec.joints)
         acting_names = [spec_joints[joint].name for joint in joints]
         idle = []
         for joint, spec_joint in enumerate(spec_joints):
@@ -538,29 +541,31 @@ class _Builder:
         if couplings:
             self._changes.append(f"removed what couples the arm with these: {', '.join(couplings)}")
         self._remove("fixed the joints that do not act", idle)
-        others = [*arm.keys, *arm.sensors, *arm.pairs, *arm.excludes, *arm.lights, *arm.cameras]
-        others += arm.equalities
-        for actuator in arm.actuators:
+        others = list(spec.keys)
+        for elements in (spec.sensors, spec.pairs, spec.excludes, spec.lights, spec.cameras):
+            others += elements
+        others += spec.equalities
+        for actuator in spec.actuators:
             drives_joint = int(actuator.trntype) in JOINT_TRANSMISSIONS
             if not (drives_joint and actuator.target in acting_names):
                 others.append(actuator)
-        others += arm.tendons
+        others += spec.tendons
         floors = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
-        others += [geom for geom in arm.geoms if geom.type in floors]
+        others += [geom for geom in spec.geoms if geom.type in floors]
         self._remove("removed what is not the arm", others)
 
     def _remove(self, words: str, elements: Iterable) -> None:
         elements = list(elements)
         names = [element.name for element in elements]
         for element in elements:
-            self._arm.delete(element)
+            self._spec.delete(element)
         if elements:
             named = f": {listed(names)}" if any(names) else ""
             self._changes.append(f"{words} ({len(elements)}{named})")
 
     def _disable_contacts(self, joints: list[int]) -> None:
         arm_touches = False
-        for i, body in enumerate(self._arm.bodies):
+        for i, body in enumerate(self._spec.bodies):
             touching = [bool(geom.contype or geom.conaffinity) for geom in body.geoms]
             arm_touches = arm_touches or any(touching)
             for geom, touches in zip(body.geoms, touching, strict=True):
@@ -594,8 +599,8 @@ class _Builder:
             self._changes.append(f"replaced the physics options with the task's: {differing}")
         if np.any(self._model.dof_frictionloss):
             raise_solver_limits(scene.option)
-        self._arm.option = scene.option
-        scene.attach(self._arm, frame=scene.worldbody.add_frame(), prefix="")
+        self._spec.option = scene.option
+        scene.attach(self._spec, frame=scene.worldbody.add_frame(), prefix="")
         paddle = scene.body(holder).add_body(name=PADDLE_BODY_NAME, pos=position, quat=quaternion)
         _add_paddle(paddle, config.paddle, scene.default)
         ball = scene.geom("ball")

@@ -49,8 +49,8 @@ class Addresses(NamedTuple):
     arm_qvel: tuple[int, ...]
     """Velocities of the acting joints in qvel."""
     actuators: tuple[int, ...]
-    """Ids of the servos, and of their controls in ctrl, which `check_servos` lets be the same: each
-    moves the acting joint of the same place in `arm_joints`."""
+    """Ids of the servos: each moves the acting joint of the same place in `arm_joints`. Each has
+    one control (`check_servos`), so they are also its places in ctrl."""
     balls: tuple[BallAddresses, ...]
     paddle_geom: int
 
@@ -91,8 +91,9 @@ def load_model(
 
     Raises:
       UserError: the file is missing, is no MJCF, lacks a name that the task needs, has a joint with
-        several actuators or one that is no position servo (`check_servos`), a range in degrees that
-        MuJoCo does not convert, more balls than `num_balls`, or a number that cannot be simulated;
+        several actuators or with one that is no position servo at rest (`check_servos`), a range in
+        degrees that MuJoCo does not convert, more balls than `num_balls`, or a number that cannot
+        be simulated;
         or half a period of a contact has fewer than four physics steps.
     """
     robot = robot or RobotConfig()
@@ -110,7 +111,8 @@ def load_model(
         _check_units_of_ranges(spec, mj_model, addresses)
         _check_balls(addresses, num_balls)
     if robot.limits.torque is not None:
-        # Of as many servos as there are torques: a wrong number is refused by `Env`, later.
+        # A wrong number of torques, or of joints, is refused where the config is known
+        # (`WorldConfig`, `env.checks.check_joint_angles`).
         torques = robot.limits.torque[: len(addresses.actuators)]
         limit_torques(mj_model, addresses.actuators[: len(torques)], torques)
     mj_model.opt.timestep = physics_dt
@@ -119,7 +121,7 @@ def load_model(
 
 
 def _compensate_gravity(spec: mujoco.MjSpec, share: float) -> None:
-    """Lets a controller carry a share of the weight of each body but the balls."""
+    """Lets a controller carry a share of the weight of each body without a free joint."""
     for body in spec.bodies:
         is_free = any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in body.joints)
         if not is_free:
@@ -127,8 +129,8 @@ def _compensate_gravity(spec: mujoco.MjSpec, share: float) -> None:
 
 
 def _drop_pictures(spec: mujoco.MjSpec) -> None:
-    """Leaves out what only pictures need, except where it makes the bodies' inertia: there MuJoCo
-    would not drop it."""
+    """Leaves out what only pictures need. Where geoms make the bodies' inertia, MuJoCo keeps them
+    whatever the flag, so it is not set."""
     from_geoms = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     if spec.compiler.inertiafromgeom != from_geoms:
         spec.compiler.discardvisual = True
@@ -208,8 +210,8 @@ def link_bodies(mj_model: mujoco.MjModel, addresses: Addresses) -> list[list[int
 
 
 def contact_pairs(mj_model: mujoco.MjModel, addresses: Addresses) -> list[int]:
-    """Indices of the contact pairs of balls and the paddle, the first ball's with the paddle first;
-    none if that one is missing."""
+    """Indices of the contact pairs among the balls and the paddle, that of the first ball with the
+    paddle first; none if that one is missing."""
     paddle = addresses.paddle_geom
     balls = [ball.geom for ball in addresses.balls]
     first = None

@@ -39,8 +39,8 @@ def torque_ranges(
 def largest_torques(
     mj_model: mujoco.MjModel, joints: Sequence[int], servos: Sequence[int]
 ) -> np.ndarray:
-    """Largest torque [n] (N m, or N of a slide) that the servos exert both ways; infinite without a
-    limit."""
+    """Largest torque [n] (N m, or N of a slide) that the servos exert in either direction: the
+    smaller of both ends; infinite without a limit."""
     low, high = torque_ranges(mj_model, joints, servos)
     return np.minimum(-low, high)
 
