@@ -132,7 +132,8 @@ class Curve(NamedTuple):
     """Metric of the environment's step."""
     over: str = "steps"
     """steps for the mean over steps, episodes for the mean of the last values of episodes, or the
-    metric that counts the events over which it is the mean."""
+    metric that counts the events over which it is the mean; the metric is then 0 on all other
+    steps."""
     title: str = ""
     """Title in the report; "" leaves it out there."""
     scale: float = 1.0
