@@ -111,7 +111,7 @@ class Recording(NamedTuple):
     paddle: jax.Array
     """Positions of the paddle's centre after the step [T, 3, K], m."""
     command: dict[str, jax.Array]
-    """Commands [T, K]."""
+    """Commands after the step [T, K]."""
     running: jax.Array
     """Whether the episode had not ended before the step [T, K], bool."""
     command_velocity: jax.Array | None = None
@@ -256,7 +256,7 @@ class Task:
 
     def next_command(self, state: TaskState, command: Values) -> Values:
         """The commands from now on, for a task whose commands move within an episode. It is called
-        after every step, and right after each `first_command`.
+        once at a reset and once after every step, where that is a redraw after `first_command`.
 
         Args:
           state: the task's state after the step or the reset.
