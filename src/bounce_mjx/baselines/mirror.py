@@ -19,8 +19,7 @@ import numpy as np
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
-from bounce_mjx.robot.geometry import upper_face
-from bounce_mjx.robot.model import data_at, scatter
+from bounce_mjx.robot.model import data_at, scatter, upper_face
 from bounce_mjx.world.config import WorldConfig
 
 # Restitution of the ball on the paddle.

@@ -23,8 +23,6 @@ from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, edited_
 from bounce_mjx.physics.engine import Engine, make_engine
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
 from bounce_mjx.robot import model as robot_model
-from bounce_mjx.robot.balls import BALLS_APART
-from bounce_mjx.robot.geometry import read_geometry
 from bounce_mjx.task.rewards import check_names
 from bounce_mjx.task.task import Start, Step, Task, TaskStep
 from bounce_mjx.world import noise
@@ -157,7 +155,7 @@ class Env:
         self.layout = config.layout
         check_joint_angles(config, self.mj_model, self.addresses)
         check_contacts(self.mj_model, config.randomization.terms, self.addresses)
-        self.task.geometry = read_geometry(
+        self.task.geometry = robot_model.read_geometry(
             self.mj_model, self.addresses, config.default_joint_angles
         )
         check_start(config, self.task)
@@ -414,7 +412,7 @@ class Env:
         qvel = scatter(np.zeros(self.mj_model.nv), self.addresses.arm_qvel, joint_velocities)
 
         if thrown is None:
-            heights = np.array([[0.0, 0.0, BALLS_APART * i] for i in range(num_balls)])
+            heights = np.array([[0.0, 0.0, robot_model.BALLS_APART * i] for i in range(num_balls)])
             thrown = (np.array(self.config.ball_init_pos) + heights, np.zeros((num_balls, 3)))
         thrown_positions, thrown_velocities = thrown
         positions = jnp.asarray(thrown_positions, dtype).reshape(num_balls, 3)

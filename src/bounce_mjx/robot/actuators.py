@@ -1,13 +1,16 @@
-"""The actuators of a model: which joint each one moves, and whether it is a position servo.
+"""The actuators of a model: which joint each one moves, whether it is a position servo, and the
+torques that it can exert there.
 
 An acting joint of the task has exactly one actuator, a position servo, whose control is the target
 position of the joint, times the gear. An arm that is adopted may have other ones, such as motors.
 
 MuJoCo counts actuators (`nactuator`) and controls (`nu`) apart, as a `<pid>` has several controls:
-`actuator_ctrladr` is the first control of each actuator.
+`actuator_ctrladr` is the first control of each actuator. It limits an actuator by its `forcerange`,
+which the `gear` multiplies, and a joint by its `actuatorfrcrange`; `servo_settings` also finds the
+limit of an actuator that is no servo, whose control may limit it too.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -123,6 +126,52 @@ def servo_range(model: mujoco.MjModel, actuator: int) -> tuple[float, float]:
     return float(low), float(high)
 
 
+def force_ranges(mj_model: mujoco.MjModel, servos: Sequence[int]) -> np.ndarray:
+    """Lower and upper ends [2, n] of the `forcerange` of actuators [n]; infinite without a
+    limit."""
+    low, high = mj_model.actuator_forcerange[list(servos)].T
+    is_limited = mj_model.actuator_forcelimited[list(servos)].astype(bool)
+    return np.stack([np.where(is_limited, low, -np.inf), np.where(is_limited, high, np.inf)])
+
+
+def torque_ranges(
+    mj_model: mujoco.MjModel, joints: Sequence[int], servos: Sequence[int]
+) -> np.ndarray:
+    """Least and greatest torque [2, n] (N m, or N of a slide) of the servos [n] of joints [n];
+    infinite without a limit."""
+    gears = mj_model.actuator_gear[list(servos), 0]
+    low, high = np.sort(gears * force_ranges(mj_model, servos), axis=0)
+    joint_low, joint_high = mj_model.jnt_actfrcrange[list(joints)].T
+    is_limited = mj_model.jnt_actfrclimited[list(joints)].astype(bool)
+    return np.stack(
+        [
+            np.where(is_limited, np.maximum(low, joint_low), low),
+            np.where(is_limited, np.minimum(high, joint_high), high),
+        ]
+    )
+
+
+def largest_torques(
+    mj_model: mujoco.MjModel, joints: Sequence[int], servos: Sequence[int]
+) -> np.ndarray:
+    """Largest torque [n] (N m, or N of a slide) that the servos exert in either direction: the
+    smaller of both ends; infinite without a limit."""
+    low, high = torque_ranges(mj_model, joints, servos)
+    return np.minimum(-low, high)
+
+
+def limit_torques(
+    mj_model: mujoco.MjModel, servos: Sequence[int], torques: Sequence[float]
+) -> None:
+    """Narrows the `forcerange` of servos [n] to torques [n] (N m) at their joints; a weaker servo
+    keeps its own. Each has 0 in its range (`model.check_servos`)."""
+    forces = np.asarray(torques) / np.abs(mj_model.actuator_gear[list(servos), 0])
+    low, high = force_ranges(mj_model, servos)
+    narrowed = np.stack([np.maximum(low, -forces), np.minimum(high, forces)], axis=1)
+    mj_model.actuator_forcerange[list(servos)] = narrowed
+    mj_model.actuator_forcelimited[list(servos)] = True
+
+
 class _ForceRange(NamedTuple):
     """One of MuJoCo's limits of an actuator's force."""
 
@@ -138,7 +187,7 @@ class _ForceRange(NamedTuple):
 def _force_limit(model: mujoco.MjModel, joint: int, actuator: int) -> float | None:
     """Largest force of a joint's actuator in both directions, N m or N; None for no limit: by the
     force range, by the range of a motor's control or activation, or by the joint's own limit. Of a
-    servo it is that of `torques.largest_torques`.
+    servo it is that of `largest_torques`.
 
     Raises:
       UserError: the actuator pushes one way only, or not at all.

@@ -13,7 +13,7 @@ from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.observation import Kinematics
 
 if TYPE_CHECKING:
-    from bounce_mjx.robot.geometry import Geometry
+    from bounce_mjx.robot.model import Geometry
 
 TaskState = Any
 """A pytree that a task keeps of an episode."""
@@ -213,8 +213,7 @@ class Task:
         """Sizes and places of ball and paddle in the model. An environment sets those of its own
         model (`env.task.geometry = ...`); a task without one compiles the config's model here."""
         # Imported here, as a process that reads the settings alone needs no JAX.
-        from bounce_mjx.robot.geometry import read_geometry
-        from bounce_mjx.robot.model import find_addresses, load_model
+        from bounce_mjx.robot.model import find_addresses, load_model, read_geometry
 
         config = self.config
         model = load_model(

@@ -19,7 +19,7 @@ PADDLE_HOME = (0.59356, 0.0, 0.0498)
 
 
 NumBalls = Annotated[int, pydantic.BeforeValidator(settings.whole_number), Field(ge=1, le=3)]
-"""Number of balls, up to `robot.balls.MAX_BALLS`."""
+"""Number of balls, up to `robot.model.MAX_BALLS`."""
 
 
 class Command(NamedTuple):
