@@ -9,8 +9,7 @@ import trimesh
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.robot.arm import compile_spec
-from bounce_mjx.robot.balls import add_balls
-from bounce_mjx.robot.model import scene_spec
+from bounce_mjx.robot.model import add_balls, scene_spec
 from bounce_mjx.task.task import Marker
 from bounce_mjx.viewers.simulation import EnvFrame
 from bounce_mjx.world.config import WorldConfig

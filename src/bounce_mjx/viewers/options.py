@@ -6,6 +6,7 @@ from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field
 
+from bounce_mjx.config.command_line import Flag
 from bounce_mjx.config.settings import Positive, StrictModel
 
 MAX_ENVS = 16
@@ -18,7 +19,7 @@ class ViewerOptions(StrictModel):
     viewer: Literal["auto", "browser", "native"] = "auto"
     """browser serves a page, native opens MuJoCo's own window, auto is native on a machine with a
     display and browser elsewhere."""
-    video: Path | None = None
+    video: Annotated[Path | None, Flag(instead_of="--out")] = None
     """File for a video, .mp4, .webp or .gif, instead of a viewer."""
     html: Path | None = None
     """File for a page that replays the episode offline, instead of a viewer."""
