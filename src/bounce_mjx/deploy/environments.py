@@ -29,7 +29,8 @@ from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import RandomizationConfig
 
 ONNX = ".onnx"
-NOMINAL, TRAINING = "nominal", "training"
+NOMINAL = "nominal"
+TRAINING = "training"
 """Worlds of a policy: the model's own, and those that its training sampled."""
 
 # Wrappers of Gymnasium and SB3 after which the numbers are no longer the environment's own.
@@ -156,19 +157,22 @@ def environment_of(env: Any) -> Env:
                 f"{type(inner).__name__} changes the observations or the actions, and a policy "
                 "takes the environment's own; give the environment within it"
             )
-        parts = vars(inner) if hasattr(inner, "__dict__") else {}
-        task = getattr(type(inner), "task", None) or parts.get("task")
+        attributes = vars(inner) if hasattr(inner, "__dict__") else {}
+        task = getattr(type(inner), "task", None) or attributes.get("task")
         if isinstance(task, property):
             task = inner.task
-        names = ("env", "venv", "_env", "envs")
-        parts = [task, *(parts.get(name) for name in names)]
-        found = [part for part in parts if part is not None]
-        if not found:
+        held = [task]
+        for name in ("env", "venv", "_env", "envs"):
+            held.append(attributes.get(name))
+        held = [part for part in held if part is not None]
+        if not held:
             raise UserError(
                 f"{type(env).__name__} holds no environment of bounce_mjx; give one that its "
                 "adapters made, such as gymnasium.make('bounce_mjx/Task-v0', policy=...)"
             )
-        inner = found[0][0] if isinstance(found[0], list | tuple) else found[0]
+        inner = held[0]
+        if isinstance(inner, list | tuple):
+            inner = inner[0]
     return inner
 
 

@@ -254,7 +254,7 @@ def in_driver_order(metadata: Metadata, names: Sequence[str], order: Sequence[in
 
     limits = metadata.limits
     if limits is not None:
-        limits = CommandLimits(*(None if x is None else ordered(x) for x in limits))
+        limits = CommandLimits._make(None if x is None else ordered(x) for x in limits)
     per_joint = {name: ordered(getattr(metadata, name)) for name in _PER_JOINT}
     chain = tuple(link._replace(joint=list(order).index(link.joint)) for link in metadata.chain)
     return metadata._replace(joint_names=tuple(names), limits=limits, chain=chain, **per_joint)

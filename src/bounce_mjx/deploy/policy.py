@@ -114,7 +114,8 @@ class DeployedPolicy:
                 f"an observation has no {', '.join(missing)}, which this policy measures; use "
                 "Run(...).policy_in(env)"
             )
-        self._places, self._observation_size = dict(places), size
+        self._places = dict(places)
+        self._observation_size = size
 
     def reset(self, targets: np.ndarray | None = None) -> None:
         """Forgets the past. The next step fills the whole history with its measurements.
@@ -199,12 +200,10 @@ class DeployedPolicy:
             last = angles if self.motion.end is None else self.motion.end.position
             measured = measured | {"servo_lead": last - angles}
         for left in reversed(range(steps)):
-            between = measured
-            if left:
-                between = {
-                    name: value + left / steps * (self._measured.get(name, value) - value)
-                    for name, value in measured.items()
-                }
+            between = {}
+            for name, value in measured.items():
+                earlier = self._measured.get(name, value)
+                between[name] = value + left / steps * (earlier - value) if left else value
             action = self._network.step(between, self._action)
         self._measured = measured
         self._action = action
