@@ -241,6 +241,8 @@ def _force_limit(model: mujoco.MjModel, joint: int, actuator: int) -> float | No
         if not force_range.is_limited:
             continue
         low, high = force_range.range.tolist()
+        # Stricter than `model.check_servos`: the limit also becomes that of a made servo, which
+        # pushes both ways.
         if not low < 0.0 < high:
             most = max(-low, high)
             raise UserError(
