@@ -294,14 +294,15 @@ class DeployedPolicy:
         return self._network.observation
 
     def _needs(self) -> tuple[str, ...]:
+        """The measurements of which the network's inputs are made, but those with a default."""
         reads = self._network.reads
         optional = ("ball_quaternion", "ball_angular_velocity")
-        users = {name: {name} for name in self.units if name not in optional}
-        users["joint_angles"] |= {"paddle_position", "servo_lead"}
-        users["ball_position"].add("ball_picture")
+        inputs_of = {name: {name} for name in self.units if name not in optional}
+        inputs_of["joint_angles"] |= {"paddle_position", "servo_lead"}
+        inputs_of["ball_position"].add("ball_picture")
         if self.metadata.velocity != "measured":
-            users["ball_position"] |= users.pop("ball_velocity")
-        return tuple(name for name in users if users[name] & reads)
+            inputs_of["ball_position"] |= inputs_of.pop("ball_velocity")
+        return tuple(name for name, inputs in inputs_of.items() if inputs & reads)
 
     def check(
         self, measurements: Mapping[str, Any], needs: Sequence[str] | None = None
