@@ -236,8 +236,8 @@ class _Graph:
         """Name of a node's output."""
         output = output or f"{kind}_{len(self.nodes)}"
         names = [value if isinstance(value, str) else self._constant(value) for value in inputs]
-        made = self.helper.make_node(kind, names, [output], name=output, **attributes)
-        self.nodes.append(made)
+        node = self.helper.make_node(kind, names, [output], name=output, **attributes)
+        self.nodes.append(node)
         return output
 
     def _constant(self, value: np.ndarray) -> str:

@@ -221,8 +221,10 @@ def to_entries(metadata: Metadata) -> dict[str, str]:
 def from_entries(entries: dict[str, str]) -> Metadata:
     """Metadata from the entries of `to_entries`; ValueError for another format."""
     # A file of another format lacks entries too, but the format is the reason.
-    if "format" in entries and (given := json.loads(entries["format"])) != FORMAT:
-        raise ValueError(f"its format is {given}, not {FORMAT}; export the policy again")
+    if "format" in entries:
+        file_format = json.loads(entries["format"])
+        if file_format != FORMAT:
+            raise ValueError(f"its format is {file_format}, not {FORMAT}; export the policy again")
     later = Metadata._field_defaults
     missing = [name for name in Metadata._fields if name not in entries and name not in later]
     if missing:
