@@ -16,7 +16,7 @@ from bounce_mjx.evaluation.failures import (
     film_episode,
     wilson_interval,
 )
-from bounce_mjx.evaluation.policy_evaluation import conditions_of
+from bounce_mjx.evaluation.policy_evaluation import setup_of
 from bounce_mjx.evaluation.robustness import find_episode, measure_conditions
 from bounce_mjx.evaluation.statistics import Statistics
 from bounce_mjx.evaluation.suite import load_suite
@@ -38,7 +38,7 @@ class _Jumpy:
 def conditions():
     world = {"action_latency": (0.0, 0.03), "paddle_tilt": (-0.05, 0.05), "restitution": (0.7, 0.9)}
     config = EnvConfig(episode_seconds=0.5, randomization=world)
-    return conditions_of(config, EvaluationOptions(EPISODES, SEED))
+    return setup_of(config, EvaluationOptions(EPISODES, SEED))
 
 
 @pytest.fixture(scope="module")

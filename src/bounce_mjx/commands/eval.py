@@ -108,7 +108,7 @@ def main(args: Sequence[str]) -> None:
         print(describe(entries, report.recording.running.shape[-1]))
         found[name] = [entry._asdict() for entry in entries]
     if command.failures:
-        failures = failures_of(evaluated.conditions, evaluated.statistics)
+        failures = failures_of(evaluated.setup, evaluated.statistics)
         found["failures"] = [failure._asdict() for failure in failures]
         terms = associations(evaluated.statistics, failures)
         console.print(failures_table(failures, terms, command.episodes))

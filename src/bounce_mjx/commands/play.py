@@ -133,7 +133,7 @@ def _episode_finder(
     Raises:
       UserError: the suite has no such condition.
     """
-    from bounce_mjx.evaluation.policy_evaluation import InEvaluation, conditions_of
+    from bounce_mjx.evaluation.policy_evaluation import InEvaluation, setup_of
     from bounce_mjx.evaluation.robustness import find_episode
 
     options = EvaluationOptions(
@@ -141,7 +141,7 @@ def _episode_finder(
     )
     if command.condition is None:
         return lambda: InEvaluation(
-            conditions_of(config.env, options), options.episodes, command.episode
+            setup_of(config.env, options), options.episodes, command.episode
         )
     path, conditions, _ = suite_conditions(command.suite, config, command.world)
     labels = [condition.label for condition in conditions]

@@ -17,7 +17,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
 from bounce_mjx.evaluation.config import EvaluationOptions, Physics, command_ranges, on_engine
 from bounce_mjx.evaluation.episodes import make_evaluator
-from bounce_mjx.evaluation.policy_evaluation import Conditions, InEvaluation
+from bounce_mjx.evaluation.policy_evaluation import EpisodeSetup, InEvaluation
 from bounce_mjx.evaluation.results import is_share, judge
 from bounce_mjx.evaluation.statistics import Statistics
 from bounce_mjx.evaluation.suite import Condition, condition_label
@@ -174,7 +174,7 @@ def find_episode(
     ranges = _stack_ranges(names, _padded(members[start : start + size], size))
     place_in_call = (place - start) * options.episodes + episode
     return InEvaluation(
-        Conditions(env, condition.commands, ranges), size * options.episodes, place_in_call
+        EpisodeSetup(env, condition.commands, ranges), size * options.episodes, place_in_call
     )
 
 
