@@ -80,15 +80,20 @@ def failures_of(setup: EpisodeSetup, statistics: Statistics) -> list[Failure]:
         results = env.task.results(episodes_of(alone, commands))
         # A mean over all episodes says nothing of one of them.
         shares = [result for result in results if is_share(result.measured)]
-        failed = [result.name for result in shares if result.passed is False]
-        if not s.running[i]:
+        missed = [result for result in shares if result.passed is False]
+        lasted = bool(s.running[i])
+        if not lasted:
+            # One that ended before there was something to measure did not miss that.
+            missed = [result for result in missed if result.value is not None]
+        failed = [result.name for result in missed]
+        if not lasted:
             failed.insert(0, _cause(s.ended_by, i))
         if failed:
             found.append(
                 Failure(
                     episode=i,
                     seconds=float(s.steps[i]) * env.dt,
-                    lasted=bool(s.running[i]),
+                    lasted=lasted,
                     failed=tuple(failed),
                     command={name: float(x[i]) for name, x in s.command.items()},
                     world={name: x[i].astype(float).tolist() for name, x in s.world.items()},
