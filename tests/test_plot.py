@@ -43,13 +43,14 @@ from bounce_mjx.runs.folders import save_config
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.task import Curve, term_names
-from bounce_mjx.task.bounce import Bounce, BounceReward
+from bounce_mjx.task.bounce import Bounce, BounceConfig, BounceReward
 from bounce_mjx.task.registry import find_task
 from bounce_mjx.task.task import Hits
 from bounce_mjx.training.events import Event
 from bounce_mjx.training.log import TensorBoardLog
 from tiny_runs import TINY
 
+CHECKOUT = Path(__file__).parents[1]
 TERMS = term_names(BounceReward)
 CURVES = (
     Curve("episode/return", "", title="return of an episode"),
@@ -96,6 +97,37 @@ def test_runs_that_differ_in_the_seed_are_one_group(runs: list[Path]) -> None:
         "num_envs 2048 (one run)",
     ]
     assert [group.label for group in group_runs(runs[:3])] == ["3 runs"]
+
+
+def test_a_sweep_of_an_own_algorithms_setting_is_several_groups(tmp_path: Path) -> None:
+    """Though its code is not run."""
+    runs = []
+    algorithm = f"{CHECKOUT / 'examples/smooth_ppo.py'}:SmoothPPO"
+    for cost in (0.02, 0.2):
+        config = TrainConfig(algorithm=algorithm)
+        run = write_run(tmp_path / str(cost), config, {"episode/return": {1: 1.0}})
+        path = run / "config.yaml"
+        path.write_text(path.read_text().replace("ppo:\n", f"ppo:\n  smoothness_cost: {cost}\n"))
+        runs.append(run)
+    labels = [group.label for group in group_runs(runs)]
+    assert labels == ["smoothness_cost 0.02 (one run)", "smoothness_cost 0.2 (one run)"]
+    plain = write_run(tmp_path / "plain", TrainConfig(), {"episode/return": {1: 1.0}})
+    labels = [group.label for group in group_runs([plain, *runs])]
+    assert labels[0] == "algorithm ppo (one run)"
+    assert "smoothness_cost 0.2" in labels[2]
+
+
+def test_the_labels_of_groups_differ(tmp_path: Path) -> None:
+    """Whatever else the groups have of their own."""
+    runs = []
+    fast = BounceConfig(control_dt=0.005, action_scale=0.01, episode_seconds=10.0)
+    for env, discount in ((BounceConfig(), 0.98), (fast, 0.98), (fast, 0.97)):
+        config = TrainConfig(env=env, ppo=PPOConfig(discount=discount))
+        run = tmp_path / str(len(runs))
+        runs.append(write_run(run, config, {"episode/return": {1: 1.0}}))
+    labels = [group.label for group in group_runs(runs)]
+    assert len(set(labels)) == 3
+    assert all("discount" in label and "control_dt" in label for label in labels)
 
 
 @pytest.mark.parametrize(
