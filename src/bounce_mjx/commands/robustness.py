@@ -73,8 +73,8 @@ def main(args: Sequence[str]) -> None:
         suite, version = f"twice what {command.world} assumes", ""
     set_up_jax(*(evaluation.on_engine(condition.env, command.physics) for condition in conditions))
     checkpoint, policy, actor = read_actor(checkpoint, config)
-    no_run = checkpoint.run in {MIRROR_LAW.run, *map(resource_path, POLICIES.values())}
-    out = command.out or (Path("robustness") if no_run else checkpoint.run)
+    is_run = checkpoint.run not in {MIRROR_LAW.run, *map(resource_path, POLICIES.values())}
+    out = command.out or (checkpoint.run if is_run else Path("robustness"))
     # Fails before the measurement if its results could not be written.
     with writable(out, "choose another folder with --out"):
         out.mkdir(parents=True, exist_ok=True)
@@ -102,7 +102,7 @@ def main(args: Sequence[str]) -> None:
         write_output(out / name, content)
     print(*(out / name for name in files), sep="\n")
     lost = [outcome for outcome in outcomes if outcome.lost and outcome.physics != "mujoco"]
-    # Films are of the whole suite's programs, on the config's engine.
+    # A film simulates the programs of the whole suite (`find_episode`), on the config's engine.
     if lost and not command.assumed and command.physics == "config":
         worst = min(lost, key=lambda outcome: outcome.lasted)
         film = "--condition", worst.label, "--episode", str(worst.lost[0])

@@ -132,7 +132,7 @@ def film_command(args: Sequence[str], omitted: Sequence[str], *film: str) -> str
 
 
 class WhichPolicy(StrictModel):
-    """Which policy a command is about: in whose runs it is looked for. A command adds the flags
+    """Where a command looks for its policy: a task's runs, or a folder. A command adds the flags
     for its paths, and for the robot and the world if it simulates."""
 
     task: str | None = None

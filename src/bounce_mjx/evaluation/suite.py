@@ -138,7 +138,7 @@ def load_suite(
       world: config of the policy in a named world, which each condition changes; by default, the
         policy's without randomisation.
       assumed: nested settings of `env` by the name of the world's assumption that they double. Each
-        is a condition, after the nominal one.
+        is a condition, after the nominal one, whose other terms are those of `world`.
 
     Raises:
       UserError: the file is missing or invalid.
@@ -146,7 +146,8 @@ def load_suite(
     suite = read_suite(path)
     nominal = Perturbation(name=NOMINAL, group=NOMINAL)
     world = world or _unrandomized(trained)
-    names, conditions = {NOMINAL}, [_condition(nominal, None, trained, world, NOMINAL)]
+    names = {NOMINAL}
+    conditions = [_condition(nominal, None, trained, world, NOMINAL)]
     for key, settings in (assumed or {}).items():
         twice = Perturbation(name=f"twice {key}", group="twice the assumed")
         doubled = validate(type(world), merged(world.model_dump(), settings), twice.name)
@@ -194,8 +195,8 @@ def neutral_commands(env: WorldConfig) -> dict[str, tuple[float, float]]:
     """Range of each command in a world without randomisation: the task's default range for all
     policies that were trained with it, so that those with wider ranges are measured like the
     others; else the policy's own."""
-    ranges, defaults = dict(env.commands), type(env)().commands
-    for name, default in defaults.items():
+    ranges = dict(env.commands)
+    for name, default in type(env)().commands.items():
         if ranges[name].low <= default.low and default.high <= ranges[name].high:
             ranges[name] = default
     return {name: (command.low, command.high) for name, command in ranges.items()}
@@ -283,10 +284,12 @@ def _broadcast(term: str, num_joints: int, low: Any, high: Any) -> Bounds:
 def _contains(trained: WorldConfig, term: str, bounds: Bounds) -> bool:
     """Whether the training range of a term or of a command contains other bounds."""
     if term in trained.commands:
-        sampled = trained.commands[term][:2]
+        sampled = command_ranges(trained)[term]
     else:
         sampled = getattr(trained.randomization, term) or neutral_range(term, trained)
     if sampled is None:
         return False
-    (low, high), tolerance = map(np.asarray, sampled), 1e-9
-    return bool(np.all(low <= bounds[0] + tolerance) and np.all(bounds[1] <= high + tolerance))
+    low, high = map(np.asarray, sampled)
+    lowest, highest = bounds
+    tolerance = 1e-9
+    return bool(np.all(low <= lowest + tolerance) and np.all(highest <= high + tolerance))

@@ -57,7 +57,11 @@ def association_lines(associations: Sequence[Association]) -> list[str]:
 
 
 def failures_figure(associations: Sequence[Association]) -> Figure:
-    """The share of failures by third of the ranges of the terms that go with it the most."""
+    """The share of failures by third of the ranges of the terms that go with it the most.
+
+    Args:
+      associations: at least one.
+    """
     shown = list(associations[:_PANELS])
     with style():
         figure, axes = make_panels(len(shown), 3, 2.4)

@@ -67,12 +67,13 @@ def write_report(run: Path, recording: Recording | None = None) -> Path:
     if robustness is not None:
         drawn.append(("Perturbed worlds", robustness_figure(robustness)))
     robot = "Peitian AIR4-560" if config.env.mjcf is None else config.env.mjcf.stem
-    replay, report = replay_first_and_worst(env, recording), results.best
+    replay = replay_first_and_worst(env, recording)
+    report = results.best
     num_recorded = recording.running.shape[-1]
     seconds = results.seconds | {"total": sum(results.seconds.values())}
     phases = [[name, f"{value:.1f}"] for name, value in seconds.items()]
     resets = "fresh resets" if results.fresh_resets else "the resets of the selection"
-    body = f"""<h1>{report.summary}</h1>
+    body = f"""<h1>{html.escape(report.summary)}</h1>
 <p>Run <code>{html.escape(str(run))}</code>, seed {config.seed}, task {html.escape(config.task)} on
 the robot {html.escape(robot)}. The best of {len(results.evaluations)} evaluations,
 after {results.best_steps:,} of {results.trained_steps:,} environment steps, on {resets}:

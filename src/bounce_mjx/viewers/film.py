@@ -94,9 +94,9 @@ def film_player(
     """
 
     def simulate() -> FilmPlayer:
-        conditions, episodes, episode = find()
-        acting = actor(conditions.env)
-        return FilmPlayer(film_episode(conditions, acting, policy, episodes, seed, episode))
+        setup, episodes, episode = find()
+        acting = actor(setup.env)
+        return FilmPlayer(film_episode(setup, acting, policy, episodes, seed, episode))
 
     return simulate
 
