@@ -33,6 +33,8 @@ class Flag(NamedTuple):
     """Whether the value has no flag."""
     is_repeated: bool = False
     """Whether the flag may come several times, each with one of the values."""
+    instead_of: str | None = None
+    """A flag of other commands for which this command has this one, such as --out: for an error."""
 
 
 def stdout(**options: Any) -> Console:
@@ -147,9 +149,8 @@ def read_flags(
     _add_arguments(parser, fields, defaults, shown)
     given, unknown = parser.parse_known_intermixed_args([_in_our_form(word) for word in args])
     if unknown and not is_first:
-        flag = unknown[0].partition("=")[0]
-        near = suggest(flag, flags_of(fields))
-        parser.error(f"unknown argument {unknown[0]}" + (f"; {near}" if near else ""))
+        advice = _near_flag(unknown[0].partition("=")[0], fields)
+        parser.error(f"unknown argument {unknown[0]}" + (advice and f"; {advice}"))
     values = {}
     for key, value in vars(given).items():
         values[key] = _plain(fields[key].annotation, value)
@@ -169,6 +170,14 @@ def _in_our_form(word: str) -> str:
     if value.lower() == "false":
         return _negated(flag)
     return f"{flag}{equals}{value}"
+
+
+def _near_flag(word: str, fields: Mapping[str, FieldInfo]) -> str:
+    """A question about the flag that an unknown word may stand for; empty if none is near."""
+    stand_ins = {_mark(field).instead_of: key for key, field in fields.items()}
+    if word in stand_ins:
+        return f"did you mean {flag_names(fields)[stand_ins[word]]}?"
+    return suggest(word, flags_of(fields))
 
 
 def _pairs(words: list[str | None], flag: str, parser: "_Parser") -> dict[str | None, str | None]:

@@ -34,11 +34,10 @@ from bounce_mjx.env.env import Env, State
 from bounce_mjx.errors import UserError, needed
 from bounce_mjx.evaluation.episodes import reset_episodes
 from bounce_mjx.learning.policy import make_networks
+from bounce_mjx.robot.actuators import largest_torques
 from bounce_mjx.robot.arm import joint_name
 from bounce_mjx.robot.config import is_packaged
-from bounce_mjx.robot.geometry import upper_face
-from bounce_mjx.robot.model import find_addresses, joint_names, load_model
-from bounce_mjx.robot.torques import largest_torques
+from bounce_mjx.robot.model import find_addresses, joint_names, load_model, upper_face
 from bounce_mjx.runs.checkpoints import read_actor
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import Checkpoint

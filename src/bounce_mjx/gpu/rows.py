@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bounce_mjx.gpu.availability import has_kernels
+from bounce_mjx.gpu.elementwise import has_kernels
 
 # Rows are float32; another number of 32 bits keeps its bits.
 _TYPES = (jnp.float32, jnp.int32, jnp.uint32, jnp.bool_)

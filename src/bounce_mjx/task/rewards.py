@@ -5,7 +5,7 @@
 group, the config's `reward`, in which each field whose type is a subclass of `RewardTerm` is a term
 (`weighted_terms`). Then the config and the flags follow as well. To add a term, extend the group by
 a field, the task's `Config` by that group, and the task by that `Config`; if the task gives each
-term its own inputs, extend its `step` too.
+term its own inputs, or the term needs others, extend its `step` too.
 """
 
 from __future__ import annotations
@@ -83,7 +83,8 @@ def weighted_terms(
     """Each term [] times its weight; their sum is the reward.
 
     Args:
-      inputs: what the formula of every term takes; without any inputs it takes None.
+      inputs: what the formula of every term takes that is not in `term_inputs`. It may be left out:
+        if all terms are in these, or if none is, and each formula takes None.
       term_inputs: by a term's name, what its formula takes instead.
 
     Raises:
@@ -152,7 +153,8 @@ def horizontal_distance(a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 class Flight(NamedTuple):
-    """A free flight without air, from the past to the height of its end."""
+    """A free flight without air, down to the height of its end. Its highest position may be in the
+    past."""
 
     top: jax.Array
     """Highest position [..., 3], m."""

@@ -9,7 +9,7 @@ import numpy as np
 from bounce_mjx.errors import reason_of, shorten
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training.seeds import SeedRun
-from bounce_mjx.training.trainer import Metrics
+from bounce_mjx.training.trainer import BlockMetrics
 
 MIN_SECONDS = 0.1
 """Shortest mean time to the end of an episode, s; after a reset a ball flies for longer."""
@@ -18,7 +18,7 @@ MAX_REWARD = 1e4
 """Largest mean of a reward term in an iteration, times `ppo.reward_scale`."""
 
 
-def first_block_fault(metrics: Metrics, config: TrainConfig) -> str | None:
+def first_block_fault(metrics: BlockMetrics, config: TrainConfig) -> str | None:
     """What is wrong with the first block, as a sentence; None if it can be learned from. Settings
     that no policy can learn with show there, before anything is saved, and in every seed.
 

@@ -41,7 +41,7 @@ from bounce_mjx.training.log import TensorBoardLog
 from bounce_mjx.training.ppo_trainer import PPOTrainer, iterations_per_block
 from bounce_mjx.training.saving import Saver
 from bounce_mjx.training.seeds import SeedRun
-from bounce_mjx.training.trainer import Metrics, Snapshot, Trainer
+from bounce_mjx.training.trainer import BlockMetrics, Snapshot, Trainer
 
 Result = TypeVar("Result")
 MakeTrainer = Callable[[TrainConfig, Env], Trainer]
@@ -375,7 +375,7 @@ class Job:
         """Whether the training ends here."""
         return self.is_done() or self.is_solved()
 
-    def train_block(self) -> tuple[Metrics, float]:
+    def train_block(self) -> tuple[BlockMetrics, float]:
         """Trains for a block of I iterations; its metrics, each [S, I], and its duration, s.
 
         Raises:
@@ -396,7 +396,7 @@ class Job:
             seed.report = None
         return metrics, seconds
 
-    def log_block(self, metrics: Metrics, seconds: float) -> None:
+    def log_block(self, metrics: BlockMetrics, seconds: float) -> None:
         """Says and logs a block.
 
         Raises:

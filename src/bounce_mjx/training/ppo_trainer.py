@@ -23,7 +23,7 @@ from bounce_mjx.learning.statistics import RunningStatistics
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training import hosts
 from bounce_mjx.training.setup import compiler_options
-from bounce_mjx.training.trainer import Metrics, Snapshot
+from bounce_mjx.training.trainer import BlockMetrics, Snapshot
 
 _AXIS = "devices"
 
@@ -70,7 +70,7 @@ class PPOTrainer:
             """The first training state of one seed [] or of S seeds [S]."""
             return init(make_key(seeds))
 
-        def train_block(state: ppo.TrainingState) -> tuple[ppo.TrainingState, Metrics]:
+        def train_block(state: ppo.TrainingState) -> tuple[ppo.TrainingState, ppo.Metrics]:
             return run(state, iterations_per_block(config))
 
         # One object each, not methods, so that JAX traces them only once.
@@ -136,7 +136,7 @@ class PPOTrainer:
             warm = initial._replace(params=params, statistics=statistics)
             self.state = hosts.distribute(warm, self._sharding)
 
-    def run(self) -> Metrics:
+    def run(self) -> BlockMetrics:
         """Trains for a block of I iterations.
 
         Returns:

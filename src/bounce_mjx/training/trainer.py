@@ -9,7 +9,8 @@ from jax.sharding import Mesh
 
 from bounce_mjx.learning.policy import Policy
 
-Metrics = dict[str, np.ndarray]
+BlockMetrics = dict[str, np.ndarray]
+"""Metrics of a block of I iterations of S seeds, each [S, I], by name."""
 
 
 class Snapshot(NamedTuple):
@@ -54,7 +55,7 @@ class Trainer(Protocol):
             their inputs (`checkpoints.read_start`); not with a state.
         """
 
-    def run(self) -> Metrics:
+    def run(self) -> BlockMetrics:
         """Trains for a block of I iterations (`ppo_trainer.iterations_per_block`), each of
         `ppo.batch_steps` environment steps.
 

@@ -19,7 +19,7 @@ PADDLE_HOME = (0.59356, 0.0, 0.0498)
 
 
 NumBalls = Annotated[int, pydantic.BeforeValidator(settings.whole_number), Field(ge=1, le=3)]
-"""Number of balls, up to `robot.balls.MAX_BALLS`."""
+"""Number of balls, up to `robot.model.MAX_BALLS`."""
 
 
 class Command(NamedTuple):
@@ -92,12 +92,14 @@ class ResetConfig(settings.StrictModel):
 
 
 class RobotSettings(settings.StrictModel):
-    """The robot, its sensors and its ball: the settings that a named world may have."""
+    """The settings that a named world may have (`world.named`): those of a robot, its sensors and
+    its ball."""
 
     robot: RobotConfig = RobotConfig()
     """Adoption of an arm."""
     physics_dt: Annotated[settings.Positive, Field(ge=1e-5, le=0.1)] = 0.001
-    """Physics time step, s; at most an eighth of a period of the contact, 2.5 ms by default."""
+    """Physics time step, s; at most an eighth of a period of the contact, which is 2.5 ms for the
+    project's own robot."""
     control_dt: Annotated[settings.Positive, Field(ge=1e-5, le=0.1)] = 0.01
     """Time between two actions, s; a whole number of physics steps."""
     friction: settings.Friction | None = None
@@ -236,8 +238,8 @@ class WorldConfig(RobotSettings):
         """The settings that depend on where an arm holds the paddle at a reset. A task adds its
         own.
 
-        The ball of the original specification starts 5 mm beside the paddle's centre; another arm's
-        starts 0.4 m over it.
+        Another arm's ball starts 0.4 m over the paddle's centre, displaced as the task's start is
+        from the world's: the 5 mm of the world's own start beside its paddle are left out.
 
         Args:
           paddle: centre of the level paddle at `default_joint_angles`, m.

@@ -54,7 +54,8 @@ class Part(NamedTuple):
 
 class ObservationConfig(StrictModel):
     """The quantities that the policy sees, and how many values of each: 0 for none, 1 for the
-    newest, N for the last N, the newest first."""
+    newest, N for the last N, the newest first. Each of the group state is a field of `Kinematics`
+    too."""
 
     joint_angles: Annotated[History, Quantity(None, "rad", "state")] = 1
     """Measured positions of the acting joints: 0 leaves them out, and N shows the last N, as for
