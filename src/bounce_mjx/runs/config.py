@@ -203,6 +203,7 @@ def load_run_config(
     values.pop(BASE, None)
     sources = _sources_in(values.pop(SOURCES, None))
     its_task = _task_of_run(values["task"], run, task)
+    # Here, as the name may stand for code that the user has named otherwise.
     env = validate(its_task.Config, values.get("env", {}), str(path), "env")
     values = values | {"env": env}
     if algorithm is not None:

@@ -229,6 +229,9 @@ class Job:
     def read_state(self, resume: Path) -> None:
         """Reads the checkpoint from which the resumed run continues.
 
+        Its state has all that a block needs: networks, optimizer, environments and random keys. So
+        the training goes on bit for bit, on as many devices and with the same compiled programs.
+
         Args:
           resume: the run's folder, or a checkpoint in it.
         """
