@@ -97,6 +97,15 @@ BROKEN = {
         "a damper on j1",
         "both ways",
     ),
+    "a gain that is not fixed": (
+        mjcf(
+            arm(),
+            '<general joint="j1" gaintype="affine" gainprm="5 1"/>' + motors("j2 j3 j4 j5 j6"),
+        ),
+        "tool",
+        "an actuator on j1 whose strength follows from more than its control",
+        "forcerange",
+    ),
     "missing mesh": (
         mjcf(
             arm(tip='<geom type="mesh" mesh="m"/>'),
@@ -439,6 +448,7 @@ def test_each_shape_that_touches_counts_whatever_its_group(tmp_path) -> None:
 
 MOTORS = {
     "motor": ('gear="10"', True),
+    "bias of 0": ('gear="10" biastype="affine"', True),
     "delayed": ('gear="10" dyntype="filter" dynprm="0.01"', True),
     "integrator": ('gear="10" dyntype="integrator"', False),
     "integrator of a range": ('gear="10" dyntype="integrator" actrange="-2 4"', True),

@@ -27,6 +27,10 @@ _DELAYS = (
     mujoco.mjtDyn.mjDYN_FILTEREXACT,
 )
 """Of an actuator whose activation never leaves the range of its control."""
+_BIASES_BY_NUMBERS = (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
+"""Biases that are 0 where their numbers are."""
+_KNOWN_GAINS = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_PID)
+"""Of a motor or a controller: without a range, its force has no limit."""
 JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 """Of an actuator that drives a joint; for a hinge or a slide, both are the same."""
 
@@ -101,7 +105,7 @@ def servo_settings(model: mujoco.MjModel, joint: int, actuator: int) -> ServoSet
     """The settings of the actuator that drives a joint.
 
     Raises:
-      UserError: it pushes one way only.
+      UserError: it pushes one way only, or its force limit is unknown.
     """
     limit = _force_limit(model, joint, actuator)
     if not (is_direct(model, actuator) and is_position_servo(model, actuator)):
@@ -190,7 +194,7 @@ def _force_limit(model: mujoco.MjModel, joint: int, actuator: int) -> float | No
     servo it is that of `largest_torques`.
 
     Raises:
-      UserError: the actuator pushes one way only, or not at all.
+      UserError: the actuator pushes one way only, or not at all, or its limit is unknown.
     """
     _check_pushes(model, joint, actuator)
     gear = float(model.actuator_gear[actuator, 0])
@@ -198,10 +202,11 @@ def _force_limit(model: mujoco.MjModel, joint: int, actuator: int) -> float | No
     control = model.actuator_ctrladr[actuator]
     dynamics = int(model.actuator_dyntype[actuator])
     # The force of a motor is its gain times its activation, which may be the control itself.
-    is_motor = (
-        model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
-        and model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_NONE
+    gain_type = int(model.actuator_gaintype[actuator])
+    has_bias = int(model.actuator_biastype[actuator]) not in _BIASES_BY_NUMBERS or np.any(
+        model.actuator_biasprm[actuator, :3]
     )
+    is_motor = gain_type == mujoco.mjtGain.mjGAIN_FIXED and not has_bias
     has_activation = dynamics != mujoco.mjtDyn.mjDYN_NONE
     ranges = (
         _ForceRange(
@@ -236,6 +241,8 @@ def _force_limit(model: mujoco.MjModel, joint: int, actuator: int) -> float | No
         if not force_range.is_limited:
             continue
         low, high = force_range.range.tolist()
+        # Stricter than `model.check_servos`: the limit also becomes that of a made servo, which
+        # pushes both ways.
         if not low < 0.0 < high:
             most = max(-low, high)
             raise UserError(
@@ -244,6 +251,11 @@ def _force_limit(model: mujoco.MjModel, joint: int, actuator: int) -> float | No
                 f"{most:g}"
             )
         limits.append(min(-low, high) * abs(force_range.factor))
+    if not limits and gain_type not in _KNOWN_GAINS:
+        raise UserError(
+            f"an actuator on {joint_name(model, joint)} whose strength follows from more than its "
+            "control; give it a forcerange, or drive the joint by a <position> or <motor>"
+        )
     limit = min(limits, default=np.inf)
     return limit if np.isfinite(limit) else None
 

@@ -42,7 +42,7 @@ JOINT_FIELDS = ("jnt_pos", "jnt_axis")
 # Viewers show the groups 0 to 2. Where a link has a picture, this is the group of the shapes that
 # touch, and of no other shape of an adopted arm.
 HIDDEN_GROUP = 3
-_ALSO_HIDDEN_GROUP = 4
+_ALSO_HIDDEN_GROUP = 5
 # Smallest change of a joint's range that is reported, rad or m.
 _NARROWER = 1e-3
 _HANDLE_RADIUS = 0.011

@@ -51,7 +51,7 @@ _REACH_SAMPLES = 500
 # Distance of a pose from the joint limits, rad or m: the noise of a reset's joint positions. Of a
 # short range it is a tenth.
 _LEAST_MARGIN = 0.1
-# Distance from the joint limits that is plenty, rad.
+# Distance from the joint limits that is plenty, rad or m.
 _AMPLE_MARGIN = 0.5
 # Radius of the column over the paddle that is the ball's way, m.
 _CLEARANCE = 0.09
@@ -348,7 +348,8 @@ class _Search:
 
     def _is_clear(self, paddle: np.ndarray) -> bool:
         """Whether the links, as straight lines between the joints, stay above the floor and out of
-        the ball's way; in the pose of the last `_forward`."""
+        the ball's way; in the pose of the last `_forward`. The way from the last link's origin to
+        the paddle is left out, as it ends in the ball's."""
         ends = [self._data.xanchor[joint] for joint in self._joints]
         ends.append(self._data.xpos[self._body])
         for i, (start, end) in enumerate(itertools.pairwise(ends)):

@@ -11,6 +11,7 @@ term its own inputs, or the term needs others, extend its `step` too.
 from __future__ import annotations
 
 import itertools
+import typing
 from collections.abc import Collection
 from typing import Any, NamedTuple
 
@@ -69,12 +70,26 @@ class Proportional(RewardTerm):
 
 def term_names(reward: type[StrictModel]) -> tuple[str, ...]:
     """Names of the terms in a group of settings, in order: of the fields whose type is a subclass
-    of `RewardTerm`, and no union."""
-    return tuple(
-        name
-        for name, field in reward.model_fields.items()
-        if isinstance(field.annotation, type) and issubclass(field.annotation, RewardTerm)
-    )
+    of `RewardTerm`.
+
+    Raises:
+      UserError: a field may be a term or something else.
+    """
+    names = []
+    for name, field in reward.model_fields.items():
+        if _is_term(field.annotation):
+            names.append(name)
+        elif any(map(_is_term, typing.get_args(field.annotation))):
+            raise UserError(
+                f"{name} in {reward.__name__} may be a term of the reward or something else; give "
+                "it the type of one term, which the weight 0 turns off"
+            )
+    return tuple(names)
+
+
+def _is_term(annotation: Any) -> bool:
+    """Whether a type is that of a term."""
+    return isinstance(annotation, type) and issubclass(annotation, RewardTerm)
 
 
 def weighted_terms(

@@ -15,7 +15,7 @@ from bounce_mjx.world.observation import ObservationConfig, ObservationLayout
 from bounce_mjx.world.randomization import EACH_JOINT, TERMS, RandomizationConfig
 
 PADDLE_HOME = (0.59356, 0.0, 0.0498)
-"""Centre of the paddle of the project's own arm at a reset, m."""
+"""Centre of the paddle of the project's own arm at a reset, m: the home in the tasks' settings."""
 
 
 NumBalls = Annotated[int, pydantic.BeforeValidator(settings.whole_number), Field(ge=1, le=3)]

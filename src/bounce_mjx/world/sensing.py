@@ -192,21 +192,21 @@ class Sensors:
         picture = take_picture(self._config, now.world, now.clock, balls, before.picture)
         measured = self._measure(now, picture)
         histories = {}
-        task_histories = {}
+        of_task = {}
         for name, history in before.histories.items():
             if name in measured:
                 histories[name] = with_newest(history, measured[name])
             else:
-                task_histories[name] = history
-        expected = set(task_histories)
-        task, task_histories = self._task.next_quantities(before.task, task_histories, measured)
-        if set(task_histories) != expected:
+                of_task[name] = history
+        expected = set(of_task)
+        task, next_of_task = self._task.next_quantities(before.task, of_task, measured)
+        if set(next_of_task) != expected:
             raise UserError(
                 f"next_quantities of the task {type(self._task).__name__} returns the histories "
-                f"{', '.join(task_histories) or 'none'}; return those of its argument: "
+                f"{', '.join(next_of_task) or 'none'}; return those of its argument: "
                 f"{', '.join(sorted(expected)) or 'none'}"
             )
-        return Sensing(balls, picture, histories | task_histories, task)
+        return Sensing(balls, picture, histories | next_of_task, task)
 
     def _measure(self, now: Instant, picture: Picture) -> dict[str, jax.Array]:
         """The measured value [size] of each quantity of the world and of each command. The ball's

@@ -290,6 +290,7 @@ def _read_joint(model: EditedModel, joint: int, frame: Frame) -> chain.Link:
         first_moment=ZERO3,
         inertia=ZERO_MATRIX3,
         armature=model["dof_armature", dof],
+        # Whatever the flags: `physics.support` refuses the flag damper.
         damping=model["dof_damping", dof],
         stiffness=model["jnt_stiffness", joint] if springs else 0.0,
         spring_position=model["qpos_spring", position],
