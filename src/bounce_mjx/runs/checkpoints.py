@@ -48,8 +48,8 @@ NETWORKS = "networks"
 NETWORK_KEYS = ("hidden_layers", "critic_layers", "shared_critic", "activation")
 """Keys of `ppo` that shape the networks."""
 
-# Keys that may differ between a checkpoint and the training that resumes from it. All other keys
-# shape the training's state.
+# Keys that may differ between a checkpoint and the training that resumes from it. All others must
+# be the same.
 RESUMABLE_KEYS = frozenset(
     "total_steps eval_every save_every eval_episodes screening_episodes eval_seed "
     "stop_when_solved log_dir num_devices".split()
@@ -128,7 +128,8 @@ def read_networks(
     read_record(checkpoint)
     if (checkpoint.folder / NETWORKS).is_dir():
         item = NETWORKS
-    elif (checkpoint.folder / TRAINING).is_dir():
+    elif checkpoint.is_old and (checkpoint.folder / TRAINING).is_dir():
+        # Version 0.1.0 has both networks in its state alone.
         item = TRAINING
     else:
         raise UserError(

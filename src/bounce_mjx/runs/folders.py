@@ -240,7 +240,7 @@ def find_checkpoint(path: str | Path) -> Checkpoint:
 
 
 def latest_checkpoint(run: Path, place: Path | None = None) -> Checkpoint:
-    """Newest intact checkpoint of a run, from which its training resumes.
+    """Newest checkpoint of a run that is intact, or its only one, from which its training resumes.
 
     Args:
       place: folder of the run in which it lies; that of a checkpoint finds this one.

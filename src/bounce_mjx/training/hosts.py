@@ -93,8 +93,8 @@ def agree(config: TrainConfig, resume: Path | None) -> None:
 
 def exchange(value: Any) -> list[Any]:
     """The values of all processes, by number; every process must call this at the same point. They
-    are plain data, and go through JAX's coordination service: the devices may still compile in
-    another process, and would not wait for longer than 30 s."""
+    are plain data, and go through JAX's coordination service: another process may still compile,
+    for which the devices would wait for 30 s at most."""
     processes = distributed.global_state
     if processes.client is None:
         return [value]
