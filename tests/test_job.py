@@ -493,6 +493,11 @@ def test_a_policy_that_could_not_be_saved_is_not_the_best(tmp_path: Path, monkey
     fail(monkeypatch, 2)
     run = train(tmp_path, {1: 5.0, 2: 9.0, 3: 7.0})
     assert results_of(run)["best_steps"] == 3 * BLOCK and iterations_of(best_checkpoint(run)) == 3
+    fail(monkeypatch, 2)
+    run = train(tmp_path, {1: 5.0, 2: 9.0, 3: 4.0})
+    assert results_of(run)["best_steps"] == BLOCK and iterations_of(best_checkpoint(run)) == 1
+    # The final evaluation is that of the policy that was saved.
+    assert results_of(run)["details"]["mean_return"] == 5.0
 
 
 def test_results_that_could_not_be_saved_do_not_end_a_training(tmp_path: Path, monkeypatch) -> None:
