@@ -42,7 +42,7 @@ class Progress(pydantic.BaseModel):
         return self.model_copy(update={"evaluations": list(self.evaluations)})
 
     @property
-    def solved(self) -> bool:
+    def wait_is_over(self) -> bool:
         """Whether a margin has come, or the wait for it is over."""
         if self.margin_steps is not None:
             return True
@@ -83,7 +83,7 @@ class Progress(pydantic.BaseModel):
 def are_solved(seeds: Sequence[Progress]) -> bool:
     """Whether `stop_when_solved` ends the training of these seeds. Those that have diverged do not
     count."""
-    return all(seed.solved for seed in seeds if seed.fault is None)
+    return all(seed.wait_is_over for seed in seeds if seed.fault is None)
 
 
 class Results(Progress):
