@@ -136,17 +136,33 @@ def test_assumed_numbers_are_doubled_entry_by_entry() -> None:
 
 
 def test_less_of_a_limit_is_harder(tmp_path: Path) -> None:
-    keys = ["max_joint_velocity", "action_scale", "randomization.torque_limit"]
+    keys = [
+        "max_joint_velocity",
+        "action_scale",
+        "randomization.torque_limit",
+        "robot.servo_force_limit",
+        "robot.limits.jerk",
+        "robot.gravity_compensation",
+    ]
     env = {
+        "robot": {
+            "servo_force_limit": [80.0, 12.0],
+            "limits": {"velocity": [2.0], "acceleration": [10.0], "jerk": [5000.0]},
+            "gravity_compensation": 1.0,
+        },
         "max_joint_velocity": 4.0,
         "action_scale": 0.02,
         "randomization": {"torque_limit": [20.0, 40.0]},
     }
-    path = written(tmp_path, env=env, sources=dict.fromkeys(keys, "An example."), assumed=keys)
+    sources = dict.fromkeys([*keys, "robot"], "An example.")
+    path = written(tmp_path, env=env, sources=sources, assumed=keys)
     assert read_world(path).double_assumed({}) == {
         "max_joint_velocity": {"max_joint_velocity": 2.0},
         "action_scale": {"action_scale": 0.04},
         "randomization.torque_limit": {"randomization": {"torque_limit": [10.0, 20.0]}},
+        "robot.servo_force_limit": {"robot": {"servo_force_limit": [40.0, 6.0]}},
+        "robot.limits.jerk": {"robot": {"limits": {"jerk": [2500.0]}}},
+        "robot.gravity_compensation": {"robot": {"gravity_compensation": 0.5}},
     }
 
 

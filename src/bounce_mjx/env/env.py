@@ -491,7 +491,7 @@ class Env:
         )
         result = jax.eval_shape(lambda: self.task.step(state.task, step))
         check_metrics(result.metrics, self.task)
-        check_tags(self.task)
+        check_tags(self.task, result.metrics)
         rewards = [f"reward/{name}" for name in result.reward]
         metrics = dict.fromkeys([*rewards, *result.metrics, *ENDS], zero)
         metrics |= self._privileged_metrics(state.world, truth)

@@ -4,8 +4,9 @@
 `reward/<name>`, the log and the report follow. The tasks of the package make them from settings: a
 group, the config's `reward`, in which each field whose type is a subclass of `RewardTerm` is a term
 (`weighted_terms`). Then the config and the flags follow as well. To add a term, extend the group by
-a field, the task's `Config` by that group, and the task by that `Config`; if the task gives each
-term its own inputs, or the term needs others, extend its `step` too.
+a field, the task's `Config` by that group, and the task by that `Config`. That is enough in
+`bounce`, whose terms share their inputs. The other tasks give each term its own, and know their own
+terms alone: keep their group, and extend `step` by a term that it adds to the result's `reward`.
 """
 
 from __future__ import annotations

@@ -18,13 +18,19 @@ CURRICULUM = RandomizationConfig.model_fields.keys() - TERMS.keys()
 """Keys of the randomisation that describe the training, not the world. A world's file may have
 them, for a training in it; they need no source, as they are no numbers of the robot."""
 
+_LESS_IS_HARDER = {
+    "max_joint_velocity",
+    "robot.servo_force_limit",
+    "robot.gravity_compensation",
+}
+
 
 class NamedWorld(StrictModel):
     """The content of a world's file."""
 
     robot: str | None = None
     """Name of a robot in configs/robots/, or its file, relative to the world's folder; null for any
-    robot. (`env.robot` has settings of an arm's adoption.)"""
+    robot. (`env.robot` has settings of an arm: its adoption, its limits.)"""
     env: RobotSettings = RobotSettings()
     """Settings of the environment (`runs.worlds` puts them in place of the config's). A term of the
     randomisation that it does not have is as in the task's defaults."""
@@ -77,8 +83,9 @@ class NamedWorld(StrictModel):
 
         A term of the randomisation goes twice as far from its nominal value, within its bounds. A
         number of which less is harder is halved instead: a term without a nominal value
-        (`torque_limit`, `camera_rate`, the intervals), `max_joint_velocity`, and the limits of the
-        robot.
+        (`torque_limit`, `camera_rate`, the intervals), `max_joint_velocity`, and the robot's
+        `limits`, `servo_force_limit` and `gravity_compensation`. Whoever builds a config with
+        these settings refuses a number beyond the bounds of a setting that is no term.
 
         Args:
           nominals: the values of all terms without randomisation (`env.env.model_nominals`).
@@ -130,8 +137,8 @@ def _double(key: str, value: Any, nominals: Mapping[str, Any]) -> Any:
     group, _, name = key.rpartition(".")
     if group == "randomization":
         return [_double_end(name, end, nominals) for end in value]
-    is_limit = group == "robot.limits" or key == "max_joint_velocity"
-    factor = 0.5 if is_limit else 2.0
+    less_is_harder = group == "robot.limits" or key in _LESS_IS_HARDER
+    factor = 0.5 if less_is_harder else 2.0
     return (factor * np.array(value)).tolist()
 
 
