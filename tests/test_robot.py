@@ -122,6 +122,11 @@ BROKEN = {
         "tool",
         "ball joint j4",
     ),
+    "a joint without a name, and one with its stand-in": (
+        mjcf(arm().replace('name="j3" ', "").replace('"j2"', '"joint2"'), motors("joint2")),
+        "tool",
+        "an unnamed joint that would be called joint2, as another one is",
+    ),
     "loop": (
         mjcf(arm(), motors(ARM_JOINTS), '<equality><joint joint1="j2" joint2="j3"/></equality>'),
         "tool",

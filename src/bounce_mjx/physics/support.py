@@ -27,15 +27,14 @@ _HARMLESS = frozenset(
 _BOTH_ZERO = (
     "opt.disableactuator opt.noslip_iterations nplugin jnt_stiffnesspoly dof_dampingpoly "
     "actuator_dyntype actuator_delay actuator_damping actuator_dampingpoly actuator_armature "
-    "pair_adhesion"
+    "pair_adhesion geom_surfacevel"
 )
 # Further ones, for features that one of them lacks. (The fused engine's contacts come from pairs
 # alone, so geoms may not touch by their own types.)
 _ZERO = {
     "fused": "opt.density opt.viscosity opt.wind nflex nmocap neq ntendon jnt_limited "
     "geom_contype geom_conaffinity pair_margin pair_gap",
-    "mjx": "tendon_stiffnesspoly tendon_dampingpoly actuator_actearly geom_adhesion "
-    "geom_surfacevel",
+    "mjx": "tendon_stiffnesspoly tendon_dampingpoly actuator_actearly geom_adhesion",
 }
 
 
