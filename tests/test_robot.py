@@ -436,6 +436,17 @@ def test_what_held_the_arm_to_a_loose_object_is_named(rod, tmp_path) -> None:
     assert any(held in change for change in changes)
 
 
+def test_what_holds_the_arm_by_its_gripper_is_named(tmp_path) -> None:
+    hand = HAND.replace("<body ", '<body name="hand" ', 1)
+    equalities = f'<equality>{MIMIC}<weld name="bench" body1="hand"/></equality>'
+    (tmp_path / "arm.xml").write_text(mjcf(arm(tip=hand), motors(ARM_JOINTS), equalities))
+    changes = build_arm(tmp_path / "arm.xml", RobotConfig(site="tool")).changes
+    assert any(
+        change.endswith("couples the arm with these: equality constraint bench")
+        for change in changes
+    )
+
+
 def test_each_shape_that_touches_counts_whatever_its_group(tmp_path) -> None:
     """A link has a picture where some of its shapes touch and others do not. A file that hides a
     shape itself (group 3) makes no pictures of the others."""

@@ -1,7 +1,7 @@
 """An arm's MJCF in the task's scene, with MjSpec; `adopt.py` searches its settings.
 
 Every change by which the arm moves otherwise than in the user's file is collected (`Arm.changes`),
-which `commands.adopt` prints. A gripper goes whole: what constrains it alone is not named.
+which `commands.adopt` prints. A gripper goes whole: what couples its own parts is not named.
 """
 
 import contextlib
@@ -771,9 +771,12 @@ def _ends_of_tendon(model: mujoco.MjModel, tendon: int) -> list[_End]:
 def _acts_on_arm(
     model: mujoco.MjModel, ends: list[_End], joints: list[int], loose: list[int]
 ) -> bool:
-    """Whether what has these ends acts on an acting joint, or on a body of the arm that one
-    moves."""
+    """Whether what has these ends acts on an acting joint, or on a body of the arm that one moves;
+    also by its gripper, which it holds to something beside the arm."""
     moved = model.jnt_bodyid[joints].tolist()
+    moves = [is_below(model, _body_of(model, end), moved) for end in ends]
+    if any(moves) and not all(moves):
+        return True
     for end in ends:
         body = _body_of(model, end)
         if end.kind == mujoco.mjtObj.mjOBJ_JOINT:

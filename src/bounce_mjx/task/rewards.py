@@ -46,7 +46,7 @@ class Near(RewardTerm):
     """Length at half the weight, in the unit of the error."""
 
     def value(self, error: jax.Array) -> jax.Array:
-        """The unweighted term [] for an error [] or [...]."""
+        """The unweighted term [] for an error of any shape."""
         return 1.0 / (1.0 + jnp.sum(jnp.square(error)) / self.scale**2)
 
 
@@ -62,7 +62,7 @@ class Gaussian(RewardTerm):
 
 
 class Proportional(RewardTerm):
-    """A term proportional to a number."""
+    """A term proportional to a number; a negative weight makes it a penalty."""
 
     def value(self, number: jax.Array) -> jax.Array:
         """The number [] itself."""
@@ -99,8 +99,8 @@ def weighted_terms(
     """Each term [] times its weight; their sum is the reward.
 
     Args:
-      inputs: what the formula of every term takes that is not in `term_inputs`. It may be left out:
-        if all terms are in these, or if none is, and each formula takes None.
+      inputs: what the formula of every term takes that is not in `term_inputs`. Leave it out where
+        `term_inputs` has every term, or where no formula needs any.
       term_inputs: by a term's name, what its formula takes instead.
 
     Raises:

@@ -35,20 +35,20 @@ class NamedWorld(StrictModel):
     """Settings of the environment (`runs.worlds` puts them in place of the config's). A term of the
     randomisation that it does not have is as in the task's defaults."""
     sources: dict[str, str] = {}
-    """Where each number comes from, one sentence, by its dotted key in `env` or that of a group."""
+    """Where each setting comes from, a sentence, by its dotted key in `env` or that of a group."""
     assumed: tuple[str, ...] = ()
     """Keys whose numbers nobody has measured; their source is the reason for the number."""
 
     @pydantic.model_validator(mode="after")
     def _check_sources(self):
         """Each setting has a source, itself or with its group; no source is of another setting."""
-        numbers = flat(self.settings)
+        given = flat(self.settings)
         groups = set()
-        for key in numbers:
+        for key in given:
             *parents, _ = key.split(".")
             groups |= {".".join(parents[:depth]) for depth in range(1, len(parents) + 1)}
         for key, source in self.sources.items():
-            if key not in numbers and key not in groups:
+            if key not in given and key not in groups:
                 raise ValueError(
                     f"sources has {shorten(key)}, but env has no such key; give env that key, or "
                     "remove the source"
@@ -56,14 +56,14 @@ class NamedWorld(StrictModel):
             if not source.strip():
                 raise ValueError(f"{key} has an empty source; write one sentence")
         for key in self.assumed:
-            if key not in numbers:
+            if key not in given:
                 raise ValueError(
                     f"assumed has {shorten(key)}, but env has no such key; give env that key, or "
                     "remove it"
                 )
-            if not _can_be_doubled(key, numbers[key]):
+            if not _can_be_doubled(key, given[key]):
                 raise ValueError(f"{key} is assumed, but is no number to double; remove it")
-        for key in numbers:
+        for key in given:
             if key.startswith("randomization.") and key.split(".")[1] in CURRICULUM:
                 continue
             if not any(key == source or key.startswith(f"{source}.") for source in self.sources):
