@@ -39,7 +39,8 @@ NO_PAIR = (
 
 
 INSEPARABLE = ("pair_solref",)
-"""Fields in whose rows one number tells the meaning of another: they change together."""
+"""Fields in whose rows one number tells the meaning of another: they change together
+(`adapters.randomization` varies such a row as a whole)."""
 
 
 class Edit(NamedTuple):
@@ -218,7 +219,8 @@ def edited(
     """
     model = EditedModel(mj_model, addresses)
     if parameters.contact_stiffness is not None or parameters.contact_damping is not None:
-        # The engines read both numbers of a solref in one format: an untouched one changes too.
+        # Stiffness and damping are entries of the direct format, so a solref in the other format is
+        # first written as -k, -b.
         for pair in contact_pairs(mj_model, addresses):
             stiffness, damping = model.stiffness_and_damping("pair", pair)
             model.put("pair_solref", pair, [-float(stiffness), -float(damping)])

@@ -2,7 +2,8 @@
 
 MuJoCo's `solref` holds both numbers in one of two formats. In the direct one, `solref="-k -b"`, k
 is the stiffness, 1/s^2, and b the damping, 1/s; the other one has a time constant and a damping
-ratio.
+ratio. `world.sampling` computes the damping of a restitution, and `physics.edited` writes -k and
+-b.
 """
 
 import math

@@ -98,7 +98,8 @@ class CatchState(NamedTuple):
     """What the task keeps of an episode."""
 
     fall: jax.Array
-    """Vertical velocity of the ball after the last step [], m/s."""
+    """Vertical velocity of the ball after the last step [], m/s (of the reward, `fall` is another
+    speed)."""
     offset: jax.Array
     """From the paddle's centre to the ball after the last step [3], m."""
     contact: jax.Array
