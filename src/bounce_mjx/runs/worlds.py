@@ -105,7 +105,7 @@ def _layer_of_robot(task: type[Task], robot: Path) -> Layer:
     # Imports JAX, which a command line alone does not need.
     from bounce_mjx.robot.model import paddle_home
 
-    home = paddle_home(env.mjcf, env.robot, env.default_joint_angles)
+    home = paddle_home(env.mjcf, env.robot, env.default_joint_angles, env.physics_dt, env.num_balls)
     return Layer(source, values | {"env": of_world | task.Config.settings_at(home)})
 
 
