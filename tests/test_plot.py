@@ -37,7 +37,7 @@ from bounce_mjx.reports.curves import (
     mean_and_band,
     read_curves,
 )
-from bounce_mjx.reports.figures import curves_figure
+from bounce_mjx.reports.figures import curves_figure, rewards_figure
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import save_config
 from bounce_mjx.runs.progress import load_results
@@ -175,6 +175,13 @@ def test_only_the_figures_that_are_numbers_count(tmp_path: Path) -> None:
     curves = read_curves(run).curves
     assert list(curves) == ["episode/return"]
     assert (curves["episode/return"].steps, curves["episode/return"].values) == ([1], [2.0])
+    # A figure without panels has its title alone.
+    assert not rewards_figure(group_runs([run])).axes
+    # The run was resumed and diverged: its first value is not that of the final policy.
+    with SummaryWriter(logdir=str(run), filename_suffix=".resumed") as log:
+        log.add_scalar("episode/return", math.nan, 1)
+    with pytest.raises(UserError, match="no learning curves.*diverged"):
+        read_curves(run)
 
 
 def test_a_log_of_an_earlier_version_has_the_present_names(tmp_path: Path) -> None:

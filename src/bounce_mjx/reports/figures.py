@@ -186,7 +186,7 @@ def _draw_curves(
     for axes, curve in zip(panels, shown, strict=True):
         _draw_curve(axes, groups, curve)
     # A panel whose curve has no points yet would have its own steps.
-    last_step = max(axes.get_xlim()[1] for axes in panels)
+    last_step = max((axes.get_xlim()[1] for axes in panels), default=0.0)
     for axes in panels:
         axes.set_xlim(0, last_step)
     add_legend(figure)

@@ -194,12 +194,17 @@ class Trail:
         position comes several times. None before the first frame."""
 
     def add(self, frame: EnvFrame) -> None:
-        """Adds a frame's positions."""
+        """Adds a frame's positions; those of an environment that is still in its last frame, as in
+        a pause, are there already."""
         if self.points is None:
             self.points = np.tile(frame.balls, (self.length, 1, 1, 1))
             self._time = frame.time
-        self.points = np.concatenate([self.points[1:], frame.balls[None]])
-        restarted = frame.time < self._time
+        advanced = frame.time > self._time
+        self.points[:-1, advanced] = self.points[1:, advanced]
+        self.points[-1, advanced] = frame.balls[advanced]
+        # A reset after a reset is at the same time, with its balls elsewhere.
+        is_same = (frame.time == self._time) & np.all(frame.balls == self.points[-1], axis=(1, 2))
+        restarted = ~advanced & ~is_same
         self.points[:, restarted] = frame.balls[restarted]
         self._time = frame.time
 

@@ -135,10 +135,11 @@ def _serve(
     from bounce_mjx.viewers.guard import open_server
 
     port = free_port(options.host, options.port)
-    address = Address(options.host, port, options.allow_host)
     simulation = simulate()
-    opening = open_server(address.host, address.port, address.allowed)
+    opening = open_server(options.host, port, options.allow_host)
     with StopRequest() as stop, opening as server:
+        # Another program may have taken the port meanwhile; viser then takes the next one.
+        address = Address(options.host, server.get_port())
         say = partial(console.out, f"viewer: {address.url}  (Ctrl-C ends it)", highlight=False)
         run_page(server, simulation, start, lambda: stop.requested, say, options.seconds)
 

@@ -1,5 +1,6 @@
 """Episodes as NumPy frames: stepped live for a viewer, or recorded."""
 
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -271,21 +272,20 @@ def in_real_time(
 def resample(recording: EnvFrame, dt: float, fps: float) -> EnvFrame:
     """A recording [T, N, ...] at another rate.
 
-    Positions are interpolated in time, but not across a reset; other values come from the last
-    control step.
+    Positions are interpolated in time, but not across a reset; `over` and `lost` tell what came
+    since the frame before; other values come from the last control step.
 
     Args:
       dt: time between the frames of the recording, s.
       fps: desired frames per second.
 
     Returns:
-      The frames at 0, 1/fps, 2/fps, ... s, as long as the recording lasts, at least the first:
-      [F, N, ...].
+      The frames at 0, 1/fps, 2/fps, ... s up to the last one of the recording: [F, N, ...].
     """
     last = len(recording.time) - 1
-    num_frames = max(1, int(last * dt * fps + 1e-6))
-    steps = np.arange(num_frames) / (fps * dt)
-    before = np.minimum(steps.astype(int), last)
+    num_frames = 1 + math.ceil(last * dt * fps - 1e-6)
+    steps = np.minimum(np.arange(num_frames) / (fps * dt), last)
+    before = steps.astype(int)
     after = np.minimum(before + 1, last)
     fraction = (steps - before)[:, None] * ~recording.over[before]
     frames = jax.tree.map(lambda values: values[before], recording)
@@ -294,8 +294,13 @@ def resample(recording: EnvFrame, dt: float, fps: float) -> EnvFrame:
         # Transposed, a share for each frame and environment fits values of any further axes.
         return (values[before].T + fraction.T * (values[after] - values[before]).T).T
 
+    def happened(values: np.ndarray) -> np.ndarray:
+        counts = np.cumsum(values, axis=0)[before]
+        return values[before] | (np.diff(counts, axis=0, prepend=0) > 0)
+
     moving = "time", "qpos", "balls", "paddle"
-    return frames._replace(**{name: blend(getattr(recording, name)) for name in moving})
+    blended = {name: blend(getattr(recording, name)) for name in moving}
+    return frames._replace(**blended, over=happened(recording.over), lost=happened(recording.lost))
 
 
 def _change(env: Env, states: State, command: World, push: jax.Array, world: World) -> State:
