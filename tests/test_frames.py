@@ -4,14 +4,18 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from viser.infra import StateSerializer
 
 from bounce_mjx import BounceBall
 from bounce_mjx.env.env import State
 from bounce_mjx.task import term_names
 from bounce_mjx.task.bounce_rewards import BounceReward
 from bounce_mjx.viewers.browser import reward_bars
-from bounce_mjx.viewers.display import Display, Trail, body_scenes
+from bounce_mjx.viewers.display import TRAIL_SECONDS, Display, Trail, body_scenes
+from bounce_mjx.viewers.page import replay
+from bounce_mjx.viewers.scene import ANNOUNCED_SECONDS, Scene
 from bounce_mjx.viewers.simulation import EnvFrame, make_random_controller, resample
+from viewing import watch
 
 
 def ramp(over: tuple[int, ...] = ()) -> EnvFrame:
@@ -67,6 +71,29 @@ def test_the_path_of_a_ball_has_each_of_its_positions_once() -> None:
         start = jax.tree.map(lambda values: values[0], frames)
         trail.add(start._replace(balls=start.balls + place))
         assert trail.points[:, 0, 0, 0].tolist() == [place] * 3
+
+
+def test_a_replay_shows_the_path_and_the_loss_for_as_long_as_the_live_page(
+    env: BounceBall, monkeypatch
+) -> None:
+    """At any rate of frames."""
+    lost = ramp(over=(10,))
+    lost = lost._replace(
+        qpos=np.tile(env.mj_model.qpos0, (11, 1, 1)),
+        command={"target_height": np.full((11, 1), 0.5)},
+        metrics={"n_bounces": np.zeros((11, 1))},
+    )
+    scenes, seconds = [], []
+    watch(monkeypatch, Scene, "update", lambda scene, frames: scenes.append(scene))
+    watch(monkeypatch, StateSerializer, "insert_sleep", lambda _, time: seconds.append(time))
+    for fps in (1, 30, 200):
+        scenes.clear()
+        seconds.clear()
+        replay(env, lost, fps)
+        scene = scenes[-1]
+        assert scene._trail.length == max(1, round(TRAIL_SECONDS * fps))
+        assert scene._labels[0].text == "LOST"
+        np.testing.assert_allclose(sum(seconds), len(scenes) / fps + ANNOUNCED_SECONDS)
 
 
 SHAPES = """<mujoco><worldbody>
