@@ -104,7 +104,8 @@ _TAKEN_NAMES = frozenset((*RUN_PLOTS, EVALUATION))
 
 
 def run_plot(name: str, title: str | None) -> Callable[[Draw], Draw]:
-    """Registers a function as a `RunPlot`, in place of one that was registered with this name.
+    """Registers a function as a `RunPlot`, in place of one that was registered with this name. It
+    belongs into the task's file, which is imported before anything is drawn.
 
     Raises:
       UserError: the name is that of a picture of the package.

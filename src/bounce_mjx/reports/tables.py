@@ -100,6 +100,6 @@ def details_line(report: Report) -> str:
         title, unit = (part.replace("_", " ") for part in _NAME.fullmatch(name).groups(""))
         unit = unit.replace(" ", "/")
         if name != "episodes":
-            rounded = value and float(f"{value:.4g}")
+            rounded = None if value is None else float(f"{value:.4g}")
             parts.append(f"{title} {figure_text(rounded, 'g')} {unit}".rstrip())
     return f"{report.details['episodes']:.0f} episodes: {', '.join(parts)}"

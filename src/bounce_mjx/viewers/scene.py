@@ -126,6 +126,7 @@ class Scene:
             self._trail.add(frame)
             over = frame.over[: self.num_envs]
             self._lost = np.where(over, frame.lost[: self.num_envs], self._lost)
+        frame = frames[-1]
         with self._server.atomic():
             for i, label in enumerate(self._labels):
                 qpos, command, metrics = environment_pose(frame, i)
@@ -139,6 +140,7 @@ class Scene:
                 height = max(_LABEL_HEIGHT, top + _LABEL_DISTANCE)
                 label.position = self._label_places[i] + (0.0, 0.0, height)
             for body, handle in self._bodies.items():
+                # What moves: a joint's body, or a marker.
                 if display.model.body_weldid[body]:
                     handle.batched_positions = positions[:, body] + self._offsets
                     handle.batched_wxyzs = rotations[:, body]

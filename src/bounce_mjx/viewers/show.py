@@ -29,7 +29,8 @@ class Shown(NamedTuple):
     title: str
     policy: Policy | None = None
     film: Callable[[], FilmPlayer] | None = None
-    """Simulates an episode of an evaluation, which is shown in place of new ones."""
+    """Simulates an episode of an evaluation, which is shown in place of new ones. Called once, when
+    the files and the port are checked."""
 
 
 def show(
@@ -160,7 +161,7 @@ def _simulate(
     # The page's slider goes up to the simulated number. On a CPU, MJX is too slow for 16.
     if has_sliders and len(shown) == 1 and envs[0].engine.name == "fused":
         num_envs = MAX_ENVS
-    # Policies side by side are compared in one world: where one of them has none to sample, in the
+    # Policies side by side are compared in one world: where the config of one samples none, in the
     # nominal one.
     is_sampled = all(one.config.randomization.terms for one in shown)
     world = None if is_sampled else {}

@@ -115,8 +115,8 @@ class Simulation:
         self.command: dict[str, float] = {}
         """Commands of all environments that are set; the others are sampled."""
         self.world: dict[str, Sequence[float]] | None = None
-        """Entries of some terms of the world that are on, in all environments, with the others
-        nominal; None for a world sampled at each reset."""
+        """Entries of terms of the world, in all environments; those that are not named are nominal.
+        None for a world sampled at each reset."""
         self.others: Sequence[Simulation] = ()
         """Simulations of the same robot that are shown with this one, after its environments, and
         have its commands and its world."""
@@ -125,8 +125,8 @@ class Simulation:
         self._key = jax.random.PRNGKey(seed)
         self._push = np.zeros(3, np.float32)
         self._steps = np.zeros(num_envs, np.int32)
-        nothing = jax.eval_shape(self._fresh_states, self._key)
-        self._states = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), nothing)
+        shapes = jax.eval_shape(self._fresh_states, self._key)
+        self._states = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
         over = np.ones(num_envs, bool)
         restart = jax.jit(self._restart).lower(self._key, self._states, self._steps, over)
         advance = jax.jit(self._advance).lower(*self._inputs())
@@ -181,6 +181,7 @@ class Simulation:
         self._push = np.zeros(3, np.float32)
         self._key, self._states, self._steps, frame = self._step_program(*inputs)
         self._frame = jax.device_get(frame)
+        # The last frame of an episode stays until the next step.
         if self._frame.over.any():
             self._reset(self._frame.over)
         return self.frame
@@ -198,9 +199,11 @@ class Simulation:
         command = {name: np.float32(self.command.get(name, np.nan)) for name in config.commands}
         world = {}
         for name in config.randomization.terms:
+            # A term without a nominal value stays sampled.
             if name in self.env.nominals:
                 shape = TERMS[name].shape(self.env.action_size)
                 entries = self._entries(name)
+                # A number has the shape (), and its entries may be a tuple of one.
                 world[name] = np.full(shape or 1, entries, np.float32).reshape(shape)
         return self.policy, self._key, self._states, self._steps, command, self._push, world
 

@@ -165,7 +165,7 @@ def draw_frames(
 
 def caption(picture: np.ndarray, readings: dict[str, str], height: float) -> np.ndarray:
     """A picture [height, width, 3] with a caption: the task's readings, the first one large, and
-    the ball's height, m."""
+    the first ball's height, m."""
     image = Image.fromarray(picture)
     draw = ImageDraw.Draw(image, "RGBA")
     unit = max(16, image.height // 26)
