@@ -140,11 +140,7 @@ def read_flags(
         formatter_class=lambda prog: argparse.HelpFormatter(prog, max_help_position=26, width=100),
     )
     _add_arguments(parser, fields, defaults, shown)
-    # Also --num_envs, --report=true and --report=false.
-    words = [re.sub(r"^--[^=]+", lambda flag: flag[0].replace("_", "-"), word) for word in args]
-    words = [re.sub(r"^--(.+)=false$", r"--no-\1", word, flags=re.I) for word in words]
-    words = [re.sub(r"^(--.+)=true$", r"\1", word, flags=re.I) for word in words]
-    given, unknown = parser.parse_known_intermixed_args(words)
+    given, unknown = parser.parse_known_intermixed_args(plain_words(args))
     if unknown and not is_first:
         advice = _near_flag(unknown[0].partition("=")[0], fields)
         parser.error(f"unknown argument {unknown[0]}" + (advice and f"; {advice}"))
@@ -154,6 +150,14 @@ def read_flags(
         if isinstance(values[key], list) and dict in types_in(fields[key].annotation):
             values[key] = _pairs(values[key], flag_names(fields)[key], parser)
     return values
+
+
+def plain_words(args: Sequence[str]) -> list[str]:
+    """The words of a command line with each flag in one spelling: --num-envs for --num_envs,
+    --report for --report=true, and --no-report for --report=false."""
+    words = [re.sub(r"^--[^=]+", lambda flag: flag[0].replace("_", "-"), word) for word in args]
+    words = [re.sub(r"^--(.+)=false$", r"--no-\1", word, flags=re.I) for word in words]
+    return [re.sub(r"^(--.+)=true$", r"\1", word, flags=re.I) for word in words]
 
 
 def _near_flag(word: str, fields: Mapping[str, FieldInfo]) -> str:
