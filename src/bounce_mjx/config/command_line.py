@@ -147,7 +147,7 @@ def read_flags(
         formatter_class=lambda prog: argparse.HelpFormatter(prog, max_help_position=26, width=100),
     )
     _add_arguments(parser, fields, defaults, shown)
-    given, unknown = parser.parse_known_intermixed_args([_in_our_form(word) for word in args])
+    given, unknown = parser.parse_known_intermixed_args(plain_words(args))
     if unknown and not is_first:
         advice = _near_flag(unknown[0].partition("=")[0], fields)
         parser.error(f"unknown argument {unknown[0]}" + (advice and f"; {advice}"))
@@ -159,8 +159,13 @@ def read_flags(
     return values
 
 
-def _in_our_form(word: str) -> str:
-    """--num-envs for --num_envs, --report for --report=true, and --no-report for --report=false."""
+def plain_words(args: Sequence[str]) -> list[str]:
+    """The words of a command line with each flag in one spelling: --num-envs for --num_envs,
+    --report for --report=true, and --no-report for --report=false."""
+    return [_plain_word(word) for word in args]
+
+
+def _plain_word(word: str) -> str:
     if not word.startswith("--"):
         return word
     flag, equals, value = word.partition("=")
