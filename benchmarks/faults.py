@@ -31,8 +31,7 @@ from bounce_mjx.deploy.motion import paddle_position
 from bounce_mjx.env.env import world_model
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import POLICIES, resource_path
-from bounce_mjx.robot.balls import BALLS_APART
-from bounce_mjx.robot.model import find_addresses
+from bounce_mjx.robot.model import BALLS_APART, find_addresses
 from bounce_mjx.runs.config import load_run_config
 
 RATE = 500.0

@@ -25,7 +25,8 @@ values out of range and settings without effect are refused. A list is `256 256`
 the command line, and a switch `--stop-when-solved`, `--no-stop-when-solved` or
 `--stop-when-solved=false`. Whole numbers are below 2^31, steps at most 10^12 (`1e6` is one too).
 
-- `env.control_dt` is a multiple of `env.physics_dt`, and at most `env.episode_seconds`.
+- `env.control_dt` is a multiple of `env.physics_dt`; an episode is whole control steps, at least
+  one.
 - An episode must not end where it starts (`env.ball_init_pos`), and the ball and the targets are
   above the paddle in `env.default_joint_angles`.
 - `ppo.num_minibatches` divides `ppo.num_envs` × `ppo.rollout_length`; a rollout is at most an

@@ -29,8 +29,7 @@ from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, make_en
 from bounce_mjx.physics.edited import edited_model
 from bounce_mjx.physics.support import unsupported_feature
 from bounce_mjx.resources import resource_path
-from bounce_mjx.robot.balls import add_balls
-from bounce_mjx.robot.model import find_addresses, load_model
+from bounce_mjx.robot.model import add_balls, find_addresses, load_model
 from bounce_mjx.world.randomization import RandomizationConfig
 from bounce_mjx.world.sampling import nominal_values, physics_parameters
 from random_worlds import random_parameters

@@ -121,11 +121,31 @@ def test_the_newest_checkpoint_and_the_one_that_is_named_are_kept(tmp_path: Path
     stored = []
     for steps, kept in ((10, None), (20, 10), (20, 10), (30, 21), (40, None)):
         number = save_checkpoint(run, CONFIG, steps, items, kept=kept)
-        stored.append(sorted(checkpoint.steps for checkpoint in stored_checkpoints(run)))
-        assert latest_checkpoint(run).steps == number == stored[-1][-1]
-        assert verify(latest_checkpoint(run)).steps == steps
+        stored.append(sorted(checkpoint.number for checkpoint in stored_checkpoints(run)))
+        newest = latest_checkpoint(run)
+        assert newest.number == number == stored[-1][-1]
+        assert newest.steps == verify(newest).steps == steps
     assert stored == [[10], [10, 20], [10, 21], [21, 30], [40]]
     assert [path.name for path in (run / "checkpoints").iterdir()] == ["40"]
+
+
+def test_a_checkpoint_that_cannot_be_removed_stays_beside_the_new_one(
+    run: Path, state, monkeypatch
+) -> None:
+    """The new one is saved: its training must not take it for lost."""
+    rename = Path.rename
+
+    def fail(path: Path, target: Path) -> Path:
+        if path.name == "64":
+            raise PermissionError
+        return rename(path, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", fail)
+        assert save_checkpoint(run, CONFIG, 128, items_of(state)) == 128
+    assert {checkpoint.number for checkpoint in stored_checkpoints(run)} == {64, 128}
+    save_checkpoint(run, CONFIG, 192, items_of(state))
+    assert [checkpoint.number for checkpoint in stored_checkpoints(run)] == [192]
 
 
 @pytest.fixture(scope="module")
@@ -139,9 +159,9 @@ def two(tmp_path_factory: pytest.TempPathFactory, state: TrainingState) -> Path:
 
 
 def test_the_best_checkpoint_has_the_best_evaluation(two: Path) -> None:
-    assert (best_checkpoint(two).steps, latest_checkpoint(two).steps) == (64, 128)
+    assert (best_checkpoint(two).number, latest_checkpoint(two).number) == (64, 128)
     for number in (64, 128):
-        assert find_checkpoint(two / f"checkpoints/{number}").steps == number
+        assert find_checkpoint(two / f"checkpoints/{number}").number == number
 
 
 @pytest.mark.parametrize("wrong", [64, 128])
@@ -155,7 +175,7 @@ def test_the_intact_checkpoint_takes_the_place_of_a_damaged_one(
         damaged = run / file.relative_to(two)
         damaged.write_bytes(damaged.read_bytes() + b"more")
         for find in (best_checkpoint, latest_checkpoint, find_checkpoint):
-            assert find(run).steps == other, file
+            assert find(run).number == other, file
         warn_once.cache_clear()
         with pytest.raises(UserError, match=f"checkpoints/{wrong} is damaged"):
             read_policy(find_checkpoint(run / f"checkpoints/{wrong}"), CONFIG)

@@ -206,6 +206,24 @@ def test_api_reference_is_fresh() -> None:
     assert content("api.md") == written, "docs/api.md is stale; it names the command that prints it"
 
 
+def test_what_a_page_imports_is_in_a_reference() -> None:
+    """In the API; settings are in the config reference, and the tasks have a page."""
+    documented = set(re.findall(r"^### (\w+)$", content("api.md"), re.MULTILINE))
+    for page in PAGES:
+        for block in re.findall(
+            r"^```py.*?^```", page.read_text("utf-8"), re.MULTILINE | re.DOTALL
+        ):
+            for module, names in re.findall(
+                r"^from (bounce_mjx\S*) import (.+)$", block, re.MULTILINE
+            ):
+                for name in names.split(", "):
+                    member = getattr(importlib.import_module(module), name, None)
+                    is_setting = inspect.isclass(member) and issubclass(member, StrictModel)
+                    is_type = module == "bounce_mjx.config.settings"
+                    if not (inspect.ismodule(member) or is_setting or is_type or member is Bounce):
+                        assert name in documented, f"{page_id(page)}: {module}.{name}"
+
+
 def test_api_reference_has_arguments_shapes_and_errors() -> None:
     page = content("api.md")
     entry = page.split("\n### Env\n")[1].split("\n### ")[0]

@@ -42,6 +42,14 @@ def test_resampling_does_not_blend_two_episodes() -> None:
     np.testing.assert_allclose(frames.balls[:, 0, 0, 0], expected)
 
 
+def test_a_recording_that_is_shorter_than_a_picture_is_one_picture() -> None:
+    """As of an episode that ended on its first or second step."""
+    for steps in (1, 2):
+        short = jax.tree.map(lambda values, steps=steps: values[:steps], ramp())
+        frames = resample(short, dt=0.01, fps=30)
+        np.testing.assert_array_equal(frames.balls, short.balls[:1])
+
+
 SHAPES = """<mujoco><worldbody>
   <body><geom type="sphere" size=".1"/></body>
   <body><geom type="capsule" size=".1 .3"/></body>

@@ -8,6 +8,7 @@ import json
 import os
 import shutil
 import signal
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -34,7 +35,7 @@ from bounce_mjx.runs.folders import (
     stored_checkpoints,
 )
 from bounce_mjx.runs.settings import Choice, stack
-from bounce_mjx.training import job
+from bounce_mjx.training import hosts, job
 from bounce_mjx.training.events import Event
 from bounce_mjx.training.faults import first_block_fault
 from bounce_mjx.training.trainer import Snapshot
@@ -384,7 +385,7 @@ def test_an_evaluation_that_was_stopped_is_repeated(tmp_path: Path) -> None:
     assert latest_checkpoint(run).steps == BLOCK
     train(tmp_path, {1: 5.0}, run)
     best = best_checkpoint(run)
-    assert (best.steps, read_record(best).steps) == (BLOCK + 1, BLOCK)
+    assert (best.number, best.steps) == (BLOCK + 1, BLOCK)
     assert results_of(run)["best_steps"] == BLOCK
 
 
@@ -466,11 +467,14 @@ def test_a_named_checkpoint_is_the_one_that_is_resumed(tmp_path: Path) -> None:
     assert iterations_of(best_checkpoint(run)) == 1 and iterations_of(latest_checkpoint(run)) == 4
 
 
-@pytest.mark.parametrize("wrong", ["best", "newest"])
+@pytest.mark.parametrize("wrong", ["best", "newest", "newest of three"])
 def test_a_resumed_training_goes_on_from_what_is_intact(tmp_path: Path, wrong: str, capsys) -> None:
-    """Results, checkpoints and what is resumed agree on the best policy that is left."""
+    """Results, checkpoints and what is resumed agree on the best policy that is left. A process
+    that is killed may leave three checkpoints."""
     run = train(tmp_path, {1: 9.0, 2: 1.0})
-    steps = 64 if wrong == "best" else 128
+    steps = {"best": 64, "newest": 128, "newest of three": 192}[wrong]
+    if wrong == "newest of three":
+        shutil.copytree(run / "checkpoints/128", run / "checkpoints/192")
     (run / f"checkpoints/{steps}/record/metadata").write_text("")
     train(tmp_path, {1: 9.0, 2: 1.0, 3: 0.5}, run)
     assert f"checkpoints/{steps} is damaged" in capsys.readouterr().err
@@ -503,6 +507,124 @@ def test_a_training_that_ends_without_room_says_so(tmp_path: Path, monkeypatch) 
     assert iterations_of(latest_checkpoint(run)) == 1
     train(tmp_path, {2: 9.0, 3: 7.0}, run)
     assert results_of(run)["best_steps"] == 2 * BLOCK and iterations_of(best_checkpoint(run)) == 2
+
+
+def test_a_warm_start_that_meets_all_results_is_trained_until_a_margin(
+    tmp_path: Path, monkeypatch
+) -> None:
+    """The wait for a margin counts from a policy that was trained; one with a margin needs none."""
+    networks = "networks of a warm start"
+    monkeypatch.setattr(checkpoints, "read_start", lambda config, env: networks)
+    returns = dict.fromkeys(range(6), 1.0)
+    settings = {"warm_start": Path("robust_small"), "stop_when_solved": True}
+    run = train(tmp_path / "a", returns, margins={0: 0.5, 1: 0.5, 3: 1.0}, **settings)
+    assert evaluated_steps(run) == [0, 64, 128]
+    assert results_of(run)["solved_steps"] == 0
+    run = train(tmp_path / "b", returns, margins={0: 0.5, 3: 0.5, 4: 1.0}, **settings)
+    assert evaluated_steps(run) == [0, 64, 128, 192, 256]
+    said = io.StringIO()
+    run = train(tmp_path / "c", returns, margins={0: 1.0}, said=said, **settings)
+    assert evaluated_steps(run) == [0]
+    assert "the training ends: all results are met with a margin" in said.getvalue()
+
+
+def test_a_signal_after_the_evaluation_of_a_warm_start_says_how_to_resume(
+    tmp_path: Path, monkeypatch
+) -> None:
+    monkeypatch.setattr(checkpoints, "read_start", lambda config, env: "networks")
+
+    def stop(event: Event) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    settings = {"warm_start": Path("robust_small")}
+    with pytest.raises(job.TrainingStopped, match="stopped after 0 steps; continue with: "):
+        train(tmp_path, {0: 1.0, 1: 2.0}, callbacks=[stop], **settings)
+    (run,) = tmp_path.iterdir()
+    assert latest_checkpoint(run).steps == 0
+    train(tmp_path, {1: 2.0}, run, **settings)
+    assert evaluated_steps(run) == [0, 64]
+
+
+def test_a_callback_ends_a_training_on_several_hosts_after_a_block_or_an_evaluation(
+    tmp_path: Path, monkeypatch
+) -> None:
+    """Two threads stand for two processes: one that waits for the other in vain breaks it off."""
+    number = threading.local()
+    values: dict[int, object] = {}
+    together = threading.Barrier(2, timeout=10)
+
+    def exchange(value: object) -> list[object]:
+        values[number.process] = json.loads(json.dumps(value))
+        together.wait()
+        both = [values[0], values[1]]
+        together.wait()
+        return both
+
+    monkeypatch.setattr(hosts, "exchange", exchange)
+    monkeypatch.setattr(hosts, "is_leader", lambda: number.process == 0)
+
+    def host(process: int, log_dir: Path, callback) -> Path:
+        number.process = process
+        return train(log_dir, RETURNS, callbacks=[callback])
+
+    def train_on_both(log_dir: Path, callback) -> Path:
+        with concurrent.futures.ThreadPoolExecutor() as pool:
+            runs = [pool.submit(host, process, log_dir, callback) for process in range(2)]
+            run, same = (run.result() for run in runs)
+        assert run == same
+        return run
+
+    run = train_on_both(tmp_path / "evaluation", lambda event: np.bool_(event.report is None))
+    assert evaluated_steps(run) == [64]
+    run = train_on_both(tmp_path / "block", lambda event: event.report is not None)
+    assert evaluated_steps(run) == [64]
+
+
+@pytest.mark.parametrize("wrong", ["one", "all"])
+def test_a_seed_whose_best_policy_is_damaged_gets_another_one(
+    tmp_path: Path, wrong: str, capsys
+) -> None:
+    """Also where the run has met all results; a line names what was damaged."""
+    margins = {1: 1.0}
+    settings = {"num_seeds": SEEDS, "margins": margins, "stop_when_solved": True}
+    run = train(tmp_path, RETURNS, **settings)
+    damaged = [0] if wrong == "one" else range(SEEDS)
+    for seed in damaged:
+        (run / f"seed_{seed:03d}/checkpoints/64/record/metadata").write_text("")
+        (run / f"seed_{seed:03d}/results.json").unlink()
+    train(tmp_path, RETURNS, run, **settings)
+    warnings = capsys.readouterr().err
+    for seed in range(SEEDS):
+        folder = run / f"seed_{seed:03d}"
+        assert (f"{folder}/checkpoints/64 is damaged" in warnings) == (seed in damaged)
+        assert results_of(folder)["best_steps"] == BLOCK
+        assert iterations_of(best_checkpoint(folder)) == 1
+        # It may be repaired.
+        assert (folder / "checkpoints/64.damaged/policy").is_dir() == (seed in damaged)
+
+
+def test_damaged_states_of_several_seeds_are_set_aside(tmp_path: Path) -> None:
+    """As where a process was killed between the writing of one and the removal of the other, and
+    whatever was set aside before."""
+    run = train(tmp_path, {1: 1.0, 2: 2.0}, num_seeds=SEEDS)
+    states = run / "checkpoints"
+    shutil.copytree(states / "128", states / "192")
+    shutil.copytree(states / "128", states / "192.damaged")
+    (states / "192/record/metadata").write_text("")
+    said = io.StringIO()
+    train(tmp_path, {1: 1.0, 2: 2.0, 3: 3.0}, run, num_seeds=SEEDS, said=said)
+    assert (states / "192.damaged_2/training").is_dir() and (states / "192.damaged").is_dir()
+    assert f"the damaged checkpoint is kept as {states}/192.damaged_2" in said.getvalue()
+    assert iterations_of(best_checkpoint(run / "seed_000")) == 3
+
+
+def test_a_seed_whose_config_was_edited_is_refused(tmp_path: Path) -> None:
+    """Its config would be written anew, and the next best policy would take the place of its."""
+    run = train(tmp_path, {1: 1.0}, num_seeds=SEEDS)
+    config = run / "seed_001/config.yaml"
+    config.write_text(config.read_text().replace("discount: 0.98", "discount: 0.5"))
+    with pytest.raises(UserError, match="seed_001/checkpoints/64 has a different config"):
+        train(tmp_path, {1: 1.0, 2: 2.0}, run, num_seeds=SEEDS)
 
 
 class Diverging(CountingTrainer):
@@ -571,3 +693,15 @@ def test_a_seed_that_diverges_leaves_the_others(tmp_path: Path) -> None:
     evaluated = [evaluated_steps(run / f"seed_{i:03d}") for i in range(SEEDS)]
     assert evaluated == [[64, 128, 192, 256], [64, 128], [64, 128, 192, 256]]
     assert iterations_of(best_checkpoint(run / "seed_001")) == 2
+
+
+def test_a_solved_run_goes_on_with_more_steps_also_beside_a_seed_that_diverged(
+    tmp_path: Path,
+) -> None:
+    class DivergingAtOnce(CountingTrainer):
+        faults = {(1, 1): 2}
+
+    settings = {"num_seeds": SEEDS, "stop_when_solved": True, "margins": {1: 1.0}}
+    run = train(tmp_path, RETURNS, trainer=DivergingAtOnce, **settings)
+    assert evaluated_steps(run / "seed_000") == [64]
+    assert not stack(Choice(resume=run)).config({"total_steps": 10**6}).stop_when_solved

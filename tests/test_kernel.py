@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from bounce_mjx import BounceBall
-from bounce_mjx.gpu import availability, rows
 from bounce_mjx.gpu import elementwise as kernel
+from bounce_mjx.gpu import rows
 from bounce_mjx.learning import ppo
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState
@@ -173,11 +173,11 @@ def test_rows_hold_every_type(monkeypatch):
 
 
 def test_only_supported_gpus_use_kernels_unless_they_are_off(monkeypatch):
-    assert not availability.has_kernels()
+    assert not kernel.has_kernels()
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     for capability, expected in (("9.0", True), ("10.0", True), ("8.6", False), ("gfx90a", False)):
         device = type("Device", (), {"compute_capability": capability})
         monkeypatch.setattr(jax, "local_devices", lambda backend=None, device=device: [device])
-        assert availability.has_kernels() is expected
+        assert kernel.has_kernels() is expected
     monkeypatch.setenv("BOUNCE_MJX_GPU_KERNEL", "off")
-    assert not availability.has_kernels()
+    assert not kernel.has_kernels()

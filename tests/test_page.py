@@ -13,6 +13,7 @@ import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 import viser
@@ -25,7 +26,7 @@ from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training import watch as watched
 from bounce_mjx.training.events import Event
 from bounce_mjx.training.watch import TrainingPage
-from bounce_mjx.viewers import browser
+from bounce_mjx.viewers import browser, guard
 from bounce_mjx.viewers.guard import open_server
 from bounce_mjx.viewers.scene import Scene
 from bounce_mjx.viewers.simulation import Simulation, make_zero_controller
@@ -168,16 +169,54 @@ def test_keys_act(page) -> None:
     client.press("pause")
 
 
+def test_a_paused_page_shows_the_values_that_hold(page, mirrored: Simulation) -> None:
+    """What a user set in a pause and gave up again is not shown any more."""
+    client, did = page
+    client.press("pause")
+    wait_until(lambda: stands_still(did))
+    height, sampled = client.control("height, m"), client.control("sampled at each reset")
+    client.set(height, 0.8)
+    client.values.clear()
+    client.set(sampled, True)
+    wait_until(lambda: mirrored.command == {})
+    holds = round(float(mirrored.frame.command["target_height"][0]), 2)
+    while client.values.get(height) != holds:
+        client.receive()
+    client.press("pause")
+
+
+def test_a_film_has_no_keys_that_change_it(mirrored: Simulation, monkeypatch) -> None:
+    film = viewing.film_of(mirrored, 20)
+    with served(film, monkeypatch) as client:
+        # The last key of those that a film has.
+        client.control("slower")
+        assert client.has("pause") and client.has("reset")
+        for label in ("target height up", "target height down", "push the ball up"):
+            assert not client.has(label), label
+
+
 NAN, INFINITY, HUGE = float("nan"), float("inf"), 2**63 - 1
 # For each control what a page may not send it, and at the end a value that it may have.
 HOSTILE = {
     "robots": (1e308, -1e308, 40, HUGE, -HUGE, NAN, INFINITY, "many", "nan", [1], None, True, 2),
-    "speed": (1e9, -1e9, NAN, INFINITY, -INFINITY, "fast", "nan", {}, b"", 0.5),
+    "speed": (1e9, -1e9, NAN, INFINITY, -INFINITY, "fast", "nan", "inf", {}, b"", 0.5),
     "height, m": (1e9, -1.0, NAN, -INFINITY, "high", "inf", [0.5, 0.6], 0.6),
     "speed, m/s": (1e9, NAN, INFINITY, "nan", None, 1.0),
     "pause": (0.0, "yes", None, [], NAN, False),
     "push": ("sideways", "", 3, None, [], "x" * 2000, "ball up"),
 }
+WORDS = {"level 2": True, "1-leg": True, "walk": True, "": True} | dict.fromkeys(
+    ("nan", "inf", "-Infinity", " 7", "1e308", "1_0", "٣"), False
+)
+
+
+def test_a_text_may_be_a_choice_but_no_number() -> None:
+    """viser would read a number, or none, from such a text, and send it to the other pages."""
+    for text, is_choice in WORDS.items():
+        message = {"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": text}}
+        assert guard._is_valid(msgspec.msgpack.encode(message)) is is_choice, text
+
+
 FOREIGN = (
     [1, 2, 3],
     None,

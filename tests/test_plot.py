@@ -10,6 +10,8 @@ import time
 import xml.etree.ElementTree
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import yaml
@@ -21,7 +23,9 @@ from bounce_mjx import BounceBall
 from bounce_mjx.commands import plot as plot_command
 from bounce_mjx.commands import report as report_command
 from bounce_mjx.commands import train as train_command
+from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation.statistics import empty_recording
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.reports import figures
 from bounce_mjx.reports import page as report_page
@@ -39,12 +43,14 @@ from bounce_mjx.runs.folders import save_config
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.task import Curve, term_names
-from bounce_mjx.task.bounce import Bounce, BounceReward
+from bounce_mjx.task.bounce import Bounce, BounceConfig, BounceReward
+from bounce_mjx.task.registry import find_task
 from bounce_mjx.task.task import Hits
 from bounce_mjx.training.events import Event
 from bounce_mjx.training.log import TensorBoardLog
 from tiny_runs import TINY
 
+CHECKOUT = Path(__file__).parents[1]
 TERMS = term_names(BounceReward)
 CURVES = (
     Curve("episode/return", "", title="return of an episode"),
@@ -91,6 +97,37 @@ def test_runs_that_differ_in_the_seed_are_one_group(runs: list[Path]) -> None:
         "num_envs 2048 (one run)",
     ]
     assert [group.label for group in group_runs(runs[:3])] == ["3 runs"]
+
+
+def test_a_sweep_of_an_own_algorithms_setting_is_several_groups(tmp_path: Path) -> None:
+    """Though its code is not run."""
+    runs = []
+    algorithm = f"{CHECKOUT / 'examples/smooth_ppo.py'}:SmoothPPO"
+    for cost in (0.02, 0.2):
+        config = TrainConfig(algorithm=algorithm)
+        run = write_run(tmp_path / str(cost), config, {"episode/return": {1: 1.0}})
+        path = run / "config.yaml"
+        path.write_text(path.read_text().replace("ppo:\n", f"ppo:\n  smoothness_cost: {cost}\n"))
+        runs.append(run)
+    labels = [group.label for group in group_runs(runs)]
+    assert labels == ["smoothness_cost 0.02 (one run)", "smoothness_cost 0.2 (one run)"]
+    plain = write_run(tmp_path / "plain", TrainConfig(), {"episode/return": {1: 1.0}})
+    labels = [group.label for group in group_runs([plain, *runs])]
+    assert labels[0] == "algorithm ppo (one run)"
+    assert "smoothness_cost 0.2" in labels[2]
+
+
+def test_the_labels_of_groups_differ(tmp_path: Path) -> None:
+    """Whatever else the groups have of their own."""
+    runs = []
+    fast = BounceConfig(control_dt=0.005, action_scale=0.01, episode_seconds=10.0)
+    for env, discount in ((BounceConfig(), 0.98), (fast, 0.98), (fast, 0.97)):
+        config = TrainConfig(env=env, ppo=PPOConfig(discount=discount))
+        run = tmp_path / str(len(runs))
+        runs.append(write_run(run, config, {"episode/return": {1: 1.0}}))
+    labels = [group.label for group in group_runs(runs)]
+    assert len(set(labels)) == 3
+    assert all("discount" in label and "control_dt" in label for label in labels)
 
 
 @pytest.mark.parametrize(
@@ -190,13 +227,30 @@ def test_a_panel_has_a_point_for_each_evaluation_and_steps_in_millions() -> None
         "episode/return": LoggedCurve(steps, np.array([1.0, 2.0, 3.0])),
         "results/mean_return": LoggedCurve(steps[1:], np.array([7.0, 9.0])),
     }
-    axes = curves_figure([Group("one run", [RunCurves(Path("run"), curves, 4_000_000)])]).axes[0]
+    task_curves = (Curve("task/height", "", title="without a point yet"),)
+    group = Group("one run", [RunCurves(Path("run"), curves, 4_000_000)], task_curves)
+    axes, empty = curves_figure([group]).axes
+    assert empty.get_xlim() == axes.get_xlim()
     (points,) = [line for line in axes.lines if line.get_label() == "evaluation, without noise"]
     assert (points.get_marker(), points.get_linestyle()) == ("o", "None")
     assert points.get_xydata().tolist() == [[2e6, 7.0], [4e6, 9.0]]
     (met,) = [line for line in axes.lines if line.get_label() == "all results met"]
     assert set(met.get_xdata()) == {4_000_000}
     assert [axes.xaxis.get_major_formatter()(x) for x in (0, 5e5, 2e6)] == ["0", "500k", "2M"]
+
+
+def test_each_ball_is_drawn_and_the_legend_has_one_word_for_all() -> None:
+    """Juggling, before the first step."""
+    env = Env(find_task("juggle").Config())
+    keys = jax.random.split(jax.random.PRNGKey(0), 1)
+    shapes = jax.eval_shape(jax.vmap(env.reset, out_axes=-1), keys)
+    states = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    recording = empty_recording(env, states, 1)
+    recording = recording._replace(running=jnp.ones_like(recording.running))
+    axes = figures.evaluation_figure(env, recording).axes[0]
+    labels = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert labels[-2:] == ["balls", "paddle"] and labels.count("balls") == 1
+    assert len(axes.lines) == len(labels) + 1
 
 
 def test_hits_beside_the_paddle_are_drawn(env: BounceBall) -> None:
@@ -210,18 +264,38 @@ def test_hits_beside_the_paddle_are_drawn(env: BounceBall) -> None:
         assert min(left, right) < y < max(left, right) and min(top, bottom) < x < max(top, bottom)
 
 
-def test_plot_of_several_runs(trained: Path, tmp_path: Path) -> None:
+@pytest.fixture
+def own_plots(monkeypatch):
+    """Registers a plot for each of some titles, named own_0, own_1, ..."""
+    monkeypatch.setattr(figures, "RUN_PLOTS", dict(figures.RUN_PLOTS))
+
+    def register(*titles: str) -> None:
+        for i, title in enumerate(titles):
+            figures.run_plot(f"own_{i}", title)(lambda groups, columns=1: Figure((1.0, 1.0)))
+
+    return register
+
+
+@pytest.mark.parametrize("name", ["curves", "rewards", "evaluation"])
+def test_no_plot_takes_the_place_of_one_of_the_package(name: str) -> None:
+    with pytest.raises(UserError, match=f"'{name}' has the name of .*; choose another name"):
+        figures.run_plot(name, "Mine")
+
+
+def test_plot_of_several_runs(trained: Path, tmp_path: Path, own_plots) -> None:
     other = shutil.copytree(trained, tmp_path / "other")
     save_config(other, read_preset(trained / "config.yaml").model_copy(update={"seed": 1}))
     (tmp_path / "p").mkdir()
     (tmp_path / "mine").write_text("mine")
     (tmp_path / "p/curves.svg").symlink_to(tmp_path / "mine")
+    own_plots("Mine", "Mine")
     plot_command.main([str(trained), str(other), "--formats", "svg", "--out", str(tmp_path / "p")])
-    assert {path.name for path in (tmp_path / "p").iterdir()} == {"curves.svg", "rewards.svg"}
+    names = {"curves.svg", "rewards.svg", "own_0.svg", "own_1.svg"}
+    assert {path.name for path in (tmp_path / "p").iterdir()} == names
     assert (tmp_path / "mine").read_text() == "mine"
 
 
-def check_report(run: Path) -> str:
+def check_report(run: Path, own_plots: int = 0) -> str:
     """The text of a report, after checking that the page is complete and needs no other file."""
     page = (run / "report.html").read_text(encoding="utf-8")
     sources = re.findall(r'(?:src|href)="([^"]*)"', page)
@@ -230,7 +304,7 @@ def check_report(run: Path) -> str:
         replays[0].partition(",")[2]
     )
     # Curves, the best checkpoint, and a panel for each reward term.
-    assert len(sources) - len(replays) == 2 + len(TERMS)
+    assert len(sources) - len(replays) == 2 + own_plots + len(TERMS)
     for source in set(sources) - set(replays):
         kind, _, data = source.partition(",")
         assert kind == "data:image/svg+xml;base64"
@@ -270,13 +344,15 @@ def test_training_leaves_a_report(trained: Path) -> None:
 
 
 @pytest.mark.slow
-def test_report_is_drawn_again(trained: Path, tmp_path: Path, capsys) -> None:
+def test_report_is_drawn_again(trained: Path, tmp_path: Path, own_plots, capsys) -> None:
+    """With each plot of the user's code, also of one title."""
     run, other = shutil.copytree(trained, tmp_path / "run"), tmp_path / "other"
     other.write_text("mine")
     (run / "report.html").unlink()
     (run / "report.html").symlink_to(other)
+    own_plots("Mine", "Mine", "The best checkpoint")
     report_command.main([str(run)])
-    check_report(run)
+    check_report(run, own_plots=3)
     assert other.read_text() == "mine"
     page = (run / "report.html").read_text("utf-8")
     assert "Peitian AIR4-560" in page and "MuJoCo 3." in page

@@ -1,5 +1,6 @@
 """A policy brings its environment into every library, and is refused in another one."""
 
+import importlib
 import importlib.util
 from pathlib import Path
 
@@ -65,41 +66,75 @@ def test_robust_keeps_the_ball_in_the_environment_that_it_brings() -> None:
     assert not ended.any()
 
 
-@pytest.mark.parametrize("name", ["robust", "ur5e", "slow run"])
-def test_every_library_gets_the_environment_of_the_policy(name: str, slow_run: Path, need) -> None:
-    policy = slow_run if name == "slow run" else name
-    trained = Run(policy).config.env
-    nominal = trained.model_copy(update={"randomization": RandomizationConfig()})
-    makers = {
-        "gymnasium": lambda: gymnasium.make(TASK_ID, policy=policy),
-        "vector": lambda: gymnasium.make_vec(TASK_ID, 2, policy=policy),
-        "wrapped": lambda: gymnasium.wrappers.RecordEpisodeStatistics(
-            gymnasium.make(TASK_ID, policy=policy)
-        ),
-        "sb3": lambda: _adapter("sb3", "Sb3VecEnv", need, "stable_baselines3")(2, policy=policy),
-        "torch": lambda: _adapter("torch", "TorchVectorEnv", need, "torch")(
-            num_envs=2, policy=policy
-        ),
-        "brax": lambda: _adapter("brax", "BraxBounceBall", need, "brax")(policy=policy),
-        "gymnax": lambda: _adapter("gymnax_env", "GymnaxBounceBall", need)(policy=policy),
-        "playground": lambda: _adapter(
-            "playground", "PlaygroundBounceBall", need, "mujoco_playground"
-        )(policy=policy),
-        "jax": lambda: Run(policy).env(),
-    }
-    for library, make in makers.items():
-        env = environment_of(make())
-        assert env.config == nominal, library
-        assert interface_of(env.config) == interface_of(trained), library
-    assert policy_environment(policy, world="training").randomization.terms == (
-        trained.randomization.terms
-    )
+LIBRARIES = "gymnasium vector wrapped sb3 torch rsl_rl skrl brax gymnax playground".split()
+
+
+def _make(library: str, need, **settings):
+    """An environment in a library."""
+    match library:
+        case "gymnasium":
+            return gymnasium.make(TASK_ID, **settings)
+        case "vector":
+            return gymnasium.make_vec(TASK_ID, 2, **settings)
+        case "wrapped":
+            return gymnasium.wrappers.RecordEpisodeStatistics(gymnasium.make(TASK_ID, **settings))
+        case "sb3":
+            return _adapter("sb3", "Sb3VecEnv", need, "stable_baselines3")(2, **settings)
+        case "torch":
+            return _adapter("torch", "TorchVectorEnv", need, "torch")(num_envs=2, **settings)
+        case "rsl_rl":
+            wrap = _adapter("torch.rsl_rl_env", "RslRlVecEnv", need, "torch", "rsl_rl")
+            return wrap(_make("torch", need, **settings))
+        case "skrl":
+            wrap = _adapter("torch.skrl_env", "SkrlEnv", need, "torch", "skrl")
+            return wrap(_make("torch", need, **settings))
+        case "brax":
+            return _adapter("brax", "BraxBounceBall", need, "brax")(**settings)
+        case "gymnax":
+            return _adapter("gymnax_env", "GymnaxBounceBall", need)(**settings)
+        case "playground":
+            make = _adapter("playground", "PlaygroundBounceBall", need, "mujoco_playground")
+            return make(**settings)
 
 
 def _adapter(module: str, name: str, need, *libraries: str):
     for library in libraries:
         need(library)
-    return getattr(__import__(f"bounce_mjx.adapters.{module}", fromlist=[name]), name)
+    return getattr(importlib.import_module(f"bounce_mjx.adapters.{module}"), name)
+
+
+def _time_limit(library: str, env) -> int | None:
+    """Control steps of an episode as a library says them; None where its user does."""
+    match library:
+        case "gymnasium" | "vector" | "wrapped":
+            return env.spec.max_episode_steps
+        case "torch":
+            return env.episode_steps
+        case "rsl_rl":
+            return env.max_episode_length
+        case "gymnax":
+            return env.default_params.max_steps_in_episode
+
+
+@pytest.mark.parametrize("name", ["robust", "ur5e", "slow run"])
+def test_every_library_gets_the_environment_of_the_policy(name: str, slow_run: Path, need) -> None:
+    """And its time limit; the policy is refused in the library's environment without it."""
+    policy = slow_run if name == "slow run" else name
+    trained = Run(policy).config.env
+    nominal = trained.model_copy(update={"randomization": RandomizationConfig()})
+    assert Run(policy).env().config == nominal
+    for library in LIBRARIES:
+        env = _make(library, need, policy=policy)
+        config = environment_of(env).config
+        assert config == nominal, library
+        assert interface_of(config) == interface_of(trained), library
+        steps = _time_limit(library, env)
+        assert steps in (None, round(20.0 / trained.control_dt)), library
+        with pytest.raises(UserError, match="is of another environment"):
+            Run(policy).policy_in(_make(library, need))
+    assert policy_environment(policy, world="training").randomization.terms == (
+        trained.randomization.terms
+    )
 
 
 def test_a_policy_refuses_another_environment(slow_run: Path) -> None:

@@ -36,7 +36,7 @@ def test_a_training_does_not_wait_long_for_a_margin(evaluations, solved: bool) -
     progress = Progress()
     for steps, margin in evaluations:
         result = Result("stable", "episodes, %", 0.0, ">= 99", margin is not None, margin)
-        progress.improves(Report((result,), {"mean_return": 1.0}), steps, 0.0)
+        progress.add(Report((result,), {"mean_return": 1.0}), steps, 0.0)
     assert progress.solved is solved
 
 
@@ -47,7 +47,7 @@ def test_of_equal_evaluations_the_newest_is_the_best() -> None:
     full = Report((result,), {"mean_return": 1.0})
     screened = Report((result,), {"mean_return": 9.0}, screening=True)
     for steps, report, is_best in ((64, full, True), (128, full, True), (192, screened, False)):
-        assert progress.improves(report, steps, 0.0) is is_best
+        assert progress.add(report, steps, 0.0) is is_best
     assert progress.best_steps == 128
 
 

@@ -21,10 +21,10 @@ from bounce_mjx.evaluation.c_episodes import episode_models
 from bounce_mjx.learning.ppo import PPO
 from bounce_mjx.physics import Control, PhysicsState, edited_model, servo_targets
 from bounce_mjx.physics.control import drag
+from bounce_mjx.robot.actuators import largest_torques, torque_ranges
 from bounce_mjx.robot.config import RobotConfig
 from bounce_mjx.robot.contact import damping_of_restitution, restitution_of_damping
 from bounce_mjx.robot.model import load_model
-from bounce_mjx.robot.torques import largest_torques, torque_ranges
 from bounce_mjx.world.actuation import add_delay, start_actuation
 from bounce_mjx.world.randomization import TERMS, RandomizationConfig
 from bounce_mjx.world.sampling import nominal_values, physics_parameters, sample_world

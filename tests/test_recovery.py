@@ -151,7 +151,7 @@ def test_killed_at_any_moment(tmp_path: Path, straight: Path) -> None:
 
     def steps_saved() -> int:
         """Environment steps of the latest complete checkpoint."""
-        stored = (x.steps for run in log_dir.glob("*") for x in stored_checkpoints(run))
+        stored = (x.number for run in log_dir.glob("*") for x in stored_checkpoints(run))
         return max(stored, default=0)
 
     def wait_until(happens: Callable[[], bool]) -> None:
@@ -178,8 +178,8 @@ def test_killed_at_any_moment(tmp_path: Path, straight: Path) -> None:
             (run,) = log_dir.glob("*")
             checkpoint = latest_checkpoint(run)
             arrays(checkpoint)
-            assert checkpoint.steps >= saved
-            saved = checkpoint.steps
+            assert checkpoint.number >= saved
+            saved = checkpoint.number
             args = ["--resume", str(run)]
         else:
             shutil.rmtree(log_dir, ignore_errors=True)
@@ -215,10 +215,10 @@ def test_a_reader_reads_the_next_checkpoint_where_a_training_replaces_one(run: P
     finally:
         ended.set()
         saver.join()
-    assert len({checkpoint.steps for checkpoint, _ in read}) > 1
+    assert len({checkpoint.number for checkpoint, _ in read}) > 1
     for checkpoint, marked in read:
-        if checkpoint.steps >= STEPS:
-            assert all((leaf == checkpoint.steps).all() for leaf in jax.tree.leaves(marked))
+        if checkpoint.number >= STEPS:
+            assert all((leaf == checkpoint.number).all() for leaf in jax.tree.leaves(marked))
 
 
 # Evaluations and logs

@@ -3,6 +3,7 @@
 import copy
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import mujoco
@@ -24,11 +25,12 @@ from bounce_mjx.commands import adopt as adopt_command
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.contacts import ContactChecker
 from bounce_mjx.resources import resource_path
+from bounce_mjx.robot.actuators import servo_settings
 from bounce_mjx.robot.adopt import adopt, check_as_alone
 from bounce_mjx.robot.arm import build_arm, compile_spec, locate, naming, read_spec
 from bounce_mjx.robot.config import PaddleConfig, RobotConfig
 from bounce_mjx.robot.model import data_at, find_addresses, joint_names, load_model
-from bounce_mjx.robot.pose import mounts, place_paddle
+from bounce_mjx.robot.pose import clearance, mounts, place_paddle
 from bounce_mjx.runs.settings import read_preset
 from random_worlds import random_parameters
 
@@ -53,6 +55,13 @@ MIMIC = '<joint joint1="left" joint2="right"/>'
 GRIP = '<fixed name="grip"><joint joint="left" coef="1"/><joint joint="right" coef="1"/></fixed>'
 BELT = '<fixed name="{}"><joint joint="j2" coef="1"/><joint joint="j3" coef="-1"/></fixed>'
 
+# A rod beside the arm, and what holds its forearm to it.
+ROD = '<body name="rod" pos="0.5 0 0.2">{}<geom size=".02" mass=".1"/></body>'
+FOREARM = arm().replace(
+    'pos="0 0 0.3"><joint name="j4"', 'name="forearm" pos="0 0 0.3"><joint name="j4"'
+)
+HOLD = '<equality><connect body1="rod" body2="forearm" anchor="0 0 0"/></equality>'
+
 BROKEN = {
     "two joints": (TWO_JOINTS, "tool", "too few joints", "2 (a, b)"),
     "two arms": (
@@ -75,6 +84,27 @@ BROKEN = {
         "the range -3 to 3 of j1",
         "reaches 90 to 180",
         "ctrlrange",
+    ),
+    "a muscle": (
+        mjcf(arm(), '<muscle joint="j1" lengthrange="0 1"/>' + motors("j2 j3 j4 j5 j6")),
+        "tool",
+        "a muscle on j1",
+        "both ways",
+    ),
+    "a damper": (
+        mjcf(arm(), '<damper joint="j1" kv="3" ctrlrange="0 1"/>' + motors("j2 j3 j4 j5 j6")),
+        "tool",
+        "a damper on j1",
+        "both ways",
+    ),
+    "a gain that is not fixed": (
+        mjcf(
+            arm(),
+            '<general joint="j1" gaintype="affine" gainprm="5 1"/>' + motors("j2 j3 j4 j5 j6"),
+        ),
+        "tool",
+        "an actuator on j1 whose strength follows from more than its control",
+        "forcerange",
     ),
     "missing mesh": (
         mjcf(
@@ -107,6 +137,11 @@ BROKEN = {
         ),
         "tool",
         "the unnamed tendon (j2, j3) on the arm",
+    ),
+    "a rod from the world to the arm": (
+        mjcf(ROD.format('<joint axis="0 1 0"/>') + FOREARM, motors(ARM_JOINTS), HOLD),
+        "tool",
+        "unnamed equality constraint (connect: rod, forearm) on the arm",
     ),
     "loop after a gripper's constraint": (
         mjcf(
@@ -383,6 +418,62 @@ def test_an_adopted_arm_moves_as_its_file(style, tmp_path) -> None:
             mujoco.mj_forward(m, data)
             accelerations.append([data.joint(name).qacc[0] for name in names])
         np.testing.assert_allclose(*accelerations, rtol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "rod", [ROD.format("<freejoint/>"), ROD.format("").replace("pos", 'mocap="true" pos')]
+)
+def test_what_held_the_arm_to_a_loose_object_is_named(rod, tmp_path) -> None:
+    """It goes with the object, and the arm moves otherwise."""
+    (tmp_path / "arm.xml").write_text(mjcf(rod + FOREARM, motors(ARM_JOINTS), HOLD))
+    changes = build_arm(tmp_path / "arm.xml", RobotConfig(site="tool")).changes
+    held = "couples the arm with these: unnamed equality constraint (connect: rod, forearm)"
+    assert any(held in change for change in changes)
+
+
+def test_each_shape_that_touches_counts_whatever_its_group(tmp_path) -> None:
+    """A link has a picture where some of its shapes touch and others do not. A file that hides a
+    shape itself (group 3) makes no pictures of the others."""
+    clearances = []
+    for group in (0, 3):
+        hidden = f'<geom size=".01" group="{group}" pos="0 0 .1"/>'
+        wall = f'<geom type="box" size=".5 .5 .1" pos="0 0 1.8"/>{hidden}'
+        (tmp_path / "arm.xml").write_text(mjcf(wall + arm(tip=hidden), motors(ARM_JOINTS)))
+        config = RobotConfig.model_validate({"site": "tool", "paddle": {"position": (0, 0, 0.6)}})
+        model = compile_spec(build_arm(tmp_path / "arm.xml", config).spec, tmp_path)
+        pose = SimpleNamespace(angles=[0.0] * 6, mount=config.paddle)
+        clearances.append(clearance(model, find_addresses(model), pose))
+    assert clearances[0] == clearances[1] < 0.2
+
+
+MOTORS = {
+    "motor": ('gear="10"', True),
+    "bias of 0": ('gear="10" biastype="affine"', True),
+    "delayed": ('gear="10" dyntype="filter" dynprm="0.01"', True),
+    "integrator": ('gear="10" dyntype="integrator"', False),
+    "integrator of a range": ('gear="10" dyntype="integrator" actrange="-2 4"', True),
+}
+
+
+@pytest.mark.parametrize("motor", MOTORS)
+def test_the_force_limit_of_a_motor_is_what_it_exerts(motor) -> None:
+    """In both directions; an integrator adds up its control, so the control's range is no limit."""
+    attributes, has_limit = MOTORS[motor]
+    general = f'<general joint="j1" gainprm="5" ctrlrange="-2 4" {attributes}/>'
+    hub = f'<body>{hinge("j1", "0 0 1")}<geom size="1" mass="1e6"/></body>'
+    model = mujoco.MjModel.from_xml_string(mjcf(hub, general))
+    exerted = []
+    for control in (-2.0, 4.0):
+        data = mujoco.MjData(model)
+        data.ctrl[0] = control
+        mujoco.mj_step(model, data, 2000)
+        exerted.append(abs(data.qfrc_actuator[0]))
+    limit = servo_settings(model, 0, 0).force_limit
+    if has_limit:
+        np.testing.assert_allclose(limit, min(exerted), rtol=1e-6)
+    else:
+        assert limit is None
+        assert min(exerted) > 3.0 * 5.0 * 10.0
 
 
 def test_names_of_the_scene_may_be_those_of_the_arm(tmp_path) -> None:

@@ -218,6 +218,31 @@ def test_every_condition_gets_its_own_ranges_and_outcome(tmp_path: Path, monkeyp
     ]
 
 
+def test_each_condition_is_judged_as_an_evaluation_in_its_own_world(tmp_path, monkeypatch) -> None:
+    """Also where the task's bounds depend on the world, and conditions share a program: an error of
+    1.2 cm is within balance's bound with pushes, and beyond the one without."""
+    trained = find_task("balance").Config()
+    pushed = dict(
+        name="pushed", strengths=[0.1, 0], terms={"push_speed": "strength", "push_interval": 2}
+    )
+    content = {"perturbations": [pushed, dict(name="all", trained_ranges=True)]}
+    (tmp_path / "suite.yaml").write_text(yaml.safe_dump(content))
+    conditions = load_suite(tmp_path / "suite.yaml", trained)
+    # Not the pushes that the task's own world has.
+    assert conditions[0].ranges.keys() == trained.commands.keys()
+
+    def make_evaluator(env, networks, count):
+        sums = {"steps": np.ones(count), "squares": np.full(count, 0.012**2)}
+        ones = np.ones(count)
+        measured = Statistics(ones > 0, 2000.0 * ones, ones, Tally(sums))
+        return lambda policy, key, ranges: (measured, None)
+
+    monkeypatch.setattr(robustness, "make_evaluator", make_evaluator)
+    outcomes = measure_conditions(None, lambda env: None, conditions, EvaluationOptions(4))
+    assert [outcome.label for outcome in outcomes] == ["nominal", "pushed 0.1", "pushed 0", "all"]
+    assert [outcome.failed for outcome in outcomes] == [["error"], [], ["error"], []]
+
+
 def outcome(name: str, strength: float | None = None, **changes) -> ConditionOutcome:
     values = dict(zip(RESULTS, (100.0, 99.0, 98.0, 1.4, 100.0), strict=True))
     given = dict(

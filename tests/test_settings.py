@@ -195,7 +195,7 @@ def test_a_whole_config_stands_alone_below_what_python_says() -> None:
         ({"nonsense": 5}, "train: unknown key nonsense; known keys here are"),
         ({"num_env": 5}, "train: unknown key num_env; did you mean ppo.num_envs?"),
         ({"task": "catch"}, "the config is of the task bounce, and task is catch; leave it out"),
-        ({"resume": "somewhere"}, "--config and --resume cannot be combined"),
+        ({"resume": "somewhere"}, "config and resume cannot be combined"),
         ({"num_envs": 0}, "train: ppo.num_envs is 0, but must be greater than or equal to 1"),
     ):
         with pytest.raises(UserError) as caught:

@@ -164,10 +164,18 @@ NOMINAL = {slider.term: slider.world_value(slider.nominal) for slider in SLIDERS
 def test_a_slider_reaches_every_value_that_a_reset_samples() -> None:
     own = RandomizationConfig(action_latency=(0.0, 0.08), paddle_tilt=((-0.1, 0.0), (0.02, 0.2)))
     config = with_sliders(BounceConfig(randomization=own))
-    spans = {slider.term: slider.span for slider in sliders_for(config.randomization)}
+    spans = {slider.term: slider.span for slider in sliders_for(config)}
     assert spans["action_latency"] == pytest.approx((0.0, 0.08))
     assert spans["paddle_tilt"] == pytest.approx((-0.1, 0.2))
     assert spans["restitution"] == (0.6, 0.98)
+
+
+def test_another_model_has_no_slider_for_a_restitution() -> None:
+    """Its nominal one is unknown, whatever its own randomisation says."""
+    own = RandomizationConfig(restitution=(0.5, 0.98))
+    config = BounceConfig(mjcf=Path("scene.xml"), randomization=own)
+    terms = {slider.term for slider in sliders_for(with_sliders(config))}
+    assert terms == {slider.term for slider in SLIDERS} - {"restitution"}
 
 
 @pytest.mark.slow

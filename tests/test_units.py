@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import jax
 import numpy as np
+import pydantic
 import pytest
 import yaml
 
@@ -263,6 +264,15 @@ def test_a_mistyped_name_in_a_task_is_one_sentence(wrong: str, reason: str, monk
     monkeypatch.setattr(Mistyped, "wrong", wrong)
     with pytest.raises(UserError, match=reason):
         jax.eval_shape(env.reset, jax.random.key(0))
+
+
+def test_a_term_that_may_be_none_is_refused() -> None:
+    """It would be left out of the reward in silence."""
+    group = pydantic.create_model(
+        "Terms", __base__=task.StrictModel, low=(task.Near | None, task.Near())
+    )
+    with pytest.raises(UserError, match="^low in Terms may be a term of the reward or something"):
+        task.weighted_terms(group(), 0.0)
 
 
 def test_a_task_has_its_own_config() -> None:

@@ -89,6 +89,12 @@ def test_evaluations_are_filmed_for_tensorboard(opengl, tmp_path: Path) -> None:
     good, still = np.array(videos)
     assert np.abs(good[-1] - good[0]).max() > 50
     assert np.abs(good[-1] - still[-1]).max() > 50
+    # What a killed training filmed after its checkpoint does not count.
+    resumed = EvaluationVideo(seconds=0.6, size=(64, 48), fps=10)
+    resumed._simulation = film._simulation
+    resumed(Event(tmp_path, config, 96, {}, policy=blind))
+    log = EventAccumulator(str(tmp_path / "video")).Reload()
+    assert [event.step for event in log.Images("policy")] == [64, 96]
 
 
 VIDEOS = {

@@ -20,8 +20,12 @@ from websockets.typing import Subprotocol
 
 from bounce_mjx import BounceBall, EnvConfig, task
 from bounce_mjx.baselines.mirror import MirrorLaw
+from bounce_mjx.evaluation.failures import Film
 from bounce_mjx.evaluation.results import Report, Result
+from bounce_mjx.evaluation.statistics import Statistics
+from bounce_mjx.task.task import Recording, Tally
 from bounce_mjx.viewers import show
+from bounce_mjx.viewers.film import FilmPlayer
 from bounce_mjx.viewers.options import PageStart, ViewerOptions
 from bounce_mjx.viewers.simulation import EnvFrame, Simulation, make_policy_controller
 from bounce_mjx.world.config import WorldConfig
@@ -67,6 +71,22 @@ def _exchangeable() -> Simulation:
     return Simulation(env, controller, 2, seed=0, policy=np.float32(0.0))
 
 
+def film_of(simulation: Simulation, steps: int) -> FilmPlayer:
+    """A film of the next steps of a simulation's first robot."""
+    frames = simulation.record(steps * simulation.env.dt)
+    recording = Recording(
+        joint_angles=None,
+        ball=None,
+        paddle=frames.paddle[1:, :1].transpose(0, 2, 1),
+        command={name: values[1:, :1] for name, values in frames.command.items()},
+        running=np.ones((steps, 1), bool),
+        qpos=frames.qpos[1:, :1].transpose(0, 2, 1),
+        metrics={name: values[1:, :1] for name, values in frames.metrics.items()},
+    )
+    statistics = Statistics(np.ones(1, bool), np.full(1, steps), np.zeros(1), Tally({}, {}))
+    return FilmPlayer(Film(simulation.env, recording, statistics))
+
+
 class Client:
     """A client of the page that speaks viser's protocol but is not a browser."""
 
@@ -84,6 +104,11 @@ class Client:
         self.sliders: dict[str, tuple[float, float, float]] = {}
         self.lines: list[str] = []
         self.height_axis: object = None
+        self.values: dict[str, object] = {}
+
+    def has(self, label: str) -> bool:
+        """Whether a control or a key's command of this label has come so far."""
+        return label in self._controls
 
     def control(self, label: str) -> str:
         """The identifier of a control or of a key's command, by its label."""
@@ -114,6 +139,8 @@ class Client:
                 self.height_axis = props["scales"]["y"]["range"]
             updates = message.get("updates", {})
             self.texts += [part["content"] for part in (props, updates) if "content" in part]
+            if "value" in updates:
+                self.values[message["uuid"]] = updates["value"]
             if "text" in updates:
                 self._labels.append(updates["text"])
 
@@ -152,7 +179,7 @@ def served(simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> Iterator[
         if ended.is_set():
             raise KeyboardInterrupt
 
-    watch(monkeypatch, Simulation, "step", step)
+    watch(monkeypatch, type(simulation), "step", step)
 
     def serve() -> None:
         try:
@@ -166,10 +193,13 @@ def served(simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> Iterator[
     while "viewer" not in printed.getvalue():
         assert server.is_alive(), failures
         time.sleep(0.05)
-    yield Client(re.search(r"http://\S+", printed.getvalue())[0])
-    assert server.is_alive(), failures
-    ended.set()
-    server.join(PATIENCE)
+    try:
+        yield Client(re.search(r"http://\S+", printed.getvalue())[0])
+        assert server.is_alive(), failures
+    finally:
+        # Else a test that fails would never end.
+        ended.set()
+        server.join(PATIENCE)
     assert [type(failure) for failure in failures] == [KeyboardInterrupt], failures
 
 

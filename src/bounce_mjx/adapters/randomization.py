@@ -140,7 +140,8 @@ def _fields_of(model: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _equal(a: Any, b: Any) -> bool:
-    leaves, others = jax.tree.leaves(a), jax.tree.leaves(b)
+    leaves = jax.tree.leaves(a)
+    others = jax.tree.leaves(b)
     if any(isinstance(x, jax.core.Tracer) for x in leaves):
         return False
     return len(leaves) == len(others) and all(map(np.array_equal, leaves, others))

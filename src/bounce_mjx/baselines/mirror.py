@@ -19,8 +19,7 @@ import numpy as np
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
-from bounce_mjx.robot.geometry import upper_face
-from bounce_mjx.robot.model import data_at, scatter
+from bounce_mjx.robot.model import data_at, scatter, upper_face
 from bounce_mjx.world.config import WorldConfig
 
 # Restitution of the ball on the paddle.
@@ -42,8 +41,6 @@ _ITERATIONS = 4
 class _Impact(NamedTuple):
     """The next impact of a ball that flies freely until then."""
 
-    height: jax.Array
-    """Height of the ball over its place of contact now [], m."""
     arriving: jax.Array
     """Speed downward with which it arrives [], m/s."""
     leaving: jax.Array
@@ -154,7 +151,7 @@ class MirrorLaw:
         change = angles + speeds * self._lag + self._sag - start
         max_acceleration = config.robot.limits.acceleration
         if max_acceleration is not None:
-            # As fast as the joint can still stop at its target.
+            # As fast as the joint can still stop at its target, which itself moves on in the step.
             stopping_speed = jnp.sqrt(np.array(max_acceleration) * jnp.abs(change))
             stopping = config.control_dt * stopping_speed
             change = jnp.clip(change, -stopping, stopping) + config.control_dt * speeds
@@ -175,7 +172,8 @@ class MirrorLaw:
         impact = self._next_impact(ball, velocity, place, target)
         mirroring = (impact.leaving / impact.arriving - _RESTITUTION) / (1.0 + _RESTITUTION)
         mirroring = jnp.clip(mirroring, *_MIRRORING)
-        height = place[2] - mirroring * jnp.maximum(impact.height, -self._contact_distance)
+        ball_height = ball[2] - (place[2] + self._contact_distance)
+        height = place[2] - mirroring * jnp.maximum(ball_height, -self._contact_distance)
         centre = place[:2] + jnp.clip(impact.offset, -_MAX_DISTANCE, _MAX_DISTANCE)
         # The time of flight after the impact is 2 leaving / gravity.
         gravity = float(-self._gravity[2])
@@ -198,7 +196,7 @@ class MirrorLaw:
         arriving = jnp.where(height > 0.0, jnp.sqrt(squared_speed), leaving)
         time_of_flight = (velocity[2] + arriving) / gravity
         offset = ball[:2] + time_of_flight * velocity[:2] - place[:2]
-        return _Impact(height, arriving, leaving, offset)
+        return _Impact(arriving, leaving, offset)
 
     def _pose(self, angles: jax.Array) -> jax.Array:
         """Forward kinematics [5] of joint angles [n], as `_paddle`."""

@@ -52,7 +52,7 @@ class EvalCommand(WhichPolicy):
     package, here."""
     physics: evaluation.Physics = "config"
     """Physics engine: mujoco is MuJoCo's C engine; config is the engine used in training."""
-    json_file: Annotated[Path | None, Flag(name="json")] = None
+    json_file: Annotated[Path | None, Flag(name="json", instead_of="--out")] = None
     """File to write the results to."""
 
 

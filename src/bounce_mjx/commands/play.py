@@ -67,6 +67,8 @@ def main(args: Sequence[str]) -> None:
     if len(command.checkpoints) > MAX_ENVS:
         raise UserError(f"{len(command.checkpoints)} policies are given; give at most {MAX_ENVS}")
     check_one_world(command.nominal, command.world, command.randomization)
+    if "suite" in command.model_fields_set and command.condition is None:
+        raise UserError("--suite is that of a condition; add --condition, or omit --suite")
     if command.episode is None:
         flags = {"--nominal": command.nominal, "--episodes": command.episodes}
         flags |= {"--condition": command.condition}

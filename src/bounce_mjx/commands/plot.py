@@ -42,7 +42,7 @@ def main(args: Sequence[str]) -> None:
     drawn = {name: plot.draw(groups) for name, plot in figures.RUN_PLOTS.items()}
     if len(checkpoints) == 1:
         recording = page.record_checkpoint(checkpoints[0])
-        drawn["evaluation"] = figures.evaluation_figure(Env(configs[0].env), recording)
+        drawn[figures.EVALUATION] = figures.evaluation_figure(Env(configs[0].env), recording)
     for name, figure in drawn.items():
         for suffix in command.formats:
             path = command.out / f"{name}.{suffix}"

@@ -60,6 +60,8 @@ def main(args: Sequence[str]) -> None:
 
     if command.assumed and command.world is None:
         raise UserError("--assumed needs a named world; give one with --world, or leave it out")
+    if command.assumed and "suite" in command.model_fields_set:
+        raise UserError("--assumed leaves the suite out; omit --suite, or --assumed")
     console = stdout()
     checkpoint = command.choose(command.checkpoint, command.robot)
     config = command.config_of(checkpoint, command.robot)

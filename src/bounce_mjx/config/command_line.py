@@ -33,6 +33,8 @@ class Flag(NamedTuple):
     """Whether the value has no flag."""
     is_repeated: bool = False
     """Whether the flag may come several times, each with one of the values."""
+    instead_of: str | None = None
+    """A flag of other commands for which this command has this one, such as --out: for an error."""
 
 
 def stdout(**options: Any) -> Console:
@@ -144,15 +146,22 @@ def read_flags(
     words = [re.sub(r"^(--.+)=true$", r"\1", word, flags=re.I) for word in words]
     given, unknown = parser.parse_known_intermixed_args(words)
     if unknown and not is_first:
-        flag = unknown[0].partition("=")[0]
-        advice = "; ".join(filter(None, [unknown[0], suggest(flag, flags_of(fields))]))
-        parser.error(f"unknown argument {advice}")
+        advice = _near_flag(unknown[0].partition("=")[0], fields)
+        parser.error(f"unknown argument {unknown[0]}" + (advice and f"; {advice}"))
     values = {}
     for key, value in vars(given).items():
         values[key] = _plain(fields[key].annotation, value)
         if isinstance(values[key], list) and dict in types_in(fields[key].annotation):
             values[key] = _pairs(values[key], flag_names(fields)[key], parser)
     return values
+
+
+def _near_flag(word: str, fields: Mapping[str, FieldInfo]) -> str:
+    """A question about the flag that an unknown word may stand for; empty if none is near."""
+    stand_ins = {_mark(field).instead_of: key for key, field in fields.items()}
+    if word in stand_ins:
+        return f"did you mean {flag_names(fields)[stand_ins[word]]}?"
+    return suggest(word, flags_of(fields))
 
 
 def _pairs(words: list[str | None], flag: str, parser: "_Parser") -> dict[str | None, str | None]:

@@ -29,7 +29,8 @@ from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import RandomizationConfig
 
 ONNX = ".onnx"
-NOMINAL, TRAINING = "nominal", "training"
+NOMINAL = "nominal"
+TRAINING = "training"
 """Worlds of a policy: the model's own, and those that its training sampled."""
 
 # Wrappers of Gymnasium and SB3 after which the numbers are no longer the environment's own.
@@ -68,12 +69,12 @@ def environment_config(
         if world is not None:
             raise UserError(f"{title}: world is that of a policy, and none is given; give policy")
         return validate(task_config(task or DEFAULT), settings, title)
-    given = {
-        key: value.model_dump() if isinstance(value, pydantic.BaseModel) else value
-        for key, value in settings.items()
-    }
-    trained = policy_environment(policy, task, world, given.get("mjcf"))
-    config = validate(type(trained), merged(trained.model_dump(), given), title)
+    on_top = {}
+    for key, value in settings.items():
+        is_group = isinstance(value, pydantic.BaseModel)
+        on_top[key] = value.model_dump() if is_group else value
+    trained = policy_environment(policy, task, world, on_top.get("mjcf"))
+    config = validate(type(trained), merged(trained.model_dump(), on_top), title)
     check_interface(
         interface_of(trained),
         interface_of(config),
@@ -115,17 +116,19 @@ def policy_environment(
         advice = suggest(str(policy), POLICIES)
         advice = advice or f"give {', '.join(POLICIES)}, a run's folder or an .onnx file"
         raise UserError(f"there is no policy {shorten(str(policy))}; {advice}")
-    name = None if task is None else task if isinstance(task, str) else task_name(task)
+    name = task
+    if task is not None and not isinstance(task, str):
+        name = task_name(task)
     its_file = name if name is not None and is_file(name) else None
     if path.suffix == ONNX:
         trained = _environment_in_file(path, its_file, mjcf)
     else:
         trained = load_run_config(find_run(path), its_file).env
-    own = task_name(trained.task)
-    if name is not None and not is_same_code(name, own):
+    name_of_policy = task_name(trained.task)
+    if name is not None and not is_same_code(name, name_of_policy):
         raise UserError(
-            f"the policy {policy} is of the task {own}, and the environment of the task {name}; "
-            "leave one of them out"
+            f"the policy {policy} is of the task {name_of_policy}, and the environment of the task "
+            f"{name}; leave one of them out"
         )
     if world not in (None, NOMINAL, TRAINING):
         return env_in_world(trained, Path(world))[0]
@@ -156,19 +159,22 @@ def environment_of(env: Any) -> Env:
                 f"{type(inner).__name__} changes the observations or the actions, and a policy "
                 "takes the environment's own; give the environment within it"
             )
-        parts = vars(inner) if hasattr(inner, "__dict__") else {}
-        task = getattr(type(inner), "task", None) or parts.get("task")
+        attributes = vars(inner) if hasattr(inner, "__dict__") else {}
+        task = getattr(type(inner), "task", None) or attributes.get("task")
         if isinstance(task, property):
             task = inner.task
-        names = ("env", "venv", "_env", "envs")
-        parts = [task, *(parts.get(name) for name in names)]
-        found = [part for part in parts if part is not None]
-        if not found:
+        held = [task]
+        for name in ("env", "venv", "_env", "envs"):
+            held.append(attributes.get(name))
+        held = [part for part in held if part is not None]
+        if not held:
             raise UserError(
                 f"{type(env).__name__} holds no environment of bounce_mjx; give one that its "
                 "adapters made, such as gymnasium.make('bounce_mjx/Task-v0', policy=...)"
             )
-        inner = found[0][0] if isinstance(found[0], list | tuple) else found[0]
+        inner = held[0]
+        if isinstance(inner, list | tuple):
+            inner = inner[0]
     return inner
 
 

@@ -34,11 +34,10 @@ from bounce_mjx.env.env import Env, State
 from bounce_mjx.errors import UserError, needed
 from bounce_mjx.evaluation.episodes import reset_episodes
 from bounce_mjx.learning.policy import make_networks
+from bounce_mjx.robot.actuators import largest_torques
 from bounce_mjx.robot.arm import joint_name
 from bounce_mjx.robot.config import is_packaged
-from bounce_mjx.robot.geometry import upper_face
-from bounce_mjx.robot.model import find_addresses, joint_names, load_model
-from bounce_mjx.robot.torques import largest_torques
+from bounce_mjx.robot.model import find_addresses, joint_names, load_model, upper_face
 from bounce_mjx.runs.checkpoints import read_actor
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import Checkpoint
@@ -297,37 +296,51 @@ def _control_step(
     inputs = {part.name: _floats(part.history, part.size) for part in _inputs(env)}
     if not of_task:
         return lambda histories: {"action": network(histories)}, inputs
-    rows = (env.num_balls,) if env.num_balls > 1 else ()
-    measured = {
-        name: _floats(*(rows if quantity.per_ball else ()), quantity.entries(env.num_joints, 1))
-        for name, quantity in ObservationConfig.quantities().items()
-    }
-    measured |= dict.fromkeys(env.commands, _floats(1))
-    measured["ball_picture"] = measured["ball_position"]
-    leaves, tree = jax.tree.flatten_with_path(jax.eval_shape(task.first_quantities, measured)[0])
-    memory = {
-        f"memory/{jax.tree_util.keystr(path, simple=True, separator='/')}": leaf
-        for path, leaf in leaves
-    }
 
-    def control_step(rows: dict[str, jax.Array]) -> dict[str, jax.Array]:
-        values = {
-            name: rows[f"{MEASURED}{name}"].reshape(shaped.shape)
-            for name, shaped in measured.items()
-        }
-        past = {name: rows[name] for name in of_task}
-        before = tree.unflatten([rows[name] for name in memory])
-        start, first = task.first_quantities(values)
-        after, later = task.next_quantities(before, past, values)
-        first = {name: jnp.broadcast_to(first[name], past[name].shape) for name in of_task}
+    measured = _measured_shapes(env)
+    memory_shapes, _ = jax.eval_shape(task.first_quantities, measured)
+    leaves, structure = jax.tree.flatten_with_path(memory_shapes)
+    memory = {}
+    for path, leaf in leaves:
+        place = jax.tree_util.keystr(path, simple=True, separator="/")
+        memory[f"memory/{place}"] = leaf
+
+    def control_step(arrays: dict[str, jax.Array]) -> dict[str, jax.Array]:
+        values = {}
+        for name, shaped in measured.items():
+            values[name] = arrays[MEASURED + name].reshape(shaped.shape)
+        past = {name: arrays[name] for name in of_task}
+        before = structure.unflatten([arrays[name] for name in memory])
+
+        # At the first control step, a history is full of the first value.
+        memory_at_first, first = task.first_quantities(values)
+        memory_later, later = task.next_quantities(before, past, values)
+        at_first = {name: jnp.broadcast_to(first[name], past[name].shape) for name in of_task}
         remembered, seen = jax.tree.map(
-            lambda new, next_one: jnp.where(rows[IS_FIRST], new, next_one),
-            (start, first),
-            (after, {name: later[name] for name in of_task}),
+            lambda at_first, later: jnp.where(arrays[IS_FIRST], at_first, later),
+            (memory_at_first, at_first),
+            (memory_later, {name: later[name] for name in of_task}),
         )
-        kept = seen | dict(zip(memory, jax.tree.leaves(remembered), strict=True))
-        action = {"action": network(rows | seen)}
-        return action | {f"{NEXT}{name}": value for name, value in kept.items()}
+        outputs = {"action": network(arrays | seen)}
+        for name, history in seen.items():
+            outputs[NEXT + name] = history
+        for name, leaf in zip(memory, jax.tree.leaves(remembered), strict=True):
+            outputs[NEXT + name] = leaf
+        return outputs
 
-    inputs |= {f"{MEASURED}{n}": _floats(x.size) for n, x in measured.items()}
+    for name, shaped in measured.items():
+        inputs[MEASURED + name] = _floats(shaped.size)
     return control_step, inputs | memory | {IS_FIRST: jax.ShapeDtypeStruct((), bool)}
+
+
+def _measured_shapes(env: WorldConfig) -> dict[str, jax.ShapeDtypeStruct]:
+    """Shapes of what a task may compute its quantities from: the measurements and the commands."""
+    measured = {}
+    for name, quantity in ObservationConfig.quantities().items():
+        size = quantity.entries(env.num_joints, 1)
+        has_rows = quantity.per_ball and env.num_balls > 1
+        measured[name] = _floats(env.num_balls, size) if has_rows else _floats(size)
+    for name in env.commands:
+        measured[name] = _floats(1)
+    measured["ball_picture"] = measured["ball_position"]
+    return measured

@@ -64,7 +64,8 @@ def arm_responses(metadata: Metadata) -> np.ndarray:
     slower = largest_term(metadata, "servo_damping", 1.0) / least_term(metadata, "servo_gain", 1.0)
     slowest = lag * slower + largest_term(metadata, "servo_lag")
     latencies = np.arange(0.0, latency + _LATER + 1e-9, _APART) / dt
-    lags = [_NO_LAG, *np.linspace(lag, slowest, 3 if slowest > 1.5 * lag else 1)]
+    num_lags = 3 if slowest > 1.5 * lag else 1
+    lags = np.concatenate([[_NO_LAG], np.linspace(lag, slowest, num_lags)])
     length = math.ceil(latencies[-1] + 4.0 * slowest / dt) + 1
     steps = np.arange(length)
     responses = []
@@ -182,16 +183,17 @@ class Watch:
     ) -> Iterator[Fault]:
         """The faults in the newest picture of the balls [B, 3], whose age may not be known."""
         if not self._pictures or np.any(balls != self._pictures[-1][0]):
-            self._pictures = [*self._pictures[-_EARLIER:], (balls, self._time - (age or 0.0))]
+            taken = self._time - (age or 0.0)
+            self._pictures = self._pictures[-_EARLIER:] + [(balls, taken)]
         seen = self._pictures
         # A ball in flight that does not move is an old picture, whatever its age is said to be.
         if age is None or np.max(balls[:, 2]) > paddle[2] + _FLYING:
             age = max(self._time - seen[-1][1], age or 0.0)
         if not -_SYNCHRONOUS <= age <= self._max_age:
             yield "old_picture", f"the picture of the ball is {1e3 * age:.0f} ms old"
-        beside, before = (
-            np.linalg.norm((picture - paddle)[:, :2], axis=1) for picture in (balls, seen[0][0])
-        )
+        earliest_balls, _ = seen[0]
+        beside = np.linalg.norm((balls - paddle)[:, :2], axis=1)
+        before = np.linalg.norm((earliest_balls - paddle)[:, :2], axis=1)
         leaves = (beside > _BESIDE) & (beside >= before) & (len(seen) > _EARLIER)
         if np.any((paddle[2] - balls[:, 2] > _BELOW) | leaves):
             yield "ball_lost", "the ball is lost"

@@ -88,16 +88,16 @@ def onnx_graph(
     results = graph.run(closed.jaxpr, closed.consts, sorted(inputs))
     for name, result in zip(sorted(outputs), results, strict=True):
         graph.node("Identity", result, output=name)
-    used = {name for node in graph.nodes for name in node.input}
-    tensors = [
-        [
-            graph.helper.make_tensor_value_info(name, graph.code(row.dtype), ["N", *row.shape])
-            for name, row in group.items()
-        ]
-        for group in ({name: inputs[name] for name in inputs if name in used}, outputs)
-    ]
-    constants = list(graph.constants.values())
-    return graph.helper.make_graph(graph.nodes, "policy", *tensors, constants)
+    used: set[str] = set()
+    for node in graph.nodes:
+        used.update(node.input)
+    return graph.helper.make_graph(
+        graph.nodes,
+        "policy",
+        inputs=[graph.tensor(name, row) for name, row in inputs.items() if name in used],
+        outputs=[graph.tensor(name, row) for name, row in outputs.items()],
+        initializer=list(graph.constants.values()),
+    )
 
 
 def _axes(equation: JaxprEqn) -> list[int]:
@@ -131,8 +131,11 @@ def _sources(equation: JaxprEqn, indices: Mapping[int, np.ndarray]) -> tuple[lis
 def _evaluate(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
     """The results of an operation on constants, also within a trace."""
     with jax.ensure_compile_time_eval():
-        results = equation.primitive.bind(*map(jax.numpy.asarray, operands), **equation.params)
-    return [np.asarray(r) for r in (results if equation.primitive.multiple_results else [results])]
+        arrays = map(jax.numpy.asarray, operands)
+        results = equation.primitive.bind(*arrays, **equation.params)
+    if not equation.primitive.multiple_results:
+        return [np.asarray(results)]
+    return list(map(np.asarray, results))
 
 
 class _Graph:
@@ -174,7 +177,9 @@ class _Graph:
         types, counterpart = _OPERATIONS.get(name, ("", ""))
         if not {atom.aval.dtype for atom in atoms} <= {_TYPES[letter] for letter in types}:
             self._refuse(equation)
-        aligned = [self._align(*pair, equation) for pair in zip(operands, atoms, strict=True)]
+        aligned = []
+        for operand, atom in zip(operands, atoms, strict=True):
+            aligned.append(self._align(operand, atom, equation))
         if isinstance(counterpart, str):
             return [self.node(counterpart, *aligned)]
         return [counterpart(self, equation, *aligned)]
@@ -231,8 +236,8 @@ class _Graph:
         """Name of a node's output."""
         output = output or f"{kind}_{len(self.nodes)}"
         names = [value if isinstance(value, str) else self._constant(value) for value in inputs]
-        made = self.helper.make_node(kind, names, [output], name=output, **attributes)
-        self.nodes.append(made)
+        node = self.helper.make_node(kind, names, [output], name=output, **attributes)
+        self.nodes.append(node)
         return output
 
     def _constant(self, value: np.ndarray) -> str:
@@ -241,6 +246,10 @@ class _Graph:
             name = f"constant_{len(self.constants)}"
             self.constants[key] = self._from_array(np.array(value), name)
         return self.constants[key].name
+
+    def tensor(self, name: str, row: jax.ShapeDtypeStruct) -> Any:
+        """ONNX's description of an input or an output: any number of rows."""
+        return self.helper.make_tensor_value_info(name, self.code(row.dtype), ["N", *row.shape])
 
     def cast(self, x: Value, dtype: Any) -> str:
         """An array as another type."""

@@ -221,8 +221,10 @@ def to_entries(metadata: Metadata) -> dict[str, str]:
 def from_entries(entries: dict[str, str]) -> Metadata:
     """Metadata from the entries of `to_entries`; ValueError for another format."""
     # A file of another format lacks entries too, but the format is the reason.
-    if "format" in entries and (given := json.loads(entries["format"])) != FORMAT:
-        raise ValueError(f"its format is {given}, not {FORMAT}; export the policy again")
+    if "format" in entries:
+        file_format = json.loads(entries["format"])
+        if file_format != FORMAT:
+            raise ValueError(f"its format is {file_format}, not {FORMAT}; export the policy again")
     later = Metadata._field_defaults
     missing = [name for name in Metadata._fields if name not in entries and name not in later]
     if missing:
@@ -254,7 +256,7 @@ def in_driver_order(metadata: Metadata, names: Sequence[str], order: Sequence[in
 
     limits = metadata.limits
     if limits is not None:
-        limits = CommandLimits(*(None if x is None else ordered(x) for x in limits))
+        limits = CommandLimits._make(None if x is None else ordered(x) for x in limits)
     per_joint = {name: ordered(getattr(metadata, name)) for name in _PER_JOINT}
     chain = tuple(link._replace(joint=list(order).index(link.joint)) for link in metadata.chain)
     return metadata._replace(joint_names=tuple(names), limits=limits, chain=chain, **per_joint)

@@ -108,9 +108,13 @@ def paddle_position(metadata: Metadata, joint_angles: np.ndarray) -> np.ndarray:
     Rodrigues' formula for the hinges' rotations."""
     joints = [link.joint for link in metadata.chain]
     turned = joint_angles[..., joints] - [link.reference for link in metadata.chain]
-    # One number for each hinge, or one array of a batch. Python's numbers are the fastest for one.
-    numbers = (np.moveaxis(f(turned), -1, 0) for f in (np.cos, np.sin))
-    cosines, sines = (x.tolist() if x.ndim == 1 else x for x in numbers)
+    # One number for each hinge, or one array of a batch.
+    cosines = np.moveaxis(np.cos(turned), -1, 0)
+    sines = np.moveaxis(np.sin(turned), -1, 0)
+    if turned.ndim == 1:
+        # Python's numbers are the fastest.
+        cosines = cosines.tolist()
+        sines = sines.tolist()
     x, y, z = metadata.paddle
     for i in reversed(range(len(joints))):
         a, b, c = metadata.chain[i].axis

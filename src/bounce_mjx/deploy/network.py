@@ -38,21 +38,21 @@ class OnnxNetwork:
         )
         entries = self._session.get_modelmeta().custom_metadata_map
         self.metadata: Metadata = from_entries(entries)
-        self._inputs = {i.name: i for i in self._session.get_inputs()}
-        self._remembered = {
-            output.name.removeprefix(NEXT): np.zeros((1, *output.shape[1:]), _TYPES[output.type])
-            for output in self._session.get_outputs()
-            if output.name != "action"
-        }
-        self._outputs = ["action", *(f"{NEXT}{name}" for name in self._remembered)]
-        self._sizes = {
-            part.name: (part.history, part.size)
-            for part in self.metadata.observation
-            if part.name not in self._remembered
-        }
-        self._measured = [
-            name.removeprefix(MEASURED) for name in self._inputs if name.startswith(MEASURED)
-        ]
+        self._inputs = {entry.name: entry for entry in self._session.get_inputs()}
+        self._outputs = ["action"]
+        self._remembered = {}
+        for output in self._session.get_outputs():
+            if output.name != "action":
+                self._outputs.append(output.name)
+                self._remembered[output.name.removeprefix(NEXT)] = _zeros(output)
+        self._sizes = {}
+        for part in self.metadata.observation:
+            if part.name not in self._remembered:
+                self._sizes[part.name] = (part.history, part.size)
+        self._measured = []
+        for name in self._inputs:
+            if name.startswith(MEASURED):
+                self._measured.append(name.removeprefix(MEASURED))
         self.reads = {*self._measured, *self._sizes}
         """Names of the quantities that the action depends on."""
         self._order: np.ndarray | None = None
@@ -71,11 +71,10 @@ class OnnxNetwork:
         self._is_first = True
         self._memory = self._remembered
         self._histories = {name: np.zeros(size) for name, size in self._sizes.items()}
-        self._rows = {
-            name: np.zeros((1, *row.shape[1:]), _TYPES[row.type])
-            for name, row in self._inputs.items()
-            if name not in self._memory
-        }
+        self._rows = {}
+        for name, entry in self._inputs.items():
+            if name not in self._memory:
+                self._rows[name] = _zeros(entry)
         balls = np.zeros(3 * self.metadata.num_balls)
         self._picture: tuple[np.ndarray, np.ndarray, float] | None = None
         self._unknown = {
@@ -165,3 +164,8 @@ class OnnxNetwork:
             last_position = position
         self._picture = last_position, velocity, age
         return velocity
+
+
+def _zeros(entry: Any) -> np.ndarray:
+    """One row of an input or an output of the graph, filled with 0."""
+    return np.zeros((1, *entry.shape[1:]), _TYPES[entry.type])

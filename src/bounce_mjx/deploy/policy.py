@@ -114,7 +114,8 @@ class DeployedPolicy:
                 f"an observation has no {', '.join(missing)}, which this policy measures; use "
                 "Run(...).policy_in(env)"
             )
-        self._places, self._observation_size = dict(places), size
+        self._places = dict(places)
+        self._observation_size = size
 
     def reset(self, targets: np.ndarray | None = None) -> None:
         """Forgets the past. The next step fills the whole history with its measurements.
@@ -199,12 +200,10 @@ class DeployedPolicy:
             last = angles if self.motion.end is None else self.motion.end.position
             measured = measured | {"servo_lead": last - angles}
         for left in reversed(range(steps)):
-            between = measured
-            if left:
-                between = {
-                    name: value + left / steps * (self._measured.get(name, value) - value)
-                    for name, value in measured.items()
-                }
+            between = {}
+            for name, value in measured.items():
+                earlier = self._measured.get(name, value)
+                between[name] = value + left / steps * (earlier - value) if left else value
             action = self._network.step(between, self._action)
         self._measured = measured
         self._action = action
@@ -295,14 +294,15 @@ class DeployedPolicy:
         return self._network.observation
 
     def _needs(self) -> tuple[str, ...]:
+        """The measurements of which the network's inputs are made, but those with a default."""
         reads = self._network.reads
         optional = ("ball_quaternion", "ball_angular_velocity")
-        users = {name: {name} for name in self.units if name not in optional}
-        users["joint_angles"] |= {"paddle_position", "servo_lead"}
-        users["ball_position"].add("ball_picture")
+        inputs_of = {name: {name} for name in self.units if name not in optional}
+        inputs_of["joint_angles"] |= {"paddle_position", "servo_lead"}
+        inputs_of["ball_position"].add("ball_picture")
         if self.metadata.velocity != "measured":
-            users["ball_position"] |= users.pop("ball_velocity")
-        return tuple(name for name in users if users[name] & reads)
+            inputs_of["ball_position"] |= inputs_of.pop("ball_velocity")
+        return tuple(name for name, inputs in inputs_of.items() if inputs & reads)
 
     def check(
         self, measurements: Mapping[str, Any], needs: Sequence[str] | None = None

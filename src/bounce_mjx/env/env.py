@@ -23,8 +23,6 @@ from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, edited_
 from bounce_mjx.physics.engine import Engine, make_engine
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
 from bounce_mjx.robot import model as robot_model
-from bounce_mjx.robot.balls import BALLS_APART
-from bounce_mjx.robot.geometry import read_geometry
 from bounce_mjx.task.rewards import check_names
 from bounce_mjx.task.task import Start, Step, Task, TaskStep
 from bounce_mjx.world import noise
@@ -59,7 +57,7 @@ class Redraw(NamedTuple):
     """What later samples of the commands within an episode need."""
 
     age: jax.Array
-    """Time since the commands were sampled [], s."""
+    """Time since the commands were sampled [], s (an evaluation's `Moment.command_seconds`)."""
     ranges: dict[str, tuple[jax.Array, jax.Array]]
     """The range of each command."""
 
@@ -144,7 +142,8 @@ class Env:
             for the model's own.
 
         Raises:
-          UserError: the config has no task, or the MJCF file or the engine does not fit it.
+          UserError: the config has no task, or its task, start or terms, the MJCF file or the
+            engine do not fit it.
         """
         check_has_task(config)
         self.config = config
@@ -156,7 +155,7 @@ class Env:
         self.layout = config.layout
         check_joint_angles(config, self.mj_model, self.addresses)
         check_contacts(self.mj_model, config.randomization.terms, self.addresses)
-        self.task.geometry = read_geometry(
+        self.task.geometry = robot_model.read_geometry(
             self.mj_model, self.addresses, config.default_joint_angles
         )
         check_start(config, self.task)
@@ -216,7 +215,8 @@ class Env:
             `shares`.
 
         Raises:
-          UserError: the ranges lack a term, or have an unknown one.
+          UserError: the ranges lack a term, or have an unknown one; the task's code returns wrong
+            names; or the model lacks what a term changes, or was edited.
         """
         robot_model.check_unedited(self.mj_model, self._fingerprint)
         if ranges is None:
@@ -231,7 +231,7 @@ class Env:
         sampled = sample_commands(command_ranges, draws.commands)
         physics = self._first_physics(draws, world, self.task.throw(draws.task, sampled))
         truth = self._kinematics(physics, parameters)
-        first_command = self._first_command(sampled)
+        first_command = self._task_command(sampled)
         task = self.task.reset(Start(truth, first_command, draws.task))
         command = self._checked_next_command(task, first_command)
 
@@ -343,6 +343,7 @@ class Env:
         out."""
         terms = self.config.randomization.terms
         commands = self.config.commands
+        # With all commands on both sides, none is missing and none is unknown.
         check_names("a reset", "range", {*ranges, *commands}, {*terms, *commands})
 
     def _sample_world(
@@ -411,7 +412,7 @@ class Env:
         qvel = scatter(np.zeros(self.mj_model.nv), self.addresses.arm_qvel, joint_velocities)
 
         if thrown is None:
-            heights = np.array([[0.0, 0.0, BALLS_APART * i] for i in range(num_balls)])
+            heights = np.array([[0.0, 0.0, robot_model.BALLS_APART * i] for i in range(num_balls)])
             thrown = (np.array(self.config.ball_init_pos) + heights, np.zeros((num_balls, 3)))
         thrown_positions, thrown_velocities = thrown
         positions = jnp.asarray(thrown_positions, dtype).reshape(num_balls, 3)
@@ -431,7 +432,7 @@ class Env:
             for name, command in self.config.commands.items()
         }
 
-    def _first_command(self, sampled: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    def _task_command(self, sampled: dict[str, jax.Array]) -> dict[str, jax.Array]:
         """The task's commands from their samples, at a reset and at each redraw, each []."""
         command = self.task.first_command(sampled)
         named = f"first_command of the task {type(self.task).__name__}"
@@ -471,7 +472,7 @@ class Env:
         draws = noise.uniform(counter, noise.COMMAND, (len(ranges),), age.dtype)
         # JAX has sorted the keys of the state's dictionary.
         in_order = {name: ranges[name] for name in self.config.commands}
-        new_command = self._first_command(sample_commands(in_order, draws))
+        new_command = self._task_command(sample_commands(in_order, draws))
         command = {}
         for name, last_value in state.command.items():
             command[name] = jnp.where(is_due, new_command[name], last_value)
@@ -540,8 +541,8 @@ class Env:
             values = truth._asdict() | commands
         else:
             values = dict(state.sensing.histories)
-            # A command may have been set since the last step.
-            # Not over a set of the names, whose order, and so the program, differs by process.
+            # A command may have been set since the last step. (A loop over a set of names would
+            # have another order, and so another program, in each process.)
             for name, command in commands.items():
                 if name in values:
                     values[name] = jnp.concatenate([command[None], values[name][1:]])

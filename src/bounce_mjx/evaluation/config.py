@@ -20,6 +20,11 @@ def on_engine(env: WorldConfig, physics: Physics) -> WorldConfig:
     return env.model_copy(update={"physics": physics}) if physics in ("fused", "mjx") else env
 
 
+def command_ranges(env: WorldConfig) -> dict[str, tuple[float, float]]:
+    """The range from which each command is sampled."""
+    return {name: (command.low, command.high) for name, command in env.commands.items()}
+
+
 class EvaluationOptions(NamedTuple):
     """How a policy is measured."""
 

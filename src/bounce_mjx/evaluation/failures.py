@@ -8,11 +8,12 @@ import jax
 import numpy as np
 
 from bounce_mjx.env.env import Env
+from bounce_mjx.evaluation.config import command_ranges
 from bounce_mjx.evaluation.episodes import make_filmer
 from bounce_mjx.evaluation.policy_evaluation import Conditions
+from bounce_mjx.evaluation.results import episodes_of, is_share
 from bounce_mjx.evaluation.statistics import Statistics
 from bounce_mjx.learning.policy import Actor, Policy
-from bounce_mjx.task.results import Episodes
 from bounce_mjx.task.task import Recording
 
 # Quantile of the normal distribution for 95% intervals.
@@ -72,14 +73,13 @@ def failures_of(conditions: Conditions, statistics: Statistics) -> list[Failure]
     """The failed episodes of an evaluation."""
     env, commands, _ = conditions
     s = jax.tree.map(np.asarray, statistics)
-    trained = {name: (c.low, c.high) for name, c in env.config.commands.items()}
+    commands = command_ranges(env.config) | commands
     found = []
     for i in range(len(s.running)):
-        own = slice(i, i + 1)
-        tally = jax.tree.map(lambda x, own=own: x[own].astype(float), s.tally)
-        figures = Episodes(tally.sums, tally.maxima, s.running[own], trained | commands)
+        alone = jax.tree.map(lambda figure, i=i: figure[i : i + 1], s)
+        results = env.task.results(episodes_of(alone, commands))
         # A mean over all episodes says nothing of one of them.
-        shares = [x for x in env.task.results(figures) if x.measured.endswith("%")]
+        shares = [result for result in results if is_share(result.measured)]
         failed = [result.name for result in shares if result.passed is False]
         if not s.running[i]:
             failed.insert(0, _cause(s.ended_by, i))

@@ -8,7 +8,12 @@ import jax.numpy as jnp
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
-from bounce_mjx.evaluation.config import DEFAULT_OPTIONS, EvaluationOptions, on_engine
+from bounce_mjx.evaluation.config import (
+    DEFAULT_OPTIONS,
+    EvaluationOptions,
+    command_ranges,
+    on_engine,
+)
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import Report, judge
 from bounce_mjx.evaluation.statistics import Statistics
@@ -89,7 +94,7 @@ def conditions_of(env_config: WorldConfig, options: EvaluationOptions) -> Condit
     """
     given = {name: (value, value) for name, value in options.commands.items()}
     neutral = neutral_commands(env_config) if options.nominal else {}
-    own = {name: (command.low, command.high) for name, command in env_config.commands.items()}
+    own = command_ranges(env_config)
     commands = {name: ends for name, ends in (neutral | given).items() if ends != own[name]}
     world = env_config.randomization
     if options.nominal:

@@ -4,12 +4,14 @@ import dataclasses
 from typing import Annotated, Any
 
 import jax
+import numpy as np
 from pydantic import Field, InstanceOf
 
 from bounce_mjx.env.env import Env
+from bounce_mjx.evaluation.config import command_ranges
 from bounce_mjx.evaluation.statistics import Statistics
 from bounce_mjx.task.results import Episodes, Figure, Result
-from bounce_mjx.task.task import Recording
+from bounce_mjx.task.task import Recording, Task
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,30 +67,43 @@ class Report:
         }
 
 
+def is_share(measured: str) -> bool:
+    """Whether a result is a share of episodes, steps or events, from what it measures
+    (`Result.measured`)."""
+    return measured.endswith("%")
+
+
+def episodes_of(statistics: Statistics, commands: dict[str, tuple[float, float]]) -> Episodes:
+    """Statistics of E episodes as a task judges them: NumPy arrays, the figures in float64.
+
+    Args:
+      commands: range of each command in these episodes.
+    """
+    tally = jax.tree.map(lambda figure: np.asarray(figure, np.float64), statistics.tally)
+    return Episodes(tally.sums, tally.maxima, np.asarray(statistics.running), commands)
+
+
 def judge(
     env: Env,
     statistics: Statistics,
     recording: Recording | None = None,
     commands: dict[str, tuple[float, float]] | None = None,
+    task: Task | None = None,
 ) -> Report:
     """The report of an evaluation, from the statistics of E episodes.
 
     Args:
       recording: of the first episodes.
       commands: ranges of commands in these episodes, where they are not the config's.
+      task: the task with the settings of these episodes, where they are not the environment's.
     """
-    s = jax.tree.map(lambda x: jax.device_get(x).astype(float), statistics)
-    trained = {name: (c.low, c.high) for name, c in env.config.commands.items()}
-    episodes = Episodes(
-        sums=s.tally.sums,
-        maxima=s.tally.maxima,
-        lasted=jax.device_get(statistics.running),
-        commands=trained | (commands or {}),
-    )
+    task = task or env.task
+    measured = jax.device_get(statistics)
+    episodes = episodes_of(measured, command_ranges(env.config) | (commands or {}))
     details = {
-        "episodes": float(len(s.running)),
-        **env.task.details(episodes),
-        "mean_return": float(s.episode_return.mean()),
-        "mean_length_s": float(s.steps.mean() * env.dt),
+        "episodes": float(len(measured.running)),
+        **task.details(episodes),
+        "mean_return": float(measured.episode_return.astype(float).mean()),
+        "mean_length_s": float(measured.steps.astype(float).mean() * env.dt),
     }
-    return Report(env.task.results(episodes), details, jax.device_get(recording))
+    return Report(task.results(episodes), details, jax.device_get(recording))

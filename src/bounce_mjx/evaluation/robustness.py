@@ -15,10 +15,10 @@ from pydantic import Field
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
-from bounce_mjx.evaluation.config import EvaluationOptions, Physics, on_engine
+from bounce_mjx.evaluation.config import EvaluationOptions, Physics, command_ranges, on_engine
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.policy_evaluation import Conditions, InEvaluation
-from bounce_mjx.evaluation.results import judge
+from bounce_mjx.evaluation.results import is_share, judge
 from bounce_mjx.evaluation.statistics import Statistics
 from bounce_mjx.evaluation.suite import Condition, condition_label
 from bounce_mjx.learning.policy import Actor, Policy
@@ -102,7 +102,7 @@ class RobustnessReport(pydantic.BaseModel):
         shares = [
             value
             for name, value in outcome.values.items()
-            if value is not None and self.measured.get(name, "").endswith("%")
+            if value is not None and is_share(self.measured.get(name, ""))
         ]
         return min(shares, default=100.0 * outcome.lasted) / 100.0
 
@@ -193,9 +193,12 @@ def _program(members: Sequence[Condition], physics: Physics) -> tuple[Env, list[
     env = Env(_spanning_config(members, physics))
     is_dry = any("joint_frictionloss" in condition.ranges for condition in members)
     on_c = physics == "mujoco" or (env.engine.name == "mjx" and is_dry)
-    own = {name: (command.low, command.high) for name, command in env.config.commands.items()}
     # Of the commands, those for which a condition has another range than the config.
-    changed = [name for name in own if any(c.commands[name] != own[name] for c in members)]
+    changed = [
+        name
+        for name, ends in command_ranges(env.config).items()
+        if any(condition.commands[name] != ends for condition in members)
+    ]
     return env, [*env.config.randomization.terms, *changed], on_c
 
 
@@ -208,7 +211,10 @@ def _padded(batch: list[Condition], size: int) -> list[Condition]:
 def _outcome(
     env: Env, condition: Condition, statistics: Statistics, engine: str
 ) -> ConditionOutcome:
-    report = judge(env, statistics, commands=condition.commands)
+    # What a task judges may depend on the world, and the program's spans several.
+    task = condition.config.task(condition.config)
+    task.geometry = env.task.geometry
+    report = judge(env, statistics, commands=condition.commands, task=task)
     return ConditionOutcome(
         perturbation=condition.perturbation.name,
         group=condition.perturbation.group,

@@ -15,6 +15,7 @@ from bounce_mjx.config.settings import Finite, StrictModel, merged, nested
 from bounce_mjx.config.validation import validate
 from bounce_mjx.env.env import model_nominals
 from bounce_mjx.errors import UserError, shorten
+from bounce_mjx.evaluation.config import command_ranges
 from bounce_mjx.task.registry import find_task
 from bounce_mjx.world.actuation import DEFAULT_PUSH_INTERVAL
 from bounce_mjx.world.config import WorldConfig
@@ -34,7 +35,8 @@ NOMINAL = "nominal"
 """Name of the condition without perturbation, which is always measured."""
 
 _SIGNS = {"strength": 1.0, "-strength": -1.0}
-# For constant commands, and for pushes of speed 0, s.
+# Neutral values of terms that have none in `TERMS`: commands that never change, and pushes that
+# come at any interval, as their neutral speed is 0, s.
 _INTERVALS = {"command_interval": 1e9, "push_interval": DEFAULT_PUSH_INTERVAL}
 
 Bounds = tuple[np.ndarray, np.ndarray]
@@ -76,6 +78,8 @@ class Condition(NamedTuple):
     """Strength in the perturbation's unit; None for a perturbation without strengths."""
     env: WorldConfig
     """World and task of the policy, without randomisation."""
+    randomization: RandomizationConfig
+    """The perturbed terms, each with its range."""
     ranges: dict[str, Bounds]
     """Lower and upper ends of the ranges of all commands and of the perturbed terms, in the shapes
     of the terms."""
@@ -88,8 +92,13 @@ class Condition(NamedTuple):
         return condition_label(self.perturbation.name, self.strength, self.perturbation.unit)
 
     def range(self, name: str) -> Bounds:
-        """Range of a command, or of a term; neutral if it is not perturbed."""
+        """Range of a command, or of a term; a term that is not perturbed has its neutral one."""
         return self.ranges.get(name) or neutral_range(name, self.env)
+
+    @property
+    def config(self) -> WorldConfig:
+        """World and task of the condition."""
+        return self.env.model_copy(update={"randomization": self.randomization})
 
     @property
     def commands(self) -> dict[str, tuple[float, float]]:
@@ -99,7 +108,12 @@ class Condition(NamedTuple):
 
 def condition_label(perturbation: str, strength: float | None, unit: str) -> str:
     """A perturbation and its strength in words."""
-    return perturbation if strength is None else f"{perturbation} {strength:g} {unit}".rstrip()
+    return f"{perturbation} {strength_text(strength, unit)}".rstrip()
+
+
+def strength_text(strength: float | None, unit: str) -> str:
+    """A strength with its unit; empty for a perturbation without strengths."""
+    return "" if strength is None else f"{strength:g} {unit}".rstrip()
 
 
 def read_suite(path: Path) -> Suite:
@@ -131,7 +145,7 @@ def load_suite(
     """
     suite = read_suite(path)
     nominal = Perturbation(name=NOMINAL, group=NOMINAL)
-    world = world or trained.model_copy(update={"randomization": RandomizationConfig()})
+    world = world or _unrandomized(trained)
     names, conditions = {NOMINAL}, [_condition(nominal, None, trained, world, NOMINAL)]
     for key, settings in (assumed or {}).items():
         twice = Perturbation(name=f"twice {key}", group="twice the assumed")
@@ -142,25 +156,34 @@ def load_suite(
         if perturbation.name in names:
             raise UserError(f"{source}: the name is taken; give each perturbation its own name")
         names.add(perturbation.name)
-        given = perturbation.terms, perturbation.settings
-        uses = any(_fill_in(values, 0.0) != values for values in given)
-        if any(given) == perturbation.trained_ranges or uses != bool(perturbation.strengths):
-            raise UserError(
-                f"{source}: give terms or settings, with the word strength in a value if and only "
-                "if it has strengths, or trained_ranges: true"
-            )
+        _check_content(perturbation, source)
         if perturbation.task and not issubclass(trained.task, find_task(perturbation.task)):
             continue
         if perturbation.trained_ranges and not trained.randomization.terms:
             continue
         for strength in perturbation.strengths or (None,):
-            place = source if strength is None else f"{source} at {strength:g} {perturbation.unit}"
-            conditions.append(_condition(perturbation, strength, trained, world, place.rstrip()))
+            place = source
+            if strength is not None:
+                place += f" at {strength_text(strength, perturbation.unit)}"
+            conditions.append(_condition(perturbation, strength, trained, world, place))
     return conditions
 
 
+def _check_content(perturbation: Perturbation, source: str) -> None:
+    """Raises UserError unless a perturbation says what it changes, and what has its strengths."""
+    changes = [perturbation.terms, perturbation.settings]
+    has_changes = any(changes)
+    has_strengths = bool(perturbation.strengths)
+    uses_strength = _fill_in(changes, 0.0) != changes
+    if has_changes == perturbation.trained_ranges or uses_strength != has_strengths:
+        raise UserError(
+            f"{source}: give terms or settings, with the word strength in a value if and only "
+            "if it has strengths, or trained_ranges: true"
+        )
+
+
 def neutral_range(name: str, env: WorldConfig) -> Bounds | None:
-    """Range of a term without effect on the world; None if the term has no such value."""
+    """Range of a term, not of a command, without effect on the world; None if it has none."""
     value = _INTERVALS.get(name, TERMS[name].nominal)
     if value == MODEL:
         value = model_nominals(env).get(name)
@@ -186,28 +209,37 @@ def _condition(
     source: str,
 ) -> Condition:
     value = None if strength is None else strength * UNITS[perturbation.unit]
-    without = {"randomization": RandomizationConfig()}
-    plain = world.model_copy(update=without)
-    env = _with_changes(plain, _fill_in(perturbation.settings, value), source)
+    env = _with_changes(_unrandomized(world), _fill_in(perturbation.settings, value), source)
     commands = neutral_commands(env)
     if perturbation.trained_ranges:
-        sampled, commands = trained.randomization, {n: c[:2] for n, c in trained.commands.items()}
+        sampled = trained.randomization
+        commands = command_ranges(trained)
     else:
-        ends = {term: _ends(x, source) for term, x in _fill_in(perturbation.terms, value).items()}
-        commands |= {
-            name: tuple(env.commands[name].checked(x, f"{source}: {name}") for x in ends.pop(name))
-            for name in ends.keys() & env.commands.keys()
-        }
-        own = {name: getattr(world.randomization, name) for name in world.randomization.terms}
-        sampled = validate(
-            type(env), dict(env) | {"randomization": own | ends}, source
-        ).randomization
-    ranges = {name: getattr(sampled, name) for name in sampled.terms} | commands
-    ranges = {name: _broadcast(name, env.num_joints, *ends) for name, ends in ranges.items()}
-    contained = not differing_keys(env, trained.model_copy(update=without)) and all(
+        terms = {name: getattr(world.randomization, name) for name in world.randomization.terms}
+        for name, entry in _fill_in(perturbation.terms, value).items():
+            low, high = _ends(entry, source)
+            if name in env.commands:
+                command = env.commands[name]
+                label = f"{source}: {name}"
+                commands[name] = command.checked(low, label), command.checked(high, label)
+            else:
+                terms[name] = low, high
+        # The others are off, also those that the task's own world has.
+        others = RandomizationConfig().model_dump()
+        settings = dict(env) | {"randomization": others | terms}
+        sampled = validate(type(env), settings, source).randomization
+    ends = {name: getattr(sampled, name) for name in sampled.terms} | commands
+    ranges = {
+        name: _broadcast(name, env.num_joints, low, high) for name, (low, high) in ends.items()
+    }
+    is_trained = not differing_keys(env, _unrandomized(trained)) and all(
         _contains(trained, name, bounds) for name, bounds in ranges.items()
     )
-    return Condition(perturbation, strength, env, ranges, contained)
+    return Condition(perturbation, strength, env, sampled, ranges, is_trained)
+
+
+def _unrandomized(config: WorldConfig) -> WorldConfig:
+    return config.model_copy(update={"randomization": RandomizationConfig()})
 
 
 def _with_changes(env: WorldConfig, settings: dict[str, Any], source: str) -> WorldConfig:

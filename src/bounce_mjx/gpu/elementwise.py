@@ -11,6 +11,7 @@ than float32, and with `BOUNCE_MJX_GPU_KERNEL=off`. It also compiles derivatives
 
 import functools
 import math
+import os
 from collections.abc import Callable
 
 import jax
@@ -21,13 +22,25 @@ from jax.extend.core import Primitive
 from jax.interpreters import mlir
 from jax.sharding import NamedSharding, PartitionSpec
 
-from bounce_mjx.gpu.availability import has_kernels
-
 Arrays = tuple[jax.Array, ...]
 ElementwiseFunction = Callable[..., Arrays]
 
 # Environments in a block: the 128 threads of a warpgroup, with which Mosaic GPU computes.
 _BLOCK = 128
+_SWITCH = "BOUNCE_MJX_GPU_KERNEL"
+# Of NVIDIA's Hopper.
+_MIN_COMPUTE_CAPABILITY = 9.0
+
+
+def has_kernels() -> bool:
+    """Whether JAX's default device runs the package's own GPU kernels."""
+    if jax.default_backend() != "gpu" or os.environ.get(_SWITCH) == "off":
+        return False
+    # For AMD's GPUs this is a name, such as gfx90a.
+    capabilities = [str(device.compute_capability) for device in jax.local_devices(backend="gpu")]
+    return all(
+        c.replace(".", "").isdigit() and float(c) >= _MIN_COMPUTE_CAPABILITY for c in capabilities
+    )
 
 
 def elementwise(

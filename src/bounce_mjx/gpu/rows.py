@@ -3,13 +3,14 @@ one kernel per iteration."""
 
 import dataclasses
 import functools
+import math
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bounce_mjx.gpu.availability import has_kernels
+from bounce_mjx.gpu.elementwise import has_kernels
 
 # Rows are float32; another number of 32 bits keeps its bits.
 _TYPES = (jnp.float32, jnp.int32, jnp.uint32, jnp.bool_)
@@ -35,22 +36,26 @@ def pack(tree: Any) -> Any:
     leaves, structure = jax.tree.flatten(tree)
     if not has_kernels() or any(x.dtype not in _TYPES for x in leaves):
         return tree
-    rows = [to_float(x).reshape(-1, x.shape[-1] if x.ndim else 1) for x in leaves]
-    arrays = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves)
-    return Rows(jnp.concatenate(rows), structure, arrays)
+    rows = []
+    arrays = []
+    for leaf in leaves:
+        batch_size = leaf.shape[-1] if leaf.ndim else 1
+        rows.append(to_float(leaf).reshape(-1, batch_size))
+        arrays.append(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype))
+    return Rows(jnp.concatenate(rows), structure, tuple(arrays))
 
 
 def unpack(packed: Any) -> Any:
     """The pytree that was packed. Axes that a loop has added come first in each array."""
     if not isinstance(packed, Rows):
         return packed
-    ends = np.cumsum([np.prod(x.shape[:-1], dtype=int) for x in packed.arrays])
-    parts = jnp.split(packed.rows, ends[:-1], axis=-2)
-    added = packed.rows.shape[:-2]
-    return packed.structure.unflatten(
-        from_float(part.reshape(added + x.shape), x.dtype)
-        for part, x in zip(parts, packed.arrays, strict=True)
-    )
+    num_rows = [math.prod(array.shape[:-1]) for array in packed.arrays]
+    parts = jnp.split(packed.rows, np.cumsum(num_rows)[:-1], axis=-2)
+    added_axes = packed.rows.shape[:-2]
+    leaves = []
+    for part, array in zip(parts, packed.arrays, strict=True):
+        leaves.append(from_float(part.reshape(added_axes + array.shape), array.dtype))
+    return packed.structure.unflatten(leaves)
 
 
 def to_float(x: jax.Array) -> jax.Array:

@@ -48,7 +48,8 @@ def _is_of_a_fixed_world(pattern: str, known: Sequence[str]) -> bool:
 
 
 def step_metrics(result: vector.VectorStep, groups: int, curves: Sequence[Curve]) -> Metrics:
-    """Sums of one step of B environments, of which `rollout_metrics` makes means.
+    """Sums of one step of B environments, of which `rollout_metrics` makes means. What a curve is
+    the mean of over events is 0 on all other steps (`Curve.over`), and is summed as it is.
 
     Args:
       result: of the step of all environments.

@@ -32,7 +32,7 @@ class Policy(NamedTuple):
 
 
 class Actor(Protocol):
-    """What acts: the networks of a training run, or a law without parameters."""
+    """What acts: the `Networks` of a training run, or a law without parameters."""
 
     def act(self, policy: Any, observation: jax.Array) -> jax.Array:
         """Actions [..., A] in [-1, 1] for observations [..., N]."""
@@ -69,7 +69,7 @@ class NetworkFunctions(NamedTuple):
 
 
 class Networks(NamedTuple):
-    """The two networks of a training run."""
+    """The two networks of a training run, and the part that they may share."""
 
     policy_network: NetworkFunctions
     """Its inputs are observations [..., N], its output is an `ActionDistribution` [..., A]."""
@@ -78,7 +78,7 @@ class Networks(NamedTuple):
     features [..., H] and the metrics), its output the values [...]."""
     features: Callable[[Any, jax.Array], jax.Array]
     """(parameters of the policy, normalised observations [..., N]) -> its last hidden layer
-    [..., H]."""
+    [..., H]; only a shared critic needs it."""
 
     def act(self, policy: Policy, observation: jax.Array) -> jax.Array:
         """The most likely actions [..., A] for observations [..., N], clipped to [-1, 1]."""
@@ -167,6 +167,7 @@ class PolicyNetwork(nn.Module):
         mean_init = orthogonal(_MEAN_GAIN)
         mean = nn.Dense(self.action_size, kernel_init=mean_init)(hidden)
         init_log_std = jnp.full(self.action_size, jnp.log(jnp.float32(self.init_noise_std)))
+        # The names of the parameters in the policies' files.
         log_std = self.param("std_logparam", lambda _: {"log_value": init_log_std})["log_value"]
         return ActionDistribution(mean, jnp.broadcast_to(jnp.exp(log_std), mean.shape))
 

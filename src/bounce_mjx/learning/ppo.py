@@ -43,8 +43,8 @@ from bounce_mjx.learning.statistics import (
 # Factor by which one minibatch step may change the learning rate.
 _LEARNING_RATE_FACTOR = 1.1
 
-# Number of groups in which samples are shuffled, a power of two. If there are more, each has at
-# least _MIN_GROUP_ENVS environments; if fewer, the batch cannot be divided into so many.
+# Number of groups in which samples are shuffled, a power of two: twice as many as long as each
+# keeps _MIN_GROUP_ENVS environments, half as many as long as the batch cannot be divided.
 _GROUPS = 64
 _MIN_GROUP_ENVS = 64
 
@@ -71,7 +71,8 @@ class TrainingState(NamedTuple):
     statistics: RunningStatistics
     """Statistics of the networks' inputs [N + K]: the observation and K critic metrics."""
     learning_rate: jax.Array
-    """Learning rate that the KL rule has reached []."""
+    """Learning rate that the KL rule has reached [], `LearnerState.adapted_rate`;
+    `PPO.learning_rate` says which one acts."""
     env: vector.VectorState
     key: jax.Array
     """Random key of the next iteration."""
@@ -122,7 +123,8 @@ class Samples(NamedTuple):
     advantage: jax.Array
     """[T, B]; in a minibatch with the mean 0 and the standard deviation 1."""
     value_target: jax.Array
-    """What the value network should predict, the scaled and discounted return [T, B]."""
+    """What the value network should predict, the scaled and discounted return [T, B]: the advantage
+    plus the value of the rollout."""
     noise_bound: jax.Array
     """Lower bound of the action noise in the sample's environment [T, B, 1]."""
     normalizer: Normalizer
@@ -206,7 +208,8 @@ class PPO:
     def make_optimizer(self) -> optax.GradientTransformation:
         """Gradient of all parameters in one array [P] -> what the learning rate scales and a step
         subtracts [P]: Adam on clipped gradients. So it has the gradient's sign and no learning
-        rate, as `optax.scale_by_adam`, and not as `optax.adam`."""
+        rate, as `optax.scale_by_adam`, and not as `optax.adam`. It gets no parameters, which a
+        weight decay would need."""
         clip = optax.clip_by_global_norm(self.config.max_grad_norm)
         return optax.chain(clip, optax.scale_by_adam(eps=1e-5))
 
@@ -265,6 +268,8 @@ class PPO:
         advantage, value_target = self.advantages(state, rollout, bootstrap)
         # The next rollout normalises by the new statistics, so the networks learn on inputs
         # normalised by them; otherwise the policy would shift with every change of the statistics.
+        # The log_prob and the advantages are those of the old ones, so that the ratio in the loss
+        # does not begin at exactly 1.
         new_statistics = statistics.update(state.statistics, rollout.inputs)
         normalizer = new_statistics.normalizer
         samples = Samples(
@@ -283,7 +288,8 @@ class PPO:
         if "policy/kl" in minibatch_metrics:
             # How far the whole update has moved the policy: that of the last epoch.
             metrics["policy/kl"] = jnp.mean(minibatch_metrics["policy/kl"][-1])
-        # With the KL rule that with which the next update begins, with a schedule that of this one.
+        # The KL rule's rate is the one with which the next update begins; a schedule's is that of
+        # this update.
         metrics["policy/learning_rate"] = self.learning_rate(learned.learning_rate, state.iteration)
         metrics["loss/explained_variance"] = 1.0 - jnp.var(advantage) / jnp.var(value_target)
         metrics["fault"] = fault
@@ -311,7 +317,8 @@ class PPO:
         fresh = vector.first_states(self.env, reset_key, config.num_envs, ranges)
 
         def control_step(carry: tuple, noise: jax.Array) -> tuple:
-            # Packed, because on a GPU each array that a loop carries costs a kernel in each step.
+            # Packed into one array, because on a GPU each array that a loop carries costs a kernel
+            # in each step; elsewhere `pack` changes nothing.
             packed, timeout_inputs = carry
             env_state = unpack(packed)
             inputs = self.network_inputs(vector.observe(env_state), env_state.env.metrics)
@@ -510,7 +517,8 @@ class PPO:
     def loss(self, params: Params, samples: Samples) -> tuple[jax.Array, Metrics]:
         """The loss of a minibatch [], and its parts and other metrics [] by name: the clipped
         surrogate objective (Schulman et al. 2017, equation 7), the squared error of the values and
-        the entropy bonus (equation 9). A subclass adds a term here."""
+        the entropy bonus (equation 9). A subclass adds a term here, and metrics, of which the log
+        has the mean over all minibatches (of policy/kl over those of the last epoch)."""
         config = self.config
         policy = self.distribution(params, samples.inputs, samples.noise_bound)
         log_ratio = policy.log_prob(samples.action) - samples.log_prob

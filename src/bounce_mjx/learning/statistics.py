@@ -31,7 +31,8 @@ class RunningStatistics(NamedTuple):
     mean: jax.Array
     """Mean of the inputs [N]; 0 before the first input."""
     summed_variance: jax.Array
-    """Sum of the squared distances of the inputs from their mean [N]."""
+    """Sum of the squared distances of the inputs from their mean [N]: `count` times their
+    variance. The name is brax's, and that of stored states."""
     std: jax.Array
     """Standard deviation of the inputs [N], including MIN_VARIANCE; 1 before the first input."""
 
@@ -65,9 +66,9 @@ def update(statistics: RunningStatistics, batch: jax.Array) -> RunningStatistics
     from_old_mean = batch - statistics.mean
     mean = statistics.mean + jnp.sum(from_old_mean, axis=batch_axes) / count
     from_new_mean = batch - mean
-    added_variance = jnp.sum(from_old_mean * from_new_mean, axis=batch_axes)
+    added_squares = jnp.sum(from_old_mean * from_new_mean, axis=batch_axes)
     # Rounding may make the sum negative.
-    summed_variance = jnp.maximum(statistics.summed_variance + added_variance, 0.0)
+    summed_variance = jnp.maximum(statistics.summed_variance + added_squares, 0.0)
     std = jnp.sqrt(summed_variance / count + MIN_VARIANCE)
     return RunningStatistics(count, mean, summed_variance, std)
 
@@ -75,10 +76,10 @@ def update(statistics: RunningStatistics, batch: jax.Array) -> RunningStatistics
 def normalize(inputs: jax.Array, normalizer: Normalizer) -> jax.Array:
     """Inputs [..., N] in standard deviations from their mean, clipped to +-MAX_NORMALIZED.
 
-    An input that varied by less than about 1.4e-4 (a standard deviation) becomes 0, whatever its
-    value: it counts as constant. The fused physics keeps the ball's
-    quaternion and spin constant; on other engines they drift by rounding, and this drift must not
-    be magnified into a signal.
+    An input that varied by less than about 1.4e-4 (a standard deviation) counts as constant, and
+    becomes 0 whatever its value. Such are the ball's quaternion and spin: the fused physics keeps
+    them constant, but on other engines they drift by rounding, which must not be magnified into a
+    signal.
     """
     standardized = (inputs - normalizer.mean) / normalizer.std
     clipped = jnp.clip(standardized, -MAX_NORMALIZED, MAX_NORMALIZED)

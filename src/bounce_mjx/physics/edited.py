@@ -18,6 +18,7 @@ import numpy as np
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics.parameters import Array, PhysicsParameters
 from bounce_mjx.physics.scalars import Scalar, Vec, add, maximum, minimum, mul
+from bounce_mjx.robot.actuators import force_ranges, torque_ranges
 from bounce_mjx.robot.arm import raise_solver_limits
 from bounce_mjx.robot.contact import stiffness_and_damping
 from bounce_mjx.robot.model import (
@@ -28,7 +29,6 @@ from bounce_mjx.robot.model import (
     link_bodies,
 )
 from bounce_mjx.robot.numbers import field_of
-from bounce_mjx.robot.torques import force_ranges, torque_ranges
 
 # MuJoCo's mjMINMU: its C engine computes with no smaller coefficient of friction.
 MIN_FRICTION = 1e-5

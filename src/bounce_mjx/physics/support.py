@@ -23,12 +23,14 @@ _HARMLESS = frozenset(
     "equality frictionloss limit spring warmstart filterparent sensor midphase eulerdamp "
     "autoreset nativeccd island multiccd energy fwdinv invdiscrete".split()
 )
-# Fields that must be 0, for features that both engines lack; below, those that one of them lacks.
+# Fields that must be 0, for features that both engines lack.
 _BOTH_ZERO = (
     "opt.disableactuator opt.noslip_iterations nplugin jnt_stiffnesspoly dof_dampingpoly "
     "actuator_dyntype actuator_delay actuator_damping actuator_dampingpoly actuator_armature "
     "pair_adhesion"
 )
+# Further ones, for features that one of them lacks. (The fused engine's contacts come from pairs
+# alone, so geoms may not touch by their own types.)
 _ZERO = {
     "fused": "opt.density opt.viscosity opt.wind nflex nmocap neq ntendon jnt_limited "
     "geom_contype geom_conaffinity pair_margin pair_gap",

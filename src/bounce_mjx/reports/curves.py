@@ -13,8 +13,9 @@ import numpy as np
 from bounce_mjx.config.files import flat
 from bounce_mjx.config.user_code import is_file, read_source
 from bounce_mjx.errors import UserError, reason_of, shorten
-from bounce_mjx.runs.config import ROBOT, TrainConfig, load_run_config
+from bounce_mjx.runs.config import CONFIG_FILE, ROBOT, TrainConfig, load_run_config
 from bounce_mjx.runs.files import MANIFEST_FILE
+from bounce_mjx.runs.presets import read_config_file
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.task.task import Curve
 
@@ -114,18 +115,50 @@ def group_runs(runs: Sequence[Path]) -> list[Group]:
         if own["env.mjcf"] is not None:
             copies["env.mjcf"] = (run / ROBOT / MANIFEST_FILE).read_bytes()
         own |= {key: f"{Path(own[key]).name} {zlib.crc32(x):08x}" for key, x in copies.items()}
-    shown = [name for name in settings[0] if any(x[name] != settings[0][name] for x in settings)]
+        if "algorithm" in copies:
+            own |= _own_settings(run, own)
+    shown = _telling_first(settings)
     groups: dict[str, list[int]] = {}
     for i, each in enumerate(settings):
         groups.setdefault(json.dumps(each), []).append(i)
     return [
         Group(
-            _label(configs[members[0]], {x: settings[members[0]][x] for x in shown}, len(members)),
+            _label(configs[members[0]], _chosen(settings[members[0]], shown), len(members)),
             [read_curves(runs[i]) for i in members],
             configs[members[0]].env.task.curves,
         )
         for members in groups.values()
     ]
+
+
+def _own_settings(run: Path, settings: dict[str, Any]) -> dict[str, Any]:
+    """The settings of a user's own algorithm, which the config has only where its code is run."""
+    stored = flat({"ppo": read_config_file(run / CONFIG_FILE).get("ppo", {})})
+    return {name: value for name, value in stored.items() if name not in settings}
+
+
+def _chosen(settings: dict[str, Any], names: Sequence[str]) -> dict[str, Any]:
+    """The settings of these names that there are."""
+    return {name: settings[name] for name in names if name in settings}
+
+
+def _telling_first(settings: Sequence[dict[str, Any]]) -> list[str]:
+    """The names of the settings that differ, first those that a label needs to tell the runs
+    apart."""
+
+    def num_told_apart(names: Sequence[str]) -> int:
+        return len({json.dumps([values.get(name) for name in names]) for values in settings})
+
+    # In the order of the settings; an algorithm of one's own may have more.
+    names = dict.fromkeys(name for values in settings for name in values)
+    rest = [name for name in names if num_told_apart([name]) > 1]
+
+    needed = []
+    while num_told_apart(needed) < num_told_apart(rest + needed):
+        best = max(rest, key=lambda name: num_told_apart([*needed, name]))
+        needed.append(best)
+        rest.remove(best)
+    return needed + rest
 
 
 def mean_and_band(curves: Sequence[LoggedCurve]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

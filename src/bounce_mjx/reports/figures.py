@@ -1,6 +1,6 @@
 """Figures of a training run and of an evaluation, drawn with matplotlib.
 
-They do not use pyplot, so they need no display and can be drawn in several threads.
+They do not use pyplot, so they need no display.
 """
 
 import functools
@@ -18,8 +18,9 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from bounce_mjx.env.env import Env
+from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.statistics import paddle_points
-from bounce_mjx.reports.curves import Group, mean_and_band
+from bounce_mjx.reports.curves import Group, LoggedCurve, mean_and_band
 from bounce_mjx.task.task import Curve, Histogram, Hits, Recording
 
 RETURN = "episode/return"
@@ -50,32 +51,19 @@ style = functools.partial(matplotlib.rc_context, _STYLE)
 """The look of all figures, around what draws them."""
 
 
+Draw = Callable[..., Figure]
+"""Draws groups of runs (`curves.Group`). Its argument `columns`, which has a default, is the most
+panels side by side."""
+
+
 class RunPlot(NamedTuple):
     """A plot of trainings."""
 
     title: str | None
-    """Heading in the report; None for a plot that it shows in its own way."""
-    draw: Callable[..., Figure]
-    """A function of groups of runs (`curves.Group`) and `columns`, the most panels side by side."""
+    """Heading in the report; None for a plot that `bounce-mjx plot` alone draws."""
+    draw: Draw
 
 
-Draw = Callable[..., Figure]
-
-RUN_PLOTS: dict[str, RunPlot] = {}
-"""The plots that `bounce-mjx plot` and the report draw, by the names of their files."""
-
-
-def run_plot(name: str, title: str | None) -> Callable[[Draw], Draw]:
-    """Registers a function as a `RunPlot`."""
-
-    def register(draw: Draw) -> Draw:
-        RUN_PLOTS[name] = RunPlot(title, style()(draw))
-        return draw
-
-    return register
-
-
-@run_plot("curves", "Learning curves")
 @style()
 def curves_figure(groups: Sequence[Group], columns: int = 3) -> Figure:
     """The return and the curves of the task over the training, with points for evaluations.
@@ -93,7 +81,6 @@ def curves_figure(groups: Sequence[Group], columns: int = 3) -> Figure:
     return figure
 
 
-@run_plot("rewards", title=None)
 @style()
 def rewards_figure(groups: Sequence[Group], columns: int = 5) -> Figure:
     """The weighted reward terms over the training, at most `columns` panels side by side."""
@@ -101,6 +88,37 @@ def rewards_figure(groups: Sequence[Group], columns: int = 5) -> Figure:
     title = "weighted reward terms over environment steps,\nmean of a control step"
     figure.suptitle(title, fontsize=10)
     return figure
+
+
+RUN_PLOTS = {
+    "curves": RunPlot("Learning curves", curves_figure),
+    # The report has `reward_panels`, as many side by side as there is room for.
+    "rewards": RunPlot(None, rewards_figure),
+}
+"""The plots that `bounce-mjx plot` and the report draw, by the names of their files."""
+
+EVALUATION = "evaluation"
+"""Name of the file of `evaluation_figure`."""
+
+_TAKEN_NAMES = frozenset((*RUN_PLOTS, EVALUATION))
+
+
+def run_plot(name: str, title: str | None) -> Callable[[Draw], Draw]:
+    """Registers a function as a `RunPlot`, in place of one that was registered with this name.
+
+    Raises:
+      UserError: the name is that of a picture of the package.
+    """
+    if name in _TAKEN_NAMES:
+        raise UserError(
+            f"the plot {name!r} has the name of a picture of the package; choose another name"
+        )
+
+    def register(draw: Draw) -> Draw:
+        RUN_PLOTS[name] = RunPlot(title, style()(draw))
+        return draw
+
+    return register
 
 
 @style()
@@ -167,6 +185,10 @@ def _draw_curves(
     figure, panels = make_panels(len(shown), columns, height)
     for axes, curve in zip(panels, shown, strict=True):
         _draw_curve(axes, groups, curve)
+    # A panel whose curve has no points yet would have its own steps.
+    last_step = max(axes.get_xlim()[1] for axes in panels)
+    for axes in panels:
+        axes.set_xlim(0, last_step)
     add_legend(figure)
     return figure
 
@@ -175,30 +197,46 @@ def _draw_curve(axes: Axes, groups: Sequence[Group], shown: Curve) -> None:
     """One line for a group of one run; for several runs, faint lines, their mean, and a band of one
     standard deviation on each side. A point for each evaluation, in which actions are not sampled,
     and a dotted line where a run first met all results."""
+    # Evaluations log the means of a task's metrics in metres.
     evaluated = "mean_return" if shown.tag == RETURN else f"mean_{shown.metric}_m"
     for i, group in enumerate(groups):
-        colour, curves = f"C{i}", [x.curves[shown.tag] for x in group.runs if shown.tag in x.curves]
+        curves = [run.curves[shown.tag] for run in group.runs if shown.tag in run.curves]
         if curves:
-            steps, mean, deviation = mean_and_band(curves)
-            low, mean, high = (shown.scale * (mean + side * deviation) for side in (-1, 0, 1))
-            # A line of one point shows nothing.
-            marker = "." if len(steps) == 1 else ""
-            axes.plot(steps, mean, color=colour, marker=marker, lw=1.6, label=group.label)
-        if len(curves) > 1:
-            for curve in curves:
-                axes.plot(curve.steps, shown.scale * curve.values, color=colour, alpha=0.3, lw=0.7)
-            axes.fill_between(steps, low, high, color=colour, alpha=0.2, linewidth=0)
+            _draw_group(axes, curves, shown.scale, f"C{i}", group.label)
     for i, group in enumerate(groups):
         for run in group.runs:
-            if (points := run.curves.get(f"results/{evaluated}")) is not None:
-                label, heights = "evaluation, without noise", shown.scale * points.values
-                axes.plot(points.steps, heights, "o", color=f"C{i}", ms=4.0, label=label)
-            if (steps := run.solved_steps) is not None:
-                axes.axvline(steps, color=f"C{i}", ls=":", lw=1.0, label="all results met")
+            points = run.curves.get(f"results/{evaluated}")
+            if points is not None:
+                values = shown.scale * points.values
+                label = "evaluation, without noise"
+                axes.plot(points.steps, values, "o", color=f"C{i}", ms=4.0, label=label)
+            if run.solved_steps is not None:
+                axes.axvline(
+                    run.solved_steps, color=f"C{i}", ls=":", lw=1.0, label="all results met"
+                )
     axes.set_title(shown.title)
     axes.set_xlim(left=0)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+
+
+def _draw_group(
+    axes: Axes, curves: Sequence[LoggedCurve], scale: float, colour: str, label: str
+) -> None:
+    """The mean of a curve over runs, with each run and the band if there are several."""
+    steps, mean, deviation = mean_and_band(curves)
+    mean = scale * mean
+    deviation = scale * deviation
+    # A line of one point shows nothing.
+    marker = "." if len(steps) == 1 else ""
+    axes.plot(steps, mean, color=colour, marker=marker, lw=1.6, label=label)
+    if len(curves) == 1:
+        return
+    for curve in curves:
+        axes.plot(curve.steps, scale * curve.values, color=colour, alpha=0.3, lw=0.7)
+    axes.fill_between(
+        steps, mean - deviation, mean + deviation, color=colour, alpha=0.2, linewidth=0
+    )
 
 
 def _begin_at_zero(axes: Axes) -> None:
@@ -233,7 +271,12 @@ def _draw_heights(axes: Axes, env: Env, recording: Recording) -> None:
         heights = [level[name] for level in levels]
         constant = f" {heights[0]:.2f} m" if len(set(heights)) == 1 else ""
         axes.plot(time, heights, color=f"C{2 + i}", label=f"{name}{constant}")
-    axes.plot(time, recording.ball[:steps, ..., 2, 0], color="C0", label="ball")
+    balls = recording.ball[:steps, ..., 2, 0].reshape(steps, -1)
+    # One label for all of them.
+    name = "ball" if balls.shape[1] == 1 else "balls"
+    for heights in balls.T:
+        axes.plot(time, heights, color="C0", label=name)
+        name = None
     axes.plot(time, recording.paddle[:steps, 2, 0], color="C1", label="paddle")
     axes.set_xlim(0.0, env.config.episode_seconds)
     _begin_at_zero(axes)
@@ -244,7 +287,7 @@ def _draw_heights(axes: Axes, env: Env, recording: Recording) -> None:
 
 def _draw_histogram(axes: Axes, plot: Histogram) -> None:
     values, bound = plot.values, plot.bound
-    axes.set_title(f"{plot.title} ({len(values):,} {plot.counted})")
+    axes.set_title(f"{plot.title}\n({len(values):,} {plot.counted})")
     axes.set_ylabel(plot.counted)
     half = max(1.25 * bound, 1.05 * float(np.abs(values).max(initial=0.0)))
     axes.hist(values, bins=51, range=(-half, half), color="C0")
@@ -262,7 +305,7 @@ def draw_hits(axes: Axes, env: Env, plot: Hits, points: np.ndarray) -> None:
     axes.plot([0], [0], "+", color=_GREY)
     x, y = 100.0 * points.T[:2]
     axes.plot(y, x, ".", markersize=3, alpha=0.4, color="C0", markeredgewidth=0)
-    axes.set_title(f"{plot.title} ({len(points):,})")
+    axes.set_title(f"{plot.title}\n({len(points):,})")
     axes.set(xlabel="paddle's y", ylabel="paddle's x", aspect="equal")
     width = max(1.3 * half_y, 1.05 * float(np.abs(y).max(initial=0.0)))
     height = max(1.3 * half_x, 1.05 * float(np.abs(x).max(initial=0.0)))

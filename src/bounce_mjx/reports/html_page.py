@@ -47,10 +47,14 @@ def page(title: str, body: str) -> str:
 """
 
 
-def figures_html(figures: Mapping[str, Figure]) -> str:
-    """Figures below their titles, side by side where the page is wide enough."""
+def figures_html(figures: Iterable[tuple[str, Figure]]) -> str:
+    """Figures below their titles, side by side where the page is wide enough.
+
+    Args:
+      figures: each with its title; several may have the same one.
+    """
     parts = []
-    for title, figure in figures.items():
+    for title, figure in figures:
         source = data_url("image/svg+xml", image(figure, "svg"))
         title = html.escape(title)
         parts.append(f'<figure><h2>{title}</h2><img alt="{title}" src="{source}"></figure>\n')

@@ -59,7 +59,7 @@ def _describe_logs(logs: Sequence[Log], checkups: Sequence[Checkup]) -> str:
             f"<h2>{html.escape(log.source)}: angles against their commands</h2>\n<ul>"
             + "".join(f"<li>{html.escape(text)}</li>\n" for text in said)
             + f"</ul>\n{table(header, rows)}\n"
-            + figures_html(figures)
+            + figures_html(figures.items())
         )
     return "\n".join(parts)
 
@@ -104,7 +104,7 @@ below with the interval that contains it with 95% probability.</p>
 <h2>Errors in units of the sensors' noise</h2>
 {table(["sensor", "model's own world", "identified", "windows held out"], fits)}
 {_describe_joints(found, joint_names)}
-{figures_html(figures)}
+{figures_html(figures.items())}
 <h2>What the log leaves open</h2>
 <ul>
 {said}</ul>

@@ -60,12 +60,12 @@ def write_report(run: Path, recording: Recording | None = None) -> Path:
     env = Env(config.env)
     recording = recording or record_checkpoint(best_checkpoint(run))
     robustness = load_robustness(run)
-    drawn = {"The best checkpoint": figures.evaluation_figure(env, recording, _WIDTH)}
+    drawn = [("The best checkpoint", figures.evaluation_figure(env, recording, _WIDTH))]
     for plot in figures.RUN_PLOTS.values():
         if plot.title is not None:
-            drawn[plot.title] = plot.draw(groups, columns=_COLUMNS)
+            drawn.append((plot.title, plot.draw(groups, columns=_COLUMNS)))
     if robustness is not None:
-        drawn["Perturbed worlds"] = robustness_figure(robustness)
+        drawn.append(("Perturbed worlds", robustness_figure(robustness)))
     robot = "Peitian AIR4-560" if config.env.mjcf is None else config.env.mjcf.stem
     replay, report = replay_first_and_worst(env, recording), results.best
     num_recorded = recording.running.shape[-1]

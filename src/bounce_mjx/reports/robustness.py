@@ -6,6 +6,7 @@ from itertools import groupby
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, PowerNorm
 from matplotlib.figure import Figure
@@ -14,7 +15,7 @@ from rich.markup import escape
 from rich.table import Column, Table
 
 from bounce_mjx.evaluation.robustness import ConditionOutcome, RobustnessReport
-from bounce_mjx.evaluation.suite import NOMINAL
+from bounce_mjx.evaluation.suite import NOMINAL, strength_text
 from bounce_mjx.reports.figures import PANEL_WIDTH, style
 from bounce_mjx.reports.tables import figure_text, plain_table
 from bounce_mjx.runs.files import read_stored
@@ -52,23 +53,31 @@ def summary(report: RobustnessReport) -> str:
 def robustness_table(report: RobustnessReport) -> Table:
     """Table of the results in each condition; an asterisk marks a missed bound."""
     letters = result_letters(report)
-    described = [f"{x}  {name}: {report.measured.get(name, '')}" for name, x in letters.items()]
-    headers = "strength", *(f"{letter} " for letter in letters.values()), ""
-    columns = [Column(header, justify="right") for header in headers]
     # A word that is wider than the terminal leaves continues in the next line.
-    table = plain_table(summary(report), Column("condition", overflow="fold"), *columns)
+    columns = [Column("condition", overflow="fold"), Column("strength", justify="right")]
+    columns += [Column(f"{letter} ", justify="right") for letter in letters.values()]
+    table = plain_table(summary(report), *columns, Column(justify="right"))
+    described = [
+        f"{letter}  {result}: {report.measured.get(result, '')}"
+        for result, letter in letters.items()
+    ]
     table.caption = escape("\n".join([*described, "*  misses its bound"]))
-    for _, rows in _rows(report.outcomes):
-        for i, outcome in enumerate(rows):
+    for _, outcomes in _rows(report.outcomes):
+        for i, outcome in enumerate(outcomes):
             name = escape(outcome.perturbation) if i == 0 else ""
-            strength = "" if outcome.strength is None else f"{outcome.strength:g} {outcome.unit}"
+            strength = strength_text(outcome.strength, outcome.unit)
+            figures = [_figure_cell(outcome, result) for result in outcome.values]
             verdict = "[green]pass" if outcome.passed else "[red]FAIL"
-            figures = []
-            for result, value in outcome.values.items():
-                text = figure_text(value, ".2f" if value is None or abs(value) < 10.0 else ".1f")
-                figures.append(f"[red]{text}*" if result in outcome.failed else f"{text} ")
-            table.add_row(name, strength.rstrip(), *figures, verdict)
+            table.add_row(name, strength, *figures, verdict)
     return table
+
+
+def _figure_cell(outcome: ConditionOutcome, result: str) -> str:
+    """A result in a condition, with an asterisk if it misses its bound."""
+    value = outcome.values[result]
+    is_small = value is None or abs(value) < 10.0
+    text = figure_text(value, ".2f" if is_small else ".1f")
+    return f"[red]{text}*" if result in outcome.failed else f"{text} "
 
 
 def result_letters(report: RobustnessReport) -> dict[str, str]:
@@ -81,38 +90,60 @@ def robustness_figure(report: RobustnessReport) -> Figure:
     """Chart of perturbations by strength. The colour of a cell shows the lowest of the results that
     are shares. A cell has a tick or the letters of the missed results; a frame marks conditions
     within the training ranges."""
-    letters, rows = result_letters(report), _rows(report.outcomes)
+    letters = result_letters(report)
+    rows = _rows(report.outcomes)
     figure = Figure(figsize=(2.0 * PANEL_WIDTH, _LINE * len(rows) + 1.8), layout="constrained")
     figure.suptitle(summary(report), fontsize=10, wrap=True)
     axes = figure.subplots()
-    cells = max(8, *(len(outcomes) for _, outcomes in rows))
-    axes.set(xlim=(0.0, cells), ylim=(len(rows), 0.0), xticks=[], frame_on=False)
+    widest = max(8, *(len(outcomes) for _, outcomes in rows))
+    axes.set(xlim=(0.0, widest), ylim=(len(rows), 0.0), xticks=[], frame_on=False)
     axes.set_yticks(np.arange(len(rows)) + 0.5, [label for label, _ in rows])
     axes.tick_params(length=0, labelsize=8)
     axes.grid(False)
-    for y, (label, (_, outcomes)) in enumerate(zip(axes.get_yticklabels(), rows, strict=True)):
-        label.set_fontweight("normal" if outcomes else "bold")
+    for y, (_, outcomes) in enumerate(rows):
+        if not outcomes:
+            axes.get_yticklabels()[y].set_fontweight("bold")
         for x, outcome in enumerate(outcomes):
-            shade = float(_SCALE(100.0 * report.worst_share(outcome)))
-            edge = _INK if outcome.trained else "none"
-            cell = Rectangle(
-                (x + 0.05, y + 0.06), 0.9, 0.88, facecolor=_COLOURS(shade), edgecolor=edge
-            )
-            axes.add_patch(cell)
-            strength = "" if outcome.strength is None else f"{outcome.strength:g}"
             missed = "".join(letters[name] for name in outcome.failed)
-            ink = _INK if 0.2 < shade < 0.8 else _PAPER
-            text = f"{strength}\n{missed or _TICK}"
-            axes.text(x + 0.5, y + 0.5, text, fontsize=7, ha="center", va="center", color=ink)
-    scale = ScalarMappable(_SCALE, _COLOURS)
-    bar = figure.colorbar(
-        scale, ax=axes, location="bottom", ticks=(0, 50, 75, 90, 100), shrink=0.5, aspect=50
-    )
-    bar.set_label("lowest result of those in %", fontsize=8)
+            _draw_cell(axes, (x, y), outcome, report.worst_share(outcome), missed)
+    _draw_scale(figure, axes)
     missed = "   ".join(f"{letter} {name}" for name, letter in letters.items())
     below = f"{_TICK} all judged results met; missed: {missed}; framed: within the trained ranges"
     figure.supxlabel(below, fontsize=8, wrap=True)
     return figure
+
+
+def _draw_cell(
+    axes: Axes, corner: tuple[int, int], outcome: ConditionOutcome, share: float, missed: str
+) -> None:
+    """A condition's cell, of the size 1.
+
+    Args:
+      share: the lowest of its results that are shares, from 0 to 1.
+      missed: letters of the results that it misses.
+    """
+    x, y = corner
+    shade = float(_SCALE(100.0 * share))
+    edge = _INK if outcome.trained else "none"
+    face = _COLOURS(shade)
+    axes.add_patch(Rectangle((x + 0.05, y + 0.06), 0.9, 0.88, facecolor=face, edgecolor=edge))
+    # The unit stands beside the row.
+    text = f"{strength_text(outcome.strength, '')}\n{missed or _TICK}"
+    ink = _INK if 0.2 < shade < 0.8 else _PAPER
+    axes.text(x + 0.5, y + 0.5, text, fontsize=7, ha="center", va="center", color=ink)
+
+
+def _draw_scale(figure: Figure, axes: Axes) -> None:
+    """The colours of the shares, below the cells."""
+    bar = figure.colorbar(
+        ScalarMappable(_SCALE, _COLOURS),
+        ax=axes,
+        location="bottom",
+        ticks=(0, 50, 75, 90, 100),
+        shrink=0.5,
+        aspect=50,
+    )
+    bar.set_label("lowest result of those in %", fontsize=8)
 
 
 def _rows(outcomes: Sequence[ConditionOutcome]) -> list[tuple[str, list[ConditionOutcome]]]:

@@ -1,13 +1,16 @@
-"""The actuators of a model: which joint each one moves, and whether it is a position servo.
+"""The actuators of a model: which joint each one moves, whether it is a position servo, and the
+torques that it can exert there.
 
 An acting joint of the task has exactly one actuator, a position servo, whose control is the target
-position of the joint, times the gear. An arm that is adopted may have other ones.
+position of the joint, times the gear. An arm that is adopted may have other ones, such as motors.
 
 MuJoCo counts actuators (`nactuator`) and controls (`nu`) apart, as a `<pid>` has several controls:
-`actuator_ctrladr` is the first control of each actuator.
+`actuator_ctrladr` is the first control of each actuator. It limits an actuator by its `forcerange`,
+which the `gear` multiplies, and a joint by its `actuatorfrcrange`; `servo_settings` also finds the
+limit of an actuator that is no servo, whose control may limit it too.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -18,6 +21,16 @@ from bounce_mjx.robot.names import joint_name
 
 ACTING_KINDS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 """Joints of one number, which a position servo can move."""
+_DELAYS = (
+    mujoco.mjtDyn.mjDYN_NONE,
+    mujoco.mjtDyn.mjDYN_FILTER,
+    mujoco.mjtDyn.mjDYN_FILTEREXACT,
+)
+"""Of an actuator whose activation never leaves the range of its control."""
+_BIASES_BY_NUMBERS = (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
+"""Biases that are 0 where their numbers are."""
+_KNOWN_GAINS = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_PID)
+"""Of a motor or a controller: without a range, its force has no limit."""
 JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 """Of an actuator that drives a joint; for a hinge or a slide, both are the same."""
 
@@ -45,7 +58,7 @@ def joint_actuators(model: mujoco.MjModel) -> dict[int, list[int]]:
 
 
 def single_actuators(model: mujoco.MjModel, joints: Collection[int]) -> dict[int, int]:
-    """The actuator of each of some joints that has one, in the model's order.
+    """The actuators of those of some joints that have one, by joint, in the model's order.
 
     Raises:
       UserError: a joint has several; the text starts with what is wrong.
@@ -62,8 +75,9 @@ def single_actuators(model: mujoco.MjModel, joints: Collection[int]) -> dict[int
 
 
 def is_position_servo(model: mujoco.MjModel, actuator: int) -> bool:
-    """Whether an actuator's control, or its filtered or integrated one, is a target position, times
-    the gear. `is_direct` tells whether it is the control itself.
+    """Whether an actuator acts as a position servo, whose target is a joint position times the
+    gear. `is_direct` tells whether the target is the control itself, not a filtered or an
+    integrated one.
 
     MuJoCo's force is gain * control + offset + factor * position + ...; a servo has the gain as its
     stiffness, and no offset.
@@ -91,7 +105,7 @@ def servo_settings(model: mujoco.MjModel, joint: int, actuator: int) -> ServoSet
     """The settings of the actuator that drives a joint.
 
     Raises:
-      UserError: it pushes one way only.
+      UserError: it pushes one way only, or its force limit is unknown.
     """
     limit = _force_limit(model, joint, actuator)
     if not (is_direct(model, actuator) and is_position_servo(model, actuator)):
@@ -116,6 +130,52 @@ def servo_range(model: mujoco.MjModel, actuator: int) -> tuple[float, float]:
     return float(low), float(high)
 
 
+def force_ranges(mj_model: mujoco.MjModel, servos: Sequence[int]) -> np.ndarray:
+    """Lower and upper ends [2, n] of the `forcerange` of actuators [n]; infinite without a
+    limit."""
+    low, high = mj_model.actuator_forcerange[list(servos)].T
+    is_limited = mj_model.actuator_forcelimited[list(servos)].astype(bool)
+    return np.stack([np.where(is_limited, low, -np.inf), np.where(is_limited, high, np.inf)])
+
+
+def torque_ranges(
+    mj_model: mujoco.MjModel, joints: Sequence[int], servos: Sequence[int]
+) -> np.ndarray:
+    """Least and greatest torque [2, n] (N m, or N of a slide) of the servos [n] of joints [n];
+    infinite without a limit."""
+    gears = mj_model.actuator_gear[list(servos), 0]
+    low, high = np.sort(gears * force_ranges(mj_model, servos), axis=0)
+    joint_low, joint_high = mj_model.jnt_actfrcrange[list(joints)].T
+    is_limited = mj_model.jnt_actfrclimited[list(joints)].astype(bool)
+    return np.stack(
+        [
+            np.where(is_limited, np.maximum(low, joint_low), low),
+            np.where(is_limited, np.minimum(high, joint_high), high),
+        ]
+    )
+
+
+def largest_torques(
+    mj_model: mujoco.MjModel, joints: Sequence[int], servos: Sequence[int]
+) -> np.ndarray:
+    """Largest torque [n] (N m, or N of a slide) that the servos exert in either direction: the
+    smaller of both ends; infinite without a limit."""
+    low, high = torque_ranges(mj_model, joints, servos)
+    return np.minimum(-low, high)
+
+
+def limit_torques(
+    mj_model: mujoco.MjModel, servos: Sequence[int], torques: Sequence[float]
+) -> None:
+    """Narrows the `forcerange` of servos [n] to torques [n] (N m) at their joints; a weaker servo
+    keeps its own. Each has 0 in its range (`model.check_servos`)."""
+    forces = np.asarray(torques) / np.abs(mj_model.actuator_gear[list(servos), 0])
+    low, high = force_ranges(mj_model, servos)
+    narrowed = np.stack([np.maximum(low, -forces), np.minimum(high, forces)], axis=1)
+    mj_model.actuator_forcerange[list(servos)] = narrowed
+    mj_model.actuator_forcelimited[list(servos)] = True
+
+
 class _ForceRange(NamedTuple):
     """One of MuJoCo's limits of an actuator's force."""
 
@@ -129,12 +189,25 @@ class _ForceRange(NamedTuple):
 
 
 def _force_limit(model: mujoco.MjModel, joint: int, actuator: int) -> float | None:
-    """Largest force of a joint's actuator, N m or N; None for no limit: by the force range, by the
-    control range of a plain motor, or by the joint's own limit."""
+    """Largest force of a joint's actuator in both directions, N m or N; None for no limit: by the
+    force range, by the range of a motor's control or activation, or by the joint's own limit. Of a
+    servo it is that of `largest_torques`.
+
+    Raises:
+      UserError: the actuator pushes one way only, or not at all, or its limit is unknown.
+    """
+    _check_pushes(model, joint, actuator)
     gear = float(model.actuator_gear[actuator, 0])
     gain = float(model.actuator_gainprm[actuator, 0])
     control = model.actuator_ctrladr[actuator]
-    is_motor = model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_NONE
+    dynamics = int(model.actuator_dyntype[actuator])
+    # The force of a motor is its gain times its activation, which may be the control itself.
+    gain_type = int(model.actuator_gaintype[actuator])
+    has_bias = int(model.actuator_biastype[actuator]) not in _BIASES_BY_NUMBERS or np.any(
+        model.actuator_biasprm[actuator, :3]
+    )
+    is_motor = gain_type == mujoco.mjtGain.mjGAIN_FIXED and not has_bias
+    has_activation = dynamics != mujoco.mjtDyn.mjDYN_NONE
     ranges = (
         _ForceRange(
             name="forcerange",
@@ -144,8 +217,16 @@ def _force_limit(model: mujoco.MjModel, joint: int, actuator: int) -> float | No
         ),
         _ForceRange(
             name="ctrlrange",
-            is_limited=bool(is_motor and model.actuator_ctrllimited[control]),
+            is_limited=bool(
+                is_motor and dynamics in _DELAYS and model.actuator_ctrllimited[control]
+            ),
             range=model.actuator_ctrlrange[control],
+            factor=gear * gain,
+        ),
+        _ForceRange(
+            name="actrange",
+            is_limited=bool(is_motor and has_activation and model.actuator_actlimited[actuator]),
+            range=model.actuator_actrange[actuator],
             factor=gear * gain,
         ),
         _ForceRange(
@@ -160,6 +241,8 @@ def _force_limit(model: mujoco.MjModel, joint: int, actuator: int) -> float | No
         if not force_range.is_limited:
             continue
         low, high = force_range.range.tolist()
+        # Stricter than `model.check_servos`: the limit also becomes that of a made servo, which
+        # pushes both ways.
         if not low < 0.0 < high:
             most = max(-low, high)
             raise UserError(
@@ -168,5 +251,27 @@ def _force_limit(model: mujoco.MjModel, joint: int, actuator: int) -> float | No
                 f"{most:g}"
             )
         limits.append(min(-low, high) * abs(force_range.factor))
+    if not limits and gain_type not in _KNOWN_GAINS:
+        raise UserError(
+            f"an actuator on {joint_name(model, joint)} whose strength follows from more than its "
+            "control; give it a forcerange, or drive the joint by a <position> or <motor>"
+        )
     limit = min(limits, default=np.inf)
     return limit if np.isfinite(limit) else None
+
+
+def _check_pushes(model: mujoco.MjModel, joint: int, actuator: int) -> None:
+    """Refuses a muscle, which only pulls, and a damper, which only brakes."""
+    gain_type = model.actuator_gaintype[actuator]
+    offset_and_stiffness = model.actuator_gainprm[actuator, :2]
+    is_affine = gain_type == mujoco.mjtGain.mjGAIN_AFFINE
+    if gain_type == mujoco.mjtGain.mjGAIN_MUSCLE:
+        kind = "muscle"
+    elif is_affine and not np.any(offset_and_stiffness):
+        kind = "damper"
+    else:
+        return
+    raise UserError(
+        f"a {kind} on {joint_name(model, joint)}, which cannot push both ways; drive the joint by "
+        "a <position> or <motor> with a force limit"
+    )

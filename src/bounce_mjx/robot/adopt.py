@@ -1,4 +1,5 @@
-"""Adoption of an unknown arm: its pose, its servos, and the settings that follow from them."""
+"""Search of the settings of an arm that is in the task's scene (`arm.py`): its pose, its servos,
+and what follows from them."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -67,7 +68,7 @@ def adopt(mjcf: Path, config: RobotConfig, control_dt: float, is_mount_given: bo
     config = _with_servos(config, None)
     with arms.naming(path):
         arm = arms.build_arm(path, config)
-        # So every body stays: the search moves the paddle's.
+        # Every body must stay, as the search moves the paddle's.
         arm.spec.compiler.fusestatic = False
         with_shapes = arms.compile_spec(arm.spec, path)
         # The search needs no shapes, and is faster without them.
@@ -84,7 +85,7 @@ def adopt(mjcf: Path, config: RobotConfig, control_dt: float, is_mount_given: bo
         if scale is None:
             servos, scale = _made_servos(model, addresses, arm, pose, control_dt)
             config = _with_servos(config, servos)
-            # `model_copy` checks nothing.
+            # `model_copy` checks nothing. The error begins with the doubt, in place of a file.
             doubt = "servos of another size than robots have, perhaps by wrong units"
             config = validate(RobotConfig, config.model_dump(), doubt)
         return Adoption(
@@ -137,8 +138,8 @@ def _ranked_poses(
 def _clear_pose(
     with_shapes: mujoco.MjModel, poses: Sequence[PaddlePose]
 ) -> tuple[PaddlePose, float]:
-    """The first pose in which the paddle keeps clear of the arm, and its distance, m; the best one
-    if there is none."""
+    """The first pose in which the paddle keeps clear of the arm, and its distance, m; if there is
+    none, the best one, of whose touch the command tells."""
     addresses = find_addresses(with_shapes)
     for pose in poses:
         distance = clearance(with_shapes, addresses, pose)

@@ -1,6 +1,6 @@
-"""Adoption of an arm: from any MJCF with a serial arm in it to the task's scene, with MjSpec.
+"""An arm's MJCF in the task's scene, with MjSpec; `adopt.py` searches its settings.
 
-Every change by which the arm moves otherwise than in the user's file is collected as one sentence.
+Every change by which the arm moves otherwise than in the user's file is collected (`Arm.changes`).
 """
 
 import contextlib
@@ -39,8 +39,10 @@ MIN_JOINTS = 3
 
 BODY_FIELDS = ("body_pos", "body_quat", "body_ipos", "body_iquat", "body_mass", "body_inertia")
 JOINT_FIELDS = ("jnt_pos", "jnt_axis")
-# Viewers show the groups 0 to 2.
+# Viewers show the groups 0 to 2. Where a link has a picture, this is the group of the shapes that
+# touch, and of no other shape of an adopted arm.
 HIDDEN_GROUP = 3
+_ALSO_HIDDEN_GROUP = 5
 # Smallest change of a joint's range that is reported, rad or m.
 _NARROWER = 1e-3
 _HANDLE_RADIUS = 0.011
@@ -76,7 +78,7 @@ class Arm(NamedTuple):
     actuators: tuple[ServoSettings, ...]
     """The file's own actuator of each acting joint, a servo or another one."""
     changes: tuple[str, ...]
-    """Changes to the user's model, one sentence each."""
+    """Changes to the user's model, a phrase each."""
     narrowed: tuple[str, ...]
     """The joints whose range a servo's ctrlrange narrows, in words."""
     file_numbers: dict[str, np.ndarray]
@@ -139,11 +141,11 @@ def build_arm(path: Path, config: RobotConfig) -> Arm:
     Raises:
       UserError: the file does not compile, or holds no arm that can do the task.
     """
-    arm = read_spec(path)
-    model = compile_spec(arm, path)
+    spec = read_spec(path)
+    model = compile_spec(spec, path)
     check_numbers(model)
     with _compiling(path):
-        return _Builder(arm, model, config).build()
+        return _Builder(spec, model, config).build()
 
 
 def read_spec(path: Path) -> mujoco.MjSpec:
@@ -223,12 +225,13 @@ def _other_sites(model: mujoco.MjModel) -> str:
 class _Builder:
     """The steps of one adoption.
 
-    `_model` is the user's file as MuJoCo compiles it. Its ids are places in the lists of the spec
-    `_arm` until the first element is deleted, in `_strip`.
+    `_spec` is the user's file, and `_model` as MuJoCo compiles it. The model's ids are places in
+    the lists of the spec until the first element is deleted, in `_strip`: what compiling fuses, it
+    also takes out of the spec.
     """
 
-    def __init__(self, arm: mujoco.MjSpec, model: mujoco.MjModel, config: RobotConfig):
-        self._arm = arm
+    def __init__(self, spec: mujoco.MjSpec, model: mujoco.MjModel, config: RobotConfig):
+        self._spec = spec
         self._model = model
         self._config = config
         self._changes: list[str] = []
@@ -242,14 +245,14 @@ class _Builder:
         actuators = self._actuators(joints)
         settings = tuple(servo_settings(model, joint, actuators[joint]) for joint in joints)
         loose = self._loose_bodies(chain, joints)
-        self._check_couplings(joints, loose)
+        couplings = self._couplings_with_loose(joints, loose)
         file_numbers = self._numbers_in_file(joints, loose)
         scene = read_spec(resource_path("mjcf/scene.xml"))
         self._rename(scene, holder)
         holder_name, joint_names = self._bind_names(holder, joints, actuators)
         self._freeze_bodies()
         self._freeze_joints(joints, actuators)
-        self._strip(joints, loose)
+        self._strip(joints, loose, couplings)
         self._disable_contacts(joints)
         self._attach(scene, holder_name, position, quaternion)
         self._replace_servos(scene, joint_names)
@@ -365,23 +368,31 @@ class _Builder:
                 f"{arm_joints}; give an MJCF with nothing but one arm on a fixed base"
             )
 
-    def _check_couplings(self, joints: list[int], loose: list[int]) -> None:
-        """Refuses an equality constraint or a tendon that acts on the arm. What has an end on a
-        loose body, such as a gripper's tendon, goes with it."""
+    def _couplings_with_loose(self, joints: list[int], loose: list[int]) -> list[str]:
+        """The equality constraints and tendons between the arm and a loose body, in words: they go
+        with that body, such as a gripper's tendon or a mocap body's weld.
+
+        Raises:
+          UserError: one couples the arm otherwise: with itself, or with the world, from which a rod
+            of a linkage hangs.
+        """
         model = self._model
         couplings = []
-        for constraint, equality in enumerate(self._arm.equalities):
-            ends = _ends_of_constraint(model, constraint)
-            if ends is None or _acts_on_arm(model, ends, joints, loose):
-                couplings.append(_constraint_words(equality))
+        for constraint, equality in enumerate(self._spec.equalities):
+            couplings.append((_constraint_words(equality), _ends_of_constraint(model, constraint)))
         for tendon in range(model.ntendon):
-            if _acts_on_arm(model, _ends_of_tendon(model, tendon), joints, loose):
-                couplings.append(_tendon_words(model, tendon))
-        if couplings:
-            raise UserError(
-                f"the {couplings[0]} on the arm, so it is not a serial chain; remove it, or give a "
-                "serial arm"
-            )
+            couplings.append((_tendon_words(model, tendon), _ends_of_tendon(model, tendon)))
+        with_loose = []
+        for words, ends in couplings:
+            if ends is not None and not _acts_on_arm(model, ends, joints, loose):
+                continue
+            if ends is None or not _lets_go(model, ends, joints, loose):
+                raise UserError(
+                    f"the {words} on the arm, so it is not a serial chain; remove it, or give a "
+                    "serial arm"
+                )
+            with_loose.append(words)
+        return with_loose
 
     def _numbers_in_file(self, joints: list[int], loose: list[int]) -> dict[str, np.ndarray]:
         """`Arm.file_numbers`."""
@@ -395,28 +406,28 @@ class _Builder:
     def _rename(self, scene: mujoco.MjSpec, holder: int) -> None:
         """Gives the arm's parts names that the task's scene does not use, and the body that holds
         the paddle a name."""
-        arm = self._arm
+        spec = self._spec
         # Each access to a list of a spec walks through the whole spec.
-        bodies = list(arm.bodies)
+        bodies = list(spec.bodies)
         if not bodies[holder].name:
             bodies[holder].name = _free_name("end_effector", bodies)
         renamed = _rename_beside(bodies[1:], scene.bodies, PADDLE_BODY_NAME)
-        renamed += _rename_beside(list(arm.joints), scene.joints)
-        renamed += _rename_beside(list(arm.geoms), scene.geoms, PADDLE_GEOM_NAME)
+        renamed += _rename_beside(list(spec.joints), scene.joints)
+        renamed += _rename_beside(list(spec.geoms), scene.geoms, PADDLE_GEOM_NAME)
         if renamed:
             self._changes.append(f"renamed what the scene has too: {listed(renamed, most=20)}")
 
     def _bind_names(
         self, holder: int, joints: list[int], actuators: dict[int, int]
     ) -> tuple[str, tuple[str, ...]]:
-        """The names of the body that holds the paddle, and of the acting joints, by which their
-        actuators find them."""
-        spec_joints = list(self._arm.joints)
-        spec_actuators = list(self._arm.actuators)
+        """Binds the actuators to the joints' new names; returns the names of the body that holds
+        the paddle, and of the acting joints."""
+        spec_joints = list(self._spec.joints)
+        spec_actuators = list(self._spec.actuators)
         for joint in joints:
             spec_actuators[actuators[joint]].target = spec_joints[joint].name
         names = tuple(spec_joints[joint].name for joint in joints)
-        return list(self._arm.bodies)[holder].name, names
+        return list(self._spec.bodies)[holder].name, names
 
     def _freeze_bodies(self) -> None:
         """Gives the bodies of the spec the numbers of the compiled model.
@@ -424,8 +435,8 @@ class _Builder:
         MuJoCo's compiler computes them from the whole file, with its units and settings. Compiled
         again in another scene, without its limits and with fewer parts, they would be others.
         """
-        compiler = self._arm.compiler
-        for i, body in enumerate(list(self._arm.bodies)[1:], start=1):
+        compiler = self._spec.compiler
+        for i, body in enumerate(list(self._spec.bodies)[1:], start=1):
             body.explicitinertial = True
             for field in BODY_FIELDS:
                 setattr(body, field.removeprefix("body_"), getattr(self._model, field)[i])
@@ -443,10 +454,11 @@ class _Builder:
 
     def _freeze_joints(self, joints: list[int], actuators: dict[int, int]) -> None:
         """Gives the acting joints and their actuators those numbers of the compiled model that
-        would change in the scene, as `_freeze_bodies`, and the joints the ranges that their servos
-        reach. MuJoCo computes the others (pos, axis, ref, springref) as in the file."""
-        spec_joints = list(self._arm.joints)
-        spec_actuators = list(self._arm.actuators)
+        would change in the scene, as `_freeze_bodies`, and the joints the ranges that the file's
+        servos reach: also where other servos replace these, as the robot's controller has that
+        range. MuJoCo computes the others (pos, axis, ref, springref) as in the file."""
+        spec_joints = list(self._spec.joints)
+        spec_actuators = list(self._spec.actuators)
         for joint in joints:
             actuator = actuators[joint]
             self._freeze_joint(spec_joints[joint], joint, actuator)
@@ -506,17 +518,18 @@ class _Builder:
             self._narrowed.append(
                 f"{name} from {low:.4g} to {high:.4g} to {reached_low:.4g} to {reached_high:.4g}"
             )
+        # Both ends are infinite, or none.
         if np.isinf(reached_high):
             return 0.0, 0.0
         return reached_low, reached_high
 
-    def _strip(self, joints: list[int], loose: list[int]) -> None:
+    def _strip(self, joints: list[int], loose: list[int], couplings: list[str]) -> None:
         """Removes all but the arm; without its free joint, a base is fixed."""
-        arm = self._arm
+        spec = self._spec
         model = self._model
         # From here on, ids of the model are no places in the spec's lists any more.
-        bodies = list(arm.bodies)
-        spec_joints = list(arm.joints)
+        bodies = list(spec.bodies)
+        spec_joints = list(spec.joints)
         acting_names = [spec_joints[joint].name for joint in joints]
         idle = []
         for joint, spec_joint in enumerate(spec_joints):
@@ -525,30 +538,34 @@ class _Builder:
                 idle.append(spec_joint)
         # MuJoCo deletes a body with what refers to it, such as a gripper's tendons.
         self._remove("removed the grippers and loose objects", [bodies[body] for body in loose])
+        if couplings:
+            self._changes.append(f"removed what couples the arm with these: {', '.join(couplings)}")
         self._remove("fixed the joints that do not act", idle)
-        others = [*arm.keys, *arm.sensors, *arm.pairs, *arm.excludes, *arm.lights, *arm.cameras]
-        others += arm.equalities
-        for actuator in arm.actuators:
+        others = list(spec.keys)
+        for elements in (spec.sensors, spec.pairs, spec.excludes, spec.lights, spec.cameras):
+            others += elements
+        others += spec.equalities
+        for actuator in spec.actuators:
             drives_joint = int(actuator.trntype) in JOINT_TRANSMISSIONS
             if not (drives_joint and actuator.target in acting_names):
                 others.append(actuator)
-        others += arm.tendons
+        others += spec.tendons
         floors = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
-        others += [geom for geom in arm.geoms if geom.type in floors]
+        others += [geom for geom in spec.geoms if geom.type in floors]
         self._remove("removed what is not the arm", others)
 
     def _remove(self, words: str, elements: Iterable) -> None:
         elements = list(elements)
         names = [element.name for element in elements]
         for element in elements:
-            self._arm.delete(element)
+            self._spec.delete(element)
         if elements:
             named = f": {listed(names)}" if any(names) else ""
             self._changes.append(f"{words} ({len(elements)}{named})")
 
     def _disable_contacts(self, joints: list[int]) -> None:
         arm_touches = False
-        for i, body in enumerate(self._arm.bodies):
+        for i, body in enumerate(self._spec.bodies):
             touching = [bool(geom.contype or geom.conaffinity) for geom in body.geoms]
             arm_touches = arm_touches or any(touching)
             for geom, touches in zip(body.geoms, touching, strict=True):
@@ -556,6 +573,8 @@ class _Builder:
                 # the world, such as a table, is shown as it is.
                 if touches and i > 0 and not all(touching):
                     geom.group = HIDDEN_GROUP
+                elif geom.group == HIDDEN_GROUP:
+                    geom.group = _ALSO_HIDDEN_GROUP
                 geom.contype = 0
                 geom.conaffinity = 0
         if arm_touches:
@@ -580,8 +599,8 @@ class _Builder:
             self._changes.append(f"replaced the physics options with the task's: {differing}")
         if np.any(self._model.dof_frictionloss):
             raise_solver_limits(scene.option)
-        self._arm.option = scene.option
-        scene.attach(self._arm, frame=scene.worldbody.add_frame(), prefix="")
+        self._spec.option = scene.option
+        scene.attach(self._spec, frame=scene.worldbody.add_frame(), prefix="")
         paddle = scene.body(holder).add_body(name=PADDLE_BODY_NAME, pos=position, quat=quaternion)
         _add_paddle(paddle, config.paddle, scene.default)
         ball = scene.geom("ball")
@@ -746,19 +765,40 @@ def _ends_of_tendon(model: mujoco.MjModel, tendon: int) -> list[_End]:
 def _acts_on_arm(
     model: mujoco.MjModel, ends: list[_End], joints: list[int], loose: list[int]
 ) -> bool:
-    """Whether what has these ends acts on an acting joint, or on a body that one moves; not where
-    it has an end on a loose body."""
-    if any(is_below(model, _body_of(model, end), loose) for end in ends):
-        return False
+    """Whether what has these ends acts on an acting joint, or on a body of the arm that one
+    moves."""
     moved = model.jnt_bodyid[joints].tolist()
     for end in ends:
+        body = _body_of(model, end)
         if end.kind == mujoco.mjtObj.mjOBJ_JOINT:
             acts = end.index in joints
         else:
-            acts = is_below(model, _body_of(model, end), moved)
+            acts = is_below(model, body, moved) and not is_below(model, body, loose)
         if acts:
             return True
     return False
+
+
+def _lets_go(model: mujoco.MjModel, ends: list[_End], joints: list[int], loose: list[int]) -> bool:
+    """Whether what has these ends goes with the loose bodies of them: some are loose, and each of
+    those is a gripper's, a mocap body, or free in the world."""
+    moved = model.jnt_bodyid[joints].tolist()
+    bodies = [_body_of(model, end) for end in ends]
+    loose_ends = [body for body in bodies if is_below(model, body, loose)]
+    for body in loose_ends:
+        is_of_gripper = is_below(model, body, moved)
+        if not is_of_gripper and _hangs(model, body):
+            return False
+    return bool(loose_ends)
+
+
+def _hangs(model: mujoco.MjModel, body: int) -> bool:
+    """Whether a body is held by the world: it is below no free and no mocap body."""
+    root = model.body_rootid[body]
+    joint = model.body_jntadr[root]
+    is_free = joint >= 0 and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE
+    is_mocap = model.body_mocapid[root] >= 0
+    return not is_free and not is_mocap
 
 
 def _body_of(model: mujoco.MjModel, end: _End) -> int:

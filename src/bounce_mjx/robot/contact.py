@@ -21,13 +21,13 @@ PAIR_SETTINGS = "condim solref solreffriction solimp margin gap adhesion frictio
 
 # With fewer physics steps in half a period of a contact, the ball can gain energy in a rebound.
 _STEPS_OF_A_CONTACT = 4
-# Fields of an MjModel with such numbers; `{}` is solref or solimp.
+# Fields of an MjModel with a solref or a solimp, which `{}` stands for.
 _FIELDS = "pair_{} geom_{} jnt_{} dof_{} eq_{} tendon_{}_lim tendon_{}_fri".split()
 
 # Damping ratios of the contact, and the measured restitution: the mean of the drops on the held
 # paddle of tests/test_randomization.py, at 1, 2, 3 and 4 m/s and eight phases of the physics step.
-# The last ratio is of no drop: by it, each ratio between has a restitution of its own, from which
-# it follows again.
+# The last entry is not measured: it makes each ratio beyond 1.6 have a restitution of its own, from
+# which the ratio follows again.
 _DROPS = (
     (0.0, 0.993), (0.005, 0.98), (0.01, 0.965), (0.0152, 0.95), (0.032, 0.90), (0.05, 0.85),
     (0.0697, 0.80), (0.0921, 0.75), (0.116, 0.70), (0.13, 0.674), (0.16, 0.622), (0.2, 0.565),
@@ -55,7 +55,8 @@ def restitution_of_damping(damping: float, stiffness: float) -> np.ndarray:
 
 def stiffness_and_damping(solref: Any, timestep: float) -> tuple[Any, Any]:
     """Stiffness k, 1/s^2, and damping b, 1/s, of a `solref` [2] in either format (MuJoCo's
-    documentation, "Modeling", solver parameters).
+    documentation, "Modeling", solver parameters; without the dmax there, which scales the numbers
+    of both formats alike).
 
     Args:
       solref: two floats, or scalars of JAX.

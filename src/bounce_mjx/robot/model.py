@@ -1,6 +1,8 @@
-"""The simulated robot: its MJCF file, the names in it, and the addresses of its data."""
+"""The simulated robot: its MJCF file, its balls, the names in it, the addresses of its data, and
+the sizes and places that tasks and controllers need."""
 
 import hashlib
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -17,14 +19,23 @@ from bounce_mjx.robot.actuators import (
     ACTING_KINDS,
     is_direct,
     is_position_servo,
+    limit_torques,
     single_actuators,
+    torque_ranges,
 )
-from bounce_mjx.robot.balls import MAX_BALLS, add_balls, ball_name
 from bounce_mjx.robot.config import RobotConfig
-from bounce_mjx.robot.contact import check_step
-from bounce_mjx.robot.names import BALL_BODY_NAME, PADDLE_GEOM_NAME, joint_name
+from bounce_mjx.robot.contact import PAIR_SETTINGS, check_step
+from bounce_mjx.robot.names import (
+    BALL_BODY_NAME,
+    BALL_NUMBERS,
+    PADDLE_GEOM_NAME,
+    joint_name,
+)
 from bounce_mjx.robot.numbers import check_numbers, physical_fields
-from bounce_mjx.robot.torques import limit_torques, torque_ranges
+
+MAX_BALLS = len(BALL_NUMBERS)
+BALLS_APART = 0.1
+"""Height of each added ball above the last one, m."""
 
 
 class BallAddresses(NamedTuple):
@@ -49,10 +60,21 @@ class Addresses(NamedTuple):
     arm_qvel: tuple[int, ...]
     """Velocities of the acting joints in qvel."""
     actuators: tuple[int, ...]
-    """Ids of the servos, and of their controls in ctrl, which `check_servos` lets be the same: each
-    moves the acting joint of the same place in `arm_joints`."""
+    """Ids of the servos: each moves the acting joint of the same place in `arm_joints`. Each has
+    one control (`check_servos`), so they are also its places in ctrl."""
     balls: tuple[BallAddresses, ...]
     paddle_geom: int
+
+
+class Geometry(NamedTuple):
+    """What a task needs of the ball and the paddle, which a model may have in any size."""
+
+    ball_radius: float
+    """Radius of the balls, m."""
+    rest_height: float
+    """Height of a ball's centre over the paddle's while they touch, m."""
+    paddle_home: tuple[float, float, float]
+    """Centre of the paddle at a reset without noise, m; the function `paddle_home` rounds it."""
 
 
 def scene_spec(mjcf: Path | None, robot: RobotConfig) -> tuple[mujoco.MjSpec, Path]:
@@ -91,8 +113,9 @@ def load_model(
 
     Raises:
       UserError: the file is missing, is no MJCF, lacks a name that the task needs, has a joint with
-        several actuators or one that is no position servo (`check_servos`), a range in degrees that
-        MuJoCo does not convert, more balls than `num_balls`, or a number that cannot be simulated;
+        several actuators or with one that is no position servo at rest (`check_servos`), a range in
+        degrees that MuJoCo does not convert, more balls than `num_balls`, or a number that cannot
+        be simulated;
         or half a period of a contact has fewer than four physics steps.
     """
     robot = robot or RobotConfig()
@@ -110,7 +133,8 @@ def load_model(
         _check_units_of_ranges(spec, mj_model, addresses)
         _check_balls(addresses, num_balls)
     if robot.limits.torque is not None:
-        # Of as many servos as there are torques: a wrong number is refused by `Env`, later.
+        # A wrong number of torques, or of joints, is refused where the config is known
+        # (`WorldConfig`, `env.checks.check_joint_angles`).
         torques = robot.limits.torque[: len(addresses.actuators)]
         limit_torques(mj_model, addresses.actuators[: len(torques)], torques)
     mj_model.opt.timestep = physics_dt
@@ -118,8 +142,45 @@ def load_model(
     return mj_model
 
 
+def ball_name(index: int) -> str:
+    """Name of the body of a ball, which counts from 0: ball_link, ball_link2, ball_link3."""
+    return BALL_BODY_NAME + BALL_NUMBERS[index]
+
+
+def add_balls(spec: mujoco.MjSpec, num_balls: int) -> None:
+    """Adds balls to a scene until it has `num_balls`: copies of the first one with all that it
+    consists of, such as its contact pair with the paddle, and pairs like that one between each two
+    balls. A ball or a pair that the scene has stays as it is.
+
+    MuJoCo's solver may then take its default number of iterations. With the shipped limits, a step
+    with two touching balls is wrong by up to four times the largest velocity.
+    """
+    if num_balls == 1 or spec.body(BALL_BODY_NAME) is None:
+        return
+    arm.raise_solver_limits(spec.option)
+    spec.copy_during_attach = True
+    for i in range(1, num_balls):
+        if spec.body(ball_name(i)) is None:
+            # The copy brings its pairs.
+            frame = spec.worldbody.add_frame(pos=[0.0, 0.0, BALLS_APART * i])
+            frame.attach_body(spec.body(BALL_BODY_NAME), prefix="", suffix=BALL_NUMBERS[i])
+    pairs = {frozenset((pair.geomname1, pair.geomname2)): pair for pair in spec.pairs}
+    touching = []
+    for i in range(num_balls):
+        for geom in spec.body(ball_name(i)).geoms:
+            # The one that `find_addresses` takes; a ball without a pair touches nothing.
+            if frozenset((geom.name, PADDLE_GEOM_NAME)) in pairs:
+                touching.append(geom.name)
+                break
+    for first, second in itertools.combinations(touching, 2):
+        if frozenset((first, second)) not in pairs:
+            with_paddle = pairs[frozenset((second, PADDLE_GEOM_NAME))]
+            settings = {name: getattr(with_paddle, name) for name in PAIR_SETTINGS}
+            spec.add_pair(geomname1=first, geomname2=second, **settings)
+
+
 def _compensate_gravity(spec: mujoco.MjSpec, share: float) -> None:
-    """Lets a controller carry a share of the weight of each body but the balls."""
+    """Lets a controller carry a share of the weight of each body without a free joint."""
     for body in spec.bodies:
         is_free = any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in body.joints)
         if not is_free:
@@ -127,8 +188,8 @@ def _compensate_gravity(spec: mujoco.MjSpec, share: float) -> None:
 
 
 def _drop_pictures(spec: mujoco.MjSpec) -> None:
-    """Leaves out what only pictures need, except where it makes the bodies' inertia: there MuJoCo
-    would not drop it."""
+    """Leaves out what only pictures need. Where geoms make the bodies' inertia, MuJoCo keeps them
+    whatever the flag, so it is not set."""
     from_geoms = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     if spec.compiler.inertiafromgeom != from_geoms:
         spec.compiler.discardvisual = True
@@ -162,7 +223,7 @@ def paddle_home(
     mjcf: Path | None, robot: RobotConfig, joint_angles: Sequence[float]
 ) -> tuple[float, float, float]:
     """Centre of the paddle at joint angles [n] (rad), m, rounded to 0.1 mm as in a config;
-    `geometry.read_geometry` has the exact one of a compiled model.
+    `read_geometry` has the exact one of a compiled model.
 
     Args:
       mjcf, robot: as for `load_model`.
@@ -176,6 +237,34 @@ def paddle_home(
     data = data_at(mj_model, addresses, joint_angles)
     x, y, z = data.geom_xpos[addresses.paddle_geom].tolist()
     return round(x, 4), round(y, 4), round(z, 4)
+
+
+def read_geometry(
+    mj_model: mujoco.MjModel, addresses: Addresses, joint_angles: Sequence[float]
+) -> Geometry:
+    """The geometry of a model whose arm starts at joint angles [n], rad."""
+    ball_radius = float(mj_model.geom_size[addresses.balls[0].geom, 0])
+    _, face_height = upper_face(mj_model, addresses, joint_angles)
+    data = data_at(mj_model, addresses, joint_angles)
+    paddle_home = tuple(data.geom_xpos[addresses.paddle_geom].tolist())
+    return Geometry(ball_radius, ball_radius + face_height, paddle_home)
+
+
+def upper_face(
+    mj_model: mujoco.MjModel, addresses: Addresses, joint_angles: Sequence[float]
+) -> tuple[np.ndarray, float]:
+    """Unit normal [3] of the paddle's face that is the upper one at these joint angles (rad), in
+    the frame of the paddle's body, and the face's distance from the paddle's centre, m."""
+    paddle = addresses.paddle_geom
+    data = data_at(mj_model, addresses, joint_angles)
+    # The height of each of the geom's axes.
+    upward = data.geom_xmat[paddle].reshape(3, 3)[2]
+    axis = int(np.argmax(abs(upward)))
+    normal_in_geom = np.sign(upward[axis]) * np.eye(3)[axis]
+    normal = np.zeros(3)
+    mujoco.mju_rotVecQuat(normal, normal_in_geom, mj_model.geom_quat[paddle])
+    half_thickness = float(mj_model.geom_aabb[paddle, 3 + axis])
+    return normal, half_thickness
 
 
 def data_at(
@@ -208,8 +297,8 @@ def link_bodies(mj_model: mujoco.MjModel, addresses: Addresses) -> list[list[int
 
 
 def contact_pairs(mj_model: mujoco.MjModel, addresses: Addresses) -> list[int]:
-    """Indices of the contact pairs of balls and the paddle, the first ball's with the paddle first;
-    none if that one is missing."""
+    """Indices of the contact pairs among the balls and the paddle, that of the first ball with the
+    paddle first; none if that one is missing."""
     paddle = addresses.paddle_geom
     balls = [ball.geom for ball in addresses.balls]
     first = None

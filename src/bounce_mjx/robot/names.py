@@ -8,8 +8,7 @@ from bounce_mjx.errors import shorten
 
 BALL_BODY_NAME = "ball_link"
 PADDLE_GEOM_NAME = "blocker"
-"""The paddle, which blocks the ball's way: whole scenes of users have the name since the first
-one."""
+"""The paddle, which blocks the ball's way: the name that whole scenes of users have."""
 PADDLE_BODY_NAME = "paddle"
 """The body of an adopted arm's paddle."""
 BALL_NUMBERS = ("", "2", "3")

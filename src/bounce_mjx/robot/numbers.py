@@ -11,7 +11,7 @@ WORLD_OPTIONS = ("gravity", "wind", "density", "viscosity")
 # Starts of the names of a model's fields with physics in them, and those of colours among them.
 _PHYSICAL = ("body_", "jnt_", "dof_", "geom_", "pair_", "actuator_", "eq_", "tendon_", "qpos")
 _PICTURED = ("geom_rgba", "geom_matid", "geom_group")
-# Fields that MuJoCo's compiler can compute from others.
+# Fields that MuJoCo's compiler can compute from others; an error names one of them last.
 _DERIVED = frozenset(
     "actuator_acc0 actuator_length0 body_inertia body_invweight0 body_subtreemass dof_M0 "
     "dof_invweight0 dof_length geom_aabb geom_rbound".split()

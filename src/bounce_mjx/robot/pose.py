@@ -2,9 +2,9 @@
 
 Inverse kinematics by damped least squares (Wampler 1986; Buss 2004) from many seeds. The best pose
 has the largest score of conditioning, distance to the joint limits and strength. The same arm
-written in degrees and in radians, whose numbers differ by rounding, has the same start pose: the
-search has no step that rounding changes, except at a threshold, and almost equal scores are told
-apart by the posture.
+written in degrees and in radians, whose numbers differ by rounding, has the same start pose, as
+almost equal scores are told apart by the posture. (A pose that lies exactly at a threshold may be
+in or out.)
 """
 
 import itertools
@@ -51,7 +51,7 @@ _REACH_SAMPLES = 500
 # Distance of a pose from the joint limits, rad or m: the noise of a reset's joint positions. Of a
 # short range it is a tenth.
 _LEAST_MARGIN = 0.1
-# Distance from the joint limits that is plenty, rad.
+# Distance from the joint limits that is plenty, rad or m.
 _AMPLE_MARGIN = 0.5
 # Radius of the column over the paddle that is the ball's way, m.
 _CLEARANCE = 0.09
@@ -91,8 +91,8 @@ class PaddlePose(NamedTuple):
     holding: np.ndarray
     """Force of each acting joint that holds the arm [n], N m or N."""
     reach: float
-    """Largest horizontal distance of the paddle from the first joint, m; of all mounts, with the
-    paddle where it was built."""
+    """Largest horizontal distance of the paddle from the first joint, m; measured once for all
+    mounts, with that of the config."""
     score: float
 
 
@@ -218,7 +218,8 @@ class _Search:
         """The poses by their score; equal ones by their distance to the reference posture.
 
         Without the second rule, rounding would choose: the last joint of an arm with a flat paddle
-        turns it in its plane, and a symmetric arm has each pose twice.
+        turns it in its plane, and a symmetric arm has each pose twice. Each group of equal ones
+        begins at the best of the rest, so rounding moves a pose at most at a group's lower edge.
         """
         beside_reference = self._reference + _SIDE
 
@@ -347,7 +348,8 @@ class _Search:
 
     def _is_clear(self, paddle: np.ndarray) -> bool:
         """Whether the links, as straight lines between the joints, stay above the floor and out of
-        the ball's way; in the pose of the last `_forward`."""
+        the ball's way; in the pose of the last `_forward`. The way from the last link's origin to
+        the paddle is left out, as it ends in the ball's."""
         ends = [self._data.xanchor[joint] for joint in self._joints]
         ends.append(self._data.xpos[self._body])
         for i, (start, end) in enumerate(itertools.pairwise(ends)):

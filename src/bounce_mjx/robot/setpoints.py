@@ -1,6 +1,7 @@
 """Setpoints between two actions, within an arm's limits of velocity, acceleration and jerk.
 
-The simulation computes them with JAX's arrays, and a deployed policy with NumPy's.
+The simulation computes them with JAX's arrays (`world.actuation`), and a deployed policy with
+NumPy's (`deploy.motion`).
 
 **Velocity and acceleration.** An action asks for a position at the end of its control step, of the
 duration T. The command's velocity changes linearly from v0 to v1 within the step. v1 is the
@@ -14,7 +15,7 @@ r^2 / 2a. The excess r T / 2 - r^2 / 2a is at most a T^2 / 8. A stop of several 
     v1 T / 2 + v1^2 / 2a + a T^2 / 8 = (v1 + a T / 2)^2 / 2a <= left
 
 so v1 <= sqrt(2 a left) - a T / 2. A stop of one step (v1 <= a T) takes v1 T / 2 more, v1 T
-together, so v1 <= left / T.
+together, so v1 <= left / T. Each bound suffices, so the larger one holds.
 
 **Jerk.** A jump of the acceleration is at most 2 a. The mean of the command over the last
 s = 2 a / j seconds turns it into a ramp of the slope j, the jerk's limit. A mean keeps all limits
@@ -55,14 +56,15 @@ class JointLimits(NamedTuple):
 
 
 class Setpoint(NamedTuple):
-    """The command at the end of a control step, before the mean."""
+    """The command at the end of a control step, which is the start of the next one, before the
+    mean."""
 
     position: Number
     """rad."""
     velocity: Number
     """rad/s."""
     acceleration: Number
-    """During the whole step, rad/s^2."""
+    """During the whole step that ends here, rad/s^2."""
 
 
 def joint_limits(limits: Any, low: Number = -np.inf, high: Number = np.inf) -> JointLimits | None:
@@ -87,7 +89,7 @@ def next_setpoint(
 
     Args:
       limits: of the commands.
-      start: that at the step's start.
+      start: that at the end of the step before.
       target: the position that the action asks for, rad.
       duration: of a control step, s.
       xp: `numpy` or `jax.numpy`.

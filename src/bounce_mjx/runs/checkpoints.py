@@ -9,6 +9,7 @@ would choose by a file of its own, would not open a folder in which one such fil
 would take a checkpoint for written whose save failed.
 """
 
+import contextlib
 import errno
 import functools
 import logging
@@ -108,7 +109,7 @@ def read_training(checkpoint: Checkpoint, template: Any) -> tuple[Any, Record]:
       template: shapes and dtypes of the state, as from `jax.eval_shape`.
     """
     if not (checkpoint.folder / TRAINING).is_dir() or checkpoint.is_old:
-        raise UserError(f"{checkpoint.folder} has no state of this version; use --warm-start")
+        raise UserError(f"{checkpoint.folder} has no state to continue from; use --warm-start")
     record = read_record(checkpoint)
     return _read_arrays(checkpoint, TRAINING, template), record
 
@@ -274,13 +275,12 @@ def save_checkpoint(
       kept: number of another checkpoint that is kept.
 
     Returns:
-      Its number: that of its steps, or the next one where there is one of as many steps.
+      Its number, see `Checkpoint`.
 
     Raises:
       NotSavedError: it could not be written; the others are as they were.
     """
     folder = run / folders.CHECKPOINTS
-    # What is being written or removed. A killed process leaves it.
     unfinished = folder / _UNFINISHED
     try:
         if not (run / CONFIG_FILE).is_file():
@@ -290,15 +290,17 @@ def save_checkpoint(
         unfinished.mkdir()
         _check_room(unfinished, items)
         others = folders.stored_checkpoints(run)
-        number = max([steps, *(other.steps + 1 for other in others)])
+        number = max([steps, *(other.number + 1 for other in others)])
         plain = config.model_dump(mode="json")
         record = Record(steps=steps, config=plain, progress=progress or {}, report=report)
         _write(unfinished / str(number), items, record)
         (unfinished / str(number)).rename(folder / str(number))
-        for other in others:
-            if other.steps != kept:
-                # First out of the way, so that no reader finds a part of it.
-                other.folder.rename(unfinished / other.folder.name)
+        with contextlib.suppress(OSError):
+            # It is saved: what cannot be removed stays until the next save.
+            for other in others:
+                if other.number != kept:
+                    # First out of the way, so that no reader finds a part of it.
+                    other.folder.rename(unfinished / other.folder.name)
     # Orbax and tensorstore raise exceptions of many types, also where the disk is full.
     except Exception as error:
         reason = getattr(error, "strerror", None) or shorten(reason_of(error), 200)

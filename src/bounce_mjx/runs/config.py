@@ -81,7 +81,8 @@ class TrainConfig(StrictModel):
     """Seed of the evaluations during training."""
     stop_when_solved: bool = False
     """End once an evaluation meets all results with a margin. Then 64 other episodes should meet
-    them too. It ends at the latest after 1.5 times the steps of the first one that meets all."""
+    them too. It ends at the latest after 1.5 times the steps of the first one, after step 0, that
+    meets all."""
     warm_start: Path | None = None
     """Run, or policy of the package, from whose networks and environment the training starts."""
     log_dir: Path = Field(default_factory=_default_log_dir)

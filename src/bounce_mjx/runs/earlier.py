@@ -1,7 +1,6 @@
-"""Runs that version 0.1.0 wrote: their policies are read, and their trainings do not go on.
-
-Their checkpoints lie in `best` and `latest`, and their configs have settings that ended or moved.
-"""
+"""What version 0.1.0 wrote. The policies of its runs are read, and their trainings do not go on:
+their checkpoints lie in `best` and `latest`. A config file, also one of the user's, may have
+settings that moved since then, or that ended and would change nothing."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,7 +21,8 @@ _ENDED = {
     "env.randomization.restitution_slope": None,
     "env.randomization.air_lift": None,
 }
-"""Settings that ended, with the value that changes nothing today; ... for any."""
+"""Settings that ended, with the value that changes nothing today; ... for any: the
+estimator ran only where `env.observation.position` asked for it."""
 _MOVED = {
     "env.joint_angle_noise": "env.reset.joint_angles",
     "env.joint_velocity_noise": "env.reset.joint_velocities",

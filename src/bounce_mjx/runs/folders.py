@@ -6,12 +6,14 @@
         task/, algorithm/               copies of the files of own ones
         events.out.tfevents.*           TensorBoard scalars
         results.json                    all evaluations, and the time of each activity
-        checkpoints/<steps>/            of the newest state, and of the one with the best evaluation
+        checkpoints/<number>/           of the newest state, and of the one with the best evaluation
             policy/                     the policy's arrays
             training/                   the training state's arrays; optional
             networks/                   both networks, for another training; optional
             record/                     the steps, the config, the evaluations so far and its own
             manifest.json               size and SHA-256 of every other file
+
+A checkpoint's number is that of the steps trained; see `Checkpoint`.
 
 A run with several seeds has one folder per seed, such as seed_003/, with the layout of a run with
 one seed; the run's own checkpoints/ holds the state of all seeds.
@@ -239,31 +241,42 @@ def latest_checkpoint(run: Path, place: Path | None = None) -> Checkpoint:
     Args:
       place: folder of the run in which it lies; that of a checkpoint finds this one.
     """
-    return max(_intact_checkpoints(run, place), key=lambda checkpoint: checkpoint.steps)
+    return max(_intact_checkpoints(run, place), key=lambda checkpoint: checkpoint.number)
 
 
-def best_checkpoint(run: Path, place: Path | None = None) -> Checkpoint:
+def best_checkpoint(
+    run: Path, place: Path | None = None, newest: Checkpoint | None = None
+) -> Checkpoint:
     """Intact checkpoint of a run with the best evaluation; among equals and without one, the
     newest.
 
     Args:
       place: see `latest_checkpoint`.
+      newest: the newest one that counts; None if all do.
     """
-    records = _intact_checkpoints(run, place)
+    records = _intact_checkpoints(run, place, newest)
 
     def quality(checkpoint: Checkpoint) -> tuple[Any, ...]:
         record = records[checkpoint]
         score = record.report.score if record and record.report else ()
         # Version 0.1.0 wrote no evaluation of a policy that it shipped.
-        return score, checkpoint.folder.parent.name == earlier.BEST, checkpoint.steps
+        return score, checkpoint.folder.parent.name == earlier.BEST, checkpoint.number
 
     return max(records, key=quality)
 
 
-def _intact_checkpoints(run: Path, place: Path | None) -> dict[Checkpoint, Record | None]:
+def _intact_checkpoints(
+    run: Path, place: Path | None, newest: Checkpoint | None = None
+) -> dict[Checkpoint, Record | None]:
     """The intact checkpoints in a folder of a run, at least one, with their records. A warning
-    names the damaged ones; a single checkpoint is not read, as its reader refuses it."""
+    names the damaged ones.
+
+    A single checkpoint is not read, and has None for its record: if it is damaged, whoever reads it
+    refuses it.
+    """
     stored = _checkpoints_in(run, place or run)
+    if newest is not None:
+        stored = [checkpoint for checkpoint in stored if checkpoint.number <= newest.number]
     if len(stored) == 1:
         return {stored[0]: None}
     intact, damaged = {}, []
@@ -278,17 +291,29 @@ def _intact_checkpoints(run: Path, place: Path | None) -> dict[Checkpoint, Recor
         raise damaged[-1]
     for error in damaged:
         warn_once(f"{error.damage}; another one is used")
-    return intact or _intact_checkpoints(run, place)
+    if not intact:
+        # A training has replaced all of them meanwhile.
+        return _intact_checkpoints(run, place, newest)
+    return intact
 
 
-def set_damaged_aside(run: Path) -> None:
-    """Renames the damaged checkpoints of a run, so that no save removes what may be repaired."""
+def set_damaged_aside(run: Path) -> list[Path]:
+    """Renames the damaged checkpoints of a run, so that no save removes what may be repaired; their
+    new folders. One that cannot be renamed stays."""
+    aside = []
     for checkpoint in stored_checkpoints(run):
         try:
             verify(checkpoint)
         except DamagedCheckpoint:
             with contextlib.suppress(OSError):
-                checkpoint.folder.rename(f"{checkpoint.folder}.damaged")
+                aside.append(checkpoint.folder.rename(_free_name(f"{checkpoint.folder}.damaged")))
+    return aside
+
+
+def _free_name(path: str) -> Path:
+    """The path if there is nothing, or else with the first number that is free, from _2."""
+    names = itertools.chain([path], (f"{path}_{number}" for number in itertools.count(2)))
+    return next(Path(name) for name in names if not os.path.lexists(name))
 
 
 def pretrained_checkpoint(name: str = PRETRAINED) -> Checkpoint:

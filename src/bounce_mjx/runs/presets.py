@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from bounce_mjx.config.files import read_mapping
-from bounce_mjx.config.user_code import is_file, source_file
+from bounce_mjx.config.user_code import is_file
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.lazy import jax
 from bounce_mjx.resources import resource_path
@@ -57,7 +57,11 @@ def preset_files(config: Sequence[Path], task: str, machine: Path | None = None)
     of_task = f"{PRESETS}/{task}"
     # The task's own first.
     files = [named_file(named_file(file, of_task), PRESETS, "preset") for file in config]
-    bases = {file: values[BASE] for file in files if BASE in (values := read_config_file(file))}
+    bases = {}
+    for file in files:
+        values = read_config_file(file)
+        if BASE in values:
+            bases[file] = values[BASE]
     for file in files[1:]:
         if bases.get(file) is not None:
             raise UserError(f"{file} lies on {files[0]}, so its {BASE} is not used; give it first")
@@ -93,9 +97,12 @@ def named_file(path: Path, folder: str, kind: str | None = None) -> Path:
     if str(path) != path.stem or os.path.isfile(path):
         return path
     named = resource_path(f"{folder}/{path}.yaml")
-    if kind is None or os.path.isfile(named):
-        return named if os.path.isfile(named) else path
+    if os.path.isfile(named):
+        return named
+    if kind is None:
+        return path
     names = sorted(file.stem for file in resource_path(folder).glob("*.yaml"))
+    # Conditions of `bounce-mjx robustness` lie there too.
     names = [name for name in names if not name.startswith("robustness")]
     raise UserError(
         f"no {kind} is named {shorten(str(path))}; give one of {', '.join(names)}, or a YAML file"
@@ -117,8 +124,9 @@ def read_config_file(
     for key in {"task", "algorithm"} & values.keys():
         name = str(values[key])
         if is_file(name):
-            file, _, attribute = name.rpartition(":")
-            name = f"{source_file(f'{path.parent / Path(file).expanduser()}:')}:{attribute}"
+            file, _, class_name = name.rpartition(":")
+            absolute = os.path.abspath(path.parent / Path(file).expanduser())
+            name = f"{absolute}:{class_name}"
         values = values | {key: name}
     env = values.get("env")
     mjcf = env.get("mjcf") if isinstance(env, dict) else None
@@ -128,7 +136,7 @@ def read_config_file(
 
 
 def default_preset(accelerator: bool) -> Path:
-    """The preset for a machine with an accelerator, or without one; both have the same task."""
+    """The preset for a machine with an accelerator, or without one."""
     return Path("default" if accelerator else "cpu")
 
 

@@ -1,5 +1,6 @@
 """Evaluations of a run, as stored in its checkpoints and in results.json."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,8 @@ from bounce_mjx.runs.files import read_stored
 RESULTS_FILE = "results.json"
 
 PATIENCE = 1.5
-"""Length of a run that waits in vain for a margin, in steps of the first evaluation that met
-all results."""
+"""A training that waits in vain for a margin ends after this many times the steps of the first
+trained policy that met all results."""
 
 
 class Progress(pydantic.BaseModel):
@@ -20,13 +21,15 @@ class Progress(pydantic.BaseModel):
 
     best: Report | None = None
     fault: str | None = None
-    """First quantity that was not finite, and its step; None unless the training diverged."""
+    """Which quantity was not finite first, and at which iteration, as a sentence; None unless the
+    training diverged."""
     best_steps: int = 0
     solved_steps: int | None = None
     """Steps at the first evaluation that met all results: the end of the time "to all five
     results" in every measurement."""
     solved_seconds: float | None = None
-    """Seconds from the start of the process, without its imports, to the end of that evaluation."""
+    """Seconds from the setup of this training, or of its last resumption, to the end of that
+    evaluation."""
     margin_steps: int | None = None
     """Steps at the first evaluation that met all with a margin
     (`Report.passed_with_margin`)."""
@@ -36,11 +39,12 @@ class Progress(pydantic.BaseModel):
 
     @property
     def solved(self) -> bool:
-        """Whether `stop_when_solved` ends the training."""
-        if self.solved_steps is None:
-            return False
-        latest = max((evaluation["steps"] for evaluation in self.evaluations), default=0)
-        return self.margin_steps is not None or latest >= PATIENCE * self.solved_steps
+        """Whether a margin has come, or the wait for it is over."""
+        if self.margin_steps is not None:
+            return True
+        # Not the policy of a warm start, as the wait would be over before the first step.
+        met = [e["steps"] for e in self.evaluations if e["passed"] and e["steps"] > 0]
+        return bool(met) and self.evaluations[-1]["steps"] >= PATIENCE * met[0]
 
     def results(self, **run: Any) -> dict[str, Any]:
         """Content of results.json, with the other fields of `Results`."""
@@ -50,23 +54,31 @@ class Progress(pydantic.BaseModel):
         """Whether the state after this number of steps was evaluated."""
         return any(evaluation["steps"] == steps for evaluation in self.evaluations)
 
-    def improves(self, report: Report, steps: int, seconds: float) -> bool:
-        """Adds an evaluation; returns whether it is the best so far.
+    def add(self, report: Report, steps: int, seconds: float) -> bool:
+        """Adds an evaluation; returns whether it is the best so far. Of equal ones the newest is.
 
         Args:
-          seconds: time from the start of the process, without its imports, to the evaluation's end.
+          seconds: see `solved_seconds`.
         """
         values = {result.name: result.value for result in report.results}
         about = {"steps": steps, "passed": report.passed, "screening": report.screening}
         self.evaluations.append(about | values)
         if report.passed and self.solved_steps is None:
-            self.solved_steps, self.solved_seconds = steps, seconds
+            self.solved_steps = steps
+            self.solved_seconds = seconds
         if report.passed_with_margin and self.margin_steps is None:
             self.margin_steps = steps
         if self.best is not None and report.score < self.best.score:
             return False
-        self.best, self.best_steps = report, steps
+        self.best = report
+        self.best_steps = steps
         return True
+
+
+def are_solved(seeds: Sequence[Progress]) -> bool:
+    """Whether `stop_when_solved` ends the training of these seeds. Those that have diverged do not
+    count."""
+    return all(seed.solved for seed in seeds if seed.fault is None)
 
 
 class Results(Progress):

@@ -25,9 +25,17 @@ class Checkpoint(NamedTuple):
     """The run's folder."""
     folder: Path
     """The checkpoint's own folder."""
-    steps: int
-    """Its number: the environment steps trained, or one more where a checkpoint without an
-    evaluation had that number."""
+    number: int
+    """The name of its folder: the environment steps trained, or one more than the largest number in
+    the run where that is as large, so that the newest checkpoint has the largest one."""
+
+    @property
+    def steps(self) -> int:
+        """Environment steps trained, as its record says; its number where that is not readable."""
+        try:
+            return _read_record(self).steps
+        except (OSError, ValueError):
+            return self.number
 
     @property
     def is_old(self) -> bool:
@@ -39,6 +47,7 @@ class Record(pydantic.BaseModel):
     """The plain data of a checkpoint."""
 
     steps: int
+    """Environment steps trained."""
     config: dict[str, Any]
     progress: dict[str, Any]
     """The evaluations so far (`Progress`); with several seeds, a list of them under "seeds"."""
@@ -70,10 +79,15 @@ def verify(checkpoint: Checkpoint) -> Record:
         else:
             # An earlier version was killed before it wrote the manifest.
             warn_once(f"{folder} has no {MANIFEST_FILE} to find damage by")
-        if checkpoint.is_old:
-            record = json.loads((folder / earlier.RECORD_FILE).read_bytes())
-            return Record.model_validate(earlier.with_report(record))
-        return Record.model_validate_json((folder / RECORD / "metadata").read_bytes())
+        return _read_record(checkpoint)
     # One of pydantic's is a ValueError.
     except (OSError, ValueError) as error:
         raise DamagedCheckpoint(checkpoint, error) from error
+
+
+def _read_record(checkpoint: Checkpoint) -> Record:
+    """Raises OSError or ValueError if it is missing or damaged."""
+    if checkpoint.is_old:
+        record = json.loads((checkpoint.folder / earlier.RECORD_FILE).read_bytes())
+        return Record.model_validate(earlier.with_report(record))
+    return Record.model_validate_json((checkpoint.folder / RECORD / "metadata").read_bytes())

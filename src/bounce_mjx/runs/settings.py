@@ -12,7 +12,8 @@ They are layers, and a later one wins:
     8. --world
     9. what the user says: flags of the command, or arguments of `train`
 
-A resumed run has two: its own config, and what the user says. `stack` finds the layers below the
+A resumed run has two: its own config, and what the user says; more steps end its
+`stop_when_solved` where that had ended it (`Stack._go_on`). `stack` finds the layers below the
 user's. `Stack.config` merges all of them and validates the result, once; the config then knows what
 set each of its values (`TrainConfig.sources`).
 """
@@ -21,7 +22,7 @@ import dataclasses
 import functools
 import itertools
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -78,6 +79,7 @@ class Choice(StrictModel):
     stop-when-solved, num-devices and log-dir. With total-steps, a run that has met all results
     continues."""
 
+    # Keys of the config too, where their docstrings are. The folder is asked only for `latest`.
     task: str | None = None
     algorithm: str | None = None
     warm_start: Path | None = None
@@ -101,16 +103,18 @@ def stack(choice: Choice, machine: Path | None = None, whole: TrainConfig | None
     if choice.resume is not None:
         return _stack_of_run(choice, whole)
     # The task decides which file a preset's name stands for, so only paths can name it.
-    given = [file for file in choice.config if os.path.isfile(file)]
-    files = [_layer_of_file(file) for file in given] if whole is None else [_layer_of(whole)]
-    policy = _policy(choice, files, whole)
-    task_name, task = _task(choice, files, policy, whole)
-    machines, named = [], []
+    paths = [file for file in choice.config if os.path.isfile(file)]
+    naming = _layers_of_files(paths) if whole is None else [_layer_of(whole)]
+    policy = _policy(choice, naming, whole)
+    task_name, task = _task(choice, naming, policy, whole)
+    machines: list[Layer] = []
+    named: list[Layer] = []
+    files = naming
     if whole is None:
         found = preset_files(choice.config, task_name, machine)
-        machines = [_layer_of_file(file) for file in [found.machine] if file is not None]
-        named = [_layer_of_file(file) for file in [found.named] if file is not None]
-        files = [_layer_of_file(file) for file in found.own]
+        machines = _layers_of_files([found.machine])
+        named = _layers_of_files([found.named])
+        files = _layers_of_files(found.own)
     algorithm_name, algorithm = _algorithm(choice, [*machines, *named, *files], whole)
     changed = _changed_defaults(algorithm)
     start = [] if policy is None else [policy.layer(is_in_world=choice.world is not None)]
@@ -133,10 +137,14 @@ def _stack_of_run(choice: Choice, whole: TrainConfig | None) -> "Stack":
     """The layer of a run that is resumed."""
     from bounce_mjx.runs.folders import find_run, named_run
 
-    excluded = {"config": choice.config or whole, "robot": choice.robot, "world": choice.world}
-    for name, value in excluded.items():
-        if value:
-            raise UserError(f"--{name} and --resume cannot be combined; leave one out")
+    excluded = {
+        "config": choice.config or whole is not None,
+        "robot": choice.robot,
+        "world": choice.world,
+    }
+    for name, is_given in excluded.items():
+        if is_given:
+            raise UserError(f"{name} and resume cannot be combined; leave one out")
     log_dir = choice.log_dir or runs_folder(find_task(choice.task or DEFAULT))
     resume = named_run(choice.resume, log_dir)
     run = find_run(resume)
@@ -162,9 +170,16 @@ def _stack_of_run(choice: Choice, whole: TrainConfig | None) -> "Stack":
     )
 
 
-def _layer_of_file(file: Path) -> Layer:
-    values = read_config_file(file)
-    return Layer(shown_file(file), {k: v for k, v in values.items() if k not in (BASE, SOURCES)})
+def _layers_of_files(files: Iterable[Path | None]) -> list[Layer]:
+    """A layer of each file; none for None."""
+    layers = []
+    for file in files:
+        if file is not None:
+            values = read_config_file(file)
+            values.pop(BASE, None)
+            values.pop(SOURCES, None)
+            layers.append(Layer(shown_file(file), values))
+    return layers
 
 
 def _layer_of(config: TrainConfig) -> Layer:
@@ -240,9 +255,11 @@ def _sources_of(layers: Sequence[Layer]) -> str:
 def _changed_defaults(algorithm: type[PPOConfig]) -> list[Layer]:
     """What an algorithm of the user's changes of PPO's defaults: it means these values, unlike a
     preset that was made for PPO. They are a layer, so that they lie above the machine's preset."""
-    own = {key: algorithm.model_fields[key].default for key in PPOConfig.model_fields}
-    known = {key: field.default for key, field in PPOConfig.model_fields.items()}
-    changed = {key: value for key, value in own.items() if value != known[key]}
+    changed = {}
+    for key, field in PPOConfig.model_fields.items():
+        default = algorithm.model_fields[key].default
+        if default != field.default:
+            changed[key] = default
     return [Layer(f"defaults of {algorithm.__qualname__}", {"ppo": changed})] if changed else []
 
 
@@ -250,16 +267,19 @@ def _notes(below: list[Layer], above: list[Layer], prefix: str) -> list[str]:
     """A line where a layer changes settings, whose keys begin with a prefix, of one below it."""
     notes = []
     for lower, upper in itertools.product(below, above):
-        one, other = flat(lower.values), flat(upper.values)
-        shared = [key for key in one if key.startswith(prefix) and key in other]
-        changed = [key for key in shared if _plain(one[key]) != _plain(other[key])]
+        after = flat(upper.values)
+        changed = []
+        for key, before in flat(lower.values).items():
+            if key.startswith(prefix) and key in after:
+                if _as_in_yaml(before) != _as_in_yaml(after[key]):
+                    changed.append(key)
         if changed:
             notes.append(f"{upper.source} wins over {lower.source}: {', '.join(changed)}")
     return notes
 
 
-def _plain(value: Any) -> Any:
-    """A value as YAML and Python alike have it."""
+def _as_in_yaml(value: Any) -> Any:
+    """A value with a list in place of a tuple, which YAML does not have."""
     return list(value) if isinstance(value, tuple) else value
 
 
@@ -299,7 +319,9 @@ def _policy(choice: Choice, files: Sequence[Layer], whole: TrainConfig | None) -
     if path is None:
         return None
     if choice.robot:
-        raise UserError("--warm-start and --robot cannot be combined; leave --robot out")
+        raise UserError(
+            "warm_start and robot cannot be combined, as the policy brings its arm; leave robot out"
+        )
     from bounce_mjx.runs.folders import find_choice, runs_in
 
     task = choice.task or _last(files, "task")
@@ -404,14 +426,15 @@ class Stack:
         if self.resume is None or "total_steps" not in user.values:
             return []
         from bounce_mjx.runs.folders import find_run, latest_checkpoint
-        from bounce_mjx.runs.progress import Progress
+        from bounce_mjx.runs.progress import Progress, are_solved
         from bounce_mjx.runs.records import verify
 
         checkpoint = latest_checkpoint(find_run(self.resume), self.resume)
         progress = verify(checkpoint).progress
         seeds = [Progress.model_validate(seed) for seed in progress.get("seeds", [progress])]
-        solved = all(seed.solved for seed in seeds)
-        return [Layer(user.source, {"stop_when_solved": False})] if solved else []
+        if are_solved(seeds):
+            return [Layer(user.source, {"stop_when_solved": False})]
+        return []
 
     def _validated(self, values: dict[str, Any]) -> TrainConfig:
         groups = {"env": self.task.Config, "ppo": self.algorithm}
@@ -431,12 +454,15 @@ class _Mistake(Exception):
     """A validation error of a group of settings."""
 
     def __init__(self, error: pydantic.ValidationError, group: str):
-        self.error, self.group, self.key = error, group, key_of(error, group)
+        self.error = error
+        self.group = group
+        self.key = key_of(error, group)
 
 
 def _merge(layers: Sequence[Layer]) -> tuple[dict[str, Any], dict[str, str]]:
     """The values of the layers, the last one's first; and the source of each by its dotted key."""
-    values, sources = {}, {}
+    values: dict[str, Any] = {}
+    sources: dict[str, str] = {}
     for layer in layers:
         values = merged(values, layer.values)
         if layer.is_world:

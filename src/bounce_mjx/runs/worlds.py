@@ -62,7 +62,8 @@ def in_world(config: TrainConfig, world: Path) -> tuple[TrainConfig, NamedWorld]
 def env_in_world(trained: WorldConfig, world: Path) -> tuple[WorldConfig, NamedWorld]:
     """`in_world` of the environment alone."""
     path = named_file(world, WORLDS, "world")
-    named, values = read_world(path), trained.model_dump()
+    named = read_world(path)
+    values = trained.model_dump()
     # The curriculum of the training goes too.
     del values["randomization"]
     if named.robot is not None:
@@ -86,25 +87,26 @@ def _robot_of(world: NamedWorld, path: Path) -> Path:
 
 
 def _read_robot(robot: Path) -> tuple[dict[str, Any], type[Task], WorldConfig]:
-    """The values of a robot's config, the task that it was written for, and its environment."""
+    """The values of a robot's config but for its task, that task, and its environment."""
     values = read_config_file(robot, "robot's config file", f"{ROBOTS}/ur5e.yaml")
     task = task_in(str(robot), values.pop("task", DEFAULT))
     return values, task, validate(task.Config, values.get("env", {}), str(robot), "env")
 
 
 def _layer_of_robot(task: type[Task], robot: Path) -> Layer:
-    """A robot's settings for a task. Those of another task are replaced by the task's own for an
-    arm with this paddle."""
+    """A robot's settings for a task. Of a file that was written for another task, the keys of the
+    world count alone; the task's own settings follow from where the arm holds the paddle."""
     source = f"the robot {shown_file(robot)}"
     values, its_task, env = _read_robot(robot)
     if issubclass(task, its_task):
         return Layer(source, values)
-    world_keys = {k: v for k, v in values.get("env", {}).items() if k in WorldConfig.model_fields}
+    of_task = values.get("env", {})
+    of_world = {key: value for key, value in of_task.items() if key in WorldConfig.model_fields}
     # Imports JAX, which a command line alone does not need.
     from bounce_mjx.robot.model import paddle_home
 
     home = paddle_home(env.mjcf, env.robot, env.default_joint_angles)
-    return Layer(source, values | {"env": world_keys | task.Config.settings_at(home)})
+    return Layer(source, values | {"env": of_world | task.Config.settings_at(home)})
 
 
 def _layer_of_same_robot(trained: WorldConfig, world: NamedWorld, path: Path) -> Layer:

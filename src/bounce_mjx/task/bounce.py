@@ -142,7 +142,8 @@ class BounceConfig(task.WorldConfig):
 
     @property
     def ball_bounds(self) -> tuple[float, float]:
-        """Where an episode ends, and twice the speed of a fall from its greatest height."""
+        """What an exported policy takes for possible: where an episode ends, and twice the speed of
+        a fall from its greatest height."""
         top = self.target_height_range[1] + self.max_height_above_target
         aside = self.max_horizontal_distance
         farthest = math.hypot(aside, aside, top)
@@ -188,7 +189,7 @@ class MeasuredFlight(NamedTuple):
     lowest: jax.Array
     """Lowest measured position while the ball is near the paddle [], m."""
     time: jax.Array
-    """Time since the first measurement near the paddle in the last bounce [], s."""
+    """Time since the last bounce began, with a first measurement near the paddle [], s."""
 
 
 class Bounce(task.Task):
@@ -284,7 +285,8 @@ class Bounce(task.Task):
     # The observation: the last bounces, from the measurements.
 
     def first_quantities(self, measured: task.Values) -> tuple[MeasuredFlight, task.Values]:
-        """Before the first bounce, its quantities are those of the start."""
+        """Before the first bounce, its quantities are those of the start. Here all are returned,
+        also those that the policy does not see."""
         ball = measured["ball_position"]
         height = ball[2]
         zero = jnp.zeros_like(height)

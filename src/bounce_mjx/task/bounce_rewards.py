@@ -373,7 +373,8 @@ class JointVelocityReward(RewardTerm):
 
 
 class BounceReward(settings.StrictModel):
-    """The reward terms: each has a weight and the constants of its formula."""
+    """The reward: numbers that several terms use, and the terms, each with a weight and the
+    constants of its formula."""
 
     target_x: settings.Coordinate = 0.58856
     """Target point of the ball, x, m."""

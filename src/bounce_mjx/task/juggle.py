@@ -11,7 +11,7 @@ from bounce_mjx.config.settings import Ascending, Coordinate, Finite, Length, Po
 from bounce_mjx.lazy import jax, jnp
 
 FLOWN = 0.125
-"""Share of its flight that the last ball has flown at a reset."""
+"""Share of its flight that the ball of the highest number has flown at a reset."""
 SETTLING_SECONDS = 2.0
 """Time since the height was commanded after which apexes count, s."""
 MAX_HEIGHT_ERROR = 0.1
@@ -48,7 +48,7 @@ class Rewards(task.StrictModel):
     landing: NearByBall = NearByBall(weight=2.0)
     """The flight ends in the column."""
     turn: NearByBall = NearByBall(weight=4.0)
-    """The next ball lands one turn later, s."""
+    """The ball of the next number lands one turn later, s."""
     home: task.Near = task.Near(scale=0.05)
     """The paddle is at home."""
     calm: task.Near = task.Near(weight=0.1, scale=10.0)
@@ -152,11 +152,11 @@ class Juggle(task.Task):
     # The start.
 
     def throw(self, draws: jax.Array, command: task.Values) -> tuple[jax.Array, jax.Array]:
-        """The balls are in their columns and land alternately, the first one first."""
+        """The balls are in their columns and land alternately, in the order of their numbers."""
         height = command["target_height"]
         period = self._period(height)
         count = self.config.num_balls
-        # Share of a period that each ball has flown more than the last one.
+        # Share of a period that each ball has flown more than that of the highest number.
         flown_more = jnp.arange(count)[::-1, None] / count
         # Time until each ball's apex along z; negative after it.
         rise = (0.5 - FLOWN - flown_more) * period * jnp.array([0.0, 0.0, 1.0])
@@ -166,7 +166,7 @@ class Juggle(task.Task):
 
     def reset(self, start: task.Start) -> tuple[jax.Array, jax.Array]:
         """Whether each ball rises [B], bool, and the number of the ball that was hit last []: the
-        last one, so that the first one is next."""
+        highest, so that ball 0 is next in turn."""
         rising = start.truth.ball_velocity[:, 2] > 0.0
         last_hit = jnp.full((), self.config.num_balls - 1.0)
         return rising, last_hit
@@ -212,10 +212,10 @@ class Juggle(task.Task):
                 "hits": jnp.sum(hits),
                 "in_turn": jnp.sum(hits & (ball_numbers == next_in_turn)),
                 "apexes": jnp.sum(apexes),
-                # Accurate ones, neither too low nor too high.
-                "high": jnp.sum(apexes & (height_errors <= MAX_HEIGHT_ERROR)),
+                "accurate": jnp.sum(apexes & (height_errors <= MAX_HEIGHT_ERROR)),
                 "height_error": jnp.sum(apexes * height_errors),
                 "touched": touched,
+                # For the marker, and logged as every metric.
                 "landing_x": next_landing[0],
                 "landing_y": next_landing[1],
             },
@@ -241,8 +241,12 @@ class Juggle(task.Task):
         return (flights.end - columns)[:, :2]
 
     def _turn_errors(self, flights: task.Flight, period: jax.Array) -> jax.Array:
-        """From a turn, `period` / B, to the time between the landings of two balls [B, 1], s; whole
-        periods do not count."""
+        """From a turn, `period` / B, to the time from the landing of each ball to that of the ball
+        of the next number [B, 1], s.
+
+        A ball lands again after a period, so whole periods do not count: of the landings, the error
+        is that of the nearest one, within half a period.
+        """
         between = jnp.roll(flights.fall, -1) - flights.fall
         late = between - period / self.config.num_balls
         nearest = jnp.mod(late + 0.5 * period, period) - 0.5 * period
@@ -286,7 +290,7 @@ class Juggle(task.Task):
                 "hits": metrics["hits"],
                 "in_turn": metrics["in_turn"],
                 "apexes": settled * metrics["apexes"],
-                "accurate": settled * metrics["high"],
+                "accurate": settled * metrics["accurate"],
             },
             maxima={"touched": metrics["touched"]},
         )

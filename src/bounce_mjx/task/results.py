@@ -47,7 +47,8 @@ class Result:
 
     name: str
     measured: str
-    """Description of the measured quantity, with its unit."""
+    """Description of the measured quantity, with its unit at the end. One in % is a share of
+    episodes, steps or events, by which an episode alone can be judged too."""
     value: Figure
     bound: str
     """The bound in words."""

@@ -5,12 +5,13 @@
 group, the config's `reward`, in which each field whose type is a subclass of `RewardTerm` is a term
 (`weighted_terms`). Then the config and the flags follow as well. To add a term, extend the group by
 a field, the task's `Config` by that group, and the task by that `Config`; if the task gives each
-term its own inputs, extend its `step` too.
+term its own inputs, or the term needs others, extend its `step` too.
 """
 
 from __future__ import annotations
 
 import itertools
+import typing
 from collections.abc import Collection
 from typing import Any, NamedTuple
 
@@ -69,12 +70,26 @@ class Proportional(RewardTerm):
 
 def term_names(reward: type[StrictModel]) -> tuple[str, ...]:
     """Names of the terms in a group of settings, in order: of the fields whose type is a subclass
-    of `RewardTerm`, and no union."""
-    return tuple(
-        name
-        for name, field in reward.model_fields.items()
-        if isinstance(field.annotation, type) and issubclass(field.annotation, RewardTerm)
-    )
+    of `RewardTerm`.
+
+    Raises:
+      UserError: a field may be a term or something else.
+    """
+    names = []
+    for name, field in reward.model_fields.items():
+        if _is_term(field.annotation):
+            names.append(name)
+        elif any(map(_is_term, typing.get_args(field.annotation))):
+            raise UserError(
+                f"{name} in {reward.__name__} may be a term of the reward or something else; give "
+                "it the type of one term, which the weight 0 turns off"
+            )
+    return tuple(names)
+
+
+def _is_term(annotation: Any) -> bool:
+    """Whether a type is that of a term."""
+    return isinstance(annotation, type) and issubclass(annotation, RewardTerm)
 
 
 def weighted_terms(
@@ -83,7 +98,8 @@ def weighted_terms(
     """Each term [] times its weight; their sum is the reward.
 
     Args:
-      inputs: what the formula of every term takes; without any inputs it takes None.
+      inputs: what the formula of every term takes that is not in `term_inputs`. It may be left out:
+        if all terms are in these, or if none is, and each formula takes None.
       term_inputs: by a term's name, what its formula takes instead.
 
     Raises:
@@ -152,7 +168,8 @@ def horizontal_distance(a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 class Flight(NamedTuple):
-    """A free flight without air, from the past to the height of its end."""
+    """A free flight without air, down to the height of its end. Its highest position may be in the
+    past."""
 
     top: jax.Array
     """Highest position [..., 3], m."""

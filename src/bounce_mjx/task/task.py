@@ -13,7 +13,7 @@ from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.observation import Kinematics
 
 if TYPE_CHECKING:
-    from bounce_mjx.robot.geometry import Geometry
+    from bounce_mjx.robot.model import Geometry
 
 TaskState = Any
 """A pytree that a task keeps of an episode."""
@@ -111,7 +111,7 @@ class Recording(NamedTuple):
     paddle: jax.Array
     """Positions of the paddle's centre after the step [T, 3, K], m."""
     command: dict[str, jax.Array]
-    """Commands [T, K]."""
+    """Commands after the step [T, K]."""
     running: jax.Array
     """Whether the episode had not ended before the step [T, K], bool."""
     command_velocity: jax.Array | None = None
@@ -132,7 +132,8 @@ class Curve(NamedTuple):
     """Metric of the environment's step."""
     over: str = "steps"
     """steps for the mean over steps, episodes for the mean of the last values of episodes, or the
-    metric that counts the events over which it is the mean."""
+    metric that counts the events over which it is the mean; the metric is then 0 on all other
+    steps."""
     title: str = ""
     """Title in the report; "" leaves it out there."""
     scale: float = 1.0
@@ -212,8 +213,7 @@ class Task:
         """Sizes and places of ball and paddle in the model. An environment sets those of its own
         model (`env.task.geometry = ...`); a task without one compiles the config's model here."""
         # Imported here, as a process that reads the settings alone needs no JAX.
-        from bounce_mjx.robot.geometry import read_geometry
-        from bounce_mjx.robot.model import find_addresses, load_model
+        from bounce_mjx.robot.model import find_addresses, load_model, read_geometry
 
         config = self.config
         model = load_model(
@@ -255,7 +255,7 @@ class Task:
 
     def next_command(self, state: TaskState, command: Values) -> Values:
         """The commands from now on, for a task whose commands move within an episode. It is called
-        after every step, and right after each `first_command`.
+        once at a reset and once after every step, where that is a redraw after `first_command`.
 
         Args:
           state: the task's state after the step or the reset.

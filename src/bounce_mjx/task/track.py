@@ -56,8 +56,8 @@ PointSpeed = Annotated[Finite, Field(ge=0.0, le=MAX_POINT_SPEED)]
 
 
 class Rewards(task.StrictModel):
-    """The reward terms. For its apexes alone the ball would swing across the point: what brings one
-    apex back to the point aims the next landing as far beyond it."""
+    """The reward terms. Rewarded for apexes alone, the ball would swing across the point: a hit
+    that brings the apex back to the point sends the next landing as far beyond it."""
 
     apex: task.Near = task.Near(weight=6.0)
     """The flight's apex is the point at that time; 0.1 m of height count as 0.03 m."""
@@ -111,7 +111,8 @@ class Config(task.WorldConfig):
 
     @property
     def commands(self) -> dict[str, task.Command]:
-        """The point, sampled as the middle of its path, its speed, and its path."""
+        """The point, its speed and its path. The ranges of the point are those of the middle of the
+        path, which is sampled; the point itself leaves them (`first_command`)."""
         x, y, z = self.home
         lowest, highest = self.height_range
         slowest, fastest = self.speed_range
@@ -204,7 +205,7 @@ class Track(task.Task):
 
     def _apex_error(self, flight: task.Flight, command: task.Values) -> jax.Array:
         """From the point at the time of the flight's apex to the apex [3], m; 0.1 m of height count
-        as 0.03 m."""
+        as 0.03 m. Of an apex before a redraw, it is the point of the new path at that time."""
         point = self._point_in(flight.rise, command)
         return (flight.top - point) * jnp.array(APEX_FACTORS)
 
@@ -224,6 +225,7 @@ class Track(task.Task):
         """The point has jumped to where it is, so that its velocity is not known yet."""
         point = paths.point(measured)[:2, 0]
         velocity = jnp.zeros_like(measured["ball_position"][:2])
+        # Any factor over 1 is a jump.
         before_jump = point - 10.0 * JUMP_SPEED * self.config.control_dt
         unknown_aim = jnp.zeros_like(velocity)[None]
         memory, histories = self.next_quantities(

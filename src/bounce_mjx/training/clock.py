@@ -10,7 +10,7 @@ class Clock:
         self.seconds: dict[str, float] = {}
         """Seconds by phase."""
         self._lap_started = time.perf_counter()
-        self._started, self._first_steps = time.monotonic(), 0
+        self.restart_estimate(0)
 
     def lap(self, phase: str) -> None:
         """Adds the time since the last lap to that of a phase."""
@@ -20,9 +20,11 @@ class Clock:
 
     def restart_estimate(self, steps: int) -> None:
         """Estimates the time that is left from what follows, after a number of steps."""
-        self._started, self._first_steps = time.monotonic(), steps
+        self._started = time.monotonic()
+        self._first_steps = steps
 
     def left(self, steps: int, total_steps: int) -> float:
-        """Estimated time to the last step, s, at the mean speed with the evaluations."""
+        """Estimated time to the last step, s, at the mean speed with the evaluations. A block must
+        have ended since `restart_estimate`."""
         share = (total_steps - steps) / (steps - self._first_steps)
         return share * (time.monotonic() - self._started)

@@ -44,14 +44,15 @@ class Evaluators:
         self, config: TrainConfig, env: Env, mesh: Mesh, pool: concurrent.futures.Executor
     ):
         """Starts the compilation in a pool."""
-        self._config, self._env = config, env
+        self._config = config
+        self._env = env
         axes = mesh.axis_names if config.num_seeds > 1 else ()
         self._sharding = NamedSharding(mesh, PartitionSpec(*axes))
         self._replicated = NamedSharding(mesh, PartitionSpec())
         self._chunk = min(config.screening_episodes or config.eval_episodes, config.eval_episodes)
         # On a CPU a chunk uses one core, and XLA runs the programs that one thread starts one after
-        # another. MJX calls LAPACK, and in jaxlib two batched calls of it may wait for each other
-        # for ever.
+        # another, so each core has a thread. MJX has one: it calls LAPACK, and in jaxlib two
+        # batched calls of it may wait for each other for ever.
         on_cpu = mesh.size == 1 and mesh.devices.flat[0].platform == "cpu"
         self._threads = os.cpu_count() if on_cpu and env.engine.name == "fused" else 1
         self._program = pool.submit(self._lower().compile)
@@ -75,8 +76,10 @@ class Evaluators:
 
     def _lower(self) -> jax.stages.Lowered:
         """The program (policy, seed, index of the first episode) -> statistics and recording of a
-        chunk of episodes. The episodes of a screening follow the episodes of a full evaluation."""
-        config, env = self._config, self._env
+        chunk of episodes. They are numbered, first those of a full evaluation, then those of a
+        screening."""
+        config = self._config
+        env = self._env
         networks = make_networks(config.ppo, env.observation_size, env.action_size)
         # No recordings of several seeds, because a batched loop would copy them at every step.
         recorded = RECORDED_EPISODES if config.num_seeds == 1 else 0
@@ -91,9 +94,13 @@ class Evaluators:
         def evaluate(policy: Policy, seed: jax.Array, first: jax.Array):
             # Keys are made inside the program: outside it, each operation would take a tenth of a
             # second. The last chunk may reach beyond the last episode.
-            keys = jax.random.split(jax.random.PRNGKey(seed))
-            counts = config.eval_episodes, config.screening_episodes
-            keys = jnp.concatenate([*map(jax.random.split, keys, counts)])
+            full, screening = jax.random.split(jax.random.PRNGKey(seed))
+            keys = jnp.concatenate(
+                [
+                    jax.random.split(full, config.eval_episodes),
+                    jax.random.split(screening, config.screening_episodes),
+                ]
+            )
             return run_all(policy, jnp.take(keys, first + jnp.arange(self._chunk), 0, mode="clip"))
 
         program = jax.jit(
@@ -111,10 +118,12 @@ class Evaluators:
     def _measure(
         self, policies: Sequence[Policy], seed: int, screening: bool = False
     ) -> list[Report]:
-        config, program = self._config, self._program.result()
+        config = self._config
+        program = self._program.result()
         first = config.eval_episodes if screening else 0
         episodes = config.screening_episodes if screening else config.eval_episodes
-        policy, several = policies[0], config.num_seeds > 1
+        several = config.num_seeds > 1
+        policy = policies[0]
         if several:
             policy = jax.tree.map(lambda *leaves: np.stack(leaves), *policies)
         on_devices = hosts.distribute(policy, jax.tree.map(lambda _: self._sharding, policy))
@@ -132,8 +141,10 @@ class Evaluators:
         if not several:
             recorded = min(RECORDED_EPISODES, episodes)
             recording = _joined(recordings[: -(-recorded // self._chunk)], recorded)
-        each = each_seed(statistics, config.num_seeds)
-        return [judge(self._env, own, recording) for own in each]
+        return [
+            judge(self._env, of_seed, recording)
+            for of_seed in each_seed(statistics, config.num_seeds)
+        ]
 
 
 def _joined(chunks: Sequence[Tree], episodes: int) -> Tree:

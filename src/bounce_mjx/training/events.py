@@ -43,25 +43,34 @@ for each seed before the training, and `close()` after it."""
 def block_points(metrics: dict[str, np.ndarray]) -> list[dict[str, float]]:
     """The finite points of each seed's curves in a block, from metrics of its iterations, each
     [S, I]. NaN stands for nothing to measure."""
-    means = {n: np.ma.masked_invalid(x).mean(axis=1).filled(math.nan) for n, x in metrics.items()}
-    # A sum, because a mean would hide a single event in many iterations.
-    means["task/non_finite"] = np.nansum(metrics["task/non_finite"], axis=1)
-    seeds = range(len(means["task/non_finite"]))
-    return [{name: float(x[i]) for name, x in means.items() if np.isfinite(x[i])} for i in seeds]
+    points: list[dict[str, float]] = [{} for _ in metrics["task/non_finite"]]
+    for name, values in metrics.items():
+        for seed_points, iterations in zip(points, values, strict=True):
+            measured = iterations[np.isfinite(iterations)]
+            # A sum, because a mean would hide a single event in many iterations.
+            if name == "task/non_finite":
+                seed_points[name] = float(measured.sum())
+            elif len(measured):
+                seed_points[name] = float(measured.mean())
+    return points
 
 
 def points_of(report: Report) -> dict[str, float]:
     """The points of an evaluation's curves."""
     values = {result.name.replace(" ", "_"): result.value for result in report.results}
     values |= report.details
-    known = {name: x for name, x in values.items() if x is not None and math.isfinite(x)}
-    return {f"results/{name}": x for name, x in known.items()}
+    points = {}
+    for name, value in values.items():
+        if value is not None and math.isfinite(value):
+            points[f"results/{name}"] = value
+    return points
 
 
 def call_all(callbacks: list[Any], method: str, *arguments: Any) -> None:
     """Calls a method of the callbacks that have it."""
     for callback in callbacks:
-        getattr(callback, method, lambda *_: None)(*arguments)
+        if hasattr(callback, method):
+            getattr(callback, method)(*arguments)
 
 
 def say(console: Console, line: str) -> None:
@@ -93,7 +102,10 @@ def block_line(
         if values:
             line += f"  {tag.rpartition('/')[2]} {np.mean(values):{form}}{spread}"
     line += f"  {seconds:.1f} s"
-    return f"{line}, {'at most ' * config.stop_when_solved}{left:.0f} s left" if left else line
+    if left:
+        bound = "at most " if config.stop_when_solved else ""
+        line += f", {bound}{left:.0f} s left"
+    return line
 
 
 def evaluation_line(num_seeds: int, steps: int, reports: Sequence[Report]) -> str:

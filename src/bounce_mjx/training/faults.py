@@ -9,7 +9,7 @@ import numpy as np
 from bounce_mjx.errors import reason_of, shorten
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training.seeds import SeedRun
-from bounce_mjx.training.trainer import Metrics
+from bounce_mjx.training.trainer import BlockMetrics
 
 MIN_SECONDS = 0.1
 """Shortest mean time to the end of an episode, s; after a reset a ball flies for longer."""
@@ -18,19 +18,19 @@ MAX_REWARD = 1e4
 """Largest mean of a reward term in an iteration, times `ppo.reward_scale`."""
 
 
-def first_block_fault(metrics: Metrics, config: TrainConfig) -> str | None:
+def first_block_fault(metrics: BlockMetrics, config: TrainConfig) -> str | None:
     """What is wrong with the first block, as a sentence; None if it can be learned from. Settings
     that no policy can learn with show there, before anything is saved, and in every seed.
 
     Args:
       metrics: each [S, I], as from `Trainer.run`.
     """
-    # What follows an iteration that diverged is not due to the settings.
+    # What follows an iteration that diverged is not due to the settings: up to and with the first.
     faults = metrics["fault"] != 0
-    counts = np.cumsum(faults, axis=1) <= faults
-    for name in filter(lambda name: name.startswith("reward/"), metrics):
-        values = metrics[name]
-        wrong = counts & ~(np.abs(config.ppo.reward_scale * values) <= MAX_REWARD)
+    until_fault = np.cumsum(faults, axis=1) <= faults
+    rewards = {name: values for name, values in metrics.items() if name.startswith("reward/")}
+    for name, values in rewards.items():
+        wrong = until_fault & ~(np.abs(config.ppo.reward_scale * values) <= MAX_REWARD)
         if wrong.any(axis=1).all():
             return (
                 f"the reward term {name.removeprefix('reward/')} is {values[wrong][0]:.3g} on "
@@ -43,9 +43,11 @@ def first_block_fault(metrics: Metrics, config: TrainConfig) -> str | None:
     if min(limit, config.env.episode_seconds) <= MIN_SECONDS or (seconds >= MIN_SECONDS).any():
         return None
     ends = {"max_joint_velocity": "too_fast", "the physics, which is not finite": "non_finite"}
-    half, nothing = 0.5 * ended.sum(), np.zeros(1)
-    often = (end for end, name in ends.items() if metrics.get(f"task/{name}", nothing).sum() > half)
-    cause = next(often, f"an end of the task {config.task}")
+    cause = f"an end of the task {config.task}"
+    for end, name in ends.items():
+        count = metrics.get(f"task/{name}")
+        if count is not None and count.sum() > 0.5 * ended.sum():
+            cause = end
     return (
         f"an episode lasts {seconds.max():.2g} s on average, less than {MIN_SECONDS:g} s, and what "
         f"ends it is {cause}; check the unit of the settings"

@@ -1,7 +1,8 @@
 """Training on several hosts, with one process per host (or per device). Process 0 is the leader.
 
-Every process runs the same program on its shard of the environments. Only the leader decides, reads
-and writes; the others receive its decisions (`exchange`) and send their shards of the state.
+Every process runs the same program on its shard of the environments. Only the leader calls the
+callbacks and writes; the others learn what it has decided (`exchange`), and send their shards of
+the state. All of them read: a run that is resumed, or a warm start, lies where each host finds it.
 """
 
 import contextlib
@@ -25,8 +26,8 @@ from bounce_mjx.runs.config import TrainConfig
 
 Tree = TypeVar("Tree")
 
-# Another process that ends at the same time prints its own sentence meanwhile: once the leader has
-# ended, JAX aborts the others at once.
+# Time for the other processes to print their own sentences: once the leader has ended, JAX aborts
+# them at once.
 _GRACE_SECONDS = 1.0
 # Longer than any compilation, ms. JAX ends the wait for a dead process.
 _NO_LIMIT = 10**9
@@ -76,7 +77,7 @@ def agree(config: TrainConfig, resume: Path | None) -> None:
     Raises:
       UserError: they differ, and so would the programs and the states of the processes.
     """
-    # Only the leader uses the folder of the runs.
+    # Only the leader makes the run's folder.
     plain = config.model_dump(mode="json", exclude={"log_dir"})
     plain["resume"] = resume and os.path.abspath(resume)
     first, *others = map(flat, exchange(plain))
@@ -123,6 +124,11 @@ def any_of(flag: bool) -> bool:
     """Whether the flag is set in any process. Every process must call this at the same point; there
     it waits for the others without a time limit."""
     return any(exchange(flag))
+
+
+def wait_for_all() -> None:
+    """Waits until every process has come to this point, see `any_of`."""
+    any_of(False)
 
 
 def distribute(tree: Tree, shardings: Any) -> Tree:

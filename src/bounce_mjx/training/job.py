@@ -33,7 +33,7 @@ from bounce_mjx.physics.convergence import solver_warning
 from bounce_mjx.runs import checkpoints, folders
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.files import writable
-from bounce_mjx.runs.progress import PATIENCE, Progress
+from bounce_mjx.runs.progress import PATIENCE, Progress, are_solved
 from bounce_mjx.training import events, faults, hosts
 from bounce_mjx.training.clock import Clock
 from bounce_mjx.training.evaluators import Evaluators
@@ -41,7 +41,7 @@ from bounce_mjx.training.log import TensorBoardLog
 from bounce_mjx.training.ppo_trainer import PPOTrainer, iterations_per_block
 from bounce_mjx.training.saving import Saver
 from bounce_mjx.training.seeds import SeedRun
-from bounce_mjx.training.trainer import Metrics, Snapshot, Trainer
+from bounce_mjx.training.trainer import BlockMetrics, Snapshot, Trainer
 
 Result = TypeVar("Result")
 MakeTrainer = Callable[[TrainConfig, Env], Trainer]
@@ -77,7 +77,8 @@ def train(
         another process trains in the run's folder, the hosts have different configs, a device
         failed, the training diverged, or its final state could not be saved.
       TrainingStopped: SIGINT, SIGTERM or SIGHUP came; the state is saved.
-      Interrupted: the signal came before the first block, and there is no run.
+      Interrupted: the signal came before the first block, or before the policy of a warm start was
+        evaluated, and there is no run.
     """
     hosts.agree(config, resume)
     with contextlib.ExitStack() as stack:
@@ -183,7 +184,8 @@ class Job:
     is_new: bool
     """Whether the run is not resumed."""
     networks: Any
-    """Those of a warm start, which the trainer starts with; None without one."""
+    """Parameters of both networks of a warm start and the statistics of their inputs, as from
+    `checkpoints.read_start`; None without one."""
     console: Console
     callbacks: list[Any]
     pool: concurrent.futures.Executor
@@ -193,14 +195,14 @@ class Job:
 
     steps: int = 0
     """Environment steps of each seed so far."""
-    is_saved: bool = True
-    """Whether the current state needs no save any more."""
+    needs_save: bool = False
+    """Whether the current state is still to be saved."""
     is_ended: bool = False
     """Whether a callback has ended the training."""
     state: Any = None
     """State from which the resumed run starts."""
     snapshot: Snapshot | None = None
-    """The current state, once it was asked for."""
+    """The current state, once it was asked for; the next block drops it."""
     seeds: list[SeedRun] = dataclasses.field(init=False)
     saver: Saver = dataclasses.field(init=False)
     evaluators: Evaluators = dataclasses.field(init=False)
@@ -233,23 +235,31 @@ class Job:
         checkpoint = folders.latest_checkpoint(self.run, resume)
         self.state, record = checkpoints.read_training(checkpoint, self.trainer.state_template)
         self.steps = record.steps
-        # What was trained after a checkpoint that the user named does not count any more.
-        newest = max(stored.steps for stored in folders.stored_checkpoints(self.run))
-        place = None if checkpoint.steps == newest else checkpoint.folder
         evaluated = record.progress.get("seeds", [record.progress])
         for seed, plain in zip(self.seeds, evaluated, strict=True):
             seed.progress = Progress.model_validate(plain)
-            seed.recall_best(place if seed.run == self.run else None)
-            if hosts.is_leader():
-                folders.set_damaged_aside(seed.run)
+            # What was trained after a checkpoint that the user named does not count any more. The
+            # folder of one of several seeds has no other policy than its best one.
+            seed.recall_best(newest=checkpoint if seed.run == self.run else None)
+        # Every process has read what the leader renames.
+        hosts.wait_for_all()
+        self.set_damaged_aside()
         if self.is_finished():
             met = "has met all results" if self.is_solved() else "has been trained to its end"
             self.say(f"{self.run} {met}, {self.steps:,} steps; add --total-steps N to train on")
 
+    def set_damaged_aside(self) -> None:
+        """Puts the damaged checkpoints of the run and of its seeds where no save removes them."""
+        if hosts.is_leader():
+            for folder in self.configs_by_folder():
+                for aside in folders.set_damaged_aside(folder):
+                    self.say(f"the damaged checkpoint is kept as {aside}")
+
     def write_configs(self) -> None:
         """Writes the config of the run and of each seed."""
-        configs = {self.run: self.config} | {seed.run: seed.config for seed in self.seeds}
-        for folder, config in configs.items() if hosts.is_leader() else ():
+        if not hosts.is_leader():
+            return
+        for folder, config in self.configs_by_folder().items():
             with writable(folder, "make room there or make it writable"):
                 folder.mkdir(exist_ok=True)
                 folders.save_config(folder, config)
@@ -290,7 +300,7 @@ class Job:
             # A process that finds its programs in the cache waits here for a process that compiles
             # them; otherwise the exchange between devices would time out after 30 s.
             self.evaluators.wait()
-            hosts.any_of(False)
+            hosts.wait_for_all()
         self.trainer.start(self.state, self.networks)
         self.state = None
         self.clock.lap("compile")
@@ -309,13 +319,13 @@ class Job:
 
     def evaluation_is_due(self) -> bool:
         """Whether the current policies are to be evaluated."""
-        is_done = self.is_done()
-        if is_done and any(seed.best is None for seed in self.healthy()):
+        # The best checkpoint of a resumed run may be damaged.
+        if self.is_finished() and any(seed.best is None for seed in self.healthy()):
             return True
         # The policy of a warm start is the one to beat.
-        is_trained = self.steps > 0 or self.networks is not None
-        at_evaluation = is_done or self.steps % self.eval_steps == 0
-        return is_trained and at_evaluation and not self.is_evaluated()
+        is_worth_it = self.steps > 0 or self.networks is not None
+        is_at_evaluation = self.is_done() or self.steps % self.eval_steps == 0
+        return is_worth_it and is_at_evaluation and not self.is_evaluated()
 
     def evaluate(self) -> None:
         """Evaluates the current policies, unless a stop is requested meanwhile."""
@@ -325,35 +335,36 @@ class Job:
         if reports is None:
             return
         seconds = sum(self.clock.seconds.values())
-        # Then it is known whether the best policy before was saved.
+        # First, as a save that has failed sets back the best policy.
         self.saver.end()
         self.clock.lap("save")
-        evaluated = [
-            (seed, report, policy)
-            for seed, report, policy in zip(self.seeds, reports, policies, strict=True)
-            if seed.progress.fault is None
-        ]
-        judged = [report for _, report, _ in evaluated]
+        told = []
+        for seed, report, policy in zip(self.seeds, reports, policies, strict=True):
+            if seed.progress.fault is None:
+                told.append(self.event(seed, events.points_of(report), report, policy))
+                seed.add_report(report, policy, self.steps, seconds)
+        judged = [event.report for event in told]
         self.say(events.evaluation_line(self.config.num_seeds, self.steps, judged))
-        for seed, report, policy in evaluated:
-            self.tell(seed, events.points_of(report), report=report, policy=policy)
-            seed.add_report(report, policy, self.steps, seconds)
-        self.is_saved = False
+        self.tell(told)
+        self.needs_save = True
+        # With the callbacks, such as a video.
+        self.clock.lap("evaluate")
         if is_first:
+            # Until now, programs were compiled beside the training.
             self.clock.restart_estimate(self.steps)
 
     def save_is_due(self) -> bool:
         """Whether the current state is to be saved: after each evaluation, and where `save_every`
         asks for it."""
         is_asked_for = self.save_steps is not None and self.steps % self.save_steps == 0
-        return not self.is_saved and (is_asked_for or self.is_evaluated())
+        return self.needs_save and (is_asked_for or self.is_evaluated())
 
     def save(self) -> None:
         """Starts to save the state, and with several seeds the policies that are the best of their
         seed."""
         self.saver.end()
         self.saver.start(self.take_snapshot(), self.steps, self.about())
-        self.is_saved = True
+        self.needs_save = False
         self.clock.lap("save")
 
     def is_stopping(self) -> bool:
@@ -364,7 +375,7 @@ class Job:
         """Whether the training ends here."""
         return self.is_done() or self.is_solved()
 
-    def train_block(self) -> tuple[Metrics, float]:
+    def train_block(self) -> tuple[BlockMetrics, float]:
         """Trains for a block of I iterations; its metrics, each [S, I], and its duration, s.
 
         Raises:
@@ -380,12 +391,12 @@ class Job:
         if self.steps == 0 and (wrong := faults.first_block_fault(metrics, self.config)):
             raise UserError(f"these settings cannot be trained: {wrong}")
         self.steps += self.block_steps
-        self.is_saved = False
+        self.needs_save = True
         for seed in self.seeds:
             seed.report = None
         return metrics, seconds
 
-    def log_block(self, metrics: Metrics, seconds: float) -> None:
+    def log_block(self, metrics: BlockMetrics, seconds: float) -> None:
         """Says and logs a block.
 
         Raises:
@@ -399,10 +410,9 @@ class Job:
         self.say(events.block_line(self.config, self.steps, seconds, left, points))
         if total := int(sum(point["task/non_finite"] for point in points)):
             self.say(f"states that were not finite, whose environments were reset: {total:,}")
-        for seed, seed_points in zip(self.seeds, points, strict=True):
-            self.tell(seed, seed_points)
+        pairs = zip(self.seeds, points, strict=True)
+        self.tell([self.event(seed, seed_points) for seed, seed_points in pairs])
         self.end_diverged(block_faults)
-        self.is_ended = hosts.any_of(self.is_ended)
         self.clock.lap("train")
 
     def finish(self) -> None:
@@ -413,17 +423,21 @@ class Job:
           Interrupted: it was requested before there was anything to save.
           UserError: the state could not be saved.
         """
-        stopping, where = self.is_stopping(), ""
+        stopping = self.is_stopping()
+        where = ""
         if self.is_finished() and not stopping:
             self.say(self.why_it_ends())
-        if stopping and self.is_new and self.steps == 0:
+        # The policy of a warm start is saved once it is evaluated.
+        has_nothing = self.is_new and self.steps == 0 and not self.is_evaluated()
+        if stopping and has_nothing:
             jax.distributed.shutdown()
             raise Interrupted
-        if not self.is_saved:
+        if self.needs_save:
             self.save()
         self.end_last_save()
         if not stopping and not self.evaluate_best():
-            stopping, where = True, ", before the final evaluation"
+            stopping = True
+            where = ", before the final evaluation"
         jax.distributed.shutdown()
         if stopping:
             raise TrainingStopped(f"stopped after {self.steps:,} steps{where}; {self.go_on}")
@@ -433,7 +447,7 @@ class Job:
         stop was requested meanwhile."""
         # A seed that diverged before its first evaluation has no best policy; another seed's policy
         # takes its place in the batch.
-        other = next(seed.best.policy for seed in self.seeds if seed.best)
+        other = next(seed.best.policy for seed in self.healthy())
         policies = [seed.best.policy if seed.best else other for seed in self.seeds]
         reports = self.wait_for_reports(self.evaluators.final, policies)
         if reports is None:
@@ -467,6 +481,10 @@ class Job:
         count = f"{mesh.size} x " if mesh.size > 1 else ""
         return f"{count}{mesh.devices.flat[0].device_kind}"
 
+    def configs_by_folder(self) -> dict[Path, TrainConfig]:
+        """The config of the run and, with several seeds, of each, by its folder."""
+        return {self.run: self.config} | {seed.run: seed.config for seed in self.seeds}
+
     def healthy(self) -> list[SeedRun]:
         """The seeds that have not diverged."""
         return [seed for seed in self.seeds if seed.progress.fault is None]
@@ -477,7 +495,7 @@ class Job:
 
     def is_solved(self) -> bool:
         """Whether the results end the training."""
-        solved = all(seed.progress.solved for seed in self.healthy())
+        solved = are_solved([seed.progress for seed in self.seeds])
         return self.config.stop_when_solved and solved
 
     def why_it_ends(self) -> str:
@@ -504,12 +522,13 @@ class Job:
         return self.snapshot
 
     def time_left(self) -> float | None:
-        """Estimated time to the last step, s. None after the first block, meanwhile other programs
-        are still compiled."""
-        if "train" in self.clock.seconds:
-            return self.clock.left(self.steps, self.config.total_steps)
-        self.clock.restart_estimate(self.steps)
-        return None
+        """Estimated time to the last step, s. None after the first block of this process, during
+        which other programs are still compiled."""
+        is_first_block = "train" not in self.clock.seconds
+        if is_first_block:
+            self.clock.restart_estimate(self.steps)
+            return None
+        return self.clock.left(self.steps, self.config.total_steps)
 
     def about(self, fresh_resets: bool = False) -> dict[str, Any]:
         """What the results say of the training, see `Results`."""
@@ -527,11 +546,26 @@ class Job:
         """Prints a line."""
         events.say(self.console, line)
 
-    def tell(self, seed: SeedRun, metrics: dict[str, float], **evaluation: Any) -> None:
-        """Tells the callbacks an `Event` of a seed."""
-        event = events.Event(seed.run, seed.config, self.steps, metrics, **evaluation)
-        answers = [callback(event) for callback in self.callbacks]
-        self.is_ended |= any(answer is False for answer in answers)
+    def event(
+        self,
+        seed: SeedRun,
+        metrics: dict[str, float],
+        report: Report | None = None,
+        policy: Policy | None = None,
+    ) -> events.Event:
+        """What the callbacks are told of a seed at the present step."""
+        return events.Event(seed.run, seed.config, self.steps, metrics, report, policy)
+
+    def tell(self, told: Sequence[events.Event]) -> None:
+        """Tells the callbacks the events of the seeds. On several hosts, every process learns
+        whether a callback has ended the training."""
+        for event in told:
+            for callback in self.callbacks:
+                answer = callback(event)
+                # A comparison of NumPy's numbers has its own False.
+                if isinstance(answer, bool | np.bool_) and not answer:
+                    self.is_ended = True
+        self.is_ended = hosts.any_of(self.is_ended)
 
     @property
     def go_on(self) -> str:
@@ -606,7 +640,7 @@ class Job:
             return folders.latest_checkpoint(self.run).folder
 
     def remove_unstarted(self, error: type[BaseException] | None, *_) -> None:
-        """Removes the folder of a new run without a checkpoint or a block."""
+        """Removes the folder of a new run that has neither a checkpoint nor a block."""
         is_unstarted = self.is_new and self.steps == 0
         if error is not None and is_unstarted and hosts.is_leader() and self.latest() is None:
             shutil.rmtree(self.run, ignore_errors=True)

@@ -40,22 +40,27 @@ class TensorBoardLog:
         finally:
             if is_free:
                 del sys.modules["torch"]
-        self.summary, self._event = summary, event_pb2.Event
-        self._session_log, self._checksum = event_pb2.SessionLog, record_writer.masked_crc32c
+        self.summary = summary
+        self._event = event_pb2.Event
+        self._session_log = event_pb2.SessionLog
+        self._checksum = record_writer.masked_crc32c
         self._resumed = resumed
         self._files: dict[Path, _LogFile] = {}
 
     def start(self, run: Path, config: TrainConfig) -> None:
         """Logs the config as hyperparameters."""
-        plain = flat(config.model_dump(mode="json")).items()
-        plain = {name: x if isinstance(x, int | float) else str(x) for name, x in plain}
+        plain = {}
+        for name, value in flat(config.model_dump(mode="json")).items():
+            plain[name] = value if isinstance(value, int | float) else str(value)
         shown = dict.fromkeys(("results/mean_return", "episode/return"), 0.0)
         for part in self.summary.hparams(plain, shown):
             self.add(run, 0, summary=part)
 
     def __call__(self, event: Event) -> None:
         """Writes the points of an event."""
-        values = (self.summary.scalar(*point).value[0] for point in event.metrics.items())
+        values = []
+        for name, value in event.metrics.items():
+            values += self.summary.scalar(name, value).value
         self.add(event.run, event.steps, summary=self.summary.Summary(value=values))
 
     def add(self, folder: Path, steps: int, **content: Any) -> None:
@@ -76,8 +81,10 @@ class TensorBoardLog:
         """An entry in the format of TensorBoard's files."""
         data = self._event(wall_time=time.time(), **content).SerializeToString()
         length = struct.pack("<Q", len(data))
-        checksums = (struct.pack("<I", self._checksum(part)) for part in (length, data))
-        return b"".join((length, next(checksums), data, next(checksums)))
+        return length + self._checksum_of(length) + data + self._checksum_of(data)
+
+    def _checksum_of(self, content: bytes) -> bytes:
+        return struct.pack("<I", self._checksum(content))
 
 
 class _LogFile:
@@ -89,19 +96,22 @@ class _LogFile:
           head: what the file begins with.
         """
         # TensorBoard reads files in the order of their names, and the clock may have been set back.
-        names = [path.name for path in folder.glob(f"{_NAME}.*")]
-        stamps = [int(found[1]) for name in names if (found := _STAMP.match(name))]
-        stamp = max([int(time.time()), *(earlier + 1 for earlier in stamps)])
+        stamp = int(time.time())
+        for path in folder.glob(f"{_NAME}.*"):
+            if found := _STAMP.match(path.name):
+                stamp = max(stamp, int(found[1]) + 1)
         self._path = folder / f"{_NAME}.{stamp:010d}.{os.getpid()}"
-        self._head, self._file = head, None
+        self._head = head
+        self._file = None
 
     def write(self, entry: bytes) -> None:
         """Writes an entry, unless there is no room for it."""
         with contextlib.suppress(OSError):
             if self._file is None:
                 self._file = self._path.open("xb", buffering=0)
-            size, written = self._file.tell(), 0
+            size = self._file.tell()
             content = entry if size else self._head + entry
+            written = 0
             try:
                 written = self._file.write(content)
             finally:

@@ -23,7 +23,7 @@ from bounce_mjx.learning.statistics import RunningStatistics
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training import hosts
 from bounce_mjx.training.setup import compiler_options
-from bounce_mjx.training.trainer import Metrics, Snapshot
+from bounce_mjx.training.trainer import BlockMetrics, Snapshot
 
 _AXIS = "devices"
 
@@ -50,7 +50,8 @@ class PPOTrainer:
         Raises:
           UserError: the config does not fit the devices or the environment.
         """
-        self._config, self._observation_size = config, env.observation_size
+        self._config = config
+        self._observation_size = env.observation_size
         self.mesh = make_mesh(config.num_devices, config.ppo, config.num_seeds)
         """The devices on which it trains."""
         algorithm = find_algorithm(config.algorithm)(config.ppo, env, episode_steps(config))
@@ -69,11 +70,12 @@ class PPOTrainer:
             """The first training state of one seed [] or of S seeds [S]."""
             return init(make_key(seeds))
 
-        def train_block(state: ppo.TrainingState) -> tuple[ppo.TrainingState, Metrics]:
+        def train_block(state: ppo.TrainingState) -> tuple[ppo.TrainingState, ppo.Metrics]:
             return run(state, iterations_per_block(config))
 
         # One object each, not methods, so that JAX traces them only once.
-        self._initial_state, self._train_block = initial_state, train_block
+        self._initial_state = initial_state
+        self._train_block = train_block
 
     @functools.cached_property
     def state_template(self) -> ppo.TrainingState:
@@ -97,7 +99,7 @@ class PPOTrainer:
 
     def compile(self, pool: concurrent.futures.Executor) -> concurrent.futures.Future:
         """Starts the compilation in a pool; the future is that of a block's program, and `start`
-        waits for the other."""
+        waits for that of the initial state, which a resumed training does not need."""
         run = jax.jit(
             self._train_block,
             in_shardings=(self._sharding,),
@@ -118,21 +120,23 @@ class PPOTrainer:
 
         Args:
           networks: those of an earlier training, which each seed starts with, and the statistics of
-            their inputs.
+            their inputs; not with a state.
         """
-        if state is None:
-            self.state = jax.block_until_ready(self._init_program.result()(self._seeds))
-        if networks is not None:
-            state = multihost_utils.process_allgather(self.state, tiled=True)
-            former = state.params, state.statistics
-            params, statistics = jax.tree.map(
-                lambda old, new: np.broadcast_to(new, old.shape), former, networks
-            )
-            state = state._replace(params=params, statistics=statistics)
         if state is not None:
             self.state = hosts.distribute(state, self._sharding)
+            return
+        self.state = jax.block_until_ready(self._init_program.result()(self._seeds))
+        if networks is not None:
+            initial = multihost_utils.process_allgather(self.state, tiled=True)
+            params, statistics = jax.tree.map(
+                lambda old, new: np.broadcast_to(new, old.shape),
+                (initial.params, initial.statistics),
+                networks,
+            )
+            warm = initial._replace(params=params, statistics=statistics)
+            self.state = hosts.distribute(warm, self._sharding)
 
-    def run(self) -> Metrics:
+    def run(self) -> BlockMetrics:
         """Trains for a block of I iterations.
 
         Returns:

@@ -45,8 +45,9 @@ class Outcome:
 class Saver:
     """Writes checkpoints and results in the background, one save after another.
 
-    A save that fails is lost, as the next one has newer data. It is said once, and so is the next
-    one that succeeds. On several hosts the leader alone writes, and all know what was written.
+    A save that fails is lost, as the next one has newer data. It is said once, at the next
+    evaluation or save, and so is the next one that succeeds. On several hosts the leader alone
+    writes, and all know what was written.
     """
 
     def __init__(
@@ -57,10 +58,14 @@ class Saver:
         pool: concurrent.futures.Executor,
         say: Callable[[str], None],
     ) -> None:
-        self._run, self._config, self._seeds = run, config, seeds
-        self._pool, self._say = pool, say
+        self._run = run
+        self._config = config
+        self._seeds = seeds
+        self._pool = pool
+        self._say = say
         self._saving: concurrent.futures.Future[Outcome] | None = None
-        self._steps, self._is_failing = 0, False
+        self._steps = 0
+        self._is_failing = False
 
     def start(self, snapshot: Snapshot | None, steps: int, about: dict[str, Any]) -> None:
         """Starts to save; the save before must have ended.
@@ -97,9 +102,11 @@ class Saver:
         """
         outcome = Outcome({})
         if self._saving is not None:
-            outcome, self._saving = self._saving.result(), None
+            outcome = self._saving.result()
+            self._saving = None
             if not is_last:
                 self._say_change(outcome.problem)
+        # The leader's, as it alone writes.
         numbers, problem = hosts.exchange([outcome.numbers, outcome.problem])[0]
         for seed in self._seeds:
             seed.end_save(numbers.get(seed.run.name), has_failed=problem is not None)
@@ -110,7 +117,7 @@ class Saver:
         if problem and not self._is_failing:
             self._say(
                 f"the state is not saved, as {self._run} cannot be written ({problem}); training "
-                "continues, and tries again after each evaluation"
+                "continues, and tries again at the next save"
             )
         if self._is_failing and not problem:
             self._say(f"the state is saved again, after {self._steps:,} steps")
@@ -119,25 +126,39 @@ class Saver:
     def _checkpoints(self, snapshot: Snapshot) -> list[Save]:
         """The checkpoints to write. With one seed, the state and its policy; with several, each
         policy that is the best of its seed, and then the state, whose record refers to them."""
-        # A copy, because the training reuses its buffers meanwhile.
-        policies, state, networks = jax.tree.map(np.array, snapshot)
-        training = {checkpoints.TRAINING: state}
+        # On a CPU the snapshot is a view of the training's buffers. JAX overwrites none that has a
+        # view, and would need more memory while they are written.
+        snapshot = jax.tree.map(np.array, snapshot)
+        training = {checkpoints.TRAINING: snapshot.state}
         progress = [seed.progress.model_dump() for seed in self._seeds]
-        is_alone, saves = len(self._seeds) == 1, []
+        if len(self._seeds) == 1:
+            # The best checkpoint stays beside the newest one.
+            (seed,) = self._seeds
+            is_best_kept = seed.saved is not None and not seed.has_unsaved_best
+            kept = seed.saved.number if is_best_kept else None
+            return [self._save_of(0, snapshot, progress[0], training, kept)]
+        saves = []
         for i, seed in enumerate(self._seeds):
-            if not is_alone and not seed.is_best:
-                continue
-            items = {checkpoints.POLICY: policies[i], **(training if is_alone else {})}
-            if networks is not None:
-                items[checkpoints.NETWORKS] = networks[i]
-            kept = None if seed.is_best or seed.saved is None else seed.saved.number
-            saves.append(
-                Save(seed.run, seed.config, self._steps, items, progress[i], seed.report, kept)
-            )
-        if not is_alone:
-            record = {"seeds": progress}
-            saves.append(Save(self._run, self._config, self._steps, training, record))
+            if seed.has_unsaved_best:
+                saves.append(self._save_of(i, snapshot, progress[i]))
+        record = {"seeds": progress}
+        saves.append(Save(self._run, self._config, self._steps, training, record))
         return saves
+
+    def _save_of(
+        self,
+        i: int,
+        snapshot: Snapshot,
+        progress: dict[str, Any],
+        training: dict[str, Any] | None = None,
+        kept: int | None = None,
+    ) -> Save:
+        """The checkpoint of seed number i, with what a training continues from if it is given."""
+        seed = self._seeds[i]
+        items = {checkpoints.POLICY: snapshot.policies[i]} | (training or {})
+        if snapshot.networks is not None:
+            items[checkpoints.NETWORKS] = snapshot.networks[i]
+        return Save(seed.run, seed.config, self._steps, items, progress, seed.report, kept)
 
 
 def _write(saves: Sequence[Save], results: dict[Path, str]) -> Outcome:

@@ -1,15 +1,15 @@
 """The seeds of a training run, and what each has reached."""
 
-import contextlib
 import dataclasses
 from pathlib import Path
 
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import warn_once
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.runs import checkpoints, folders
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.progress import Progress
+from bounce_mjx.runs.records import Checkpoint, DamagedCheckpoint
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,18 +41,20 @@ class SeedRun:
     """The best policy of those that were saved."""
 
     @property
-    def is_best(self) -> bool:
-        """Whether the current policy is the best one, and is not saved yet."""
+    def has_unsaved_best(self) -> bool:
+        """True from an evaluation of the current policy that is the best one to the end of its
+        save, which starts before the training goes on."""
         return self.best is not self.saved
 
     def add_report(self, report: Report, policy: Policy, steps: int, seconds: float) -> None:
         """Adds the evaluation of the current policy.
 
         Args:
-          seconds: see `Progress.improves`.
+          seconds: see `Progress.add`.
         """
         self.report = report
-        if self.progress.improves(report, steps, seconds):
+        is_best = self.progress.add(report, steps, seconds)
+        if is_best:
             self.best = Best(policy, report, steps)
 
     def end_save(self, number: int | None, has_failed: bool) -> None:
@@ -62,23 +64,39 @@ class SeedRun:
           number: that of the seed's checkpoint, if one was written.
           has_failed: whether something could not be written.
         """
-        if number is not None and self.is_best:
+        if number is not None and self.has_unsaved_best:
             self.saved = self.best = dataclasses.replace(self.best, number=number)
         if has_failed:
             self._take_best(self.saved)
 
-    def recall_best(self, place: Path | None) -> None:
-        """Takes for the best what the best intact checkpoint in a folder of the run says."""
+    def recall_best(self, newest: Checkpoint | None) -> None:
+        """Takes for the best what the best intact checkpoint of the run says. Where there is none,
+        a warning names the damaged one.
+
+        Args:
+          newest: the newest checkpoint that counts; None if all do.
+
+        Raises:
+          UserError: the checkpoint's config is not that of the seed's folder.
+        """
         self.saved = None
-        with contextlib.suppress(UserError):
-            checkpoint = folders.best_checkpoint(self.run, place)
-            record = checkpoints.read_record(checkpoint)
-            if record.report is not None:
-                policy = checkpoints.read_policy(checkpoint, self.config)
-                self.saved = Best(policy, record.report, record.steps, checkpoint.steps)
+        # A seed may have diverged before its first evaluation.
+        if folders.stored_checkpoints(self.run):
+            try:
+                self.saved = self._read_best(folders.best_checkpoint(self.run, newest=newest))
+            except DamagedCheckpoint as error:
+                warn_once(f"{error.damage}; another policy takes its place")
         self._take_best(self.saved)
+
+    def _read_best(self, checkpoint: Checkpoint) -> Best | None:
+        """The policy of a checkpoint with its evaluation; None if it has none."""
+        record = checkpoints.read_record(checkpoint)
+        if record.report is None:
+            return None
+        policy = checkpoints.read_policy(checkpoint, self.config)
+        return Best(policy, record.report, record.steps, checkpoint.number)
 
     def _take_best(self, best: Best | None) -> None:
         self.best = best
-        self.progress.best = best and best.report
-        self.progress.best_steps = best.steps if best else 0
+        self.progress.best = None if best is None else best.report
+        self.progress.best_steps = 0 if best is None else best.steps

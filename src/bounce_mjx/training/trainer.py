@@ -9,7 +9,8 @@ from jax.sharding import Mesh
 
 from bounce_mjx.learning.policy import Policy
 
-Metrics = dict[str, np.ndarray]
+BlockMetrics = dict[str, np.ndarray]
+"""Metrics of a block of I iterations of S seeds, each [S, I], by name."""
 
 
 class Snapshot(NamedTuple):
@@ -28,9 +29,9 @@ class Trainer(Protocol):
     """S independent runs of one algorithm, one for each seed, whose policies have the network that
     the config's `ppo` describes.
 
-    The job makes one by calling a class, or a function, with the run's config and its environment;
-    it may raise a UserError there. Then it calls `compile`, `start` once, and `run` for each block;
-    after a block it may ask for a `snapshot`.
+    The job makes one by calling a class, or a function (`make_trainer` of `training.job.train`),
+    with the run's config and its environment; it may raise a UserError there. Then it calls
+    `compile`, `start` once, and `run` for each block; after a block it may ask for a `snapshot`.
     """
 
     checked: Sequence[str]
@@ -54,15 +55,15 @@ class Trainer(Protocol):
             their inputs (`checkpoints.read_start`); not with a state.
         """
 
-    def run(self) -> Metrics:
-        """Trains for a block of I iterations (`iterations_per_block`), each of `ppo.batch_steps`
-        environment steps.
+    def run(self) -> BlockMetrics:
+        """Trains for a block of I iterations (`ppo_trainer.iterations_per_block`), each of
+        `ppo.batch_steps` environment steps.
 
         Returns:
           Metrics, each [S, I]. The job needs three: "fault", the number, from 1, of the first
           quantity of `checked` that was not finite in an iteration, and 0 if all were finite;
           "episode/ended", how many episodes ended; "task/non_finite", how many of them because the
-          physics was not finite.
+          physics was not finite. "episode/return" is said after each block where it is there.
         """
 
     def snapshot(self) -> Snapshot:

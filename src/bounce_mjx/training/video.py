@@ -29,9 +29,11 @@ class EvaluationVideo:
           size: width and height in pixels.
           fps: frames per second.
         """
-        self._seconds, self._size, self._fps = seconds, size, fps
+        self._seconds = seconds
+        self._size = size
+        self._fps = fps
         self._simulation: Simulation | None = None
-        self._log = TensorBoardLog()
+        self._log: TensorBoardLog | None = None
 
     def start(self, run: Path, config: TrainConfig) -> None:
         """
@@ -47,6 +49,9 @@ class EvaluationVideo:
             env = Env(event.config.env)
             controller = make_policy_controller(networks_of(event.config.ppo)(env))
             self._simulation = Simulation(env, controller, 1, seed=0, policy=event.policy)
+        if self._log is None:
+            # A resumed training may have filmed later policies before.
+            self._log = TensorBoardLog(resumed=event.steps - 1)
         self._simulation.policy = event.policy
         self._simulation.reset()
         recording = self._simulation.record(self._seconds)
@@ -56,9 +61,11 @@ class EvaluationVideo:
         gif = io.BytesIO()
         duration = 1000 / self._fps
         first.save(gif, "GIF", save_all=True, append_images=others, duration=duration, loop=0)
-        kind, (width, height) = self._log.summary.Summary, self._size
-        shape = {"width": width, "height": height, "colorspace": 3}
-        image = kind.Image(**shape, encoded_image_string=gif.getvalue())
+        width, height = self._size
+        kind = self._log.summary.Summary
+        image = kind.Image(
+            width=width, height=height, colorspace=3, encoded_image_string=gif.getvalue()
+        )
         summary = kind(value=[kind.Value(tag="policy", image=image)])
         # In its own folder, as TensorBoard stops reading a file once its folder has a newer one.
         folder = event.run / "video"

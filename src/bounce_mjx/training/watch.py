@@ -35,7 +35,8 @@ class TrainingPage:
         Raises:
           UserError: the page cannot be served there.
         """
-        self._config, self._console = config, console
+        self._config = config
+        self._console = console
         self._address = address._replace(port=free_port(address.host, address.port))
         self._news: queue.SimpleQueue[Event | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._serve, daemon=True)
@@ -81,7 +82,8 @@ class TrainingPage:
                 self._progress.content = _text("<b>Training has ended</b>")
             elif event.report is not None:
                 line = html.escape(evaluation_line(1, event.steps, [event.report]))
-                self._results.content, simulation.policy = _text(line), event.policy
+                self._results.content = _text(line)
+                simulation.policy = event.policy
             else:
                 done = f"{event.steps:,} of {self._config.total_steps:,} steps"
                 rate = event.metrics["speed/steps_per_second"]
@@ -90,7 +92,8 @@ class TrainingPage:
 
 def _simulate(config: TrainConfig) -> Simulation:
     """A simulation with an untrained policy."""
-    env, key = Env(config.env), jax.random.PRNGKey(config.seed)
+    env = Env(config.env)
+    key = jax.random.PRNGKey(config.seed)
     networks = make_networks(config.ppo, env.observation_size, env.action_size)
     policy = jax.device_get(untrained_policy(networks, env.observation_size, key))
     robots = _ROBOTS if env.engine.name == "fused" else 1

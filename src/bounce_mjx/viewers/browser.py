@@ -58,7 +58,7 @@ def run_page(
     server: viser.ViserServer,
     simulation: Simulation,
     start: PageStart,
-    is_over: Callable[[], object],
+    between_pictures: Callable[[], bool | None],
     on_ready: Callable[[], object] = lambda: None,
     seconds: float | None = None,
     side: viser.PanelHandle | None = None,
@@ -66,7 +66,8 @@ def run_page(
     """Builds the page of a simulation, steps it in real time, and sends pictures and plots.
 
     Args:
-      is_over: called between two pictures; whether to stop.
+      between_pictures: called between two pictures; true ends the page. A training tells its news
+        there, and returns None.
       on_ready: called when the page is built.
       seconds: simulated time; None for no end.
       side: the left panel, if it has tabs already.
@@ -90,16 +91,18 @@ def run_page(
     on_ready()
     next_plot = 0.0
     for frames in in_real_time(simulation, seconds, controls.pace):
-        if is_over():
+        if between_pictures():
             break
         controls.apply()
         if controls.num_shown != scene.num_envs:
             scene.show(controls.num_shown)
         plots.history.extend(frames)
         scene.update(frames or [simulation.frame])
-        if frames and time.monotonic() >= next_plot:
-            plots.update()
+        if time.monotonic() >= next_plot:
+            # Also in a pause, in which a user may reset, or let a value be sampled again.
             controls.show_values()
+            if frames:
+                plots.update()
             next_plot = time.monotonic() + 1.0 / _PLOT_RATE
     server.flush()
 
@@ -144,7 +147,8 @@ class _Plots:
 
     def update(self) -> None:
         """Sends the history to the page."""
-        dt, frames = self._env.dt, list(self.history)
+        dt = self._env.dt
+        frames = list(self.history)
         heights = [(*f.balls[0, :, 2], *self._levels(f).values(), f.paddle[0, 2]) for f in frames]
         times = np.arange(1 - len(heights), 1) * dt
         self._heights.data = (times, *np.array(heights).T)

@@ -26,7 +26,8 @@ _SAMPLED = "sampled at each reset"
 
 
 class _Setting:
-    """A slider, or a choice by names, for a value that is sampled as long as `sampled` is on."""
+    """A slider, or a choice by names, for a value that is sampled as long as `sampled` is on: a
+    command has a checkbox of its own, and all terms of the world have one."""
 
     def __init__(
         self,
@@ -34,14 +35,21 @@ class _Setting:
         sampled: viser.GuiCheckboxHandle,
         names: Sequence[str] = (),
     ):
-        self._handle, self.sampled, self._names = handle, sampled, list(names)
+        self.sampled = sampled
+        self._handle = handle
+        self._names = list(names)
         self._shown: float | None = None
         handle.on_update(self._take)
+        sampled.on_update(self._forget)
 
     def _take(self, event: viser.GuiEvent) -> None:
         """What a user sets is not sampled; what `show` sets is."""
         if event.client is not None:
             self.sampled.value = False
+
+    def _forget(self, _: object) -> None:
+        """Once the value is sampled again, the slider shows the user's until `show` sets it."""
+        self._shown = None
 
     @property
     def value(self) -> float:
@@ -126,9 +134,14 @@ class Controls:
             if command.names:
                 handle = gui.add_dropdown(short, command.names, disabled=self._is_film)
             else:
-                low, high = min(start, *ends), max(start, *ends)
-                step = command.step / _STEPS_PER_KEY
-                handle = gui.add_slider(short, low, high, step, start, disabled=self._is_film)
+                handle = gui.add_slider(
+                    short,
+                    min(start, *ends),
+                    max(start, *ends),
+                    command.step / _STEPS_PER_KEY,
+                    start,
+                    disabled=self._is_film,
+                )
         setting = _Setting(handle, sampled, command.names)
         if command.names:
             setting.show(start)
@@ -177,19 +190,27 @@ class Controls:
 
     def _keys(self) -> list[tuple[str, str, Callable[[viser.CommandEvent], None]]]:
         """What each key does, the key, and the function of its event."""
-        name = next(map(words, self._commands), None)
-        return [
+        keys = [
             ("pause", "space", self._pause),
             ("reset", "R", self._reset),
-            *([] if name is None else [(f"{name} up", "T", lambda _: self._move(1.0))]),
-            *([] if name is None else [(f"{name} down", "G", lambda _: self._move(-1.0))]),
             ("faster", "M", lambda _: self._accelerate(_SPEED_STEP)),
             ("slower", "N", lambda _: self._accelerate(-_SPEED_STEP)),
+        ]
+        if self._is_film:
+            return keys
+        if self._commands:
+            name = words(next(iter(self._commands)))
+            keys += [
+                (f"{name} up", "T", lambda _: self._move(1.0)),
+                (f"{name} down", "G", lambda _: self._move(-1.0)),
+            ]
+        keys += [
             ("push the ball up", "I", lambda event: self._push("up", event)),
             ("push the ball back", "K", lambda event: self._push("back", event)),
             ("push the ball left", "J", lambda event: self._push("left", event)),
             ("push the ball right", "L", lambda event: self._push("right", event)),
         ]
+        return keys
 
     def _pause(self, _: object) -> None:
         self._paused.value = not self._paused.value
@@ -203,7 +224,8 @@ class Controls:
         setting.move(steps * self._simulation.env.config.commands[name].step)
 
     def _accelerate(self, change: float) -> None:
-        self._speed.value = float(np.clip(round(self._speed.value + change, 1), *_SPEED_RANGE))
+        speed = round(_clip(self._speed) + change, 1)
+        self._speed.value = float(np.clip(speed, *_SPEED_RANGE))
 
     def _push(self, towards: str, event: viser.GuiEvent | viser.CommandEvent) -> None:
         """Requests a push of the ball in a direction as the event's page sees it."""

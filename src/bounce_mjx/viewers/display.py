@@ -9,8 +9,7 @@ import trimesh
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.robot.arm import compile_spec
-from bounce_mjx.robot.balls import add_balls
-from bounce_mjx.robot.model import scene_spec
+from bounce_mjx.robot.model import add_balls, scene_spec
 from bounce_mjx.task.task import Marker
 from bounce_mjx.viewers.simulation import EnvFrame
 from bounce_mjx.world.config import WorldConfig
@@ -33,8 +32,10 @@ FIELD_OF_VIEW = 40.0
 # A canvas that is narrower than this, such as a phone's, needs a more distant camera.
 _FULL_ASPECT = 0.9
 # On a page that is narrower than this, the panel covers the lower three fifths: the camera moves
-# away by this factor, and down by this share of what it sees.
-_PHONE_ASPECT, _PHONE_DISTANCE, _PHONE_SHIFT = 0.6, 1.25, 0.275
+# away by a factor, and down by a share of what it sees.
+_PHONE_ASPECT = 0.6
+_PHONE_DISTANCE = 1.25
+_PHONE_SHIFT = 0.275
 
 TRAIL_SECONDS = 0.6
 """Age of the end of the line, s."""
@@ -90,7 +91,8 @@ def _with_markers(config: WorldConfig, markers: Sequence[Marker]) -> mujoco.MjMo
         boxes = [((0.0, 0.0, 0.0), size)]
         if shape == "frame":
             # A plate would hide what a frame surrounds.
-            boxes, rgba = _edges(size), (*rgba[:3], 0.9)
+            boxes = _edges(size)
+            rgba = (*rgba[:3], 0.9)
         is_round = shape == "cylinder"
         for center, half in boxes:
             body.add_geom(
@@ -106,7 +108,8 @@ def _with_markers(config: WorldConfig, markers: Sequence[Marker]) -> mujoco.MjMo
 
 def _edges(size: np.ndarray) -> list[tuple[list[float], list[float]]]:
     """Centres and half-sizes of the four edges around a plate of a half-size [3]."""
-    (x, y, z), half = size, _EDGE / 2.0
+    x, y, z = size
+    half = _EDGE / 2.0
     beside = [([side * (x + half), 0.0, 0.0], [half, y + _EDGE, z]) for side in (-1.0, 1.0)]
     return beside + [([0.0, side * (y + half), 0.0], [x, half, z]) for side in (-1.0, 1.0)]
 
@@ -137,26 +140,36 @@ def _geom_mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
         vertices = model.mesh_vert[mesh.vertadr.item() :][: mesh.vertnum.item()]
         faces = model.mesh_face[mesh.faceadr.item() :][: mesh.facenum.item()]
         return trimesh.graph.smooth_shade(trimesh.Trimesh(vertices, faces), angle=_CREASE_ANGLE)
-    types, create, count = mujoco.mjtGeom, trimesh.creation, [_SEGMENTS // 2, _SEGMENTS]
-    # Half-sizes, m.
-    size = model.geom_size[geom]
-    makers = {
-        types.mjGEOM_SPHERE: lambda: create.uv_sphere(size[0], count=count),
-        types.mjGEOM_ELLIPSOID: lambda: create.uv_sphere(1.0, count=count).apply_scale(size),
-        types.mjGEOM_CAPSULE: lambda: create.capsule(2.0 * size[1], size[0], count=count),
-        types.mjGEOM_CYLINDER: lambda: create.cylinder(size[0], 2.0 * size[1], sections=_SEGMENTS),
-        types.mjGEOM_BOX: lambda: create.box(2.0 * size),
-    }
-    make = makers.get(types(int(model.geom_type[geom])))
-    return make and trimesh.graph.smooth_shade(make(), angle=_CREASE_ANGLE)
+    shape = _shape(mujoco.mjtGeom(int(model.geom_type[geom])), model.geom_size[geom])
+    return shape and trimesh.graph.smooth_shade(shape, angle=_CREASE_ANGLE)
+
+
+def _shape(kind: mujoco.mjtGeom, size: np.ndarray) -> trimesh.Trimesh | None:
+    """The mesh of a shape of MuJoCo with these half-sizes [3], m; None for another kind."""
+    count = [_SEGMENTS // 2, _SEGMENTS]
+    match kind:
+        case mujoco.mjtGeom.mjGEOM_SPHERE:
+            return trimesh.creation.uv_sphere(size[0], count=count)
+        case mujoco.mjtGeom.mjGEOM_ELLIPSOID:
+            return trimesh.creation.uv_sphere(1.0, count=count).apply_scale(size)
+        case mujoco.mjtGeom.mjGEOM_CAPSULE:
+            return trimesh.creation.capsule(2.0 * size[1], size[0], count=count)
+        case mujoco.mjtGeom.mjGEOM_CYLINDER:
+            return trimesh.creation.cylinder(size[0], 2.0 * size[1], sections=_SEGMENTS)
+        case mujoco.mjtGeom.mjGEOM_BOX:
+            return trimesh.creation.box(2.0 * size)
+    return None
 
 
 def _color(model: mujoco.MjModel, geom: int) -> np.ndarray:
     """The geom's colour [4] by MuJoCo's rule: the geom's own colour, or the material's if the geom
     has the default colour."""
-    own, material = model.geom_rgba[geom], model.geom_matid[geom]
-    is_default = np.allclose(own, (0.5, 0.5, 0.5, 1.0))
-    return model.mat_rgba[material] if material >= 0 and is_default else own
+    rgba = model.geom_rgba[geom]
+    material = model.geom_matid[geom]
+    is_default = np.allclose(rgba, (0.5, 0.5, 0.5, 1.0))
+    if material >= 0 and is_default:
+        return model.mat_rgba[material]
+    return rgba
 
 
 def _material(rgba: np.ndarray) -> trimesh.visual.material.PBRMaterial:
@@ -183,7 +196,8 @@ class Trail:
     def add(self, frame: EnvFrame) -> None:
         """Adds a frame's positions."""
         if self.points is None:
-            self.points, self._time = np.tile(frame.balls, (self.length, 1, 1, 1)), frame.time
+            self.points = np.tile(frame.balls, (self.length, 1, 1, 1))
+            self._time = frame.time
         self.points = np.concatenate([self.points[1:], frame.balls[None]])
         restarted = frame.time < self._time
         self.points[:, restarted] = frame.balls[restarted]

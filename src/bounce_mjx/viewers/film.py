@@ -1,4 +1,4 @@
-"""An episode of an evaluation in the viewers, as it was."""
+"""An episode of an evaluation in the viewers, as it was: bit for bit on a CPU."""
 
 from collections.abc import Callable, Sequence
 
@@ -22,8 +22,11 @@ class FilmPlayer(Simulation):
 
     def __init__(self, film: Film):
         """Compiles nothing."""
-        self.env, self.policy = film.env, None
-        self.command, self.world, self.others = {}, None, ()
+        self.env = film.env
+        self.policy = None
+        self.command = {}
+        self.world = None
+        self.others = ()
         self._world = {name: np.asarray(value)[0] for name, value in film.statistics.world.items()}
         self.frames = episode_frames(film.env, film.recording)
         """Every frame of the episode [T, 1, ...]."""
@@ -43,7 +46,7 @@ class FilmPlayer(Simulation):
     @property
     def sliders(self) -> tuple[WorldSlider, ...]:
         """Sliders of the terms that the world of the episode can have."""
-        return sliders_for(with_sliders(self.env.config).randomization)
+        return sliders_for(with_sliders(self.env.config))
 
     @property
     def world_values(self) -> dict[str, np.ndarray]:
@@ -73,7 +76,7 @@ class FilmPlayer(Simulation):
 
     def record(self, seconds: float | None = None) -> EnvFrame:
         """The frames of the whole episode, or of its first seconds."""
-        count = None if seconds is None else max(2, round(seconds / self.env.dt) + 1)
+        count = None if seconds is None else round(seconds / self.env.dt) + 1
         return jax.tree.map(lambda values: values[:count], self.frames)
 
 

@@ -128,7 +128,8 @@ def _make_rule(host: str, allowed: Collection[str]) -> Callable[[Headers], bool]
     names = proxies | {"localhost", host.lower(), socket.gethostname().lower()}
 
     def is_name(name: str) -> bool:
-        """Whether the page may be opened at a name. No website can let an address point here."""
+        """Whether the page may be opened at a name, or at any address: a website can let its own
+        name point to this machine, but no address."""
         with contextlib.suppress(ValueError):
             return bool(ipaddress.ip_address(name))
         return name in names
@@ -166,10 +167,21 @@ def _is_valid(data: str | bytes) -> bool:
             case {"type": "CommandTriggerMessage", "uuid": str(), **others}:
                 return not others
             case {"type": "GuiUpdateMessage", "uuid": str(), "updates": {"value": value, **others}}:
-                # viser would read a number from a text.
-                is_word = isinstance(value, str) and value.replace(" ", "").isalpha()
-                return not others and (is_word or abs(value) <= _MAX_NUMBER)
+                if isinstance(value, str):
+                    is_allowed = not _is_number(value)
+                else:
+                    is_allowed = abs(value) <= _MAX_NUMBER
+                return is_allowed and not others
     return False
+
+
+def _is_number(text: str) -> bool:
+    """Whether viser would read a number, of any size, or a NaN from a text."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _host_name(url: str) -> str:

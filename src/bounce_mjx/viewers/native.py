@@ -31,7 +31,8 @@ def show_window(simulation: Simulation, seconds: float | None, is_over: Callable
       seconds: simulated time; None for no end.
       is_over: called between two pictures; whether to close the window.
     """
-    display, trail = Display(simulation.env), Trail(simulation.env.dt)
+    display = Display(simulation.env)
+    trail = Trail(simulation.env.dt)
     trail.add(simulation.frame)
     display.pose(*environment_pose(simulation.frame, 0))
     with mujoco.viewer.launch_passive(

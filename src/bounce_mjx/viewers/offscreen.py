@@ -34,10 +34,11 @@ mujoco.MjrContext(mujoco.MjModel.from_xml_string("<mujoco/>"), mujoco.mjtFontSca
 
 
 def choose_backend() -> str:
-    """A working OpenGL library: the one that MUJOCO_GL names; otherwise EGL or OSMesa.
+    """A working OpenGL library: the one that MUJOCO_GL names; otherwise EGL or OSMesa, and that of
+    the system where it is not Linux, which is not tried.
 
     Raises:
-      UserError: no library works.
+      UserError: no library works on Linux.
     """
     wanted = os.environ.get("MUJOCO_GL", "").lower()
     if sys.platform != "linux":
@@ -60,10 +61,9 @@ def works(backend: str) -> bool:
 
 @functools.cache
 def choose_opengl() -> None:
-    """Chooses the library for every later `mujoco.Renderer`.
+    """Chooses the library for every later `mujoco.Renderer`, by replacing MuJoCo's own choice.
 
-    MuJoCo itself chooses when it is imported, and without MUJOCO_GL takes GLFW, which needs a
-    screen.
+    MuJoCo chooses when it is imported, and without MUJOCO_GL takes GLFW, which needs a screen.
 
     Raises:
       UserError: no library works.
@@ -103,7 +103,8 @@ class Renderer(contextlib.AbstractContextManager):
             )
         self._camera = camera or page_camera(env, width / height, zoom)
         model.vis.global_.fovy = FIELD_OF_VIEW
-        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+        model.vis.global_.offwidth = width
+        model.vis.global_.offheight = height
         # Half of the model's setting: twice as fast on a CPU, and still smooth.
         shadows, samples = (0, 0) if plain else (2048, 4)
         model.vis.quality.shadowsize = min(model.vis.quality.shadowsize, shadows)

@@ -6,6 +6,7 @@ from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field
 
+from bounce_mjx.config.command_line import Flag
 from bounce_mjx.config.settings import Positive, StrictModel
 
 MAX_ENVS = 16
@@ -18,12 +19,13 @@ class ViewerOptions(StrictModel):
     viewer: Literal["auto", "browser", "native"] = "auto"
     """browser serves a page, native opens MuJoCo's own window, auto is native on a machine with a
     display and browser elsewhere."""
-    video: Path | None = None
+    video: Annotated[Path | None, Flag(instead_of="--out")] = None
     """File for a video, .mp4, .webp or .gif, instead of a viewer."""
     html: Path | None = None
     """File for a page that replays the episode offline, instead of a viewer."""
     seconds: Positive | None = None
-    """Simulated time, s. The default is 10 for a recording; a viewer runs until it is closed."""
+    """Simulated time, s. The default is 10 for a recording, and the whole of an episode; a viewer
+    runs until it is closed."""
     num_envs: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 1
     """Robots side by side, on the live page and in the replay."""
     fps: Annotated[int, Field(ge=1, le=240)] | None = None
@@ -37,7 +39,7 @@ class ViewerOptions(StrictModel):
     zoom: Annotated[float, Field(ge=1.0, le=10.0)] = 1.0
     """How much larger a video shows the paddle and its ball; 1 shows the whole arm."""
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
-    """Seed of the resets."""
+    """Seed of the resets; with --episode, that of the evaluation."""
     host: str = "127.0.0.1"
     """Address of the page's server; 0.0.0.0 also admits other machines."""
     allow_host: tuple[str, ...] = ()

@@ -106,24 +106,28 @@ class Scene:
         self._lost = np.zeros(num_envs, bool)
         for client in self._server.get_clients().values():
             self._frame(client)
-        initial, (position, gaze) = self._server.initial_camera, camera_pose(self._offsets, focus)
-        initial.position, initial.look_at = tuple(position), tuple(gaze)
-        initial.up, initial.fov = (0.0, 0.0, 1.0), math.radians(FIELD_OF_VIEW)
+        position, look_at = camera_pose(self._offsets, focus)
+        camera = self._server.initial_camera
+        camera.position = tuple(position)
+        camera.look_at = tuple(look_at)
+        camera.up = (0.0, 0.0, 1.0)
+        camera.fov = math.radians(FIELD_OF_VIEW)
 
     def update(self, frames: Sequence[EnvFrame]) -> None:
         """Shows the last of the frames since the last update; the trail uses all of them."""
-        display, model, number = self._display, self._display.model, self.num_envs
-        positions = np.zeros((number, model.nbody, 3))
-        rotations = np.zeros((number, model.nbody, 4))
+        display = self._display
+        positions = np.zeros((self.num_envs, display.model.nbody, 3))
+        rotations = np.zeros((self.num_envs, display.model.nbody, 4))
         for frame in frames:
             self._trail.add(frame)
-            over = frame.over[:number]
-            self._lost = np.where(over, frame.lost[:number], self._lost)
+            over = frame.over[: self.num_envs]
+            self._lost = np.where(over, frame.lost[: self.num_envs], self._lost)
         with self._server.atomic():
             for i, label in enumerate(self._labels):
                 qpos, command, metrics = environment_pose(frame, i)
                 display.pose(qpos, command, metrics)
-                positions[i], rotations[i] = display.data.xpos, display.data.xquat
+                positions[i] = display.data.xpos
+                rotations[i] = display.data.xquat
                 # An empty label would be a white stroke.
                 label.text = self._label(frame, i)
                 label.visible = bool(label.text)
@@ -131,10 +135,10 @@ class Scene:
                 height = max(_LABEL_HEIGHT, top + _LABEL_DISTANCE)
                 label.position = self._label_places[i] + (0.0, 0.0, height)
             for body, handle in self._bodies.items():
-                if model.body_weldid[body]:
+                if display.model.body_weldid[body]:
                     handle.batched_positions = positions[:, body] + self._offsets
                     handle.batched_wxyzs = rotations[:, body]
-            path = self._trail.points[:, :number] + self._offsets[:, None]
+            path = self._trail.points[:, : self.num_envs] + self._offsets[:, None]
             self._line.points = np.stack([path[:-1], path[1:]], axis=3).reshape(-1, 2, 3)
 
     def _label(self, frame: EnvFrame, index: int) -> str:
@@ -155,7 +159,8 @@ class Scene:
     def _welcome(self, client: viser.ClientHandle) -> None:
         """Turns the camera of a new page, and once more when its panels have taken their room."""
         self._frame(client)
-        aspect, until = client.camera.aspect, time.monotonic() + _LAYOUT_SECONDS
+        aspect = client.camera.aspect
+        until = time.monotonic() + _LAYOUT_SECONDS
 
         @client.camera.on_update
         def _(camera: viser.CameraHandle) -> None:
@@ -168,9 +173,10 @@ class Scene:
         """Turns the camera of a page towards the environments."""
         # A page whose own camera is invalid keeps it.
         with contextlib.suppress(ValueError, TypeError, AssertionError, ZeroDivisionError):
-            position, gaze = camera_pose(self._offsets, self._focus, client.camera.aspect)
+            position, look_at = camera_pose(self._offsets, self._focus, client.camera.aspect)
             if np.all(np.isfinite(position)):
-                client.camera.position, client.camera.look_at = position, gaze
+                client.camera.position = position
+                client.camera.look_at = look_at
 
 
 def _grid(number: int) -> np.ndarray:

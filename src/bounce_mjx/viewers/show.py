@@ -20,8 +20,6 @@ from bounce_mjx.viewers.simulation import Controller, Simulation
 from bounce_mjx.viewers.world import reset_ranges, with_sliders
 from bounce_mjx.world.config import WorldConfig
 
-_RECORDED_SECONDS = 10.0
-
 
 class Shown(NamedTuple):
     """An environment to show, and its controller."""
@@ -105,12 +103,12 @@ def _record(
     simulate: Callable[[], Simulation], start: PageStart, options: ViewerOptions, console: Console
 ) -> None:
     """Writes the files; checks them before it simulates."""
-    film = None
+    writer = None
     if options.video is not None:
         from bounce_mjx.viewers.video import SUFFIXES, VideoWriter
 
         check_output(options.video, "--video", SUFFIXES)
-        film = VideoWriter(options.video, options.size, options.fps, options.zoom)
+        writer = VideoWriter(options.video, options.size, options.fps, options.zoom)
     if options.html is not None:
         from bounce_mjx.viewers.page import SUFFIXES, replay
 
@@ -118,13 +116,12 @@ def _record(
 
     simulation = simulate()
     with console.status("recording"):
-        seconds = options.seconds or (None if simulation.is_film else _RECORDED_SECONDS)
-        recording = simulation.record(seconds)
+        recording = simulation.record(options.seconds)
         if options.html is not None:
             page = replay(simulation.env, recording, options.fps, start.names)
             write_output(options.html, page)
-        if film is not None:
-            film.write(simulation.env, recording)
+        if writer is not None:
+            writer.write(simulation.env, recording)
     for path in (options.video, options.html):
         if path is not None:
             console.out(f"written: {path}", highlight=False)
@@ -140,7 +137,8 @@ def _serve(
     port = free_port(options.host, options.port)
     address = Address(options.host, port, options.allow_host)
     simulation = simulate()
-    with StopRequest() as stop, open_server(*address) as server:
+    opening = open_server(address.host, address.port, address.allowed)
+    with StopRequest() as stop, opening as server:
         say = partial(console.out, f"viewer: {address.url}  (Ctrl-C ends it)", highlight=False)
         run_page(server, simulation, start, lambda: stop.requested, say, options.seconds)
 
@@ -161,15 +159,17 @@ def _simulate(
     # The page's slider goes up to the simulated number. On a CPU, MJX is too slow for 16.
     if has_sliders and len(shown) == 1 and envs[0].engine.name == "fused":
         num_envs = MAX_ENVS
-    # Policies side by side are compared in one world.
+    # Policies side by side are compared in one world: where one of them has none to sample, in the
+    # nominal one.
     is_sampled = all(one.config.randomization.terms for one in shown)
+    world = None if is_sampled else {}
     simulations = []
     for one, env in zip(shown, envs, strict=True):
         ranges = reset_ranges(one.config) if has_sliders else None
         controller = one.make_controller(env)
         simulation = Simulation(env, controller, num_envs, seed, ranges, one.policy)
         simulation.command = commands
-        simulation.world = None if is_sampled else {}
+        simulation.world = world
         simulations.append(simulation)
     first, *others = simulations
     first.others = others

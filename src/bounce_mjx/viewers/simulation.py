@@ -17,6 +17,7 @@ from bounce_mjx.world.randomization import TERMS, Ranges, World
 _PICTURES_PER_SECOND = 50.0
 # If a simulation falls behind the clock by more than this, it slows down instead of catching up, s.
 _MAX_LAG = 0.1
+_RECORDED_SECONDS = 10.0
 
 Controller = Callable[[Policy | None, State, jax.Array], jax.Array]
 """A controller of N environments: (policy, if it has one; states, batch last; key, which is
@@ -151,7 +152,7 @@ class Simulation:
     @property
     def sliders(self) -> tuple[WorldSlider, ...]:
         """Sliders of the terms that can be moved."""
-        return sliders_for(self.env.config.randomization)
+        return sliders_for(self.env.config)
 
     def world_value(self, term: str) -> float:
         """The first entry of a term of the world in the first environment."""
@@ -164,17 +165,18 @@ class Simulation:
             other.reset()
 
     def push(self, velocity: tuple[float, float, float]) -> None:
-        """Adds a velocity (m/s) to every ball at the start of the next step."""
+        """Adds a velocity (m/s) to every ball at the start of the next step; to be called between
+        two steps."""
         self._push = self._push + np.asarray(velocity, np.float32)
 
     def step(self) -> EnvFrame:
         """Advances one control step."""
         for other in self.others:
-            other.command, other.world = self.command, self.world
+            other.command = self.command
+            other.world = self.world
             other.push(self._push)
             other.step()
         inputs = self._inputs()
-        # Before the program runs, so that a push of another thread meanwhile acts on the next step.
         self._push = np.zeros(3, np.float32)
         self._key, self._states, self._steps, frame = self._step_program(*inputs)
         self._frame = jax.device_get(frame)
@@ -182,8 +184,9 @@ class Simulation:
             self._reset(self._frame.over)
         return self.frame
 
-    def record(self, seconds: float) -> EnvFrame:
-        """The current frame and the frames of the following `seconds`."""
+    def record(self, seconds: float | None = None) -> EnvFrame:
+        """The current frame and the frames of the following seconds, 10 by default."""
+        seconds = _RECORDED_SECONDS if seconds is None else seconds
         frames = [self.frame]
         frames += [self.step() for _ in range(round(seconds / self.env.dt))]
         return jax.tree.map(lambda *values: np.stack(values), *frames)
@@ -195,10 +198,16 @@ class Simulation:
         world = {}
         for name in config.randomization.terms:
             if name in self.env.nominals:
-                shape, nominal = TERMS[name].shape(self.env.action_size), self.env.nominals[name]
-                entries = np.nan if self.world is None else self.world.get(name, nominal)
+                shape = TERMS[name].shape(self.env.action_size)
+                entries = self._entries(name)
                 world[name] = np.full(shape or 1, entries, np.float32).reshape(shape)
         return self.policy, self._key, self._states, self._steps, command, self._push, world
+
+    def _entries(self, term: str) -> np.ndarray | Sequence[float] | float:
+        """Entries of a term of the world that are set; nan where it is sampled."""
+        if self.world is None:
+            return np.nan
+        return self.world.get(term, self.env.nominals[term])
 
     def _reset(self, over: np.ndarray) -> EnvFrame:
         """Starts a new episode in some environments [N]; the frame of all."""
@@ -246,12 +255,15 @@ def in_real_time(
     """
     dt = simulation.env.dt
     left = float("inf") if seconds is None else round(seconds / dt)
-    owed, last = 0.0, time.monotonic()
+    owed = 0.0
+    last = time.monotonic()
     while left > 0:
         now = time.monotonic()
         owed += speed() * min(now - last, _MAX_LAG) / dt
-        due, last = min(int(owed), left), now
-        owed, left = owed - due, left - due
+        due = min(int(owed), left)
+        owed -= due
+        left -= due
+        last = now
         yield [simulation.step() for _ in range(due)]
         time.sleep(1.0 / _PICTURES_PER_SECOND)
 
@@ -267,10 +279,12 @@ def resample(recording: EnvFrame, dt: float, fps: float) -> EnvFrame:
       fps: desired frames per second.
 
     Returns:
-      The frames at 0, 1/fps, 2/fps, ... s, as long as the recording lasts: [F, N, ...].
+      The frames at 0, 1/fps, 2/fps, ... s, as long as the recording lasts, at least the first:
+      [F, N, ...].
     """
     last = len(recording.time) - 1
-    steps = np.arange(int(last * dt * fps + 1e-6)) / (fps * dt)
+    num_frames = max(1, int(last * dt * fps + 1e-6))
+    steps = np.arange(num_frames) / (fps * dt)
     before = np.minimum(steps.astype(int), last)
     after = np.minimum(before + 1, last)
     fraction = (steps - before)[:, None] * ~recording.over[before]

@@ -76,7 +76,9 @@ class VideoWriter:
           UserError: the size or the rate does not fit the format, there is no ffmpeg, or no
             OpenGL library works.
         """
-        self._path, self._size, self._zoom = path, size, zoom
+        self._path = path
+        self._size = size
+        self._zoom = zoom
         self.fps = fps or _DEFAULT_FPS[path.suffix.lower()]
         if any(pixels % 2 for pixels in size):
             raise UserError(f"--size {size[0]} {size[1]} is odd; give even numbers of pixels")

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from bounce_mjx.world.config import WorldConfig
-from bounce_mjx.world.randomization import TERMS, RandomizationConfig, Ranges, entries
+from bounce_mjx.world.randomization import TERMS, Ranges, entries
 
 
 class WorldSlider(NamedTuple):
@@ -20,7 +20,8 @@ class WorldSlider(NamedTuple):
     scale: float = 1.0
     """Factor from the slider's unit to the term's."""
     nominal: float = 0.0
-    """Position without effect on the project's own model, in the slider's unit."""
+    """Position without effect, in the slider's unit; of the restitution, on the project's own
+    model."""
 
     @property
     def span(self) -> tuple[float, float]:
@@ -42,16 +43,18 @@ SLIDERS = (
 )
 
 
-def with_sliders(config: WorldConfig) -> WorldConfig:
-    """The config with the sliders' terms active, in ranges that contain the sliders' and its own.
+def _sliders_of(config: WorldConfig) -> tuple[WorldSlider, ...]:
+    """The sliders that a model can have: the nominal restitution is that of the project's own."""
+    if config.mjcf is None:
+        return SLIDERS
+    return tuple(slider for slider in SLIDERS if slider.term != "restitution")
 
-    The nominal restitution holds only for the project's own model; other models get no slider for
-    it.
-    """
+
+def with_sliders(config: WorldConfig) -> WorldConfig:
+    """The config with the sliders' terms active, in ranges that contain the sliders' and its
+    own."""
     spans = {}
-    for slider in SLIDERS:
-        if slider.term == "restitution" and config.mjcf is not None:
-            continue
+    for slider in _sliders_of(config):
         own = entries(getattr(config.randomization, slider.term) or slider.span)
         low, high = zip(slider.span, *own, strict=True)
         spans[slider.term] = min(low), max(high)
@@ -63,7 +66,7 @@ def reset_ranges(config: WorldConfig) -> Ranges:
     """Ranges with which a reset of `with_sliders(config)` samples the worlds of `config`."""
     active = with_sliders(config).randomization.terms
     ranges = config.randomization.ranges()
-    for slider in SLIDERS:
+    for slider in _sliders_of(config):
         if slider.term in active and slider.term not in config.randomization.terms:
             shape = TERMS[slider.term].shape(config.num_joints)
             end = jnp.full(shape, slider.nominal * slider.scale, jnp.float32)
@@ -71,11 +74,11 @@ def reset_ranges(config: WorldConfig) -> Ranges:
     return ranges
 
 
-def sliders_for(config: RandomizationConfig) -> tuple[WorldSlider, ...]:
+def sliders_for(config: WorldConfig) -> tuple[WorldSlider, ...]:
     """Sliders of the active terms whose ranges contain the sliders'; each spans the whole range."""
     found = []
-    for slider in SLIDERS:
-        ends = getattr(config, slider.term)
+    for slider in _sliders_of(config):
+        ends = getattr(config.randomization, slider.term)
         spans = [] if ends is None else entries(ends)
         if spans and all(low <= slider.span[0] and slider.span[1] <= high for low, high in spans):
             limits = tuple(round(end / slider.scale, 6) for end in spans[0])

@@ -86,7 +86,8 @@ class Actuators:
         """
         angles = self._joint_angles(qpos)
         if "joint_angle_noise" in world:
-            # The same noise as in the observation from which the policy chose the action.
+            # The same noise as in the observation from which the policy chose the action: the clock
+            # moves on before the sensors measure.
             angle_noise, _ = noise.joints(clock.counter, self._config.num_joints, action.dtype)
             angles = angles + world["joint_angle_noise"] * angle_noise
         targets = self._joint_targets(angles, action, before.setpoint)
@@ -178,7 +179,7 @@ class Actuators:
         is_due = noise.is_due(interval, phase, clock.step, self._config.control_dt)
         num_balls = self._config.num_balls
         shape = () if num_balls == 1 else (num_balls,)
-        # Any counter of the step would do, as nothing else reads this stream.
+        # Any counter of the step would do; with this one the pushes are those of earlier versions.
         counter = noise.next_counter(clock.counter)
         angle = 2.0 * math.pi * noise.uniform(counter, noise.PUSH, shape, phase.dtype)
         speed = jnp.where(is_due, world["push_speed"], 0.0)
@@ -225,7 +226,7 @@ def add_delay(
     Args:
       world: the values that the episode sampled.
       memory: before the step.
-      control: of the step's action, still without disturbances.
+      control: of the step's action, without drag and push, which are never late.
       control_dt: time of one control step, s.
       num_substeps: physics steps in a control step.
     """

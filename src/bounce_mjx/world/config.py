@@ -15,11 +15,11 @@ from bounce_mjx.world.observation import ObservationConfig, ObservationLayout
 from bounce_mjx.world.randomization import EACH_JOINT, TERMS, RandomizationConfig
 
 PADDLE_HOME = (0.59356, 0.0, 0.0498)
-"""Centre of the paddle of the project's own arm at a reset, m."""
+"""Centre of the paddle of the project's own arm at a reset, m: the home in the tasks' settings."""
 
 
 NumBalls = Annotated[int, pydantic.BeforeValidator(settings.whole_number), Field(ge=1, le=3)]
-"""Number of balls, up to `robot.balls.MAX_BALLS`."""
+"""Number of balls, up to `robot.model.MAX_BALLS`."""
 
 
 class Command(NamedTuple):
@@ -41,7 +41,8 @@ class Command(NamedTuple):
     step: float = 0.05
     """Change by a key of a viewer."""
     names: tuple[str, ...] = ()
-    """Names of the values 0 to 1, 1 to 2, ..., if they are choices; a user may give a name."""
+    """Names of the values 0 to 1, 1 to 2, ..., if they are choices; a user may give a name. None is
+    a number, which would be taken for a value."""
     hidden: bool = False
     """Whether the policy need not see it, because it acts through other commands."""
 
@@ -92,12 +93,14 @@ class ResetConfig(settings.StrictModel):
 
 
 class RobotSettings(settings.StrictModel):
-    """The robot, its sensors and its ball: the settings that a named world may have."""
+    """The settings that a named world may have (`world.named`): those of a robot, its sensors and
+    its ball."""
 
     robot: RobotConfig = RobotConfig()
     """Adoption of an arm."""
     physics_dt: Annotated[settings.Positive, Field(ge=1e-5, le=0.1)] = 0.001
-    """Physics time step, s; at most an eighth of a period of the contact, 2.5 ms by default."""
+    """Physics time step, s; at most an eighth of a period of the contact, which is 2.5 ms for the
+    project's own robot."""
     control_dt: Annotated[settings.Positive, Field(ge=1e-5, le=0.1)] = 0.01
     """Time between two actions, s; a whole number of physics steps."""
     friction: settings.Friction | None = None
@@ -236,8 +239,8 @@ class WorldConfig(RobotSettings):
         """The settings that depend on where an arm holds the paddle at a reset. A task adds its
         own.
 
-        The ball of the original specification starts 5 mm beside the paddle's centre; another arm's
-        starts 0.4 m over it.
+        Another arm's ball starts 0.4 m over the paddle's centre, displaced as the task's start is
+        from the world's: the 5 mm of the world's own start beside its paddle are left out.
 
         Args:
           paddle: centre of the level paddle at `default_joint_angles`, m.

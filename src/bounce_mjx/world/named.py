@@ -26,8 +26,8 @@ class NamedWorld(StrictModel):
     """Name of a robot in configs/robots/, or its file, relative to the world's folder; null for any
     robot. (`env.robot` has settings of an arm's adoption.)"""
     env: RobotSettings = RobotSettings()
-    """Settings of the environment. A term of the randomisation that it does not have is as in the
-    task's defaults."""
+    """Settings of the environment (`runs.worlds` puts them in place of the config's). A term of the
+    randomisation that it does not have is as in the task's defaults."""
     sources: dict[str, str] = {}
     """Where each number comes from, one sentence, by its dotted key in `env` or that of a group."""
     assumed: tuple[str, ...] = ()
@@ -75,12 +75,13 @@ class NamedWorld(StrictModel):
     def double_assumed(self, nominals: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         """For each assumed key, the nested settings of `env` in which alone its number is doubled.
 
-        A term of the randomisation goes twice as far from its nominal value, within its bounds. Of
-        which less is harder is halved: a term without a nominal value, `max_joint_velocity`, and
-        the limits of the robot.
+        A term of the randomisation goes twice as far from its nominal value, within its bounds. A
+        number of which less is harder is halved instead: a term without a nominal value
+        (`torque_limit`, `camera_rate`, the intervals), `max_joint_velocity`, and the limits of the
+        robot.
 
         Args:
-          nominals: the values of all terms without randomisation (`env.model_nominals`).
+          nominals: the values of all terms without randomisation (`env.env.model_nominals`).
         """
         numbers = flat(self.settings)
         return {key: nested(key, _double(key, numbers[key], nominals)) for key in self.assumed}

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 from bounce_mjx.physics.scalars import sine_cosine
 
 BALL, JOINTS, FRAME_DROP, PUSH, COMMAND = range(5)
-"""Streams: independent random numbers of one counter, by their use."""
+"""Streams: independent random numbers of one counter, by their use. A new one goes to the end: a
+stream's number decides its random numbers."""
 
 # Numbers of a stream; no use needs more at a time.
 _STREAM_SIZE = 1024
@@ -50,6 +51,7 @@ class Clock(NamedTuple):
 def first_clock(key: jax.Array, dtype: jnp.dtype) -> Clock:
     """The clock at a reset: a sampled counter, step 0 and sampled phases; consumes the key."""
     counter = jax.lax.bitcast_convert_type(jax.random.bits(key, dtype=jnp.uint32), jnp.int32)
+    # A redraw of the commands takes this stream too, from the next counter.
     phases = uniform(counter, COMMAND, (3,), dtype)
     return Clock(counter, jnp.zeros((), jnp.int32), phases)
 

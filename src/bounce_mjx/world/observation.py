@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple, get_args
 
 from pydantic import Field
 
@@ -11,6 +11,8 @@ from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.lazy import jax, jnp
 
 History = Annotated[int, Field(ge=0, le=100)]
+Group = Literal["state", "command", "past", "task"]
+"""Places of quantities in the observation, in their order."""
 
 
 class Quantity(NamedTuple):
@@ -20,9 +22,9 @@ class Quantity(NamedTuple):
     """Number of entries of one value; None for one entry for each acting joint."""
     unit: str = ""
     """Unit of the entries; empty for a pure number."""
-    group: Literal["state", "command", "past", "task"] = "task"
-    """Place in the observation: the present state, the commands, what the world remembers of the
-    past, the task's own quantities."""
+    group: Group = "task"
+    """Place in the observation: state for the present state, command for the commands, past for
+    what the world remembers, task for the task's own quantities."""
     per_ball: bool = False
     """Whether each ball has its entries, one ball after another."""
 
@@ -30,9 +32,6 @@ class Quantity(NamedTuple):
         """Number of entries of one value."""
         size = num_joints if self.size is None else self.size
         return num_balls * size if self.per_ball else size
-
-
-_GROUPS = ("state", "command", "past", "task")
 
 
 class Part(NamedTuple):
@@ -54,7 +53,8 @@ class Part(NamedTuple):
 
 class ObservationConfig(StrictModel):
     """The quantities that the policy sees, and how many values of each: 0 for none, 1 for the
-    newest, N for the last N, the newest first."""
+    newest, N for the last N, the newest first. Each of the group state is a field of `Kinematics`
+    too."""
 
     joint_angles: Annotated[History, Quantity(None, "rad", "state")] = 1
     """Measured positions of the acting joints: 0 leaves them out, and N shows the last N, as for
@@ -89,7 +89,8 @@ class ObservationConfig(StrictModel):
             for mark in field.metadata:
                 if isinstance(mark, Quantity):
                     quantities[name] = mark
-        in_order = sorted(quantities.items(), key=lambda item: _GROUPS.index(item[1].group))
+        groups = get_args(Group)
+        in_order = sorted(quantities.items(), key=lambda item: groups.index(item[1].group))
         return dict(in_order)
 
     def counts(self, group: str | None = None) -> dict[str, int]:

@@ -32,8 +32,8 @@ def _entrywise(end: Any, number: Callable[[Any], float]) -> float | tuple[float,
     return tuple(map(number, end)) if isinstance(end, list | tuple) else number(end)
 
 
-# Its type is that of a number, which a command line and an error can name; `_entrywise` takes lists
-# too. Of a union of types they would name every one.
+# Its type is that of a number, although `_entrywise` takes lists too: a command line and an error
+# name the type, and of a union they would name each member.
 _End = Annotated[
     Finite, pydantic.WrapValidator(_entrywise), pydantic.PlainSerializer(lambda end: end)
 ]
@@ -54,8 +54,9 @@ shape."""
 
 Operation = Literal["scale", "add", "tilt_frame", "tilt_vector", "replace", "restitution", "limit"]
 """How a sampled value and the model's own parameter make the episode's parameter
-(`sampling.apply`): times a factor, plus a difference, turned by two angles, in its place, as the
-damping with this restitution, or as a limit that never raises the model's own limit."""
+(`sampling.apply`): the parameter times the value, plus the value, turned by two angles (a frame or
+a vector), the value in its place, the damping that has the value as its restitution, or the value
+as a limit that never raises the model's own limit."""
 
 MODEL = "model"
 """Nominal value that is the model's own."""

@@ -51,7 +51,7 @@ def nominal_values(
     """Values without randomisation of the terms that have one, each of the term's shape.
 
     Of a term that replaces a number of the model, it is that number. A model without a contact pair
-    has none for `restitution` and `contact_friction`, which it refuses.
+    has none for `restitution` and `contact_friction`; the first reset refuses these.
 
     Args:
       mj_model: the model.
@@ -140,8 +140,8 @@ def apply(
     """A physical parameter of an episode.
 
     Args:
-      operation: how the sampled value changes the model's own; "restitution" says what is sampled,
-        and the parameter is the damping.
+      operation: how the sampled value changes the model's own; with "restitution", the sampled
+        value is a restitution and the parameter is the contact's damping.
       model: the model's own parameters.
       parameter: name of the field of `PhysicsParameters`.
       sampled: the term's value, of its shape.
@@ -150,6 +150,7 @@ def apply(
       UserError: the term is a restitution, and the model has no contact pair of ball and paddle.
     """
     if operation in ("replace", "limit"):
+        # `physics.edited` keeps the model's own limit where that is lower.
         return sampled
     if operation == "restitution":
         if model.contact_stiffness is None:

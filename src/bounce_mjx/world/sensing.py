@@ -34,7 +34,7 @@ _TERMS = _PADDLE_TERMS | {
     "joint_velocity_noise",
     "joint_velocity_bias",
 }
-"""Terms that make measurements differ from the truth."""
+"""Terms that make measurements differ from the truth; those of a new sensor go here too."""
 
 # Older than any picture of an episode, s; its negative is below any picture's number.
 _LONG_AGO = 1e6
@@ -64,7 +64,8 @@ class Sensing(NamedTuple):
     histories: dict[str, jax.Array]
     """Last values of each observed quantity [H, size], the newest first."""
     task: Any
-    """What the task remembers of the measurements (`Task.next_quantities`)."""
+    """What the task remembers of the measurements (`Task.next_quantities`); what it keeps of the
+    true states is `EnvState.task`."""
 
 
 class Instant(NamedTuple):
@@ -129,7 +130,8 @@ class Sensors:
     def first(self, now: Instant) -> Sensing:
         """Memory at a reset: the histories repeat the first measurements, and the ball counts as
         having been where it starts, with the velocity of its start. A picture from before the reset
-        shows a thrown ball less than a tenth of its way of one control step beside that place.
+        shows a thrown ball beside that place by less than a tenth of its velocity times
+        `control_dt`, as the path between two equal places bends by that (`_ball_at`).
 
         Raises:
           UserError: the task's quantities are not those of its observation.
@@ -190,25 +192,26 @@ class Sensors:
         picture = take_picture(self._config, now.world, now.clock, balls, before.picture)
         measured = self._measure(now, picture)
         histories = {}
-        task_histories = {}
+        of_task = {}
         for name, history in before.histories.items():
             if name in measured:
                 histories[name] = with_newest(history, measured[name])
             else:
-                task_histories[name] = history
-        expected = set(task_histories)
-        task, task_histories = self._task.next_quantities(before.task, task_histories, measured)
-        if set(task_histories) != expected:
+                of_task[name] = history
+        expected = set(of_task)
+        task, next_of_task = self._task.next_quantities(before.task, of_task, measured)
+        if set(next_of_task) != expected:
             raise UserError(
                 f"next_quantities of the task {type(self._task).__name__} returns the histories "
-                f"{', '.join(task_histories) or 'none'}; return those of its argument: "
+                f"{', '.join(next_of_task) or 'none'}; return those of its argument: "
                 f"{', '.join(sorted(expected)) or 'none'}"
             )
-        return Sensing(balls, picture, histories | task_histories, task)
+        return Sensing(balls, picture, histories | next_of_task, task)
 
     def _measure(self, now: Instant, picture: Picture) -> dict[str, jax.Array]:
-        """The measured value [size] of each quantity of the world and of each command; of the
-        ball's quaternion and spin, and of an arm without errors, the present truth."""
+        """The measured value [size] of each quantity of the world and of each command. The ball's
+        quaternion and spin are the present truth, and so is the paddle's position if the joint
+        angles have no errors."""
         world = now.world
         angles, velocities = measured_joints(world, now.clock.counter, now.truth)
         measured = now.truth._asdict()
@@ -220,7 +223,7 @@ class Sensors:
             "ball_position": picture.position,
             "ball_velocity": picture.velocity,
             "ball_age": picture.age[None],
-            # By this name a task asks for what the camera saw, also in a deployed policy.
+            # The same as ball_position, by the name that exported policies have.
             "ball_picture": picture.position,
         }
         if now.setpoint is not None:

@@ -99,8 +99,10 @@ class BraxBounceBall(brax.envs.Env):
         else:
             config = validate(type(config), config.model_dump() | settings, ENV_NAME)
         self.task = Env(config)
-        self.dt, self.mj_model = self.task.dt, self.task.mj_model
-        """Time of one control step, s, and MuJoCo's model."""
+        self.dt = self.task.dt
+        """Time of one control step, s."""
+        self.mj_model = self.task.mj_model
+        """MuJoCo's model."""
         self._model = _Model(self.mj_model)
 
     @functools.cached_property

@@ -157,7 +157,8 @@ class Batch:
     def pose(self, index: int) -> tuple[np.ndarray, dict[str, float], dict[str, float]]:
         """The positions [nq], the commands, and the last step's metrics of one environment."""
         self.check_started()
-        state, metrics = self._episodes.state, self._episodes.metrics[:, index]
+        state = self._episodes.state
+        metrics = self._episodes.metrics[:, index]
         commands = {name: float(value[index]) for name, value in state.command.items()}
         values = dict(zip(self.programs.metric_names, metrics.tolist(), strict=True))
         return np.array(state.physics.qpos[:, index]), commands, values

@@ -140,7 +140,8 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if self._has_ended:
             raise ResetNeeded("the episode has ended; call reset() before the next step")
         result = self._batch.step(action[None], _NO_SEED, _NOT_RESET)
-        terminated, truncated = bool(result.terminated[0]), bool(result.truncated[0])
+        terminated = bool(result.terminated[0])
+        truncated = bool(result.truncated[0])
         self._has_ended = terminated or truncated
         metrics = result.metrics[:, 0].tolist()
         info = dict(zip(self._batch.programs.metric_names, metrics, strict=True))
@@ -447,7 +448,8 @@ def _masked(names: Sequence[str], values: np.ndarray, mask: np.ndarray) -> dict[
         return {}
     masked = {}
     # Arrays of their own, because they belong to the caller.
-    values, masks = np.where(mask, values, 0.0), np.repeat(mask[None], len(names), axis=0)
+    values = np.where(mask, values, 0.0)
+    masks = np.repeat(mask[None], len(names), axis=0)
     for name, value, own_mask in zip(names, values, masks, strict=True):
         masked[name] = value
         masked[f"_{name}"] = own_mask

@@ -59,9 +59,11 @@ class Programs:
         def first_state(key: jax.Array, commands: dict[str, jax.Array]) -> State:
             ranges = self.task.ranges()
             for name, command in self.task.config.commands.items():
-                low, high, given = command.low, command.high, commands[name]
+                given = commands[name]
                 is_free = jnp.isnan(given)
-                ranges[name] = jnp.where(is_free, low, given), jnp.where(is_free, high, given)
+                low = jnp.where(is_free, command.low, given)
+                high = jnp.where(is_free, command.high, given)
+                ranges[name] = low, high
             return self.task.reset(key, ranges)
 
         states = jax.vmap(first_state, -1, -1)(_keys(seeds), commands)

@@ -113,16 +113,16 @@ class PlaygroundBounceBall(MjxEnv):
             own = self._own_mjx_model
             task = randomized_task(task, self.mj_model, own, self._mjx_model)
         state = task.reset(rng)
-        m, physics = self.mj_model, state.pipeline_state.physics
+        physics = state.pipeline_state.physics
         dtype = physics.qpos.dtype
         still = jnp.zeros(self.action_size, dtype)
         data = TaskData(
             **physics._asdict(),
             time=jnp.zeros((), dtype),
             ctrl=self.task.control(state.pipeline_state, still)[0].ctrl,
-            mocap_pos=jnp.zeros((m.nmocap, 3), dtype),
-            mocap_quat=jnp.zeros((m.nmocap, 4), dtype),
-            xfrc_applied=jnp.zeros((m.nbody, 6), dtype),
+            mocap_pos=jnp.zeros((self.mj_model.nmocap, 3), dtype),
+            mocap_quat=jnp.zeros((self.mj_model.nmocap, 4), dtype),
+            xfrc_applied=jnp.zeros((self.mj_model.nbody, 6), dtype),
             task=state.pipeline_state._replace(physics=None),
         )
         return State(data=data, **_common(state))

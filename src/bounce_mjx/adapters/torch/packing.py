@@ -45,14 +45,16 @@ class Layout:
         self._places: list[_Place] = []
         # Made in advance, because each step makes the tensors anew.
         self._views: list[_View] = []
-        stop = 0
+        start = 0
         for leaf in leaves:
-            shape, dtype = tuple(leaf.shape), jnp.dtype(leaf.dtype)
-            start, stop = stop, stop + math.ceil(leaf.size * dtype.itemsize / 4)
+            shape = tuple(leaf.shape)
+            dtype = jnp.dtype(leaf.dtype)
+            stop = start + math.ceil(leaf.size * dtype.itemsize / 4)
             self._places.append(_Place(shape, dtype, start, stop))
             stride = torch.empty(shape, device="meta").stride()
             first = 4 * start // dtype.itemsize
             self._views.append(_View(getattr(torch, dtype.name), shape, stride, first))
+            start = stop
         self._types = {view.dtype for view in self._views}
 
     def pack(self, arrays: Any) -> jax.Array:

@@ -47,7 +47,8 @@ def to_policy(
       UserError: the network has other layers.
     """
     modules = list(mlp)
-    linears, activations = modules[::2], modules[1::2]
+    linears = modules[::2]
+    activations = modules[1::2]
     kinds = {type(module) for module in activations}
     is_known = len(kinds) == 1 and kinds <= _ACTIVATIONS.keys()
     if (

@@ -26,7 +26,8 @@ class RslRlVecEnv(VecEnv):
         self.max_episode_length = env.episode_steps
         self.device = env.device
         self.cfg = env.env.config
-        self.step_dt, self.physics_dt = env.env.dt, self.cfg.physics_dt
+        self.step_dt = env.env.dt
+        self.physics_dt = self.cfg.physics_dt
         self.render_mode = None
         self._seed: int | None = None
         self._observations = self._groups(*env.reset())

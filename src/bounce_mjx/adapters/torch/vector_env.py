@@ -94,7 +94,8 @@ class TorchVectorEnv:
         action = jax.ShapeDtypeStruct((num_envs, self.num_actions), jnp.float32)
         carried, *_ = jax.eval_shape(self._start, self._key)
         _, result = jax.eval_shape(self._step, carried, action)
-        self._carried_layout, self._result_layout = Layout(carried), Layout(result)
+        self._carried_layout = Layout(carried)
+        self._result_layout = Layout(result)
         self._jit_start = jax.jit(self._packed_start)
         self._jit_step = jax.jit(self._packed_step, donate_argnums=0)
         self._block: jax.Array | None = None

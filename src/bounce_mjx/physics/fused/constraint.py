@@ -46,7 +46,7 @@ class Row(NamedTuple):
     """A row of the contacts' Jacobian: along a normal, or along a tangent of a contact with
     friction."""
 
-    contact: ContactModel
+    pair: ContactModel
     axis: Vec
     """Unit vector in the world."""
     torques: dict[int, Vec]
@@ -87,24 +87,25 @@ def fwd_constraint(
         rows.extend(_contact_rows(model, pose, pair, contact, impedance, balls, keep))
         regularisers.append(normal_regulariser(pair, impedance))
 
+    # `half` as in `chain.solve_lower`.
     half_rows = [chain.solve_lower(mass_factor, row.joints) for row in rows]
     half_rows, half_acceleration = keep((half_rows, list(half_acceleration)))
     contact_matrix = _inverse_inertia(model, rows, half_rows)
     contact_offsets = []
     for row, half_row in zip(rows, half_rows, strict=True):
         # J a0, then -aref.
-        free_acceleration = add(
-            row.axis @ relative(row.contact, free_accelerations),
+        row_acceleration = add(
+            row.axis @ relative(row.pair, free_accelerations),
             dot(half_row, half_acceleration),
         )
         speed = _speed(row, balls, joint_velocity)
-        damped = add(free_acceleration, mul(row.contact.damping, speed))
+        damped = add(row_acceleration, mul(row.pair.damping, speed))
         contact_offsets.append(add(damped, row.position_reference))
     contact_matrix, contact_offsets = keep((contact_matrix, tuple(contact_offsets)))
     is_touching = [contact.distance < 0.0 for contact in contacts]
 
     def contact_forces(matrix: Scalars, offsets: Scalars) -> Scalars:
-        # Either all contacts have friction or none (`dynamics`).
+        # Either all contacts have friction or none (`support.unsupported_friction`).
         if model.contacts[0].friction is None:
             return normal_forces(is_touching, matrix, offsets, regularisers)
         if len(model.contacts) > 1:
@@ -236,10 +237,10 @@ def _inverse_inertia(
 def _inverse_inertia_by_balls(model: FusedModel, a: Row, b: Row) -> Scalar:
     """Share of the balls in an entry of J M^-1 J^T, 1/kg."""
     share: Scalar = 0.0
-    if a.contact is b.contact and a is not b:
+    if a.pair is b.pair and a is not b:
         # The axes of one contact's rows are orthogonal, and so are their torques.
         return share
-    for i, sign in shared_balls(a.contact, b.contact):
+    for i, sign in shared_balls(a.pair, b.pair):
         product_of_axes = 1.0 if a is b else a.axis @ b.axis
         share = add(share, mul(product_of_axes, sign / model.balls[i].mass))
         if a.torques and b.torques:
@@ -250,7 +251,7 @@ def _inverse_inertia_by_balls(model: FusedModel, a: Row, b: Row) -> Scalar:
 
 def _speed(row: Row, balls: Sequence[Ball], joint_velocity: Sequence[Scalar]) -> Scalar:
     """Relative velocity of a contact along a row, m/s: J times the velocities."""
-    speed = row.axis @ relative(row.contact, [ball.velocity for ball in balls])
+    speed = row.axis @ relative(row.pair, [ball.velocity for ball in balls])
     for i, torque in row.torques.items():
         speed = add(speed, torque @ balls[i].turning.spin)
     return add(speed, dot(row.joints, joint_velocity))
@@ -278,8 +279,8 @@ def _ball_accelerations(
     accelerations = [ZERO3] * len(model.balls)
     angular_accelerations = [ZERO3] * len(model.balls)
     for row, force in zip(rows, forces, strict=True):
-        for i in row.contact.balls:
-            along_axis = mul(force, side(row.contact, i) / model.balls[i].mass)
+        for i in row.pair.balls:
+            along_axis = mul(force, side(row.pair, i) / model.balls[i].mass)
             accelerations[i] = accelerations[i] + row.axis * along_axis
         for i, torque in row.torques.items():
             along_torque = mul(force, 1.0 / model.balls[i].inertia)

@@ -48,22 +48,22 @@ class Contact(NamedTuple):
     """Unit vector in the world from the paddle or the first ball to the last ball."""
 
 
-def side(model: ContactModel, ball: int) -> float:
+def side(pair: ContactModel, ball: int) -> float:
     """Sign with which a ball's velocity counts in the relative velocity of a contact."""
-    return 1.0 if ball == model.balls[-1] else -1.0
+    return 1.0 if ball == pair.balls[-1] else -1.0
 
 
-def relative(model: ContactModel, vectors: Sequence[Vec]) -> Vec:
+def relative(pair: ContactModel, vectors: Sequence[Vec]) -> Vec:
     """The vector of the ball at a contact with the paddle; of two balls, the last one's less the
     first one's.
 
     Args:
       vectors: one of each ball.
     """
-    last = vectors[model.balls[-1]]
-    if len(model.balls) == 1:
+    last = vectors[pair.balls[-1]]
+    if len(pair.balls) == 1:
         return last
-    return last - vectors[model.balls[0]]
+    return last - vectors[pair.balls[0]]
 
 
 def shared_balls(a: ContactModel, b: ContactModel) -> list[tuple[int, float]]:
@@ -122,9 +122,9 @@ def sphere_sphere(first_radius: Scalar, second_radius: Scalar, first: Vec, secon
     return Contact(between_centres - add(first_radius, second_radius), Vec(normal))
 
 
-def impedance_at(model: ContactModel, distance: jax.Array) -> jax.Array:
+def impedance_at(pair: ContactModel, distance: jax.Array) -> jax.Array:
     """d(r) of MuJoCo's solimp at the penetration r = |distance|, in (0, 1)."""
-    dmin, dmax, width, midpoint, power = model.solimp
+    dmin, dmax, width, midpoint, power = pair.solimp
     x = jnp.clip(jnp.abs(distance) / width, 0.0, 1.0)
     if power == 1.0:
         y = x
@@ -136,8 +136,9 @@ def impedance_at(model: ContactModel, distance: jax.Array) -> jax.Array:
 
 
 def tangents(normal: Vec) -> tuple[Vec, Vec]:
-    """Tangents of MuJoCo's contact frame (mju_makeFrame), the second up to its sign. The first
-    tangent is y, or z if the normal is close to y, made orthogonal to the normal."""
+    """Tangents of MuJoCo's contact frame (mju_makeFrame), the second up to its sign, as the pyramid
+    of friction is symmetric. The first tangent is y, or z if the normal is close to y, made
+    orthogonal to the normal."""
     x, y, z = normal
     from_y = jnp.abs(y) < 0.5
     along = jnp.where(from_y, y, z)

@@ -162,7 +162,7 @@ def _substeps(
     long function once for all programs; a trace takes some tenths of a second.
 
     Args:
-      model: of all environments, whose parameters change it.
+      model: the MJCF's; the parameters of each environment change it inside.
       motion_structure: of the first arguments, a `Motion`.
       input_structure: of the others, a `Control` and the `PhysicsParameters`.
       num_substeps: number of physics steps.

@@ -13,9 +13,10 @@ the contacts. R regularises the coefficients of a contact's edges; it is no matr
 One contact alone has a closed form (`pyramid_force`). Of several, each has under an acceleration y
 the force x(y) that minimises x.y + R / 2 (a_1^2 + ... + a_4^2): each edge has the coefficient
 a = max(0, -e.y) / R. The solution is x = x(c + Q x). MuJoCo's Newton method finds it
-(`coupled_forces`): -x(y) is the gradient of a convex function of y, which is smooth between the
+(`coupled_forces`): -x(y) is the gradient of a convex function s(y), which is smooth between the
 zones in which the contact is open, sticks or slips, and a line search keeps the steps across zones
-short enough.
+short enough. It minimises MuJoCo's primal objective 1/2 x.Q x + s(c + Q x), whose slope along a
+step d is (Q d).(x - x(y)).
 
 Every state runs the same operations, so that the threads of a GPU kernel do not diverge.
 
@@ -60,7 +61,7 @@ Scalars = tuple[Scalar, ...]
 
 
 class Cone(NamedTuple):
-    """The pyramid of one of several contacts."""
+    """The pyramid of one of several contacts (`coupled_forces`); of a single one, `_Pyramid`."""
 
     is_touching: jax.Array
     """Whether the contact exists."""

@@ -234,6 +234,8 @@ def _rotation_matrix(quaternion: Sequence[Scalar]) -> Mat:
 def _read_links(model: EditedModel) -> tuple[list[chain.Link], dict[int, Frame]]:
     """Links of the chain, and the frame of each body in its link; bodies that do not move are in
     the frame of the world. Welded bodies belong to the link of the last joint above them."""
+    # What is read from `model` may be edited, or has the form that the scalars need; `mj_model`
+    # here and below is the model without edits.
     mj_model = model.mj_model
     balls = [ball.body for ball in model.addresses.balls]
     links: list[chain.Link] = []
@@ -288,6 +290,7 @@ def _read_joint(model: EditedModel, joint: int, frame: Frame) -> chain.Link:
         first_moment=ZERO3,
         inertia=ZERO_MATRIX3,
         armature=model["dof_armature", dof],
+        # Whatever the flags: `physics.support` refuses the flag damper.
         damping=model["dof_damping", dof],
         stiffness=model["jnt_stiffness", joint] if springs else 0.0,
         spring_position=model["qpos_spring", position],
@@ -352,7 +355,7 @@ def _read_paddle(model: EditedModel, frames: dict[int, Frame]) -> Frame:
 
 
 def _read_ball(model: EditedModel, ball: BallAddresses) -> BallModel:
-    # The inertia follows the mass and the radius (`edited.edited`). An entry of the inertia alone,
+    # The inertia follows the mass and the radius (`physics.edited`). An entry of the inertia alone,
     # or of the gravity compensation, is no variable one.
     return BallModel(
         radius=model["geom_size", ball.geom, 0],
@@ -449,5 +452,5 @@ def _read_contact(model: EditedModel, pair: int, balls: tuple[int, ...]) -> Cont
 
 
 def _impedance_limits(solimp: np.ndarray) -> np.ndarray:
-    """Impedances of a `solimp` within MuJoCo's limits (mjMINIMP, mjMAXIMP)."""
+    """Impedances and midpoint of a `solimp` within MuJoCo's limits (mjMINIMP, mjMAXIMP)."""
     return np.clip(solimp, 1e-4, 1.0 - 1e-4)

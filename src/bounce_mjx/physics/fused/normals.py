@@ -28,6 +28,7 @@ def normal_forces(
         row[0] = row[0] + regulariser
     linear = [neg(offset) for offset in offsets]
     if len(is_touching) == 1:
+        # The mask of the result is enough.
         forces = nonnegative(rows, linear)
     else:
         rows, linear = not_inlined(_with_touching_alone(rows, linear, is_touching))
