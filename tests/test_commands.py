@@ -254,14 +254,16 @@ def test_run_holds_both_checkpoints_and_the_results(trained: Path) -> None:
 
 
 def test_eval_reports_five_results(trained: Path, tmp_path: Path, capsys) -> None:
-    """At a fixed target."""
+    """At a fixed target, in a world that the file names."""
     file = tmp_path / "a.json"
     line = f"{trained} --episodes 4 --target-height 0.8 --seed 5 --json {file}"
+    line += " --randomization.ball-mass 0.9 1.1"
     with pytest.raises(SystemExit) as exit_info:
         eval_command.main(line.split())
     assert exit_info.value.code == 1
     report = json.loads(file.read_text(), parse_constant=pytest.fail)
     assert report["commands"] == {"target_height": 0.8}
+    assert report["world"] is None and report["randomization"] == {"ball_mass": [0.9, 1.1]}
     (unjudged,) = (result for result in report["results"] if result["passed"] is None)
     assert unjudged["name"] == "upward speed"
     assert tuple(result["name"] for result in report["results"]) == RESULT_NAMES
