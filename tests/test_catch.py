@@ -9,7 +9,7 @@ import pytest
 from bounce_mjx import task
 from bounce_mjx.env.env import Env
 from bounce_mjx.robot.model import find_addresses
-from bounce_mjx.task.catch import Catch, Config
+from bounce_mjx.task.catch import MAX_DISTANCE, Catch, Config
 
 DT, REST_HEIGHT = 0.01, 0.0225
 
@@ -44,6 +44,16 @@ def test_throws_have_their_distribution() -> None:
     np.testing.assert_allclose(aim.mean(0), paddle[:2], atol=2e-3)
     # The slowest ball falls at 2.9 m/s and the fastest at 3.4 m/s.
     assert np.all((2.9 < gravity * flight - rising) & (gravity * flight - rising < 3.5))
+
+
+def test_no_throw_starts_beyond_the_greatest_distance() -> None:
+    """Also at a paddle so far out that the slowest throw would start beyond it."""
+    catch = Catch(Config(ball_init_pos=(1.2, 1.5, 0.1)))
+    draws = jax.random.uniform(jax.random.PRNGKey(0), (1000, catch.num_draws))
+    start, velocity = jax.vmap(lambda numbers: catch.throw(numbers, {}))(draws)
+    away = np.hypot(start[:, 0], start[:, 1])
+    assert 1.95 < away.max() < MAX_DISTANCE + 1e-3
+    assert np.hypot(velocity[:, 0], velocity[:, 1]).max() < 0.3
 
 
 def steps(ball: np.ndarray, velocity: np.ndarray, paddle: np.ndarray) -> task.TaskStep:

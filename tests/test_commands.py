@@ -69,7 +69,7 @@ MISTAKES = (
     ("play robust --out a.mp4", "unknown argument --out; did you mean --video?"),
     ("report robust", "the policy robust comes with the package", "give a run's folder"),
     ("plot catch", "the policy catch comes with the package"),
-    ("play --nominal", "--nominal of an evaluation", "need --episode"),
+    ("play --nominal", "--nominal is of an evaluation", "add its --episode"),
     ("play robust --suite robustness_v2 --episode 3", "--suite is that of a condition; add"),
     ("robustness robust --world fast_servo --assumed --suite robustness_v2", "omit --suite"),
     ("robustness robust --assumed", "--assumed needs a named world"),

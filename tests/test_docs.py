@@ -23,6 +23,7 @@ import numpy as np
 import pytest
 
 import bounce_mjx
+import mutations
 from bounce_mjx import commands as commands_package
 from bounce_mjx.commands import main as console_script
 from bounce_mjx.config import command_line as cli
@@ -498,3 +499,14 @@ def test_each_promise_has_its_place_and_its_test() -> None:
             file, _, name = test.partition("::")
             text = (CHECKOUT / "tests" / file).read_text(encoding="utf-8")
             assert name in text, f"{promise}: {test}"
+
+
+def test_each_deliberate_fault_still_has_its_place() -> None:
+    """`tests/mutations.py`, which CI does not run: the code that it changes, and the number of
+    faults in CONTRIBUTING.md."""
+    for fault, file, code, _, test in mutations.FAULTS:
+        text = (CHECKOUT / "src/bounce_mjx" / file).read_text(encoding="utf-8")
+        assert text.count(code) == 1, f"{fault}: {code}"
+        assert (CHECKOUT / "tests" / test.split(" -k ")[0]).is_file(), fault
+    said = (CHECKOUT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    assert f"puts {len(mutations.FAULTS)} deliberate faults" in said

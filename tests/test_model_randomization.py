@@ -13,6 +13,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.physics import Control, PhysicsState, make_engine
 from bounce_mjx.physics.edited import edited_model
 from bounce_mjx.physics.parameters import PhysicsParameters
+from bounce_mjx.robot.model import load_model
 from bounce_mjx.world.randomization import RandomizationConfig
 from random_worlds import random_parameters
 
@@ -86,6 +87,27 @@ def test_models_of_parameters_are_read_back(mj_model, base):
                 np.testing.assert_allclose(
                     field_of(again, name), field_of(model, name), 1e-5, 1e-12, err_msg=name
                 )
+
+
+def test_the_inertia_of_a_lone_slide_follows(tmp_path):
+    """MuJoCo takes the inertia of a joint that moves one body alone from the model."""
+    scene = """<mujoco><worldbody>
+        <body><joint name="lift" type="slide" axis="0 0 1" armature="{}"/>
+          <geom name="blocker" type="box" size=".1 .1 .01" mass="{}"/></body>
+        <body name="ball_link" pos="0 0 .5"><freejoint/>
+          <geom name="ball" type="sphere" size=".02" mass=".0027"/></body>
+      </worldbody><contact><pair geom1="blocker" geom2="ball"/></contact>
+      <actuator><position joint="lift" kp="100" kv="1"/></actuator></mujoco>"""
+    speeds = []
+    parameters = PhysicsParameters(armature=np.array([5.0]), link_mass=np.array([3.0]))
+    for numbers, given in (((1, 2), parameters), ((5, 3), PhysicsParameters())):
+        (tmp_path / "lift.xml").write_text(scene.format(*numbers))
+        model = edited_model(load_model(tmp_path / "lift.xml", 0.001), given)
+        data = mujoco.MjData(model)
+        data.ctrl[0] = 1.0
+        mujoco.mj_step(model, data)
+        speeds.append(data.qvel[0])
+    assert speeds[0] == pytest.approx(speeds[1], rel=1e-12)
 
 
 def test_terms_of_a_randomization_fn_have_their_shares(mj_model, base):

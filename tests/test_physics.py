@@ -365,6 +365,7 @@ UNSUPPORTED = {
     "actuator delay": ("<position ", '<position delay="0.005" nsample="9" ', "delay"),
     "actuator damping": ("<position ", '<position damping="1" ', "damping"),
     "actuator armature": ("<position ", '<position armature="0.1" ', "armature"),
+    "surface velocity": ("<geom contype", '<geom surfacevel="1 0 0 0 0 0" contype', "surfacevel"),
     "another actuator": (
         "</actuator>",
         '<motor site="paddle_home" gear="0 0 1 0 0 0"/></actuator>',
@@ -377,7 +378,7 @@ UNSUPPORTED = {
 UNSUPPORTED_BY_BOTH = (
     *("implicit", "discrete", "density", "viscosity", "wind", "actuator group", "noslip"),
     *("override", "sleep", "diagexact", "adhesion", "mixed solref", "solref with a zero"),
-    *("solimp width", "flex"),
+    *("solimp width", "flex", "surface velocity"),
     *("stiffness polynomial", "damping polynomial", "ellipsoid ball"),
     *("actuator delay", "actuator damping", "actuator armature", "no damper"),
 )
@@ -474,7 +475,6 @@ MJX_ONLY = {
         ),
         "flag spring or damper",
     ),
-    "surface velocity": ("<geom contype", '<geom surfacevel="1 0 0 0 0 0" contype', "surfacevel"),
 }
 
 

@@ -122,6 +122,11 @@ BROKEN = {
         "tool",
         "ball joint j4",
     ),
+    "a joint without a name, and one with its stand-in": (
+        mjcf(arm().replace('name="j3" ', "").replace('"j2"', '"joint2"'), motors("joint2")),
+        "tool",
+        "an unnamed joint that would be called joint2, as another one is",
+    ),
     "loop": (
         mjcf(arm(), motors(ARM_JOINTS), '<equality><joint joint1="j2" joint2="j3"/></equality>'),
         "tool",
@@ -429,6 +434,17 @@ def test_what_held_the_arm_to_a_loose_object_is_named(rod, tmp_path) -> None:
     changes = build_arm(tmp_path / "arm.xml", RobotConfig(site="tool")).changes
     held = "couples the arm with these: unnamed equality constraint (connect: rod, forearm)"
     assert any(held in change for change in changes)
+
+
+def test_what_holds_the_arm_by_its_gripper_is_named(tmp_path) -> None:
+    hand = HAND.replace("<body ", '<body name="hand" ', 1)
+    equalities = f'<equality>{MIMIC}<weld name="bench" body1="hand"/></equality>'
+    (tmp_path / "arm.xml").write_text(mjcf(arm(tip=hand), motors(ARM_JOINTS), equalities))
+    changes = build_arm(tmp_path / "arm.xml", RobotConfig(site="tool")).changes
+    assert any(
+        change.endswith("couples the arm with these: equality constraint bench")
+        for change in changes
+    )
 
 
 def test_each_shape_that_touches_counts_whatever_its_group(tmp_path) -> None:

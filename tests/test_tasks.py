@@ -137,16 +137,32 @@ def test_a_metric_with_a_name_of_the_environment_is_refused(name) -> None:
         jax.eval_shape(Env(Named.Config()).reset, jax.random.PRNGKey(0))
 
 
-def test_two_curves_with_one_tag_are_refused() -> None:
+@pytest.mark.parametrize(
+    "tag",
+    [
+        "task/error",  # of the curve of balance itself
+        "task/drop",  # of a metric that no curve shows
+        "task/non_finite",
+        "episode/length",
+        "length",
+        "loss/value",
+        "reward/centre",
+    ],
+)
+def test_a_curve_with_the_tag_of_another_is_refused(tag) -> None:
+    """In the log, one would silently take the other's place."""
     balance = find_task("balance")
 
     class Twice(balance):
         class Config(balance.Config):
             pass
 
-        curves = (*balance.curves, balance.curves[0])
+        curves = (*balance.curves, task.Curve(tag, "error"))
 
-    tag = balance.curves[0].tag
+        def step(self, state, step):
+            result = super().step(state, step)
+            return result._replace(metrics=result.metrics | {"drop": 1.0})
+
     with pytest.raises(UserError, match=f"the tag {tag} of a curve of the task Twice is taken"):
         jax.eval_shape(Env(Twice.Config()).reset, jax.random.PRNGKey(0))
 

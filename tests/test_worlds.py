@@ -9,14 +9,17 @@ import yaml
 from bounce_mjx.commands.train import read_command
 from bounce_mjx.config.settings import merged
 from bounce_mjx.config.validation import validate
+from bounce_mjx.deploy.export import policy_metadata
 from bounce_mjx.env.env import model_nominals
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.suite import load_suite
 from bounce_mjx.resources import resource_path
-from bounce_mjx.robot.config import LimitsConfig
+from bounce_mjx.robot.config import LimitsConfig, RobotConfig
+from bounce_mjx.robot.model import add_balls, scene_spec
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.runs.worlds import in_world
+from bounce_mjx.task.catch import Catch
 from bounce_mjx.world.config import ActionConfig
 from bounce_mjx.world.named import read_world
 from bounce_mjx.world.randomization import TERMS
@@ -137,17 +140,33 @@ def test_assumed_numbers_are_doubled_entry_by_entry() -> None:
 
 
 def test_less_of_a_limit_is_harder(tmp_path: Path) -> None:
-    keys = ["max_joint_velocity", "action_scale", "randomization.torque_limit"]
+    keys = [
+        "max_joint_velocity",
+        "action_scale",
+        "randomization.torque_limit",
+        "robot.servo_force_limit",
+        "robot.limits.jerk",
+        "robot.gravity_compensation",
+    ]
     env = {
+        "robot": {
+            "servo_force_limit": [80.0, 12.0],
+            "limits": {"velocity": [2.0], "acceleration": [10.0], "jerk": [5000.0]},
+            "gravity_compensation": 1.0,
+        },
         "max_joint_velocity": 4.0,
         "action_scale": 0.02,
         "randomization": {"torque_limit": [20.0, 40.0]},
     }
-    path = written(tmp_path, env=env, sources=dict.fromkeys(keys, "An example."), assumed=keys)
+    sources = dict.fromkeys([*keys, "robot"], "An example.")
+    path = written(tmp_path, env=env, sources=sources, assumed=keys)
     assert read_world(path).double_assumed({}) == {
         "half max_joint_velocity": {"max_joint_velocity": 2.0},
         "twice action_scale": {"action_scale": 0.04},
         "half randomization.torque_limit": {"randomization": {"torque_limit": [10.0, 20.0]}},
+        "half robot.servo_force_limit": {"robot": {"servo_force_limit": [40.0, 6.0]}},
+        "half robot.limits.jerk": {"robot": {"limits": {"jerk": [2500.0]}}},
+        "half robot.gravity_compensation": {"robot": {"gravity_compensation": 0.5}},
     }
 
 
@@ -158,6 +177,23 @@ def test_a_world_brings_its_robot() -> None:
     assert command.config.env.robot.servo_stiffness[0] > 1e4
     with pytest.raises(UserError, match="is for the robot ur5e, and a robot is given too"):
         read_command(["--world", "ur5e_rtde", "--robot", "panda"])
+
+
+def test_a_robots_own_balls_and_stiff_contact_are_taken_by_another_task(tmp_path: Path) -> None:
+    """The paddle's place is found with the step that the contact needs; and a policy for the scene
+    is exported."""
+    spec, _ = scene_spec(None, RobotConfig())
+    add_balls(spec, 2)
+    spec.compile()
+    scene = tmp_path / "two_balls.xml"
+    scene.write_text(spec.to_xml().replace('solref="-98696 -31.4"', 'solref="-1e6 -60"'))
+    env = {"mjcf": str(scene), "physics_dt": 0.0005, "num_balls": 2}
+    robot = tmp_path / "robot.yaml"
+    robot.write_text(yaml.safe_dump({"task": "juggle", "env": env}))
+    config = read_command(["--task", "catch", "--robot", str(robot)]).config.env
+    assert config.physics_dt == 0.0005
+    assert config.ball_init_pos == pytest.approx(Catch.Config().ball_init_pos, abs=1e-3)
+    assert policy_metadata(TrainConfig(task="juggle", env=env), 1).num_balls == 2
 
 
 def test_a_policy_is_measured_in_the_world_alone() -> None:

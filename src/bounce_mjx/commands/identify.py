@@ -71,7 +71,13 @@ def main(args: Sequence[str]) -> None:
         # Its ranges are of this robot's joints.
         ranges = known.settings.get("randomization", {})
         validate(type(config), config.model_dump() | {"randomization": ranges}, str(command.check))
-    model = load_model(config.mjcf, config.physics_dt, visual=False, robot=config.robot)
+    model = load_model(
+        config.mjcf,
+        config.physics_dt,
+        visual=False,
+        robot=config.robot,
+        num_balls=config.num_balls,
+    )
     names = joint_names(model)
     logs = [read_log(path, model, command.topics, command.joint_names) for path in command.logs]
     log = join(logs)

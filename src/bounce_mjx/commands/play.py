@@ -73,7 +73,8 @@ def main(args: Sequence[str]) -> None:
         flags = {"--nominal": command.nominal, "--episodes": command.episodes}
         flags |= {"--condition": command.condition}
         if given := [flag for flag, value in flags.items() if value]:
-            raise UserError(f"{' and '.join(given)} of an evaluation need --episode; add it")
+            what = "is" if len(given) == 1 else "are"
+            raise UserError(f"{' and '.join(given)} {what} of an evaluation; add its --episode")
     else:
         _check_film(command, given_commands)
     # Before the seconds that imports and the compilation take.
@@ -163,7 +164,9 @@ def _check_film(command: PlayCommand, given_commands: GivenCommands) -> None:
         raise UserError("--episode shows one episode of one policy; give one policy, one robot")
     changes = command.nominal or command.randomization.terms or given_commands.values
     if command.condition is not None and changes:
-        raise UserError("--condition is a whole world; omit other flags that change the world")
+        raise UserError(
+            "--condition is a whole world; omit --nominal, --randomization and the commands"
+        )
     episodes = _num_episodes(command)
     if command.episode >= episodes:
         raise UserError(

@@ -18,7 +18,7 @@ class PlotCommand(WhichPolicy):
     become one curve with a band, as do the seeds of one run. For a run of one seed, or one
     checkpoint in it, the evaluation is drawn too."""
     out: Path = Path("plots")
-    """Folder for the pictures: curves, rewards, what your own code registers and, for one run,
+    """Folder for the pictures: curves, rewards, what your task's file registers and, for one run,
     evaluation."""
     formats: Annotated[tuple[Literal["png", "svg"], ...], Field(min_length=1)] = ("png", "svg")
     """File formats of each picture."""
@@ -36,7 +36,7 @@ def main(args: Sequence[str]) -> None:
     runs = [command.choose_run(run) for run in command.runs or (None,)]
     seeds = [seed for run in runs for seed in runs_of_seeds(run)]
     checkpoints = [find_checkpoint(seed) for seed in seeds]
-    # Also runs the file of a task that --task names, which may register plots.
+    # Also imports the files of the tasks, which may register plots.
     configs = [command.config_of_run(checkpoint.run) for checkpoint in checkpoints]
     set_up_jax(*(config.env for config in configs))
     groups = curves.group_runs([checkpoint.run for checkpoint in checkpoints])

@@ -131,7 +131,7 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
             f"the command {min(taken)} has the name of a measurement; give it another name in "
             f"the task {env.task.__name__}"
         )
-    m = load_model(env.mjcf, env.physics_dt, visual=False, robot=env.robot)
+    m = load_model(env.mjcf, env.physics_dt, visual=False, robot=env.robot, num_balls=env.num_balls)
     addresses = find_addresses(m)
     chain, paddle, normal = _hinges(m, env.default_joint_angles)
     servos = list(addresses.actuators)

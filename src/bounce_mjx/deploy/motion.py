@@ -66,8 +66,8 @@ class Motion:
         return not (np.any(self.end.velocity) or np.any(self.end.acceleration))
 
     def aim(self, target: np.ndarray) -> None:
-        """Moves the joints toward a target [J], to be there at the end of the control step if the
-        largest step, the range and the limits allow it."""
+        """Moves the joints toward a target [J], as far as the largest step, the range and the
+        limits allow; a robot without limits gets the target itself."""
         start = self.start.position
         target = np.minimum(
             np.maximum(target, start - self._largest_step), start + self._largest_step

@@ -1,14 +1,14 @@
 """What an environment refuses before its first step: settings that its task or its model cannot
 have. Each check raises a `UserError` of one sentence."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import mujoco
 import numpy as np
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.robot.model import Addresses, joint_names, joint_ranges
-from bounce_mjx.task.task import Task
+from bounce_mjx.task.task import Curve, Task
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import TERMS
 
@@ -16,14 +16,25 @@ ENDS = ("non_finite", "too_fast")
 """Metrics of the ends of an episode that are no task's; an environment of another kind may lack
 them."""
 WORLD_PREFIXES = ("world/", "true/")
-"""Of the metrics that an environment has only where its world is sampled, or its measurements are
-noisy."""
+"""Prefixes of the metrics that an environment has only where its world is sampled (`world/`), or
+where its observation may differ from the true state of one instant (`true/`)."""
 METRIC_PREFIXES = ("reward", *WORLD_PREFIXES)
-"""Of the environment's other metrics."""
+"""Prefixes of the environment's metrics that are neither its ends nor its task's."""
 _TAKEN_METRICS = (*ENDS, "steps", "episodes")
 """Names that a task's metrics cannot have; the last two are what a curve may be over."""
-_TAKEN_TAGS = ("reward", "steps", "ended", "return", "length")
-"""Tags that a curve cannot have: the sums behind the curves that every training has."""
+_TAKEN_TAGS = (
+    "steps",
+    "ended",
+    "return",
+    "length",
+    "episode/return",
+    "episode/length",
+    "episode/ended",
+    *(f"task/{end}" for end in ENDS),
+)
+"""Tags that a curve cannot have: the curves that every training has, and the sums behind them."""
+_TAKEN_TAG_PREFIXES = ("reward", "loss/", "policy/", "speed/", "results/")
+"""Prefixes of what a training logs beside the curves of a task."""
 
 # Two turns of a joint without a range, rad; or m.
 _MAX_ANGLE = 4.0 * np.pi
@@ -71,11 +82,21 @@ def check_metrics(names: Iterable[str], task: Task) -> None:
             )
 
 
-def check_tags(task: Task) -> None:
-    """Refuses curves that would be drawn as one."""
-    taken = set(_TAKEN_TAGS)
+def unnamed_metrics(metrics: Iterable[str], curves: Sequence[Curve]) -> list[str]:
+    """The task's metrics that no curve shows or counts. A training logs each by the tag
+    `task/<metric>`, as its mean over the steps."""
+    named = {curve.metric for curve in curves} | {curve.over for curve in curves}
+    known = named.union(ENDS)
+    return [name for name in metrics if name not in known and not name.startswith(METRIC_PREFIXES)]
+
+
+def check_tags(task: Task, metrics: Iterable[str]) -> None:
+    """Refuses a curve in whose place the log would have another one, or the reverse; `metrics` are
+    the names of those of the task's step."""
+    taken = {*_TAKEN_TAGS}
+    taken.update(f"task/{name}" for name in unnamed_metrics(metrics, task.curves))
     for curve in task.curves:
-        if curve.tag in taken:
+        if curve.tag in taken or curve.tag.startswith(_TAKEN_TAG_PREFIXES):
             raise UserError(
                 f"the tag {curve.tag} of a curve of the task {type(task).__name__} is taken; "
                 "choose another one"

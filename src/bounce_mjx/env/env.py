@@ -54,7 +54,7 @@ _TRUE_QUANTITIES = (
 
 
 class Redraw(NamedTuple):
-    """What later samples of the commands within an episode need."""
+    """What later samples of the commands within an episode need, and the age of the last one."""
 
     age: jax.Array
     """Time since the commands were sampled [], s (an evaluation's `Moment.command_seconds`)."""
@@ -84,7 +84,7 @@ class EnvState(NamedTuple):
     command: dict[str, jax.Array]
     """Value [] of each command."""
     last_action: jax.Array
-    """Clipped action of the step that led here [n]; zero after a reset."""
+    """Clipped action of the step that led here [n], a task's `Step.action`; zero after a reset."""
     task: Any = ()
     """What the task keeps of the episode."""
     parameters: PhysicsParameters = PhysicsParameters()
@@ -94,7 +94,7 @@ class EnvState(NamedTuple):
     clock: Clock | None = None
     """For a randomised world, or where there is `sensing`."""
     redraw: Redraw | None = None
-    """For commands that change within an episode."""
+    """For commands that are sampled again within an episode."""
     actuation: Actuation = Actuation()
     sensing: Sensing | None = None
     """For an observation that differs from the true state of one instant."""
@@ -216,7 +216,8 @@ class Env:
 
         Raises:
           UserError: the ranges lack a term, or have an unknown one; the task's code returns wrong
-            names; or the model lacks what a term changes, or was edited.
+            names; the model lacks what a term changes, or was edited; or the engine does not
+            support what a term changes.
         """
         robot_model.check_unedited(self.mj_model, self._fingerprint)
         if ranges is None:
@@ -272,8 +273,9 @@ class Env:
         return self.finish_step(state, action, actuation, physics)
 
     def control(self, before: EnvState, action: jax.Array) -> tuple[Control, Actuation]:
-        """The part of a step before the physics: its inputs under the action [n] of `step`, late
-        by the world's latency and lag, and the memory of the actuation after the step."""
+        """The part of a step before the physics: the inputs of the physics under the action [n] of
+        `step`, late by the world's latency and lag, and the memory of the actuation after the
+        step."""
         action, _ = _clip_action(action)
         return self._actuators.next(
             before.actuation, before.physics.qpos, action, before.world, before.clock
@@ -296,7 +298,7 @@ class Env:
         before = state.pipeline_state
         physics, finite = _keep_finite(physics, before.physics)
         action, is_number = _clip_action(action)
-        # The state is then the previous one, and so is its action.
+        # The physics is then that before the step, and so is the action.
         action = jnp.where(finite, action, before.last_action)
         after = before._replace(physics=physics, last_action=action, actuation=actuation)
         truth = self.kinematics(after)
@@ -343,7 +345,7 @@ class Env:
         out."""
         terms = self.config.randomization.terms
         commands = self.config.commands
-        # With all commands on both sides, none is missing and none is unknown.
+        # The commands are on both sides, as none needs a range and each may have one.
         check_names("a reset", "range", {*ranges, *commands}, {*terms, *commands})
 
     def _sample_world(
@@ -449,7 +451,7 @@ class Env:
         return following
 
     def _first_redraw(self, world: World, ranges: Ranges, dtype: jnp.dtype) -> Redraw | None:
-        """What later samples of the commands need; None if they stay for the whole episode."""
+        """What later samples of the commands need; None if they are not sampled again."""
         if "command_interval" not in world:
             return None
         command_ranges = {}
@@ -491,7 +493,7 @@ class Env:
         )
         result = jax.eval_shape(lambda: self.task.step(state.task, step))
         check_metrics(result.metrics, self.task)
-        check_tags(self.task)
+        check_tags(self.task, result.metrics)
         rewards = [f"reward/{name}" for name in result.reward]
         metrics = dict.fromkeys([*rewards, *result.metrics, *ENDS], zero)
         metrics |= self._privileged_metrics(state.world, truth)
@@ -560,8 +562,9 @@ class Env:
         return state._replace(world=world, parameters=parameters)
 
     def _privileged_metrics(self, world: World, truth: Kinematics) -> dict[str, jax.Array]:
-        """Quantities that only a critic may see: `world/<term>` and, where the sensors differ from
-        the truth, `true/<quantity>`. Each entry of an array has its own name with an index."""
+        """Quantities that only a critic may see: `world/<term>` and, where the observation may
+        differ from the true state of one instant, `true/<quantity>`. Each entry of an array has its
+        own name with an index."""
         quantities = {f"world/{name}": value for name, value in world.items()}
         if self._sensors.are_needed:
             quantities |= {f"true/{name}": getattr(truth, name) for name in _TRUE_QUANTITIES}

@@ -40,7 +40,7 @@ class VectorState(NamedTuple):
     """Environment states, the batch last in every array."""
     clock: jax.Array
     """Steps that count towards the time limit [B], int: from 0 at a reset, or from any number, so
-    that the episodes of a training do not all end at once. No `noise.Clock`."""
+    that the episodes of a training do not all end at once. It is not a `noise.Clock`."""
     length: jax.Array
     """Steps since the reset [B], int."""
     episode_return: jax.Array
@@ -59,7 +59,7 @@ class VectorStep(NamedTuple):
     reward: jax.Array
     """Reward of the step [B]."""
     terminated: jax.Array
-    """Whether the task ended the episode [B], bool."""
+    """Whether the episode ended otherwise than by the time limit [B], bool."""
     truncated: jax.Array
     """Whether only the time limit ended the episode [B], bool."""
     metrics: dict[str, jax.Array]

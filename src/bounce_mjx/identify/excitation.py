@@ -63,7 +63,13 @@ def excite(
     Raises:
       UserError: the start pose has a contact with the floor or the table, or a joint cannot move.
     """
-    model = load_model(config.mjcf, config.physics_dt, visual=False, robot=config.robot)
+    model = load_model(
+        config.mjcf,
+        config.physics_dt,
+        visual=False,
+        robot=config.robot,
+        num_balls=config.num_balls,
+    )
     n = config.num_joints
     dt = config.control_dt
     home = np.array(config.default_joint_angles)

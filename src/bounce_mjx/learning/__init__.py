@@ -7,5 +7,6 @@
     config.py      the settings
     registry.py    how an algorithm is found by its name
 
-It knows an environment by the interface `env.vector.AnyEnv` alone.
+It knows an environment by the interface `env.vector.AnyEnv` and by the names of metrics in
+`env.checks` alone.
 """

@@ -55,8 +55,8 @@ class PPOConfig(settings.StrictModel):
     init_noise_std: settings.Positive = 0.4
     """Standard deviation of the action noise at the start."""
     min_noise_std: settings.NonNegative = 0.0
-    """Lower bound of that standard deviation: each environment has a bound of its own, evenly from
-    0 to twice this; 0 for none. Without it a long training forgets how to recover."""
+    """Mean lower bound of that standard deviation: each environment has a bound of its own, evenly
+    from 0 to twice this; 0 for none. Without it a long training forgets how to recover."""
     hidden_layers: Annotated[tuple[settings.Count, ...], Field(min_length=1)] = (128, 128)
     """Widths of the hidden layers of the policy, and of the value network by default."""
     critic_layers: Annotated[tuple[settings.Count, ...], Field(min_length=1)] | None = None

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from bounce_mjx.env import vector
-from bounce_mjx.env.checks import ENDS, METRIC_PREFIXES, WORLD_PREFIXES
+from bounce_mjx.env.checks import ENDS, WORLD_PREFIXES, unnamed_metrics
 from bounce_mjx.errors import UserError
 from bounce_mjx.task import Curve
 
@@ -48,12 +48,14 @@ def _is_of_a_fixed_world(pattern: str, known: Sequence[str]) -> bool:
 
 
 def step_metrics(result: vector.VectorStep, groups: int, curves: Sequence[Curve]) -> Metrics:
-    """Sums of one step of B environments, of which `rollout_metrics` makes means. What a curve is
-    the mean of over events is 0 on all other steps (`Curve.over`), and is summed as it is.
+    """Sums of one step of B environments, of which `rollout_metrics` makes means. A metric whose
+    curve is over events is already 0 on the other steps (`Curve.over`): it is summed without a
+    mask.
 
     Args:
       result: of the step of all environments.
-      groups: number of equal groups of environments, G. A device holds whole groups.
+      groups: number of equal groups of environments, G. A device holds whole groups, so that no
+        step sums over devices.
       curves: a task's. Each has a sum by its tag, and one of what it is the mean over.
 
     Returns:
@@ -72,7 +74,9 @@ def step_metrics(result: vector.VectorStep, groups: int, curves: Sequence[Curve]
             values[f"task/{name}"] = result.metrics[name]
 
     weights = {"steps": one, "episodes": ended} | result.metrics
-    for curve in (*curves, *_other_curves(result.metrics, curves)):
+    for name in unnamed_metrics(result.metrics, curves):
+        curves = (*curves, Curve(f"task/{name}", name, over="steps"))
+    for curve in curves:
         value = result.metrics[curve.metric]
         if curve.over == "episodes":
             value = jnp.where(ended, value, 0.0)
@@ -83,18 +87,6 @@ def step_metrics(result: vector.VectorStep, groups: int, curves: Sequence[Curve]
     rows = jnp.stack([value.astype(result.reward.dtype) for value in values.values()])
     sums = jnp.sum(rows.reshape(len(rows), groups, -1), axis=-1)
     return dict(zip(values, sums, strict=True))
-
-
-def _other_curves(metrics: Metrics, curves: Sequence[Curve]) -> list[Curve]:
-    """For each other metric of the task, its mean over the steps: for those that no curve shows or
-    is over, but for the ends of an episode."""
-    named = {curve.metric for curve in curves} | {curve.over for curve in curves}
-    known = named.union(ENDS)
-    return [
-        Curve(f"task/{name}", name, over="steps")
-        for name in metrics
-        if name not in known and not name.startswith(METRIC_PREFIXES)
-    ]
 
 
 def rollout_metrics(steps: Metrics) -> Metrics:

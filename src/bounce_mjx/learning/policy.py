@@ -132,7 +132,8 @@ def make_networks(
 
 
 def networks_of(config: PPOConfig) -> Callable[[AnyEnv], Networks]:
-    """`make_networks` of a config, as a function of the environment."""
+    """`make_networks` of a config, as a function of the environment, to act with: its value network
+    has no critic metrics."""
 
     def networks_for(env: AnyEnv) -> Networks:
         return make_networks(config, env.observation_size, env.action_size)
@@ -224,7 +225,7 @@ def orthogonal(gain: float) -> Callable[..., jax.Array]:
 def _add_orthogonal_column(
     random_columns: jax.Array, index: jax.Array, columns: jax.Array
 ) -> jax.Array:
-    """Orthonormal columns [N, M], of which those before the index are done, with that of the index.
+    """The columns [N, M], with that of the index made orthonormal to those before it.
 
     Args:
       random_columns: [N, M], of which that of the index becomes orthogonal to those before it.

@@ -6,7 +6,7 @@ iteration is `PPO.iterate`:
 
     collect       T steps of B environments with the policy as it is
     advantages    values of the states, bootstrapped at time-outs, and the advantages
-    (statistics)  those of the networks' inputs take in the rollout, and normalise the update
+    (statistics)  the rollout updates those of the inputs; the new ones normalise the update
     update        epochs of minibatches: `loss`, its gradient, a step of `learning_rate`
 
 Normalised are the networks' inputs, by the running statistics, and the advantages of each
@@ -44,7 +44,8 @@ from bounce_mjx.learning.statistics import (
 _LEARNING_RATE_FACTOR = 1.1
 
 # Number of groups in which samples are shuffled, a power of two: twice as many as long as each
-# keeps _MIN_GROUP_ENVS environments, half as many as long as the batch cannot be divided.
+# keeps _MIN_GROUP_ENVS environments, half as many as long as the batch cannot be divided. (The
+# groups of a small batch have fewer.)
 _GROUPS = 64
 _MIN_GROUP_ENVS = 64
 
@@ -52,7 +53,8 @@ _MIN_GROUP_ENVS = 64
 # writes out all steps before it, so the kernel's code grows with the square of this number.
 _UNROLL = 16
 
-# Quantities that must be finite, in the order in which a fault is named.
+# Quantities that must be finite, in the order in which a fault is named; "observation" is of the
+# critic metrics too.
 CHECKED = ("reward", "observation", "loss/value", "loss/policy", "gradient", "parameters")
 
 
@@ -163,8 +165,9 @@ class LearnerState(NamedTuple):
 
 class PPO:
     """Training as two pure functions, `init` and `run`; `jax.jit` them (the second argument of
-    `run` is static). A subclass may change every method (docs/algorithms.md); its `update` returns
-    the metric loss/gradient_norm, in which a divergence shows."""
+    `run` is static). A subclass may change every method (docs/algorithms.md; of `make_networks` the
+    value network alone). Its `update` returns the metric loss/gradient_norm, or loss/value or
+    loss/policy, in which a divergence shows."""
 
     Config = PPOConfig
     """Type of the settings; a subclass may add some, which become keys and flags."""
@@ -268,8 +271,8 @@ class PPO:
         advantage, value_target = self.advantages(state, rollout, bootstrap)
         # The next rollout normalises by the new statistics, so the networks learn on inputs
         # normalised by them; otherwise the policy would shift with every change of the statistics.
-        # The log_prob and the advantages are those of the old ones, so that the ratio in the loss
-        # does not begin at exactly 1.
+        # The log_prob and the advantages are those of the old ones; therefore the ratio in the loss
+        # begins only near 1.
         new_statistics = statistics.update(state.statistics, rollout.inputs)
         normalizer = new_statistics.normalizer
         samples = Samples(
@@ -288,8 +291,8 @@ class PPO:
         if "policy/kl" in minibatch_metrics:
             # How far the whole update has moved the policy: that of the last epoch.
             metrics["policy/kl"] = jnp.mean(minibatch_metrics["policy/kl"][-1])
-        # The KL rule's rate is the one with which the next update begins; a schedule's is that of
-        # this update.
+        # Of the KL rule: the rate with which the next update begins. Of a schedule: that of this
+        # update.
         metrics["policy/learning_rate"] = self.learning_rate(learned.learning_rate, state.iteration)
         metrics["loss/explained_variance"] = 1.0 - jnp.var(advantage) / jnp.var(value_target)
         metrics["fault"] = fault
@@ -383,8 +386,8 @@ class PPO:
         Args:
           params: of both networks.
           inputs: normalised [..., N + K].
-          noise_bound: lower bounds of the standard deviation [..., 1]. It is the root of the sum of
-            squares, as a clipped one would have no gradient.
+          noise_bound: lower bounds of the standard deviation [..., 1]. The deviation is the root of
+            std^2 + noise_bound^2, as a clipped one would have no gradient.
         """
         observation = inputs[..., : self.env.observation_size]
         mean, std = self.networks.policy_network.apply(params.policy, observation)

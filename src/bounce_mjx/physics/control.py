@@ -35,7 +35,8 @@ class Control(NamedTuple):
     All engines apply it the same way: `servo_target` gives the `ctrl` of each physics step
     (`servo_targets` that of all steps, for the C engine), the push changes the ball's velocity
     before the first step, and every step has the drag of its velocity. The unit of time is the
-    physics step in all fields but the last two.
+    physics step in all fields but the last two. (`evaluation.c_episodes` has the push and `drag` in
+    NumPy.)
     """
 
     ctrl: Any

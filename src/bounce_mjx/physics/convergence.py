@@ -1,5 +1,6 @@
 """Does MuJoCo's C solver converge with a model's own settings? The fused engine computes the
-converged solution, whatever the settings say. Trainings and evaluations print the warning."""
+converged solution, whatever the settings say. A training with the fused engine and an evaluation
+with the C engine print the warning."""
 
 import copy
 from collections.abc import Iterable
@@ -39,8 +40,8 @@ def solver_warning(mj_model: mujoco.MjModel) -> str | None:
     words = " and ".join(_as_in_mjcf(mj_model.opt, name) for name in at_fault or changed)
     return (
         f"MuJoCo's C solver stops before it converges with {words} (errors up to {error:.2g} m/s "
-        "in a step of a bounce), and the fused physics is the converged solution; leave it out of "
-        "the MJCF's <option> to get the same on the C engine"
+        "or rad/s in a step of a bounce), and the fused physics is the converged solution; leave "
+        "it out of the MJCF's <option> to get the same on the C engine"
     )
 
 

@@ -39,7 +39,8 @@ NO_PAIR = (
 
 
 INSEPARABLE = ("pair_solref",)
-"""Fields in whose rows one number tells the meaning of another: they change together."""
+"""Fields in whose rows one number tells the meaning of another: they change together
+(`adapters.randomization` varies such a row as a whole)."""
 
 
 class Edit(NamedTuple):
@@ -218,7 +219,8 @@ def edited(
     """
     model = EditedModel(mj_model, addresses)
     if parameters.contact_stiffness is not None or parameters.contact_damping is not None:
-        # The engines read both numbers of a solref in one format: an untouched one changes too.
+        # Stiffness and damping are entries of the direct format, so a solref in the other format is
+        # first written as -k, -b.
         for pair in contact_pairs(mj_model, addresses):
             stiffness, damping = model.stiffness_and_damping("pair", pair)
             model.put("pair_solref", pair, [-float(stiffness), -float(damping)])
@@ -289,6 +291,11 @@ def _derive(model: EditedModel) -> None:
         _derive_inertia(model, body, ball_of_body.get(body), body in resized)
     if edited_masses:
         _derive_subtree_masses(model)
+    for dof in model.addresses.arm_qvel:
+        body = int(model.mj_model.dof_bodyid[dof])
+        is_edited = body in edited_masses or dof in model.rows("dof_armature")
+        if is_edited and model.mj_model.dof_simplenum[dof]:
+            _derive_simple_inertia(model, dof)
 
 
 def _derive_inertia(
@@ -321,7 +328,17 @@ def _derive_inertia(
         turning = inverse_inertia * mj_model.body_inertia[body, 0].item() / inertia[0]
         model.follow("body_invweight0", body, [moving, turning])
         # MuJoCo stores the constant inertia matrix of a free body in the model.
-        model.follow("dof_M0", np.array(ball.qvel), (mass,) * 3 + inertia)
+        model.follow("dof_M0", np.array(ball.qvel), (mass, mass, mass, *inertia))
+
+
+def _derive_simple_inertia(model: EditedModel, dof: int) -> None:
+    """Sets the inertia of a joint that moves one body alone, such as a slide that carries the
+    paddle: MuJoCo stores the constant diagonal of its inertia matrix in the model."""
+    mj_model = model.mj_model
+    body = int(mj_model.dof_bodyid[dof])
+    factor = mul(model["body_mass", body], 1.0 / mj_model.body_mass[body].item())
+    of_body = (mj_model.dof_M0[dof] - mj_model.dof_armature[dof]).item()
+    model.follow("dof_M0", dof, [add(mul(factor, of_body), model["dof_armature", dof])])
 
 
 def _derive_subtree_masses(model: EditedModel) -> None:

@@ -112,8 +112,8 @@ def environment_model(constants: MjxModel, parameters: PhysicsParameters) -> mjx
     """
     mj_model = constants.mj_model
     numbers = scalars_of(parameters, jnp.result_type(float))
-    edited_model = edited(mj_model, constants.addresses, numbers)
-    if edited_model.rows("dof_frictionloss"):
+    model_edits = edited(mj_model, constants.addresses, numbers)
+    if model_edits.rows("dof_frictionloss"):
         # After one step from 2 of 24 states with a slow arm, MJX differed from C by up to
         # 0.02 rad/s, whatever the solver's tolerance.
         raise UserError(
@@ -121,15 +121,15 @@ def environment_model(constants: MjxModel, parameters: PhysicsParameters) -> mjx
             "(frictionloss); use --physics fused"
         )
     # MJX transforms every geom, even one flagged as sharing its body's frame.
-    names = edited_model.fields - {"geom_sameframe", "pair_dim"}
-    fields = {name: edited_model.array(name) for name in names}
+    names = model_edits.fields - {"geom_sameframe", "pair_dim"}
+    fields = {name: model_edits.array(name) for name in names}
     if "pair_friction" in fields:
         fields["pair_friction"] = jnp.maximum(fields["pair_friction"], MIN_FRICTION)
     model = constants.model
-    if "pair_dim" in edited_model.fields:
+    if "pair_dim" in model_edits.fields:
         # MJX cannot change the dimension of a contact pair in a model that it has.
         frictional = copy.copy(mj_model)
-        frictional.pair_dim[:] = edited_model.array("pair_dim")
+        frictional.pair_dim[:] = model_edits.array("pair_dim")
         with jax.ensure_compile_time_eval():
             model = mjx.put_model(frictional)
     return model.tree_replace(fields)

@@ -10,7 +10,7 @@ The rule for its users, stated here alone (a test looks for operations that it w
   use them: a sum with 0 and a product with 0, 1 or -1 fold.
 - `+`, `-` and `*` compute the same, but fold nothing: they stand where an operand is surely an
   array, or where both are surely constants.
-- `/` stands anywhere: two constants give a constant, and there is nothing else to fold.
+- `/` stands anywhere: two constants give a constant; a numerator 0 or a divisor 1 does not fold.
 - A constant is a float, never an int: 0.0, not 0.
 """
 

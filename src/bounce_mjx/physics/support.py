@@ -18,24 +18,25 @@ Feature = tuple[str, bool]
 """The name of a feature that an engine lacks, and whether a model has it."""
 
 _INTEGRATORS = {"fused": ("implicitfast", "Euler"), "mjx": ("Euler", "RK4", "implicitfast")}
-# Flags of the MJCF that `fused.model.read_model` obeys, or without effect on the supported models.
-_HARMLESS = frozenset(
-    "equality frictionloss limit spring warmstart filterparent sensor midphase eulerdamp "
-    "autoreset nativeccd island multiccd energy fwdinv invdiscrete".split()
+# Flags of the MJCF that `fused.model.read_model` obeys.
+_OBEYED = frozenset(("frictionloss", "spring", "eulerdamp"))
+# Flags without effect on the supported models.
+_WITHOUT_EFFECT = frozenset(
+    "equality limit warmstart filterparent sensor midphase autoreset nativeccd island multiccd "
+    "energy fwdinv invdiscrete".split()
 )
 # Fields that must be 0, for features that both engines lack.
 _BOTH_ZERO = (
     "opt.disableactuator opt.noslip_iterations nplugin jnt_stiffnesspoly dof_dampingpoly "
     "actuator_dyntype actuator_delay actuator_damping actuator_dampingpoly actuator_armature "
-    "pair_adhesion"
+    "pair_adhesion geom_surfacevel"
 )
-# Further ones, for features that one of them lacks. (The fused engine's contacts come from pairs
+# Further ones, for features that this engine lacks. (The fused engine's contacts come from pairs
 # alone, so geoms may not touch by their own types.)
 _ZERO = {
     "fused": "opt.density opt.viscosity opt.wind nflex nmocap neq ntendon jnt_limited "
     "geom_contype geom_conaffinity pair_margin pair_gap",
-    "mjx": "tendon_stiffnesspoly tendon_dampingpoly actuator_actearly geom_adhesion "
-    "geom_surfacevel",
+    "mjx": "tendon_stiffnesspoly tendon_dampingpoly actuator_actearly geom_adhesion",
 }
 
 
@@ -122,7 +123,7 @@ def _fused(m: mujoco.MjModel, addresses: Addresses) -> Iterator[Feature]:
     joints = list(addresses.arm_joints)
     paddle = addresses.paddle_geom
     balls = addresses.balls
-    lacking = ", ".join(sorted(_flags(m) - _HARMLESS))
+    lacking = ", ".join(sorted(_flags(m) - _OBEYED - _WITHOUT_EFFECT))
     yield f"the flags of the engine ({lacking})", bool(lacking)
     has_others = m.njnt != len(joints) + len(balls)
     yield "joints other than the acting ones and the ball's", has_others

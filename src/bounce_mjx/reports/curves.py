@@ -84,17 +84,18 @@ def read_curves(run: Path) -> RunCurves:
     # Those of an earlier version first, as a run may have been resumed with this one.
     for tag in sorted(log.Tags()["scalars"], key=lambda tag: tag not in _EARLIER_TAGS):
         # A resumed run may have logged a step twice; the later value belongs to the final policy.
-        values = {e.step: e.value for e in log.Scalars(tag) if math.isfinite(e.value)}
+        values = {event.step: event.value for event in log.Scalars(tag)}
         logged.setdefault(_EARLIER_TAGS.get(tag, tag), {}).update(values)
     curves = {}
     for name, values in logged.items():
-        if values:
-            steps, points = zip(*sorted(values.items()), strict=True)
+        finite = {step: value for step, value in values.items() if math.isfinite(value)}
+        if finite:
+            steps, points = zip(*sorted(finite.items()), strict=True)
             curves[name] = LoggedCurve(np.array(steps), np.array(points))
     if not curves:
         raise UserError(
-            f"{run} has no learning curves, as its training ended before its first block, or "
-            "diverged in it; start again, or give another run"
+            f"{run} has no learning curves, as its training ended before its first block or "
+            "diverged; start again, or give another run"
         )
     results = load_results(run)
     return RunCurves(run, curves, results.solved_steps if results else None)

@@ -21,12 +21,13 @@ from bounce_mjx.robot.names import joint_name
 
 ACTING_KINDS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 """Joints of one number, which a position servo can move."""
-_DELAYS = (
+_CONTROL_BOUNDS_ACTIVATION = (
     mujoco.mjtDyn.mjDYN_NONE,
     mujoco.mjtDyn.mjDYN_FILTER,
     mujoco.mjtDyn.mjDYN_FILTEREXACT,
 )
-"""Of an actuator whose activation never leaves the range of its control."""
+"""Dynamics of an actuator whose activation, if it has one, never leaves the range of its
+control."""
 _BIASES_BY_NUMBERS = (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
 """Biases that are 0 where their numbers are."""
 _KNOWN_GAINS = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_PID)
@@ -218,7 +219,9 @@ def _force_limit(model: mujoco.MjModel, joint: int, actuator: int) -> float | No
         _ForceRange(
             name="ctrlrange",
             is_limited=bool(
-                is_motor and dynamics in _DELAYS and model.actuator_ctrllimited[control]
+                is_motor
+                and dynamics in _CONTROL_BOUNDS_ACTIVATION
+                and model.actuator_ctrllimited[control]
             ),
             range=model.actuator_ctrlrange[control],
             factor=gear * gain,

@@ -1,6 +1,7 @@
 """An arm's MJCF in the task's scene, with MjSpec; `adopt.py` searches its settings.
 
-Every change by which the arm moves otherwise than in the user's file is collected (`Arm.changes`).
+Every change by which the arm moves otherwise than in the user's file is collected (`Arm.changes`),
+which `commands.adopt` prints. A gripper goes whole: what couples its own parts is not named.
 """
 
 import contextlib
@@ -299,7 +300,7 @@ class _Builder:
         """The hinges and slides of a chain of bodies, by their names.
 
         Raises:
-          UserError: it has a ball joint.
+          UserError: it has a ball joint, or an unnamed joint whose stand-in name another joint has.
         """
         model = self._model
         joints = {}
@@ -311,6 +312,11 @@ class _Builder:
             if kind == mujoco.mjtJoint.mjJNT_BALL:
                 raise UserError(
                     f"the ball joint {name} in the arm; give an arm of hinges and slides"
+                )
+            if name in joints:
+                raise UserError(
+                    f"an unnamed joint that would be called {name}, as another one is; name all "
+                    "joints of the arm"
                 )
             if kind in ACTING_KINDS:
                 joints[name] = joint
@@ -527,7 +533,7 @@ class _Builder:
         """Removes all but the arm; without its free joint, a base is fixed."""
         spec = self._spec
         model = self._model
-        # From here on, ids of the model are no places in the spec's lists any more.
+        # The model's ids are places in the spec's lists until the first deletion.
         bodies = list(spec.bodies)
         spec_joints = list(spec.joints)
         acting_names = [spec_joints[joint].name for joint in joints]
@@ -765,9 +771,12 @@ def _ends_of_tendon(model: mujoco.MjModel, tendon: int) -> list[_End]:
 def _acts_on_arm(
     model: mujoco.MjModel, ends: list[_End], joints: list[int], loose: list[int]
 ) -> bool:
-    """Whether what has these ends acts on an acting joint, or on a body of the arm that one
-    moves."""
+    """Whether what has these ends acts on an acting joint, or on a body of the arm that one moves;
+    also by its gripper, which it holds to something beside the arm."""
     moved = model.jnt_bodyid[joints].tolist()
+    moves = [is_below(model, _body_of(model, end), moved) for end in ends]
+    if any(moves) and not all(moves):
+        return True
     for end in ends:
         body = _body_of(model, end)
         if end.kind == mujoco.mjtObj.mjOBJ_JOINT:

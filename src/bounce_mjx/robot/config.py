@@ -65,7 +65,8 @@ class LimitsConfig(settings.StrictModel):
     jerk: tuple[Annotated[settings.Positive, Field(le=1e6)], ...] | None = None
     """Largest jerk of a joint's command, rad/s^3; null for none."""
     torque: tuple[Annotated[settings.Positive, Field(ge=0.01, le=1e4)], ...] | None = None
-    """Largest torque of each servo, N m; null for those of the servos."""
+    """Largest torque of each servo, N m, which narrows the MJCF's `forcerange`; null for those of
+    the servos. `randomization.torque_limit` narrows it further."""
 
     @pydantic.model_validator(mode="after")
     def _check_together(self):

@@ -220,19 +220,22 @@ def _check_balls(addresses: Addresses, num_balls: int) -> None:
 
 
 def paddle_home(
-    mjcf: Path | None, robot: RobotConfig, joint_angles: Sequence[float]
+    mjcf: Path | None,
+    robot: RobotConfig,
+    joint_angles: Sequence[float],
+    physics_dt: float,
+    num_balls: int,
 ) -> tuple[float, float, float]:
     """Centre of the paddle at joint angles [n] (rad), m, rounded to 0.1 mm as in a config;
     `read_geometry` has the exact one of a compiled model.
 
     Args:
-      mjcf, robot: as for `load_model`.
+      mjcf, robot, physics_dt, num_balls: as for `load_model`.
 
     Raises:
       UserError: as `load_model`.
     """
-    # Nothing moves, so any physics step will do.
-    mj_model = load_model(mjcf, physics_dt=0.001, visual=False, robot=robot)
+    mj_model = load_model(mjcf, physics_dt, visual=False, robot=robot, num_balls=num_balls)
     addresses = find_addresses(mj_model)
     data = data_at(mj_model, addresses, joint_angles)
     x, y, z = data.geom_xpos[addresses.paddle_geom].tolist()

@@ -1,10 +1,10 @@
 """Search of the start pose: a level paddle at a well-conditioned point in front of the robot.
 
 Inverse kinematics by damped least squares (Wampler 1986; Buss 2004) from many seeds. The best pose
-has the largest score of conditioning, distance to the joint limits and strength. The same arm
-written in degrees and in radians, whose numbers differ by rounding, has the same start pose, as
-almost equal scores are told apart by the posture. (A pose that lies exactly at a threshold may be
-in or out.)
+has, within 1%, the largest score of conditioning, distance to the joint limits and strength. The
+same arm written in degrees and in radians, whose numbers differ by rounding, has the same start
+pose, as almost equal scores are told apart by the posture. (A pose that lies exactly at a threshold
+may be in or out.)
 """
 
 import itertools

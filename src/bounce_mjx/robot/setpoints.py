@@ -1,11 +1,12 @@
 """Setpoints between two actions, within an arm's limits of velocity, acceleration and jerk.
 
-The simulation computes them with JAX's arrays (`world.actuation`), and a deployed policy with
-NumPy's (`deploy.motion`).
+The simulation computes them with JAX's arrays (`world.actuation`, and `command` within a step in
+`physics.control`), and a deployed policy with NumPy's (`deploy.motion`).
 
-**Velocity and acceleration.** An action asks for a position at the end of its control step, of the
-duration T. The command's velocity changes linearly from v0 to v1 within the step. v1 is the
-velocity that covers the distance in T, clipped to the limit of velocity, then to v0 -/+ a T.
+**Velocity and acceleration.** An action asks for a position. The command's velocity changes
+linearly from v0 to v1 within the control step, of the duration T. v1 is the distance divided by T,
+clipped to the limit of velocity, then to v0 -/+ a T. At the end of the step the command is thus
+where the action asks only if v0 = v1; from rest, it has covered half of the distance.
 
 **Range.** The command must be able to stop in the `room` between its position and the end of the
 joint's range. The step itself takes (v0 + v1) T / 2 of it; `left = room - v0 T / 2`. A stop from v1
@@ -102,6 +103,7 @@ def next_setpoint(
     least = xp.maximum(-limits.velocity, -down)
     most = xp.minimum(limits.velocity, up)
     largest_change = limits.acceleration * duration
+    # The limit of the acceleration comes last: a command that is too fast for its range brakes.
     new_velocity = xp.clip(asked, least, most)
     new_velocity = xp.clip(new_velocity, velocity - largest_change, velocity + largest_change)
     return Setpoint(

@@ -69,7 +69,7 @@ def env_in_world(trained: WorldConfig, world: Path) -> tuple[WorldConfig, NamedW
     if named.robot is not None:
         values = merged(values, _layer_of_same_robot(trained, named, path).values["env"])
     values = merged(values, named.settings)
-    return validate(type(trained), values, f"the world {path}"), named
+    return validate(type(trained), values, f"the world {shown_file(path)}", "env"), named
 
 
 def _layer_of_world(task: type[Task], world: NamedWorld, path: Path) -> Layer:
@@ -105,7 +105,7 @@ def _layer_of_robot(task: type[Task], robot: Path) -> Layer:
     # Imports JAX, which a command line alone does not need.
     from bounce_mjx.robot.model import paddle_home
 
-    home = paddle_home(env.mjcf, env.robot, env.default_joint_angles)
+    home = paddle_home(env.mjcf, env.robot, env.default_joint_angles, env.physics_dt, env.num_balls)
     return Layer(source, values | {"env": of_world | task.Config.settings_at(home)})
 
 

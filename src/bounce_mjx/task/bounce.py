@@ -305,7 +305,8 @@ class Bounce(task.Task):
         """A measured bounce starts when the ball is first measured near the paddle, or under it.
         Its position and joints are taken at the ball's lowest measured point.
 
-        `ball_picture` is the measured `ball_position`, by the name that exported policies have.
+        `ball_picture` is the measured `ball_position`, by the name of that input of an exported
+        policy: read as `ball_position`, it would change the input's name.
         """
         height = measured["ball_picture"][2]
         is_low = height < measured["paddle_position"][2] + self.config.bounce_max_distance

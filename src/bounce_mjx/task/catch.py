@@ -12,8 +12,8 @@ from bounce_mjx.config.settings import Coordinate, Duration, Friction
 from bounce_mjx.lazy import jax, jnp
 
 SPEEDS = (1.0, 2.0)
-"""Range of a throw's horizontal speed, m/s. `MAX_DISTANCE` lowers the upper end, for a far paddle
-also below the lower one."""
+"""Range of a throw's horizontal speed, m/s; `MAX_DISTANCE` lowers its upper end and, for a paddle
+farther than about 1.3 m from the base, both."""
 FLIGHT_SECONDS = (0.6, 0.7)
 """Range of the time until a thrown ball is at its aim, s."""
 MAX_DISTANCE = 2.0
@@ -98,7 +98,8 @@ class CatchState(NamedTuple):
     """What the task keeps of an episode."""
 
     fall: jax.Array
-    """Vertical velocity of the ball after the last step [], m/s."""
+    """Vertical velocity of the ball after the last step [], m/s (of the reward, `fall` is another
+    speed)."""
     offset: jax.Array
     """From the paddle's centre to the ball after the last step [3], m."""
     contact: jax.Array
@@ -133,7 +134,9 @@ class Catch(task.Task):
 
         slowest, fastest = SPEEDS
         speed_from_limit = (MAX_DISTANCE - task.length(home[:2] + aim_offset[:2])) / seconds
-        speed = slowest + (jnp.minimum(fastest, speed_from_limit) - slowest) * draws[3]
+        greatest = jnp.minimum(fastest, speed_from_limit)
+        least = jnp.minimum(slowest, greatest)
+        speed = least + (greatest - least) * draws[3]
 
         away_from_base = jnp.arctan2(home[1], home[0])
         outward = away_from_base + MAX_DIRECTION * (2.0 * draws[4] - 1.0)

@@ -73,7 +73,7 @@ def share_of_episodes(name: str, measured: str, met: np.ndarray, least: float) -
       name: of the result.
       measured: description of the measured quantity.
       met: whether each episode meets the condition [E], bool.
-      least: least share.
+      least: least share; 1 leaves no room for a margin, and training to it does not stop early.
     """
     share = float(met.mean())
     return Result(

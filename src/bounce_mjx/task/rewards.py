@@ -4,8 +4,9 @@
 `reward/<name>`, the log and the report follow. The tasks of the package make them from settings: a
 group, the config's `reward`, in which each field whose type is a subclass of `RewardTerm` is a term
 (`weighted_terms`). Then the config and the flags follow as well. To add a term, extend the group by
-a field, the task's `Config` by that group, and the task by that `Config`; if the task gives each
-term its own inputs, or the term needs others, extend its `step` too.
+a field, the task's `Config` by that group, and the task by that `Config`. That is enough in
+`bounce`, whose terms share their inputs. The other tasks give each term its own, and know their own
+terms alone: keep their group, and extend `step` by a term that it adds to the result's `reward`.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ class Near(RewardTerm):
     """Length at half the weight, in the unit of the error."""
 
     def value(self, error: jax.Array) -> jax.Array:
-        """The unweighted term [] for an error [] or [...]."""
+        """The unweighted term [] for an error of any shape."""
         return 1.0 / (1.0 + jnp.sum(jnp.square(error)) / self.scale**2)
 
 
@@ -61,7 +62,7 @@ class Gaussian(RewardTerm):
 
 
 class Proportional(RewardTerm):
-    """A term proportional to a number."""
+    """A term proportional to a number; a negative weight makes it a penalty."""
 
     def value(self, number: jax.Array) -> jax.Array:
         """The number [] itself."""
@@ -98,8 +99,8 @@ def weighted_terms(
     """Each term [] times its weight; their sum is the reward.
 
     Args:
-      inputs: what the formula of every term takes that is not in `term_inputs`. It may be left out:
-        if all terms are in these, or if none is, and each formula takes None.
+      inputs: what the formula of every term takes that is not in `term_inputs`. Leave it out where
+        `term_inputs` has every term, or where no formula needs any.
       term_inputs: by a term's name, what its formula takes instead.
 
     Raises:

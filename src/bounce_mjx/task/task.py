@@ -137,7 +137,7 @@ class Curve(NamedTuple):
     title: str = ""
     """Title in the report; "" leaves it out there."""
     scale: float = 1.0
-    """Factor from the metric's unit to the title's."""
+    """Factor from the metric's unit to the title's, in the report alone."""
 
 
 class Histogram(NamedTuple):
@@ -168,7 +168,9 @@ class Task:
     """
 
     Config: ClassVar[type[WorldConfig]]
-    """The settings of an environment with this task: those of the world, and the task's own."""
+    """The settings of an environment with this task: those of the world, and the task's own. It
+    overrides `commands`, `heights`, `ball_bounds` and `settings_at` of the world where the task
+    needs others; a field of its `observation` with a `Quantity` is a quantity of the task."""
     folder: ClassVar[str] = ""
     """Name of the folder of its runs in runs/; by default, the class's name in lower case."""
     curves: ClassVar[tuple[Curve, ...]] = ()
@@ -237,7 +239,8 @@ class Task:
         raise NotImplementedError
 
     def step(self, state: TaskState, step: Step) -> TaskStep:
-        """The task's part of a control step: events, reward, end and metrics.
+        """The task's part of a control step: events, reward, end and metrics. The new state has
+        the structure, shapes and types of that of `reset`.
 
         Args:
           state: the task's state before the step.
@@ -254,8 +257,9 @@ class Task:
         return command
 
     def next_command(self, state: TaskState, command: Values) -> Values:
-        """The commands from now on, for a task whose commands move within an episode. It is called
-        once at a reset and once after every step, where that is a redraw after `first_command`.
+        """The commands of the coming step, for a task whose commands move within an episode: those
+        at its end, at which it is judged. It is called at a reset and after every step; at a reset
+        and at a redraw, on the result of `first_command`.
 
         Args:
           state: the task's state after the step or the reset.
@@ -268,7 +272,8 @@ class Task:
         each quantity of the observation that is the task's own.
 
         Args:
-          measured: value [size] of each quantity of the world and of each command.
+          measured: value [size] of each quantity of the world and of each command; of several
+            balls [B, size].
         """
         return (), {}
 
@@ -281,7 +286,7 @@ class Task:
         Args:
           memory: what it remembered before.
           histories: [H, size] of its own quantities that the policy sees, the newest first.
-          measured: value [size] of each quantity of the world and of each command.
+          measured: as in `first_quantities`.
         """
         return memory, histories
 

@@ -236,8 +236,9 @@ class Track(task.Task):
     def next_quantities(
         self, memory: Any, histories: task.Values, measured: task.Values
     ) -> tuple[Any, task.Values]:
-        """It remembers the point [2] (m) and its velocity [2] (m/s), of a jump too: the velocity
-        after it is a new one, and no acceleration.
+        """It remembers the point [2] (m) and its velocity [2] (m/s). The velocity of a jump is
+        remembered as it is, so that the change after it is too large for an acceleration, and is
+        dropped.
 
         A velocity is unknown in the step of a jump, an acceleration in the next one too; either
         counts as 0 then.

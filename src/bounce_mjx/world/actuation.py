@@ -55,13 +55,14 @@ class Actuators:
         self._gears = mj_model.actuator_gear[list(self._addresses.actuators), 0]
 
     def first(self, qpos: jax.Array) -> Actuation:
-        """Memory at a reset, with the servos at rest at qpos [nq]."""
+        """Memory at a reset, with the servos at rest at qpos [nq]: the controls before the first
+        action are without `servo_offset`."""
         zeros = jnp.zeros(self._config.num_joints, qpos.dtype)
         targets = self._joint_targets(self._joint_angles(qpos), zeros, None)
         setpoint = None
         if self._config.action.base == "target":
             setpoint = Setpoint(targets, zeros, zeros)
-        # A step at rest: the memory has the fields of that after any step.
+        # Taken as a step at rest, so that its pytree has the structure of a later one's.
         after = self._next_setpoint(setpoint, targets)
         control = self._control(targets, setpoint, after)
         memory = start_actuation(self._config.randomization, self._config.control_dt, control)
@@ -82,7 +83,7 @@ class Actuators:
           qpos: true positions before the step [nq].
           action: clipped [n].
           world: the values that the episode sampled.
-          clock: before the step; None for a world that is not randomised.
+          clock: before the step; None for a world that is not randomised and has no sensing.
         """
         angles = self._joint_angles(qpos)
         if "joint_angle_noise" in world:
@@ -116,8 +117,8 @@ class Actuators:
           angles: measured [n], rad, without the offset of the encoders' zeros, which the servo
             shares.
           action: clipped [n].
-          setpoint: the last setpoint, to which the action adds, within `max_lead` of the measured
-            angles; None if it adds to these.
+          setpoint: the last setpoint, to which the action adds after it is clipped to `max_lead`
+            of the measured angles; None if the action adds to these.
         """
         base = angles
         if setpoint is not None:
@@ -198,6 +199,7 @@ def start_actuation(config: RandomizationConfig, control_dt: float, control: Con
     """
     queue = None
     if config.action_latency is not None:
+        # If the floor rounds a whole number of steps down, the entry that is missing is not used.
         length = math.floor(config.action_latency[1] / control_dt) + 2
         queue = jax.tree.map(
             lambda value: jnp.broadcast_to(value, (length, *value.shape)), _varying(control)

@@ -15,7 +15,8 @@ from bounce_mjx.world.observation import ObservationConfig, ObservationLayout
 from bounce_mjx.world.randomization import EACH_JOINT, TERMS, RandomizationConfig
 
 PADDLE_HOME = (0.59356, 0.0, 0.0498)
-"""Centre of the paddle of the project's own arm at a reset, m: the home in the tasks' settings."""
+"""Centre of the paddle of the project's own arm at a reset, m, from which the tasks' defaults
+follow."""
 
 
 NumBalls = Annotated[int, pydantic.BeforeValidator(settings.whole_number), Field(ge=1, le=3)]
@@ -74,8 +75,8 @@ class ActionConfig(settings.StrictModel):
     """What an action adds to."""
 
     base: Literal["measured", "target"] = "measured"
-    """measured: the measured joint angle. target: the last servo target, with which a joint reaches
-    its full speed despite latency."""
+    """measured: the measured joint angle. target: the last target, before latency and lag, with
+    which a joint reaches its full speed despite these."""
     max_lead: Annotated[settings.Positive, Field(le=3.0)] = 0.15
     """Largest distance of the last target from the measured angle, rad; for the base target."""
 
@@ -99,8 +100,8 @@ class RobotSettings(settings.StrictModel):
     robot: RobotConfig = RobotConfig()
     """Adoption of an arm."""
     physics_dt: Annotated[settings.Positive, Field(ge=1e-5, le=0.1)] = 0.001
-    """Physics time step, s; at most an eighth of a period of the contact, which is 2.5 ms for the
-    project's own robot."""
+    """Physics time step, s; at most an eighth of a period of the contact, an eighth that is 2.5 ms
+    for the project's own robot."""
     control_dt: Annotated[settings.Positive, Field(ge=1e-5, le=0.1)] = 0.01
     """Time between two actions, s; a whole number of physics steps."""
     friction: settings.Friction | None = None
@@ -193,7 +194,7 @@ class WorldConfig(RobotSettings):
         """The arm's limits fit the action and the control step."""
         limits = self.robot.limits
         if limits.velocity is not None and self.action.base == "measured":
-            # A command that follows the measured angle, which follows the command, oscillates.
+            # A setpoint that follows the measured angle, which follows the setpoint, oscillates.
             raise ValueError(
                 "robot.limits are of commands that move, to which an action adds, but action.base "
                 "is measured; set action.base to target"

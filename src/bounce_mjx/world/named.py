@@ -18,31 +18,37 @@ CURRICULUM = RandomizationConfig.model_fields.keys() - TERMS.keys()
 """Keys of the randomisation that describe the training, not the world. A world's file may have
 them, for a training in it; they need no source, as they are no numbers of the robot."""
 
+_LESS_IS_HARDER = {
+    "max_joint_velocity",
+    "robot.servo_force_limit",
+    "robot.gravity_compensation",
+}
+
 
 class NamedWorld(StrictModel):
     """The content of a world's file."""
 
     robot: str | None = None
     """Name of a robot in configs/robots/, or its file, relative to the world's folder; null for any
-    robot. (`env.robot` has settings of an arm's adoption.)"""
+    robot. (`env.robot` has settings of an arm: its adoption, its limits.)"""
     env: RobotSettings = RobotSettings()
     """Settings of the environment (`runs.worlds` puts them in place of the config's). A term of the
     randomisation that it does not have is as in the task's defaults."""
     sources: dict[str, str] = {}
-    """Where each number comes from, one sentence, by its dotted key in `env` or that of a group."""
+    """Where each setting comes from, a sentence, by its dotted key in `env` or that of a group."""
     assumed: tuple[str, ...] = ()
     """Keys whose numbers nobody has measured; their source is the reason for the number."""
 
     @pydantic.model_validator(mode="after")
     def _check_sources(self):
         """Each setting has a source, itself or with its group; no source is of another setting."""
-        numbers = flat(self.settings)
+        given = flat(self.settings)
         groups = set()
-        for key in numbers:
+        for key in given:
             *parents, _ = key.split(".")
             groups |= {".".join(parents[:depth]) for depth in range(1, len(parents) + 1)}
         for key, source in self.sources.items():
-            if key not in numbers and key not in groups:
+            if key not in given and key not in groups:
                 raise ValueError(
                     f"sources has {shorten(key)}, but env has no such key; give env that key, or "
                     "remove the source"
@@ -50,14 +56,14 @@ class NamedWorld(StrictModel):
             if not source.strip():
                 raise ValueError(f"{key} has an empty source; write one sentence")
         for key in self.assumed:
-            if key not in numbers:
+            if key not in given:
                 raise ValueError(
                     f"assumed has {shorten(key)}, but env has no such key; give env that key, or "
                     "remove it"
                 )
-            if not _can_be_doubled(key, numbers[key]):
+            if not _can_be_doubled(key, given[key]):
                 raise ValueError(f"{key} is assumed, but is no number to double; remove it")
-        for key in numbers:
+        for key in given:
             if key.startswith("randomization.") and key.split(".")[1] in CURRICULUM:
                 continue
             if not any(key == source or key.startswith(f"{source}.") for source in self.sources):
@@ -78,8 +84,9 @@ class NamedWorld(StrictModel):
 
         A term of the randomisation goes twice as far from its nominal value, within its bounds. A
         number of which less is harder is halved instead: a term without a nominal value
-        (`torque_limit`, `camera_rate`, the intervals), `max_joint_velocity`, and the limits of the
-        robot.
+        (`torque_limit`, `camera_rate`, the intervals), `max_joint_velocity`, and the robot's
+        `limits`, `servo_force_limit` and `gravity_compensation`. Whoever builds a config with
+        these settings refuses a number beyond the bounds of a setting that is no term.
 
         Args:
           nominals: the values of all terms without randomisation (`env.env.model_nominals`).
@@ -138,7 +145,7 @@ def _factor(key: str, nominals: Mapping[str, Any]) -> float:
     if group == "randomization":
         is_less_harder = name not in nominals
     else:
-        is_less_harder = group == "robot.limits" or key == "max_joint_velocity"
+        is_less_harder = group == "robot.limits" or key in _LESS_IS_HARDER
     return 0.5 if is_less_harder else 2.0
 
 

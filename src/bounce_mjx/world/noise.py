@@ -1,4 +1,4 @@
-"""Time and random numbers of an episode in a randomised world.
+"""Time and random numbers of an episode in a randomised world, or with sensing.
 
 An environment's `step` takes no key. A few integer operations on a counter in its state give
 numbers that are random enough for the noise of sensors.

@@ -71,8 +71,8 @@ NOMINALS: dict[Operation, float | Literal["model"] | None] = {
     "limit": None,
 }
 """The sampled value that changes nothing, by the operation; None where no number does that, as the
-model may have no limit. (A nominal friction makes a frictionless contact one with the least that
-MuJoCo computes with, 1e-5.)"""
+model may have no limit. (Exception: `contact_friction` turns a frictionless contact into one of the
+friction 1e-5, the least of MuJoCo's, even at its nominal 0.)"""
 
 NUMBER = ()
 """Size of a term with one number."""
@@ -91,7 +91,7 @@ class Term(NamedTuple):
     """Value without randomisation, from which the range grows during the warm-up; `MODEL` for the
     model's own. A term without one is sampled in every episode, and its range does not grow."""
     parameter: str | None = None
-    """The field of `PhysicsParameters` that it changes."""
+    """The field of `PhysicsParameters` that it changes; no two terms share one."""
     operation: Operation | None = None
     """How it changes that parameter."""
 

@@ -36,7 +36,8 @@ _TERMS = _PADDLE_TERMS | {
 }
 """Terms that make measurements differ from the truth; those of a new sensor go here too."""
 
-# Older than any picture of an episode, s; its negative is below any picture's number.
+# Older than any picture of an episode, s. Its negative, as a number of pictures, is below that of
+# any.
 _LONG_AGO = 1e6
 
 
@@ -62,7 +63,8 @@ class Sensing(NamedTuple):
     [K, B, 6] with several balls."""
     picture: Picture
     histories: dict[str, jax.Array]
-    """Last values of each observed quantity [H, size], the newest first."""
+    """Last values of each observed quantity [H, size], the newest first; of several balls
+    [H, B, size]."""
     task: Any
     """What the task remembers of the measurements (`Task.next_quantities`); what it keeps of the
     true states is `EnvState.task`."""
@@ -123,7 +125,7 @@ class Sensors:
         self._arm_qpos = addresses.arm_qpos
         terms = set(config.randomization.terms)
         self.are_needed = bool(_TERMS & terms) or not config.observation.is_momentary
-        """Whether the observation differs from the true state of a single instant."""
+        """Whether the observation may differ from the true state of a single instant."""
         sees_paddle = config.observation.paddle_position or config.observation.counts("task")
         self._misjudges_paddle = bool(sees_paddle and _PADDLE_TERMS & terms)
 
@@ -209,9 +211,9 @@ class Sensors:
         return Sensing(balls, picture, histories | next_of_task, task)
 
     def _measure(self, now: Instant, picture: Picture) -> dict[str, jax.Array]:
-        """The measured value [size] of each quantity of the world and of each command. The ball's
-        quaternion and spin are the present truth, and so is the paddle's position if the joint
-        angles have no errors."""
+        """The measured value [size] of each quantity of the world and of each command; of each ball
+        [B, size] if there are several. The ball's quaternion and spin are the present truth, and so
+        is the paddle's position unless a term of `_PADDLE_TERMS` acts and somebody sees it."""
         world = now.world
         angles, velocities = measured_joints(world, now.clock.counter, now.truth)
         measured = now.truth._asdict()

@@ -113,6 +113,7 @@ def fwd_constraint(
         force = pyramid_force(model.contacts[0], matrix, offsets, regularisers[0])
         return tuple(jnp.where(is_touching[0], component, 0.0) for component in force)
 
+    # Without dry friction these are the contacts' forces alone.
     forces, dry_friction = joint_friction.contact_and_dry_friction(
         links=model.links,
         mass_factor=mass_factor,

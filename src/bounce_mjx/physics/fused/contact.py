@@ -24,9 +24,9 @@ class ContactModel:
     balls: tuple[int, ...]
     """The ball that touches the paddle, or the two balls that touch."""
     stiffness: Scalar
-    """k of the reference acceleration, 1/s^2."""
+    """k of the reference acceleration, with the dmax of `solimp`, 1/s^2."""
     damping: Scalar
-    """b of the reference acceleration, 1/s."""
+    """b of the reference acceleration, with the dmax of `solimp`, 1/s."""
     solimp: tuple[float, float, float, float, float | int]
     """dmin, dmax, width (m), midpoint, power of the impedance; the power is an int where it is
     whole, as a product costs less than a power."""

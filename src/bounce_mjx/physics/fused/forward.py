@@ -223,6 +223,7 @@ def integrate(
     for i, link in enumerate(model.links):
         damping = link.damping if model.implicit_damping else 0.0
         if model.implicit_servos:
+            # The derivative of a servo's force is minus its damping.
             damping = sub(damping, actuation.derivative[i])
         implicit_matrix[i][i] = add(implicit_matrix[i][i], mul(damping, model.dt))
     implicit_factor = keep(chain.cholesky(implicit_matrix))

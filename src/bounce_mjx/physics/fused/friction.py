@@ -3,12 +3,14 @@
 The force of a contact, f_n along the normal and f_1, f_2 along the tangents, stays in the pyramid
 |f_1| / mu_1 + |f_2| / mu_2 <= f_n. In units of the cone, x = (f_n, f_1 / mu_1, f_2 / mu_2), these
 are the sums a_1 e_1 + ... + a_4 e_4 of the edges e = (1, +-1, 0), (1, 0, +-1) with coefficients
-a >= 0. In these units, here and in all functions below, the forces x of all contacts minimise
+a >= 0. In these units, which `pyramid_force` and `coupled_forces` convert from and into N and all
+other functions here have, the forces x of all contacts minimise
 
     1/2 x.Q x + c.x + (for each contact, R / 2 times the sum of its squared coefficients)
 
-with Q = J M^-1 J^T, which couples the contacts, c = J a0 - aref, and a0 the acceleration without
-the contacts. R regularises the coefficients of a contact's edges; it is no matrix on x.
+with Q = D J M^-1 J^T D, which couples the contacts, c = D (J a0 - aref), D the diagonal matrix of
+(1, mu_1, mu_2) for each contact, and a0 the acceleration without the contacts. R regularises the
+coefficients of a contact's edges; it is no matrix on x.
 
 One contact alone has a closed form (`pyramid_force`). Of several, each has under an acceleration y
 the force x(y) that minimises x.y + R / 2 (a_1^2 + ... + a_4^2): each edge has the coefficient

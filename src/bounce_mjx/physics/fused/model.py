@@ -88,7 +88,8 @@ class BallModel:
 @dataclasses.dataclass(frozen=True)
 class FusedModel:
     """Model of the fused engine, in SI units: constants, which fold while tracing, and scalars in
-    place of those that the parameters of an environment change."""
+    place of those that the parameters of an environment change. That of `make_engine` is never
+    stepped: each program reads the model again, with its parameters."""
 
     dt: float
     """Physics step, s."""
