@@ -63,6 +63,10 @@ MISTAKES = (
     ("train --resume latst", "there is no checkpoint folder latst; did you mean latest?"),
     ("eval pretrained --robot ur5e", "give mirror"),
     ("eval --nominal --randomization.air-drag 0 1", "--nominal and --randomization", "omit one"),
+    (
+        "eval robust --randomization.first-command-range 0.5 --randomization.warmup-steps 5",
+        "--randomization is given without a term",
+    ),
     ("eval catch --target-height 0.5", "--target-height is not a command of the run's task; omit"),
     ("export robust --out a.onnx", "unknown argument --out; did you mean --onnx?"),
     ("eval robust --out=a.json", "unknown argument --out=a.json; did you mean --json?"),
