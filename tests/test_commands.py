@@ -63,6 +63,10 @@ MISTAKES = (
     ("train --resume latst", "there is no checkpoint folder latst; did you mean latest?"),
     ("eval pretrained --robot ur5e", "give mirror"),
     ("eval --nominal --randomization.air-drag 0 1", "--nominal and --randomization", "omit one"),
+    (
+        "eval robust --randomization.first-command-range 0.5 --randomization.warmup-steps 5",
+        "--randomization is given without a term",
+    ),
     ("eval catch --target-height 0.5", "--target-height is not a command of the run's task; omit"),
     ("export robust --out a.onnx", "unknown argument --out; did you mean --onnx?"),
     ("eval robust --out=a.json", "unknown argument --out=a.json; did you mean --json?"),
@@ -254,14 +258,16 @@ def test_run_holds_both_checkpoints_and_the_results(trained: Path) -> None:
 
 
 def test_eval_reports_five_results(trained: Path, tmp_path: Path, capsys) -> None:
-    """At a fixed target."""
+    """At a fixed target, in a world that the file names."""
     file = tmp_path / "a.json"
     line = f"{trained} --episodes 4 --target-height 0.8 --seed 5 --json {file}"
+    line += " --randomization.ball-mass 0.9 1.1"
     with pytest.raises(SystemExit) as exit_info:
         eval_command.main(line.split())
     assert exit_info.value.code == 1
     report = json.loads(file.read_text(), parse_constant=pytest.fail)
     assert report["commands"] == {"target_height": 0.8}
+    assert report["world"] is None and report["randomization"] == {"ball_mass": [0.9, 1.1]}
     (unjudged,) = (result for result in report["results"] if result["passed"] is None)
     assert unjudged["name"] == "upward speed"
     assert tuple(result["name"] for result in report["results"]) == RESULT_NAMES

@@ -39,8 +39,8 @@ class EvalCommand(WhichPolicy):
     seed: NonNegativeInt = evaluation.DEFAULT_SEED
     """Seed of the resets."""
     nominal: bool = False
-    """Evaluate without domain randomisation, with the task's default commands; else each episode
-    samples its world and commands, as in training."""
+    """Evaluate without domain randomisation, with the task's default commands where the policy was
+    trained with them; else each episode samples its world and commands, as in training."""
     contacts: bool = False
     """Also count contacts of the arm with itself and the floor, which the physics leaves out, in
     the first 32 episodes."""
@@ -50,7 +50,7 @@ class EvalCommand(WhichPolicy):
     failures: bool = False
     """Also list the failed episodes with their worlds, and the terms of the world that go with
     failure, with a picture, failures.png, in the run's folder or, for a policy that comes with the
-    package, here."""
+    package and for the mirror law, here."""
     physics: evaluation.Physics = "config"
     """Physics engine: mujoco is MuJoCo's C engine; config is the engine used in training."""
     json_file: Annotated[Path | None, Flag(name="json", instead_of="--out")] = None
@@ -58,7 +58,7 @@ class EvalCommand(WhichPolicy):
 
 
 def main(args: Sequence[str]) -> None:
-    """Runs the command line; exits with 0 if all results pass, 1 if one fails, 2 on a mistake."""
+    """Runs the command line; exits with 0 if no result fails, 1 if one does, 2 on a mistake."""
     command, given_commands = parse_with_commands(EvalCommand, args, prog="bounce-mjx eval")
     from bounce_mjx.evaluation.contacts import arm_contacts, describe_contacts
     from bounce_mjx.evaluation.failures import associations, failures_of
@@ -75,13 +75,13 @@ def main(args: Sequence[str]) -> None:
 
     check_output(command.json_file, "--json")
     console = stdout()
-    checkpoint = command.choose(command.checkpoint, command.robot)
     check_one_world(command.nominal, command.world, command.randomization)
+    checkpoint = command.choose(command.checkpoint, command.robot)
     config = command.config_of(checkpoint, command.robot, command.world)
     config = in_what_if_world(config, command.randomization)
     if command.limits and config.env.robot.limits.velocity is None:
         raise UserError("the policy's arm has no command limits (env.robot.limits); omit --limits")
-    commands = given_commands.checked(config.env)
+    task_commands = given_commands.checked(config.env)
     set_up_jax(evaluation.on_engine(config.env, command.physics))
     checkpoint, policy, actor = read_actor(checkpoint, config)
     # Beside what is no run, nothing is written.
@@ -94,7 +94,7 @@ def main(args: Sequence[str]) -> None:
         seed=command.seed,
         physics=command.physics,
         nominal=command.nominal,
-        commands=commands,
+        commands=task_commands,
     )
     checks = []
     if command.contacts:
@@ -116,9 +116,26 @@ def main(args: Sequence[str]) -> None:
         entries = measure(config.env, report.recording)
         print(describe(entries, report.recording.running.shape[-1]))
         findings[name] = [entry._asdict() for entry in entries]
+    failures = []
     if command.failures:
         failures = failures_of(evaluated.setup, evaluated.statistics)
         findings["failures"] = [failure._asdict() for failure in failures]
+    if command.json_file is not None:
+        content = {
+            "checkpoint": str(checkpoint.folder),
+            "physics": evaluated.engine,
+            **report.to_dict(),
+            "seed": command.seed,
+            "commands": task_commands,
+            "nominal": command.nominal,
+            "world": None if command.world is None else str(command.world),
+            "randomization": {
+                name: getattr(command.randomization, name) for name in command.randomization.terms
+            },
+            **findings,
+        }
+        write_output(command.json_file, to_json(content))
+    if command.failures:
         terms = associations(evaluated.statistics, failures)
         if failures:
             console.print(failures_table(failures, terms, command.episodes))
@@ -133,15 +150,4 @@ def main(args: Sequence[str]) -> None:
             first_to_end = min(failures, key=lambda failure: failure.seconds)
             shown = film_command(args, _NOT_OF_PLAY, "--episode", str(first_to_end.episode))
             print(f"film of one: {shown}")
-    if command.json_file is not None:
-        content = {
-            "checkpoint": str(checkpoint.folder),
-            "physics": evaluated.engine,
-            **report.to_dict(),
-            "seed": command.seed,
-            "commands": commands,
-            "nominal": command.nominal,
-            **findings,
-        }
-        write_output(command.json_file, to_json(content))
     sys.exit(0 if report.passed else 1)

@@ -109,5 +109,5 @@ def main(args: Sequence[str]) -> None:
     if lost and not command.assumed and command.physics == "config":
         worst = min(lost, key=lambda outcome: outcome.lasted)
         film = "--condition", worst.label, "--episode", str(worst.lost[0])
-        print(f"film of a lost ball: {film_command(args, _NOT_OF_PLAY, *film)}")
+        print(f"film of one that ended: {film_command(args, _NOT_OF_PLAY, *film)}")
     sys.exit(0 if report.passed else 1)

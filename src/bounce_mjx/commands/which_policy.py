@@ -79,9 +79,14 @@ def in_what_if_world(config: TrainConfig, randomization: RandomizationConfig) ->
     """A config with the terms of the world that a user gives, if any, in place of its own.
 
     Raises:
-      UserError: a term does not fit the arm.
+      UserError: a term does not fit the arm, or what is given has no term to act on.
     """
     if not randomization.terms:
+        if randomization != RandomizationConfig():
+            raise UserError(
+                "--randomization is given without a term of the world, such as "
+                "--randomization.air-drag 0 0.2; give one, or omit it"
+            )
         return config
     given = dict(config.env) | {"randomization": randomization}
     env = validate(type(config.env), given, "the flags --randomization")

@@ -24,7 +24,8 @@ _NUM_THREADS = os.cpu_count() or 1
 
 
 def make_mujoco_evaluator(env: Env, actor: Actor, episodes: int, recorded: int = 0) -> Evaluator:
-    """Like `episodes.make_evaluator`, with `mj_step` (float64) in place of the env's engine.
+    """Like `episodes.make_evaluator`, with `mj_step` (float64) in place of the env's engine, and
+    without the copies that fill up a block: the last bits of an episode may depend on their number.
 
     Each episode is simulated in the world that its reset drew.
     """

@@ -16,7 +16,10 @@ Physics = Literal["config", "fused", "mjx", "mujoco"]
 
 
 def on_engine(env: WorldConfig, physics: Physics) -> WorldConfig:
-    """The settings of an environment with an evaluation's choice of the engine."""
+    """The settings of an environment with an evaluation's choice of the engine.
+
+    With "mujoco" they stay as they are: MuJoCo's C engine replaces only the steps of theirs.
+    """
     return env.model_copy(update={"physics": physics}) if physics in ("fused", "mjx") else env
 
 

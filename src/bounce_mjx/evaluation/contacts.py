@@ -83,9 +83,11 @@ class ContactChecker:
         model.geom_contype[:] = model.geom_conaffinity[:] = 0
         model.geom_contype[arm] = model.geom_conaffinity[arm] = 1
         model.geom_conaffinity[planes] = 1
+        # MuJoCo's broad phase has masks of the bodies.
         model.body_contype[:] = model.body_conaffinity[:] = 1
         # MuJoCo adds the margins of the two geoms.
         model.geom_margin[arm + planes] = 0.5 * margin
+        # Nor shall the MJCF's own pairs, such as the balls and the paddle, touch.
         model.pair_margin[:] = -1.0
 
     def _is_shape(self, geom: int) -> bool:

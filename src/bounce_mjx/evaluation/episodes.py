@@ -15,12 +15,12 @@ from bounce_mjx.task.task import Recording
 from bounce_mjx.world.randomization import Ranges
 
 BLOCK = 64
-"""Batches of episodes are multiples of it: on a CPU, whose vector instructions then have no
-remainder, an episode is the same bit for bit in any of them."""
+"""Evaluations are filled up to a multiple of it, and a film on a CPU is one block: the CPU's vector
+instructions then have no remainder, and an episode is the same bit for bit in any of them."""
 
 Evaluator = Callable[..., Measured]
-"""Measures E deterministic episodes: (policy, key, optional ranges as for `reset_episodes`) ->
-`Measured`. A filmer measures one."""
+"""Measures E episodes without action noise: (policy, key, optional ranges as for `reset_episodes`)
+-> `Measured`. A filmer measures one."""
 
 
 class Batch(NamedTuple):
@@ -92,8 +92,8 @@ def _lanes(env: Env, episodes: int) -> np.ndarray:
 
 
 def run_episodes(env: Env, actor: Actor, policy: Policy, states: State, recorded: int) -> Measured:
-    """Runs one deterministic episode from each of E initial states (batch last), until all have
-    ended or their time limit is reached, and records the first `recorded`."""
+    """Runs one episode without action noise from each of E initial states (batch last), until all
+    have ended or their time limit is reached, and records the first `recorded`."""
     first = begin(env, states, recorded)
     last = run_until(env, actor, policy, first, env.config.episode_steps)
     return last.statistics, last.recording

@@ -18,6 +18,7 @@ from bounce_mjx.task.task import Recording
 
 # Quantile of the normal distribution for 95% intervals.
 _Z = 1.959964
+# Of each of `ENDS`.
 _CAUSES = {"too_fast": "a joint too fast", "non_finite": "the physics"}
 
 

@@ -1,4 +1,5 @@
-"""Commands of recorded episodes at the rate of an arm's controller, against the arm's limits."""
+"""Joint commands of recorded episodes at the rate of an arm's controller, against the arm's
+limits."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -46,7 +47,8 @@ def limit_shares(config: WorldConfig, recording: Recording, rate: float = 1000) 
     times = tick * np.arange(1, count + 1)
     still = np.zeros(velocities.shape[1:])
     start = Setpoint(still, still, still)
-    # A difference of order k needs k commands before the first one of a step.
+    # A difference of order k needs k commands before the first one of a step; before an episode the
+    # arm was still.
     earlier = [still] * len(bounds)
     largest = {name: still for name in bounds}
     for after, is_running in zip(velocities, running, strict=True):

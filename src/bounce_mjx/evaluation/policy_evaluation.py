@@ -29,9 +29,10 @@ class EpisodeSetup(NamedTuple):
 
     env: Env
     commands: dict[str, tuple[float, float]]
-    """Ranges of commands; those left out have the config's."""
+    """Ranges of commands in the episodes that are judged; those left out have the config's."""
     ranges: Ranges | None
-    """Ranges of worlds and commands, as for `reset_episodes`; None for the config's."""
+    """Ranges of the worlds and commands of one or more conditions, each end [C, ...], as for
+    `reset_episodes`; None for the config's."""
 
 
 class InEvaluation(NamedTuple):
@@ -45,13 +46,13 @@ class InEvaluation(NamedTuple):
 
 
 class PolicyEvaluation(NamedTuple):
-    """A report, and the physics engine that it was measured on."""
+    """A report, and what it was measured with."""
 
     report: Report
     engine: str
     """fused, mjx or mujoco."""
     warning: str | None
-    """Why MuJoCo's C engine computes something else than the fused one; None if it does not, or was
+    """Why MuJoCo's C engine computes something else than the config's; None if it does not, or was
     not used."""
     setup: EpisodeSetup
     statistics: Statistics

@@ -25,8 +25,9 @@ from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import TERMS, RandomizationConfig, Ranges
 
-# Terms without a neutral value (the first two), or with a high cost in the physics: only the
-# conditions that need such a term are simulated with it.
+# Terms without a neutral value (the first two; `suite` has one for each interval), or with a high
+# cost in the physics: only the conditions that need such a term are simulated with it. Dry friction
+# also puts MuJoCo's C engine in the place of MJX.
 _SEPARATE_TERMS = frozenset(
     ("camera_rate", "torque_limit", "contact_friction", "joint_frictionloss")
 )
@@ -56,8 +57,8 @@ class ConditionOutcome(pydantic.BaseModel):
     mean_length_s: float
     """Mean length of the episodes, s."""
     lost: list[int] = []
-    """Numbers of the episodes that ended before their time limit. All conditions start from the
-    same keys, so that a number means the same reset in each."""
+    """Numbers of the episodes that ended before their time limit. A number means the same keys in
+    all conditions, and the same draws in those that share a program."""
     measured: Annotated[dict[str, str], Field(exclude=True)] = {}
     """What each result measures, with its unit; not stored."""
 
@@ -160,7 +161,8 @@ def find_episode(
     """Where `measure_conditions` simulates an episode of one of the conditions.
 
     Raises:
-      UserError: MuJoCo's C engine simulates it.
+      UserError: MuJoCo's C engine simulates the condition (`--physics mujoco`, or its program has
+        dry friction in MJX).
     """
     condition = conditions[index]
     (indices,) = [program for program in _programs(conditions) if index in program]
@@ -196,9 +198,9 @@ class _Program(NamedTuple):
 
     env: Env
     inputs: list[str]
-    """The terms and the commands whose ranges are inputs."""
+    """Names of the terms and the commands whose ranges are inputs."""
     on_c: bool
-    """Whether MuJoCo's C engine simulates it."""
+    """Whether MuJoCo's C engine simulates all of them."""
 
 
 def _program(members: Sequence[Condition], physics: Physics) -> _Program:

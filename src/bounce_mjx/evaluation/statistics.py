@@ -1,5 +1,5 @@
-"""Running figures of the episodes of an evaluation, from which the results are computed, and
-recordings of the first ones, for the figures."""
+"""Statistics of the episodes of an evaluation, from which the results are computed, and recordings
+of the first ones, for pictures and checks."""
 
 from typing import NamedTuple
 
@@ -17,10 +17,11 @@ RECORDED_EPISODES = 32
 
 
 class Statistics(NamedTuple):
-    """Figures over the steps of E episodes, each up to its end."""
+    """Numbers over the steps of E episodes, each up to its end."""
 
     running: jax.Array
-    """Whether the episode has not ended [E], bool."""
+    """Whether the episode has not ended [E], bool; of a whole evaluation, whether it lasted until
+    its time limit."""
     steps: jax.Array
     """Steps of the episode [E]."""
     episode_return: jax.Array
@@ -28,7 +29,8 @@ class Statistics(NamedTuple):
     tally: Tally
     """Sums and greatest values of what the task tallies, each [E]."""
     ended_by: dict[str, jax.Array] = {}
-    """Whether the episode ended by each of `ENDS` [E], bool; the task ends all others that end."""
+    """Whether the episode ended by each of `ENDS` [E], bool; of those that ended, the task
+    ended the others."""
     world: dict[str, jax.Array] = {}
     """World of the episode: its values of the active terms [E, ...]."""
     command: dict[str, jax.Array] = {}

@@ -236,6 +236,8 @@ def _condition(
                 command = env.commands[name]
                 label = f"{source}: {name}"
                 commands[name] = command.checked(low, label), command.checked(high, label)
+                if low > high:
+                    raise UserError(f"{label} is from {low} to {high}; exchange the two")
             else:
                 terms[name] = low, high
         # The others are off, also those that the task's own world has.
