@@ -40,11 +40,16 @@ _FIXED = (
     "camera_rate frame_drop ball_position_noise joint_velocity_noise push_speed push_interval "
     "command_interval ball_start"
 ).split()
-_CAMERA_RATE, _LOST, _BALL_NOISE = 120.0, 0.05, 0.002
-_ANGLE_NOISE, _VELOCITY_NOISE, _JITTER = 1e-3, 0.02, 3e-4
+_CAMERA_RATE = 120.0
+_LOST = 0.05
+_BALL_NOISE = 0.002
+_ANGLE_NOISE = 1e-3
+_VELOCITY_NOISE = 0.02
+_JITTER = 3e-4
 # Target heights, m, and control steps of each: bounces at several speeds tell the ball's latency
 # from the camera's height.
-_HEIGHTS, _HEIGHT_STEPS = (0.3, 0.8), 300
+_HEIGHTS = (0.3, 0.8)
+_HEIGHT_STEPS = 300
 _BACKLASH = np.deg2rad(0.1)
 _ASYMMETRY = 0.3
 
@@ -101,15 +106,20 @@ class _Robot:
         self.model = edited_model(plain, physics_parameters(hidden.world, plain))
         world = {name: np.asarray(value, float) for name, value in hidden.world.items()}
         self.data = mujoco.MjData(self.model)
-        self.addresses, self.world, self.flaw = find_addresses(self.model), world, hidden.flaw
+        self.addresses = find_addresses(self.model)
+        self.world = world
+        self.flaw = hidden.flaw
         self.random = np.random.default_rng(seed)
-        self.qpos, self.qvel = list(self.addresses.arm_qpos), list(self.addresses.arm_qvel)
+        self.qpos = list(self.addresses.arm_qpos)
+        self.qvel = list(self.addresses.arm_qvel)
         self.home = np.array(config.default_joint_angles)
         self.data.qpos[self.qpos] = self.home
         self.bias = world.get("encoder_bias", np.zeros(6))
         self.sent = [(-1.0, self.home + self.bias)]
-        self.filtered, self.play = self.home + self.bias, np.zeros(6)
-        self.due, self.pictures = self.random.uniform(0.0, 1.0 / _CAMERA_RATE), []
+        self.filtered = self.home + self.bias
+        self.play = np.zeros(6)
+        self.due = self.random.uniform(0.0, 1.0 / _CAMERA_RATE)
+        self.pictures = []
         self.hold_ball()
 
     def hold_ball(self) -> None:
@@ -138,7 +148,9 @@ class _Robot:
 
     def step(self) -> None:
         """One physics step."""
-        m, d, world = self.model, self.data, self.world
+        m = self.model
+        d = self.data
+        world = self.world
         dt = m.opt.timestep
         late = world["action_latency"]
         # The mean target of the step, as targets change within it.
@@ -158,7 +170,8 @@ class _Robot:
         if self.flaw == "asymmetric friction":
             friction = world["joint_frictionloss"] * _ASYMMETRY
             d.qfrc_applied[self.qvel] = -friction * np.tanh(np.abs(d.qvel[self.qvel]) / 0.02)
-        body, speed = self.addresses.balls[0].body, d.qvel[list(self.addresses.balls[0].qvel[:3])]
+        body = self.addresses.balls[0].body
+        speed = d.qvel[list(self.addresses.balls[0].qvel[:3])]
         force = -world.get("air_drag", 0.0) * np.linalg.norm(speed) * speed
         d.xfrc_applied[body, :3] = m.body_mass[body] * force
         before = self.ball()
@@ -181,13 +194,17 @@ def record(
 ) -> None:
     """Writes the log of a hidden robot: an excitation, then the robust policy with the ball, at
     several heights; the ball is dropped again after each loss."""
-    robot, policy = _Robot(config, hidden, seed), load_policy("robust")
+    robot = _Robot(config, hidden, seed)
+    policy = load_policy("robust")
     motion = excite(config, excited, 1.5)
     steps = round(config.control_dt / config.physics_dt)
     random = np.random.default_rng([seed, 1])
-    drop_at, playing, height = excited + 1.0, False, 0.5
+    drop_at = excited + 1.0
+    playing = False
+    height = 0.5
     with Recorder(path, policy.metadata.joint_names, {"target_height": "m"}) as recorder:
-        last, before = None, 0.0
+        last = None
+        before = 0.0
         for k in range(round((excited + played) / config.control_dt)):
             now = robot.data.time
             if k % _HEIGHT_STEPS == 0:
@@ -208,7 +225,9 @@ def record(
             last = arrived[-1] if arrived else last
             if robot.has_ball and robot.ball()[2] < 0.02:
                 robot.hold_ball()
-                playing, last, drop_at = False, None, now + 1.5
+                playing = False
+                last = None
+                drop_at = now + 1.5
             if k < len(motion.targets):
                 target = motion.targets[k]
             elif playing and last is not None:
@@ -234,7 +253,8 @@ def record(
 
 def errors(found: Identified, hidden: Hidden, model: mujoco.MjModel, home) -> dict[str, float]:
     """Absolute errors of what a log can show, by name and unit."""
-    estimated, true = found.layout.world(found.fit.vector), hidden.world
+    estimated = found.layout.world(found.fit.vector)
+    true = hidden.world
     normals = [_paddle_normal(model, world, home) for world in (estimated, true)]
     cosine = float(np.clip(normals[0] @ normals[1], -1.0, 1.0))
     damping = [world["servo_damping"] / world["servo_gain"] for world in (estimated, true)]
@@ -279,7 +299,8 @@ def _paddle_normal(model: mujoco.MjModel, world, home) -> np.ndarray:
     start pose."""
     given = {"paddle_tilt": np.asarray(world.get("paddle_tilt", np.zeros(2)), np.float32)}
     edited = edited_model(model, physics_parameters(given, model))
-    addresses, data = find_addresses(edited), mujoco.MjData(edited)
+    addresses = find_addresses(edited)
+    data = mujoco.MjData(edited)
     data.qpos[list(addresses.arm_qpos)] = home - world.get("encoder_bias", np.zeros(6))
     mujoco.mj_kinematics(edited, data)
     return data.geom_xmat[addresses.paddle_geom].reshape(3, 3)[:, 2]
@@ -303,8 +324,10 @@ def add_spike(path: Path, spiked: Path, seed: int) -> None:
 def measure(config: WorldConfig, hidden: Hidden, path: Path) -> dict[str, Any]:
     """The identification of one log: its errors, and whether the intervals hold the truth."""
     model = world_model(config, visual=False)
-    names, home = joint_names(model), np.array(config.default_joint_angles)
-    begin, begin_processor = time.perf_counter(), time.process_time()
+    names = joint_names(model)
+    home = np.array(config.default_joint_angles)
+    begin = time.perf_counter()
+    begin_processor = time.process_time()
     log = read_csv(path, names)
     found = identify(config, log)
     seconds = time.perf_counter() - begin
@@ -360,7 +383,8 @@ def main() -> None:
     set_up_jax(config)
     rows = []
     for seed in given.seeds:
-        hidden, path = hidden_robot(seed, given.flawless), folder / f"{seed}.csv"
+        hidden = hidden_robot(seed, given.flawless)
+        path = folder / f"{seed}.csv"
         if not path.exists():
             record(finer, hidden, seed, path)
         paths = [path]

@@ -55,7 +55,8 @@ _EXPLAINED = 3e-3
 # Pictures this close to a bounce do not count, s.
 _AT_BOUNCE = 0.012
 # Gravity, m/s^2; the flights' step of integration, s.
-_GRAVITY, _STEP = np.array([0.0, 0.0, -9.81]), 4e-3
+_GRAVITY = np.array([0.0, 0.0, -9.81])
+_STEP = 4e-3
 # Height of a table's bounce below which a minimum of the height is one, m.
 _LOW = 0.06
 # The paddle's upper face of the project's arm at its start pose, m, where the flights are moved.
@@ -78,7 +79,8 @@ def panda_logs(folder: Path) -> Iterator[ArmLog]:
         files = {path.stem: path for path in start.parent.rglob("*.txt")}
         times = np.loadtxt(files["exciting_traj_time"])
         angles = np.loadtxt(files["exciting_traj_positions"]).reshape(-1, 7)
-        sent, speeds = np.loadtxt(files["gen_time"]), np.loadtxt(files["gen_dq"]).reshape(-1, 7)
+        sent = np.loadtxt(files["gen_time"])
+        speeds = np.loadtxt(files["gen_dq"]).reshape(-1, 7)
         means = 0.5 * (speeds[1:] + speeds[:-1]) * np.diff(sent)[:, None]
         path = np.loadtxt(start) + np.vstack([np.zeros(7), np.cumsum(means, axis=0)])
         targets = np.stack([np.interp(times, sent, column) for column in path.T], axis=1)
@@ -124,17 +126,21 @@ def halves(log: Log) -> tuple[Log, Log]:
             servo_targets=log.servo_targets[sent],
         )
 
-    early, early_sent = log.times < middle, log.target_times < middle
+    early = log.times < middle
+    early_sent = log.target_times < middle
     return part(early, early_sent), part(~early, ~early_sent)
 
 
 def open_loop(config: WorldConfig, world: dict[str, np.ndarray], log: Log) -> np.ndarray:
     """Errors [n] of an arm's world on a log, root mean square, rad: one simulation on MuJoCo's C
     engine from the log's first row."""
-    plain, dt = world_model(config, visual=False), config.physics_dt
+    plain = world_model(config, visual=False)
+    dt = config.physics_dt
     model = edited_model(plain, physics_parameters(world, plain))
-    data, addresses = mujoco.MjData(model), find_addresses(model)
-    qpos, servos = list(addresses.arm_qpos), list(addresses.actuators)
+    data = mujoco.MjData(model)
+    addresses = find_addresses(model)
+    qpos = list(addresses.arm_qpos)
+    servos = list(addresses.actuators)
     count = int((log.times[-1] - log.times[0]) / dt) + 1
     send = make_targets(log, log.times[0] + dt * np.arange(count + 1))
     targets = send(float(world["action_latency"]), float(world.get("servo_lag", 0.0)))
@@ -145,7 +151,8 @@ def open_loop(config: WorldConfig, world: dict[str, np.ndarray], log: Log) -> np
     path = np.zeros((count, len(qpos)))
     for i, target in enumerate(targets):
         path[i] = data.qpos[qpos]
-        data.qpos[list(ball.qpos[:3])], data.qvel[list(ball.qvel)] = (0.0, 0.0, 50.0), 0.0
+        data.qpos[list(ball.qpos[:3])] = (0.0, 0.0, 50.0)
+        data.qvel[list(ball.qvel)] = 0.0
         data.ctrl[servos] = target + held
         mujoco.mj_step(model, data)
     expected = np.stack(
@@ -171,7 +178,8 @@ def measure_arm(arm: ArmLog, toolbox: bool) -> list[dict[str, Any]]:
     robot = None if arm.robot is None else Path(arm.robot)
     config = read_preset(Path("default"), robot).env
     model = world_model(config, visual=False)
-    names, rows = joint_names(model), []
+    names = joint_names(model)
+    rows = []
     parts = halves(arm.log)
     for which, (fitted, tested) in enumerate((parts, parts[::-1])):
         simple = follow(fitted, find_settled(fitted))
@@ -183,7 +191,8 @@ def measure_arm(arm: ArmLog, toolbox: bool) -> list[dict[str, Any]]:
         if checkup.faults:
             rows.append(row | {"refused": checkup.faults[0].text})
             continue
-        begin, begin_processor = time.perf_counter(), time.process_time()
+        begin = time.perf_counter()
+        begin_processor = time.process_time()
         try:
             found = identify(config, fitted)
         except UserError as error:
@@ -213,7 +222,8 @@ def measure_toolbox(config: WorldConfig, fitted: Log, tested: Log) -> dict[str, 
 
     row: dict[str, Any] = {}
     for optimizer, name in (("mujoco", "mujoco.sysid"), ("scipy", "least_squares(trf)")):
-        begin, begin_processor = time.perf_counter(), time.process_time()
+        begin = time.perf_counter()
+        begin_processor = time.process_time()
         world = fit_with_toolbox(config, fitted, optimizer)
         row[f"{name}, seconds"] = time.perf_counter() - begin
         row[f"{name}, processor seconds"] = time.process_time() - begin_processor
@@ -240,7 +250,8 @@ def flights(folder: Path) -> list[Flight]:
         rows = np.genfromtxt(path, delimiter=",", skip_header=1)
         if rows.ndim != 2 or len(rows) < 16 or not np.isfinite(rows).all():
             continue
-        times, places = rows[:, 0] - rows[0, 0], rows[:, 1:4]
+        times = rows[:, 0] - rows[0, 0]
+        places = rows[:, 1:4]
         height = places[:, 2]
         lowest = [
             i
@@ -254,7 +265,9 @@ def flights(folder: Path) -> list[Flight]:
 
 def flights_log(config: WorldConfig, folder: Path, given: list[Flight]) -> Log:
     """The flights, one after another, over the paddle of an arm at rest."""
-    stamps, balls, begin = [], [], 1.0
+    stamps = []
+    balls = []
+    begin = 1.0
     for i, flight in enumerate(given):
         place = flight.places - flight.places[flight.lowest] * [1.0, 1.0, 0.0]
         # Every flight went one way. The table is level: turned about the vertical, a flight is one
@@ -278,12 +291,16 @@ def _fly(start: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Args:
       start: at times[0]: place, velocity, spin times the coefficient of lift, drag.
     """
-    place, speed, lift, drag = start[:3], start[3:6], start[6:9], start[9]
+    place = start[:3]
+    speed = start[3:6]
+    lift = start[6:9]
+    drag = start[9]
 
     def pull(v: np.ndarray) -> np.ndarray:
         return _GRAVITY - drag * np.linalg.norm(v) * v + np.cross(lift, v)
 
-    places, speeds = [place], [speed]
+    places = [place]
+    speeds = [speed]
     for gap in np.diff(times):
         count = max(int(np.ceil(abs(gap) / _STEP)), 1)
         h = gap / count
@@ -313,7 +330,12 @@ def fit_side(times: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def reference(given: list[Flight]) -> dict[str, float]:
-    """Restitution, drag and share explained, by direct fits of each side."""
+    """Restitution (the ratio of the speeds), drag and share explained, by direct fits of each
+    side.
+
+    On flights with TT3D's times and a known ratio of 0.90 and 0.94, with noise of the fits' errors,
+    it finds 0.901 and 0.943, and 0.897 and 0.937 where neighbouring errors are alike by 0.9.
+    """
     rows = []
     for flight in given:
         bounce = flight.times[flight.lowest]
@@ -331,13 +353,16 @@ def reference(given: list[Flight]) -> dict[str, float]:
             before, after = states(at)
             return before[0][2] - after[0][2]
 
-        low, high = bounce - 0.02, bounce + 0.02
+        low = bounce - 0.02
+        high = bounce + 0.02
         at = brentq(gap, low, high) if gap(low) * gap(high) < 0.0 else bounce
         before, after = states(at)
-        rows.append((-after[1][2] / before[1][2], starts[0][9], starts[1][9], *errors))
-    restitution, before, after, error_before, error_after = np.array(rows).T
+        speed = -before[1][2]
+        rows.append((after[1][2] / speed, speed, starts[0][9], starts[1][9], *errors))
+    restitution, speed, before, after, error_before, error_after = np.array(rows).T
     return {
         "restitution": float(np.median(restitution)),
+        "speed, m/s": float(np.median(speed)),
         "drag before, 1/m": float(np.median(before)),
         "drag after, 1/m": float(np.median(after)),
         "explained before": float(np.mean(error_before < _EXPLAINED)),
@@ -345,15 +370,53 @@ def reference(given: list[Flight]) -> dict[str, float]:
     }
 
 
+def speed_ratio(config: WorldConfig, world: dict[str, np.ndarray], speed: float) -> float:
+    """Vertical speed after by that before a bounce on the resting paddle, on MuJoCo's C engine.
+
+    The term `restitution` sets the damping of a contact that takes 10 ms, through which the ball
+    also falls. A direct fit measures the speeds where the ball touches the paddle. The mean is over
+    where in a physics step a bounce begins.
+
+    Args:
+      speed: at which the ball comes down, m/s.
+    """
+    plain = world_model(config, visual=False)
+    model = edited_model(plain, physics_parameters(world, plain))
+    addresses = find_addresses(model)
+    ball = addresses.balls[0]
+    paddle = addresses.paddle_geom
+    servos = list(addresses.actuators)
+    arm = list(addresses.arm_qpos)
+    place = list(ball.qpos[:3])
+    motion = list(ball.qvel[:3])
+    ratios = []
+    for share in np.linspace(0.0, 1.0, 8, endpoint=False):
+        data = mujoco.MjData(model)
+        data.qpos[arm] = data.ctrl[servos] = config.default_joint_angles
+        mujoco.mj_kinematics(model, data)
+        top = data.geom_xpos[paddle][2] + model.geom_size[paddle, 2] + model.geom_size[ball.geom, 0]
+        fall = 0.01 + share * speed * config.physics_dt
+        data.qpos[place] = [*data.geom_xpos[paddle][:2], top + fall]
+        data.qvel[motion] = [0.0, 0.0, -np.sqrt(speed**2 - 2.0 * 9.81 * fall)]
+        while data.qvel[motion][2] <= 0.0 or data.qpos[place][2] < top:
+            mujoco.mj_step(model, data)
+        rise = data.qpos[place][2] - top
+        ratios.append(np.sqrt(data.qvel[motion][2] ** 2 + 2.0 * 9.81 * rise) / speed)
+    return float(np.mean(ratios))
+
+
 def measure_flights(folder: Path, most: int) -> dict[str, Any]:
     """The flights of TT3D, identified and by a direct fit."""
-    config, given = read_preset(Path("default")).env, flights(folder)[:most]
+    config = read_preset(Path("default")).env
+    given = flights(folder)[:most]
     row: dict[str, Any] = {"flights": len(given), "reference": reference(given)}
     begin = time.perf_counter()
     found = identify(config, flights_log(config, folder, given))
     row["seconds"] = time.perf_counter() - begin
-    world, windows = found.layout.world(found.fit.vector), found.windows
+    world = found.layout.world(found.fit.vector)
+    windows = found.windows
     row |= {"restitution": float(world["restitution"]), "drag, 1/m": float(world["air_drag"])}
+    row["ratio of speeds"] = speed_ratio(config, world, row["reference"]["speed, m/s"])
     row |= {"bounces": int(np.sum(windows.has_ball)), "dropped": found.dropped}
     residuals = windows.split(found.fit.predicted)[1] - windows.balls
     errors = {"before": [], "after": []}

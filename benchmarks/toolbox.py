@@ -51,7 +51,8 @@ def fit_with_toolbox(config: WorldConfig, log: Log, optimizer: Optimizer) -> dic
         }
 
     def build(values: sysid.ParameterDict, spec: mujoco.MjSpec) -> mujoco.MjModel:
-        built, servos = spec.compile(), world(values)
+        built = spec.compile()
+        servos = world(values)
         stiffness = servos["servo_gain"] * model.actuator_gainprm[actuators, 0]
         damping = servos["servo_damping"] * model.actuator_biasprm[actuators, 2]
         built.actuator_gainprm[actuators, 0] = stiffness
@@ -96,7 +97,8 @@ def _rollout(
 ) -> sysid.ModelSequences:
     """The log as one rollout from its first row, which need not rest: its first angles do not
     count."""
-    addresses, dt = find_addresses(model), model.opt.timestep
+    addresses = find_addresses(model)
+    dt = model.opt.timestep
     start = log.times[0]
     count = int((log.times[-1] - start) / dt) + 1
     # Targets are held between two control steps; the toolbox would interpolate them.

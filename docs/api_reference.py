@@ -43,13 +43,15 @@ _SECTIONS = (
         "Policies on a robot",
         "",
         "deploy.loading.load_policy deploy.policy.DeployedPolicy deploy.supervisor.Supervisor "
-        "deploy.samples.Samples deploy.faults.Watch deploy.metadata.Metadata",
+        "deploy.samples.Samples deploy.faults.Watch deploy.metadata.Metadata "
+        "deploy.recorder.Recorder",
     ),
     (
         "Policies in JAX",
         "",
         "runs.folders.find_checkpoint runs.checkpoints.read_policy learning.policy.Policy "
-        "learning.policy.make_networks learning.policy.Networks baselines.mirror.MirrorLaw",
+        "learning.policy.make_networks learning.policy.networks_of learning.policy.Networks "
+        "baselines.mirror.MirrorLaw",
     ),
     ("Rewards", "", "task.rewards task.bounce_rewards.RewardInputs"),
     ("Robots", "", "robot.config.RobotConfig robot.adopt.adopt"),
@@ -58,7 +60,13 @@ _SECTIONS = (
         "",
         "evaluation.policy_evaluation.evaluate_policy evaluation.config.EvaluationOptions "
         "evaluation.policy_evaluation.PolicyEvaluation evaluation.results.Report "
-        "evaluation.robustness.measure_conditions",
+        "evaluation.robustness.measure_conditions evaluation.episodes.make_evaluator "
+        "evaluation.results.judge",
+    ),
+    (
+        "Plots",
+        "",
+        "reports.figures.run_plot reports.figures.RunPlot reports.figures.make_panels",
     ),
     (
         "Training",
@@ -77,7 +85,9 @@ _SECTIONS = (
         "adapters.torch.vector_env.StepResult adapters.torch.rsl_rl_env.RslRlVecEnv "
         "adapters.torch.skrl_env.SkrlEnv adapters.torch.policy.to_policy "
         "adapters.torch.policy.write_run adapters.brax.environment.BraxBounceBall "
-        "adapters.gymnax_env.GymnaxBounceBall",
+        "adapters.gymnax_env.GymnaxBounceBall adapters.gymnax_env.PureJaxRLBounceBall "
+        "adapters.playground.environment.PlaygroundBounceBall adapters.brax.ppo.ppo_settings "
+        "adapters.brax.ppo.network_settings adapters.brax.ppo.load_brax_policy",
     ),
 )
 

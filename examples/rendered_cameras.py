@@ -23,6 +23,8 @@ from two_cameras import (
     rough_camera,
 )
 
+from bounce_mjx.errors import UserError
+
 WIDTH, HEIGHT = 640, 480
 FOCAL_LENGTH = 560.0
 """Of both cameras, pixels."""
@@ -131,7 +133,13 @@ class RenderedCameras:
         self.sub_frames = sub_frames
         self._cameras = tuple(cameras)
         self._random = np.random.default_rng(seed)
-        self._renderer = mujoco.Renderer(model, HEIGHT, WIDTH)
+        try:
+            self._renderer = mujoco.Renderer(model, HEIGHT, WIDTH)
+        except mujoco.FatalError as error:
+            raise UserError(
+                "pictures cannot be rendered here; without a display, set MUJOCO_GL=egl or "
+                "MUJOCO_GL=osmesa"
+            ) from error
         self._views = [_View(camera, self._renderer, model) for camera in cameras]
         self._begun = 0
         self._sums: list[np.ndarray] = []

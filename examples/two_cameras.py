@@ -699,6 +699,8 @@ def save_cameras(path: Path, cameras: Sequence[Camera]) -> None:
 
 def load_cameras(path: Path) -> tuple[Camera, ...]:
     """Reads what `save_cameras` wrote."""
+    if not path.is_file():
+        raise SystemExit(f"there is no file {path}; write it with two_cameras.py calibrate")
     entries = json.loads(path.read_text())
     return tuple(Camera(**{k: np.array(v) for k, v in entry.items()}) for entry in entries)
 
@@ -749,6 +751,10 @@ class Sources:
 
 def calibrate_by_hand(args: argparse.Namespace) -> None:
     """Asks for one pose after the other, and writes the cameras."""
+    if not args.cameras.parent.is_dir():
+        raise SystemExit(
+            f"there is no folder {args.cameras.parent} for {args.cameras.name}; make it"
+        )
     metadata = load_policy(args.policy).metadata
     sources = Sources(args.sources, args.rate, args.exposure, args.transport)
     rough = [

@@ -99,6 +99,11 @@ def test_points_without_a_circle_give_nothing_or_a_circle_of_a_ball() -> None:
         assert circle is None or 2.0 <= circle.radius <= 6.0
 
 
+def test_a_file_that_is_missing_is_named(tmp_path) -> None:
+    with pytest.raises(SystemExit, match="there is no file .*cameras.json; write it with"):
+        cameras.load_cameras(tmp_path / "cameras.json")
+
+
 def test_rays_and_projections_are_inverse() -> None:
     pair = true_cameras()
     for place in SEEN:

@@ -13,7 +13,9 @@ import pytest
 import bounce_mjx
 from bounce_mjx.commands import eval as eval_command
 from bounce_mjx.commands.main import main as console_script
-from bounce_mjx.config.command_line import flags_of
+from bounce_mjx.commands.play import PlayCommand
+from bounce_mjx.commands.which_policy import film_command
+from bounce_mjx.config.command_line import flags_of, parse
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import choose_checkpoint
@@ -67,7 +69,7 @@ MISTAKES = (
     ("play robust --out a.mp4", "unknown argument --out; did you mean --video?"),
     ("report robust", "the policy robust comes with the package", "give a run's folder"),
     ("plot catch", "the policy catch comes with the package"),
-    ("play --nominal", "--nominal of an evaluation", "need --episode"),
+    ("play --nominal", "--nominal is of an evaluation", "add its --episode"),
     ("play robust --suite robustness_v2 --episode 3", "--suite is that of a condition; add"),
     ("robustness robust --world fast_servo --assumed --suite robustness_v2", "omit --suite"),
     ("robustness robust --assumed", "--assumed needs a named world"),
@@ -272,6 +274,20 @@ def test_eval_reports_five_results(trained: Path, tmp_path: Path, capsys) -> Non
         figure = "-" if value is None else f"{value:.2f}"
         assert result == unjudged or f"{figure} {result['bound']}" in shown
     assert "FAIL" in shown and re.search(r"checkpoint: .+ physics: ", shown)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "RUN --failures --json a.json --nominal",
+        "RUN --failures=true --no-limits --contacts=False --json=a.json --nominal",
+        "RUN --no-failures --physics config --nominal=true",
+    ],
+)
+def test_the_command_of_a_film_has_no_flag_that_play_lacks(line: str) -> None:
+    shown = film_command(line.split(), eval_command._NOT_OF_PLAY, "--episode", "3")
+    assert shown == "bounce-mjx play RUN --nominal --episode 3"
+    parse(PlayCommand, shown.split()[2:], prog="bounce-mjx play")
 
 
 def test_a_policy_is_named_by_its_run_or_its_checkpoint(trained: Path, monkeypatch) -> None:

@@ -186,6 +186,17 @@ print(*sorted(imported - sys.stdlib_module_names))
     assert "bounce_mjx" in libraries and libraries <= HELP_NEEDS
 
 
+@pytest.mark.parametrize(("given", "level"), [(None, "3"), ("0", "0")])
+def test_a_command_hides_the_banner_of_a_slow_compilation(monkeypatch, given, level) -> None:
+    """Unless the user chose a level; XLA reads it when JAX is imported."""
+    monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "9")
+    monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL")
+    if given is not None:
+        monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", given)
+    console_script.main(["--version"])
+    assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == level
+
+
 def test_import_is_light(tmp_path: Path) -> None:
     """The package imports JAX only at its first use, and the environment imports none of the
     libraries of trainers, other engines, viewers and adapters."""

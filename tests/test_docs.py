@@ -23,6 +23,7 @@ import numpy as np
 import pytest
 
 import bounce_mjx
+import mutations
 from bounce_mjx import commands as commands_package
 from bounce_mjx.commands import main as console_script
 from bounce_mjx.config import command_line as cli
@@ -204,6 +205,24 @@ def test_api_reference_is_fresh() -> None:
     pytest.importorskip("griffe")
     written = runpy.run_path(str(CHECKOUT / "docs/api_reference.py"))["reference"]()
     assert content("api.md") == written, "docs/api.md is stale; it names the command that prints it"
+
+
+def test_what_a_page_imports_is_in_a_reference() -> None:
+    """In the API; settings are in the config reference, and the tasks have a page."""
+    documented = set(re.findall(r"^### (\w+)$", content("api.md"), re.MULTILINE))
+    for page in PAGES:
+        for block in re.findall(
+            r"^```py.*?^```", page.read_text("utf-8"), re.MULTILINE | re.DOTALL
+        ):
+            for module, names in re.findall(
+                r"^from (bounce_mjx\S*) import (.+)$", block, re.MULTILINE
+            ):
+                for name in names.split(", "):
+                    member = getattr(importlib.import_module(module), name, None)
+                    is_setting = inspect.isclass(member) and issubclass(member, StrictModel)
+                    is_type = module == "bounce_mjx.config.settings"
+                    if not (inspect.ismodule(member) or is_setting or is_type or member is Bounce):
+                        assert name in documented, f"{page_id(page)}: {module}.{name}"
 
 
 def test_api_reference_has_arguments_shapes_and_errors() -> None:
@@ -480,3 +499,14 @@ def test_each_promise_has_its_place_and_its_test() -> None:
             file, _, name = test.partition("::")
             text = (CHECKOUT / "tests" / file).read_text(encoding="utf-8")
             assert name in text, f"{promise}: {test}"
+
+
+def test_each_deliberate_fault_still_has_its_place() -> None:
+    """`tests/mutations.py`, which CI does not run: the code that it changes, and the number of
+    faults in CONTRIBUTING.md."""
+    for fault, file, code, _, test in mutations.FAULTS:
+        text = (CHECKOUT / "src/bounce_mjx" / file).read_text(encoding="utf-8")
+        assert text.count(code) == 1, f"{fault}: {code}"
+        assert (CHECKOUT / "tests" / test.split(" -k ")[0]).is_file(), fault
+    said = (CHECKOUT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    assert f"puts {len(mutations.FAULTS)} deliberate faults" in said

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pydantic
 import pytest
@@ -16,7 +17,7 @@ from rich.console import Console
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.env.env import Env, Redraw, State
 from bounce_mjx.errors import UserError
-from bounce_mjx.evaluation import policy_evaluation
+from bounce_mjx.evaluation import c_episodes, policy_evaluation
 from bounce_mjx.evaluation.c_episodes import episode_models, make_mujoco_evaluator
 from bounce_mjx.evaluation.config import EvaluationOptions
 from bounce_mjx.evaluation.episodes import make_evaluator, reset_episodes
@@ -33,6 +34,7 @@ from bounce_mjx.resources import TASK_POLICIES
 from bounce_mjx.task import Tally, share_of_episodes
 from bounce_mjx.task.registry import find_task
 
+AUTORESET = int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
 BOUNCES, HORIZONTAL, HEIGHT, SPEED, STABLE = range(5)
 TARGET_X = 0.58856
 DRIBBLE = f"{Path(__file__).parent.parent / 'examples' / 'dribble_task.py'}:Dribble"
@@ -344,6 +346,7 @@ def test_c_evaluates_each_episode_in_its_own_world(networks, random_policy):
         [model.body("ball_link").mass[0] for model in models], masses.ball_mass, rtol=1e-6
     )
     assert len(episode_models(BounceBall(config), PhysicsParameters())) == 1
+    assert all(model.opt.disableflags & AUTORESET for model in models)
 
 
 def test_mujoco_evaluator_agrees_with_the_fused_one(networks, random_policy):
@@ -352,21 +355,41 @@ def test_mujoco_evaluator_agrees_with_the_fused_one(networks, random_policy):
     key = jax.random.key(31)
     fused = flat(make_evaluator(env, networks, 8)(random_policy, key)[0])
     evaluate_on_c = make_mujoco_evaluator(env, networks, 8)
-    mujoco = flat(evaluate_on_c(random_policy, key)[0])
+    on_c = flat(evaluate_on_c(random_policy, key)[0])
     assert np.any(fused.n_bounces > 0), "a contact is wanted"
     assert not np.all(fused.running), "an end is wanted"
-    np.testing.assert_array_equal(mujoco.running, fused.running)
-    np.testing.assert_array_equal(mujoco.n_bounces, fused.n_bounces)
-    np.testing.assert_allclose(mujoco.steps, fused.steps, rtol=0, atol=1)
-    np.testing.assert_allclose(mujoco.rising_steps, fused.rising_steps, rtol=0, atol=1)
-    np.testing.assert_allclose(mujoco.rising_speed, fused.rising_speed, rtol=1e-2, atol=1e-3)
+    np.testing.assert_array_equal(on_c.running, fused.running)
+    np.testing.assert_array_equal(on_c.n_bounces, fused.n_bounces)
+    np.testing.assert_allclose(on_c.steps, fused.steps, rtol=0, atol=1)
+    np.testing.assert_allclose(on_c.rising_steps, fused.rising_steps, rtol=0, atol=1)
+    np.testing.assert_allclose(on_c.rising_speed, fused.rising_speed, rtol=1e-2, atol=1e-3)
     # One step more or less is worth up to about 15.
-    np.testing.assert_allclose(mujoco.episode_return, fused.episode_return, rtol=1e-2, atol=15)
+    np.testing.assert_allclose(on_c.episode_return, fused.episode_return, rtol=1e-2, atol=15)
 
     params = jax.tree.map(lambda x: jnp.nan * x, random_policy.params)
     broken = evaluate_on_c(random_policy._replace(params=params), key)[0]
     np.testing.assert_array_equal(broken.steps, 1)
     assert np.isfinite(broken.episode_return).all() and not np.any(broken.running)
+
+
+def test_an_episode_that_diverges_on_c_ends(networks, random_policy, monkeypatch, tmp_path):
+    """MuJoCo would put the arm and the ball back to the model's own pose and go on."""
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warning into a file.
+    env = BounceBall(EnvConfig(episode_seconds=0.1))
+
+    def reset(*args):
+        states = reset_episodes(*args)
+        now = states.pipeline_state
+        physics = now.physics._replace(qvel=now.physics.qvel.at[6, 1].set(1e11))
+        return states.replace(pipeline_state=now._replace(physics=physics))
+
+    monkeypatch.setattr(c_episodes, "reset_episodes", reset)
+    evaluate = make_mujoco_evaluator(env, networks, 2)
+    statistics, _ = evaluate(random_policy, jax.random.key(31))
+    np.testing.assert_array_equal(statistics.steps, [10, 1])
+    np.testing.assert_array_equal(statistics.ended_by["non_finite"], [False, True])
+    # The environment's own model stays as it was compiled.
+    assert not env.mj_model.opt.disableflags & AUTORESET
 
 
 @pytest.mark.slow

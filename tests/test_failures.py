@@ -16,7 +16,7 @@ from bounce_mjx.evaluation.failures import (
     film_episode,
     wilson_interval,
 )
-from bounce_mjx.evaluation.policy_evaluation import conditions_of
+from bounce_mjx.evaluation.policy_evaluation import EpisodeSetup, setup_of
 from bounce_mjx.evaluation.robustness import find_episode, measure_conditions
 from bounce_mjx.evaluation.statistics import Statistics
 from bounce_mjx.evaluation.suite import load_suite
@@ -38,7 +38,7 @@ class _Jumpy:
 def conditions():
     world = {"action_latency": (0.0, 0.03), "paddle_tilt": (-0.05, 0.05), "restitution": (0.7, 0.9)}
     config = EnvConfig(episode_seconds=0.5, randomization=world)
-    return conditions_of(config, EvaluationOptions(EPISODES, SEED))
+    return setup_of(config, EvaluationOptions(EPISODES, SEED))
 
 
 @pytest.fixture(scope="module")
@@ -149,6 +149,32 @@ def test_each_failure_has_its_world_and_its_time(conditions, measured) -> None:
             np.testing.assert_allclose(value, states.world[name][..., one.episode], atol=1e-6)
         height = states.command["target_height"][one.episode]
         assert one.command == {"target_height": pytest.approx(float(height))}
+
+
+def test_an_episode_misses_what_was_measured_of_it(env) -> None:
+    """One that ended within its first seconds, one that lasted without a bounce, a good one, and
+    one whose steps are off."""
+    sums = {
+        "settled_steps": [0, 1800, 1800, 1800],
+        "centred_steps": [0, 1800, 1800, 900],
+        "settled_bounces": [0, 0, 25, 25],
+        "accurate_bounces": [0, 0, 25, 25],
+        "apex_error": [0, 0, 1, 1],
+        "rising_steps": [0, 0, 1, 1],
+        "rising_speed": [0, 0, 1, 1],
+    }
+    tally = Tally(
+        {name: np.array(values, float) for name, values in sums.items()},
+        {"n_bounces": np.array([0.0, 0.0, 9.0, 9.0])},
+    )
+    lasted = np.array([False, True, True, True])
+    statistics = Statistics(lasted, np.array([80, 2000, 2000, 2000]), np.zeros(4), tally)
+    failures = failures_of(EpisodeSetup(env, {}, None), statistics)
+    assert [(one.episode, one.seconds, one.failed) for one in failures] == [
+        (0, 0.8, ("ended by the task", "consecutive bounces", "stable")),
+        (1, 20.0, ("consecutive bounces", "height")),
+        (3, 20.0, ("horizontal position",)),
+    ]
 
 
 def test_the_terms_that_go_with_failure_are_named() -> None:

@@ -4,14 +4,18 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from viser.infra import StateSerializer
 
 from bounce_mjx import BounceBall
 from bounce_mjx.env.env import State
 from bounce_mjx.task import term_names
 from bounce_mjx.task.bounce_rewards import BounceReward
 from bounce_mjx.viewers.browser import reward_bars
-from bounce_mjx.viewers.display import Display, body_scenes
+from bounce_mjx.viewers.display import TRAIL_SECONDS, Display, Trail, body_scenes
+from bounce_mjx.viewers.page import replay
+from bounce_mjx.viewers.scene import ANNOUNCED_SECONDS, Scene
 from bounce_mjx.viewers.simulation import EnvFrame, make_random_controller, resample
+from viewing import watch
 
 
 def ramp(over: tuple[int, ...] = ()) -> EnvFrame:
@@ -25,8 +29,9 @@ def ramp(over: tuple[int, ...] = ()) -> EnvFrame:
 
 
 def test_resampling_interpolates_positions() -> None:
+    """Up to the recording's last frame."""
     frames = resample(ramp(), dt=0.01, fps=60)
-    times = np.arange(6) / 60
+    times = np.arange(7) / 60
     np.testing.assert_allclose(frames.time[:, 0], times)
     for positions in (frames.qpos, frames.balls[:, 0], frames.paddle):
         np.testing.assert_allclose(positions[:, 0, 0], 100 * times)
@@ -37,17 +42,58 @@ def test_resampling_interpolates_positions() -> None:
 
 def test_resampling_does_not_blend_two_episodes() -> None:
     frames = resample(ramp(over=(3,)), dt=0.01, fps=60)
-    expected = 100 * np.arange(6) / 60
+    expected = 100 * np.arange(7) / 60
     expected[2] = 3.0  # at 3.33 steps
     np.testing.assert_allclose(frames.balls[:, 0, 0, 0], expected)
 
 
-def test_a_recording_that_is_shorter_than_a_picture_is_one_picture() -> None:
-    """As of an episode that ended on its first or second step."""
+def test_the_end_of_every_episode_is_in_a_frame() -> None:
+    """Also where it falls between two pictures, and after the last one."""
+    frames = resample(ramp(over=(4, 10)), dt=0.01, fps=30)
+    assert frames.over[:, 0].tolist() == frames.lost[:, 0].tolist() == [False, False, True, True]
+    # An episode that ended on its first or second step has its first and its last frame.
     for steps in (1, 2):
-        short = jax.tree.map(lambda values, steps=steps: values[:steps], ramp())
+        short = jax.tree.map(lambda values, steps=steps: values[:steps], ramp(over=(steps - 1,)))
         frames = resample(short, dt=0.01, fps=30)
-        np.testing.assert_array_equal(frames.balls, short.balls[:1])
+        np.testing.assert_array_equal(frames.balls, short.balls)
+        assert frames.lost[-1].all()
+
+
+def test_the_path_of_a_ball_has_each_of_its_positions_once() -> None:
+    """Of its episode, also where a frame is shown again, as in a pause."""
+    frames = ramp()
+    trail = Trail(0.2)
+    for i in (0, 1, 2, 2, 2, 2):
+        trail.add(jax.tree.map(lambda values, i=i: values[i], frames))
+    assert trail.points[:, 0, 0, 0].tolist() == [0.0, 1.0, 2.0]
+    # Two resets in a pause begin two paths, each at another place.
+    for place in (5.0, 6.0):
+        start = jax.tree.map(lambda values: values[0], frames)
+        trail.add(start._replace(balls=start.balls + place))
+        assert trail.points[:, 0, 0, 0].tolist() == [place] * 3
+
+
+def test_a_replay_shows_the_path_and_the_loss_for_as_long_as_the_live_page(
+    env: BounceBall, monkeypatch
+) -> None:
+    """At any rate of frames."""
+    lost = ramp(over=(10,))
+    lost = lost._replace(
+        qpos=np.tile(env.mj_model.qpos0, (11, 1, 1)),
+        command={"target_height": np.full((11, 1), 0.5)},
+        metrics={"n_bounces": np.zeros((11, 1))},
+    )
+    scenes, seconds = [], []
+    watch(monkeypatch, Scene, "update", lambda scene, frames: scenes.append(scene))
+    watch(monkeypatch, StateSerializer, "insert_sleep", lambda _, time: seconds.append(time))
+    for fps in (1, 30, 200):
+        scenes.clear()
+        seconds.clear()
+        replay(env, lost, fps)
+        scene = scenes[-1]
+        assert scene._trail.length == max(1, round(TRAIL_SECONDS * fps))
+        assert scene._labels[0].text == "LOST"
+        np.testing.assert_allclose(sum(seconds), len(scenes) / fps + ANNOUNCED_SECONDS)
 
 
 SHAPES = """<mujoco><worldbody>

@@ -21,6 +21,7 @@ from bounce_mjx.identify.fit import (
     _bounded_step,
     _eliminate,
     certainty,
+    correlation_times,
     minimise,
 )
 from bounce_mjx.identify.flight import acceleration, fit_flight
@@ -31,7 +32,13 @@ from bounce_mjx.identify.simulation import compensated, make_targets
 from bounce_mjx.identify.stages import Identified, _check_frame, identify
 from bounce_mjx.identify.unknowns import MOTIONS, Layout
 from bounce_mjx.identify.windows import Windows, cut
-from bounce_mjx.identify.world import compare, describe_doubts, estimates, to_yaml
+from bounce_mjx.identify.world import (
+    compare,
+    describe_doubts,
+    estimates,
+    to_yaml,
+    total_delay,
+)
 from bounce_mjx.physics import (
     Control,
     PhysicsParameters,
@@ -314,6 +321,34 @@ def test_a_model_that_does_not_explain_a_log_is_named() -> None:
     bounces = int(np.sum(found.windows.has_ball))
     (doubt,) = describe_doubts(found._replace(dropped=bounces - 1), NAMES)
     assert doubt.startswith(f"In {bounces - 1} of {bounces} windows")
+
+
+def test_errors_that_are_alike_count_as_one() -> None:
+    """Against the correlation time of y' = a y + noise, (1 + a) / (1 - a)."""
+    shares = np.array([0.0, 0.5, 0.9])
+    noise = np.random.default_rng(0).normal(size=(40, 600, 3))
+    errors = noise.copy()
+    for i in range(1, errors.shape[1]):
+        errors[:, i] += shares * errors[:, i - 1]
+    counts = np.ones(errors.shape[:2], bool)
+    expected = (1.0 + shares) / (1.0 - shares)
+    np.testing.assert_allclose(correlation_times(errors, counts), expected, rtol=0.1)
+    counts[:, 400:] = False
+    np.testing.assert_allclose(correlation_times(errors, counts), expected, rtol=0.15)
+
+
+def test_the_total_delay_is_certain_where_latency_and_lag_are_not() -> None:
+    """Also at a latency of 0, where a longer lag alone would be a longer delay."""
+    layout = Layout(6, True, 0.001)
+    model = world_model(read_preset(Path("default")).env, visual=False)
+    vector = layout.vector({"action_latency": 0.0, "servo_lag": 0.001})
+    known = layout.deviation.copy()
+    known[layout.slices["delay"]] = 1e-4
+    known[layout.slices["servo_gain"]] = 1e-3
+    known[layout.slices["servo_damping"]] = 1e-3
+    found = identified(layout, flight_log(), vector, np.diag(known**2))
+    width = total_delay(found, model).split("+- ")[1].split(" ms")[0]
+    assert 0.1 < float(width) < 0.3
 
 
 def test_a_bounded_step_is_the_best_one_within_its_bounds() -> None:

@@ -2,6 +2,7 @@
 
 import concurrent.futures
 import dataclasses
+import errno
 import io
 import itertools
 import json
@@ -23,7 +24,7 @@ from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.interrupt import Interrupted
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.runs import checkpoints
-from bounce_mjx.runs.checkpoints import policy_shapes, read_policy, read_record
+from bounce_mjx.runs.checkpoints import policy_shapes, read_networks, read_policy, read_record
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import (
     Checkpoint,
@@ -35,7 +36,7 @@ from bounce_mjx.runs.folders import (
     stored_checkpoints,
 )
 from bounce_mjx.runs.settings import Choice, stack
-from bounce_mjx.training import hosts, job
+from bounce_mjx.training import hosts, job, saving
 from bounce_mjx.training.events import Event
 from bounce_mjx.training.faults import first_block_fault
 from bounce_mjx.training.trainer import Snapshot
@@ -492,6 +493,27 @@ def test_a_policy_that_could_not_be_saved_is_not_the_best(tmp_path: Path, monkey
     fail(monkeypatch, 2)
     run = train(tmp_path, {1: 5.0, 2: 9.0, 3: 7.0})
     assert results_of(run)["best_steps"] == 3 * BLOCK and iterations_of(best_checkpoint(run)) == 3
+    fail(monkeypatch, 2)
+    run = train(tmp_path, {1: 5.0, 2: 9.0, 3: 4.0})
+    assert results_of(run)["best_steps"] == BLOCK and iterations_of(best_checkpoint(run)) == 1
+    # The final evaluation is that of the policy that was saved.
+    assert results_of(run)["details"]["mean_return"] == 5.0
+
+
+def test_results_that_could_not_be_saved_do_not_end_a_training(tmp_path: Path, monkeypatch) -> None:
+    """Neither by their margin nor by the wait for one; what was saved again counts."""
+    fail(monkeypatch, 1)
+    settings = {"margins": {1: 0.5, 3: 0.5}, "stop_when_solved": True}
+    run = train(tmp_path, dict.fromkeys(range(1, 7), 1.0), **settings)
+    results = results_of(run)
+    assert (results["solved_steps"], results["trained_steps"]) == (3 * BLOCK, 5 * BLOCK)
+    assert evaluated_steps(run) == [128, 192, 256, 320]
+
+
+def test_a_checkpoint_without_its_value_network_is_no_warm_start(tmp_path: Path) -> None:
+    run = train(tmp_path, {1: 1.0})
+    with pytest.raises(UserError, match="is without its value network; give robust_small"):
+        read_networks(latest_checkpoint(run), load_run_config(run))
 
 
 def test_a_training_that_ends_without_room_says_so(tmp_path: Path, monkeypatch) -> None:
@@ -507,6 +529,22 @@ def test_a_training_that_ends_without_room_says_so(tmp_path: Path, monkeypatch) 
     assert iterations_of(latest_checkpoint(run)) == 1
     train(tmp_path, {2: 9.0, 3: 7.0}, run)
     assert results_of(run)["best_steps"] == 2 * BLOCK and iterations_of(best_checkpoint(run)) == 2
+
+
+def test_final_results_that_cannot_be_written_cost_no_step(tmp_path: Path, monkeypatch) -> None:
+    write = saving.write_atomically
+
+    def full(path: Path, content: str) -> None:
+        if '"fresh_resets": true' in content:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        write(path, content)
+
+    monkeypatch.setattr(saving, "write_atomically", full)
+    sentence = r"\(No space left on device\), so the final results are not saved; make room, and"
+    with pytest.raises(UserError, match=sentence):
+        train(tmp_path, {1: 5.0, 2: 9.0})
+    (run,) = tmp_path.iterdir()
+    assert iterations_of(latest_checkpoint(run)) == 2
 
 
 def test_a_warm_start_that_meets_all_results_is_trained_until_a_margin(

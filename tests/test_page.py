@@ -26,8 +26,9 @@ from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training import watch as watched
 from bounce_mjx.training.events import Event
 from bounce_mjx.training.watch import TrainingPage
-from bounce_mjx.viewers import browser, guard
+from bounce_mjx.viewers import browser, guard, show
 from bounce_mjx.viewers.guard import open_server
+from bounce_mjx.viewers.options import PageStart, ViewerOptions
 from bounce_mjx.viewers.scene import Scene
 from bounce_mjx.viewers.simulation import Simulation, make_zero_controller
 from viewing import Client, LeanConfig, evaluated, served, wait_until, watch
@@ -131,6 +132,22 @@ def test_only_its_own_page_may_connect(host, allowed, pages, strangers, capfd) -
         with urllib.request.urlopen(address) as answer:
             assert b"<html" in answer.read(2000)
     assert capfd.readouterr() == ("", "")
+
+
+def test_the_printed_address_is_that_of_the_server(monkeypatch) -> None:
+    """Also where another program took the free port while the simulation was compiled."""
+    ports, printed = [], io.StringIO()
+
+    def run_page(server, simulation, start, is_over, say, seconds) -> None:
+        ports.append(server.get_port())
+        say()
+
+    monkeypatch.setattr(browser, "run_page", run_page)
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        monkeypatch.setattr(browser, "free_port", lambda host, port: other.getsockname()[1])
+        show._serve(lambda: None, PageStart("a"), ViewerOptions(), Console(file=printed))
+        assert ports != [other.getsockname()[1]]
+    assert printed.getvalue() == f"viewer: http://127.0.0.1:{ports[0]}  (Ctrl-C ends it)\n"
 
 
 def test_a_viser_that_cannot_be_guarded_is_refused(monkeypatch) -> None:

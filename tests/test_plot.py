@@ -1,6 +1,7 @@
 """Learning curves, pictures, the report of a run, and the TensorBoard log."""
 
 import base64
+import io
 import json
 import math
 import re
@@ -16,15 +17,18 @@ import numpy as np
 import pytest
 import yaml
 from matplotlib.figure import Figure
+from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboardX import SummaryWriter
 
+import bounce_mjx
 from bounce_mjx import BounceBall
 from bounce_mjx.commands import plot as plot_command
 from bounce_mjx.commands import report as report_command
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation.results import Report
 from bounce_mjx.evaluation.statistics import empty_recording
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.reports import figures
@@ -37,7 +41,8 @@ from bounce_mjx.reports.curves import (
     mean_and_band,
     read_curves,
 )
-from bounce_mjx.reports.figures import curves_figure
+from bounce_mjx.reports.figures import curves_figure, rewards_figure
+from bounce_mjx.reports.tables import results_table
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import save_config
 from bounce_mjx.runs.progress import load_results
@@ -45,7 +50,9 @@ from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.task import Curve, term_names
 from bounce_mjx.task.bounce import Bounce, BounceConfig, BounceReward
 from bounce_mjx.task.registry import find_task
+from bounce_mjx.task.results import Result
 from bounce_mjx.task.task import Hits
+from bounce_mjx.training import setup
 from bounce_mjx.training.events import Event
 from bounce_mjx.training.log import TensorBoardLog
 from tiny_runs import TINY
@@ -175,6 +182,13 @@ def test_only_the_figures_that_are_numbers_count(tmp_path: Path) -> None:
     curves = read_curves(run).curves
     assert list(curves) == ["episode/return"]
     assert (curves["episode/return"].steps, curves["episode/return"].values) == ([1], [2.0])
+    # A figure without panels has its title alone.
+    assert not rewards_figure(group_runs([run])).axes
+    # The run was resumed and diverged: its first value is not that of the final policy.
+    with SummaryWriter(logdir=str(run), filename_suffix=".resumed") as log:
+        log.add_scalar("episode/return", math.nan, 1)
+    with pytest.raises(UserError, match="no learning curves.*diverged"):
+        read_curves(run)
 
 
 def test_a_log_of_an_earlier_version_has_the_present_names(tmp_path: Path) -> None:
@@ -282,7 +296,10 @@ def test_no_plot_takes_the_place_of_one_of_the_package(name: str) -> None:
         figures.run_plot(name, "Mine")
 
 
-def test_plot_of_several_runs(trained: Path, tmp_path: Path, own_plots) -> None:
+def test_plot_of_several_runs(trained: Path, tmp_path: Path, own_plots, monkeypatch) -> None:
+    """Set up as in any command that simulates."""
+    set_up = []
+    monkeypatch.setattr(setup, "set_up_jax", lambda *configs: set_up.extend(configs))
     other = shutil.copytree(trained, tmp_path / "other")
     save_config(other, read_preset(trained / "config.yaml").model_copy(update={"seed": 1}))
     (tmp_path / "p").mkdir()
@@ -292,6 +309,7 @@ def test_plot_of_several_runs(trained: Path, tmp_path: Path, own_plots) -> None:
     plot_command.main([str(trained), str(other), "--formats", "svg", "--out", str(tmp_path / "p")])
     names = {"curves.svg", "rewards.svg", "own_0.svg", "own_1.svg"}
     assert {path.name for path in (tmp_path / "p").iterdir()} == names
+    assert len(set_up) == 2
     assert (tmp_path / "mine").read_text() == "mine"
 
 
@@ -324,6 +342,17 @@ def check_report(run: Path, own_plots: int = 0) -> str:
     return page
 
 
+def test_each_result_that_is_not_judged_is_explained() -> None:
+    """Below the console's table, in which a name in brackets is no style."""
+    bounds = {"height": "at most 0.1 (of 3 episodes)", "[speed]": "at most 2"}
+    results = [Result(name, "error, m", 1.0, bound, None) for name, bound in bounds.items()]
+    printed = io.StringIO()
+    Console(file=printed, width=80).print(results_table(Report(tuple(results), {}), "results"))
+    lines = [line.strip() for line in printed.getvalue().splitlines()]
+    assert lines[-2:] == ["height: not judged (of 3 episodes)", "[speed]: not judged"]
+    assert lines[3].startswith("[speed]")
+
+
 def as_shown(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
@@ -344,18 +373,23 @@ def test_training_leaves_a_report(trained: Path) -> None:
 
 
 @pytest.mark.slow
-def test_report_is_drawn_again(trained: Path, tmp_path: Path, own_plots, capsys) -> None:
+def test_report_is_drawn_again(
+    trained: Path, tmp_path: Path, own_plots, capsys, monkeypatch
+) -> None:
     """With each plot of the user's code, also of one title."""
     run, other = shutil.copytree(trained, tmp_path / "run"), tmp_path / "other"
     other.write_text("mine")
     (run / "report.html").unlink()
     (run / "report.html").symlink_to(other)
     own_plots("Mine", "Mine", "The best checkpoint")
+    monkeypatch.setattr(report_page.mujoco, "__version__", "9.9")
     report_command.main([str(run)])
     check_report(run, own_plots=3)
     assert other.read_text() == "mine"
     page = (run / "report.html").read_text("utf-8")
-    assert "Peitian AIR4-560" in page and "MuJoCo 3." in page
+    # A later MuJoCo writes the page, but did not train.
+    versions = re.search("<p>Trained on .* with bounce_mjx (.*)\n.* MuJoCo 9.9, JAX", page)
+    assert versions[1] == f"{bounce_mjx.__version__}." and "Peitian AIR4-560" in page
     # On a phone, what is wide scrolls by itself.
     assert page.count("<table>") == page.count('<div class="wide"><')
     assert capsys.readouterr().out.endswith("run/report.html\n")

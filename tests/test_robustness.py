@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -29,10 +30,15 @@ DRIBBLE = f"{Path(__file__).parent.parent / 'examples' / 'dribble_task.py'}:Drib
 RESULTS = ("consecutive bounces", "horizontal position", "height", "upward speed", "stable")
 
 
-def suite(tmp_path: Path, *perturbations: object, trained: EnvConfig | None = None):
-    """Conditions of a suite file, without the nominal condition."""
+def suite_file(tmp_path: Path, *perturbations: object) -> Path:
     path = tmp_path / "suite.yaml"
     path.write_text(yaml.safe_dump({"perturbations": list(perturbations)}), encoding="utf-8")
+    return path
+
+
+def suite(tmp_path: Path, *perturbations: object, trained: EnvConfig | None = None):
+    """Conditions of a suite file, without the nominal condition."""
+    path = suite_file(tmp_path, *perturbations)
     nominal, *others = load_suite(path, trained or EnvConfig())
     assert (nominal.perturbation.name, nominal.trained) == ("nominal", True)
     assert nominal.ranges.keys() == nominal.env.commands.keys()
@@ -120,6 +126,35 @@ def test_the_trained_ranges_contain_a_condition_or_not(tmp_path: Path) -> None:
     # Without randomisation, a training contains only conditions that leave the world unchanged.
     conditions = suite(tmp_path, late, tilt, both, everything)
     assert [c.trained for c in conditions] == [True, *[False] * 5]
+
+
+def test_a_training_that_always_has_a_term_does_not_contain_a_world_without(tmp_path: Path) -> None:
+    latency = dict(name="late", unit="ms", strengths=[0, 20], terms={"action_latency": "strength"})
+    path = suite_file(tmp_path, latency)
+    always = {"action_latency": (0.015, 0.045)}
+    # What has no neutral value, and how often commands change, is not asked.
+    others = {"camera_rate": (60.0, 120.0), "command_interval": (3.0, 8.0), "air_drag": (0.0, 0.2)}
+    for randomization, expected in (
+        (always | others, [False, False, True]),
+        (always | others | {"share": 0.5}, [True, True, True]),
+        (always | others | {"share": 0.5, "shares": {"action_latency": 1.0}}, [False, False, True]),
+        (others, [True, True, False]),
+    ):
+        conditions = load_suite(path, EnvConfig(randomization=randomization))
+        assert [condition.trained for condition in conditions] == expected
+
+
+def test_a_suite_names_the_contact_pair_that_a_model_lacks(tmp_path: Path) -> None:
+    """Its ball and its paddle touch as all geoms do."""
+    text = resource_path("mjcf/bounce_ball.xml").read_text(encoding="utf-8")
+    for geom in ("ball", "blocker"):
+        text = text.replace(f'<geom name="{geom}"', f'<geom name="{geom}" contype="1"')
+    model = tmp_path / "model.xml"
+    model.write_text(re.sub(r"<contact>.*</contact>", "", text, flags=re.DOTALL), encoding="utf-8")
+    stiff = dict(name="restitution", strengths=[0.8], terms={"restitution": "strength"})
+    conditions = load_suite(suite_file(tmp_path, stiff), EnvConfig(mjcf=str(model)))
+    with pytest.raises(UserError, match="the MJCF has no contact pair of the ball and the paddle"):
+        measure_conditions(None, lambda env: None, conditions, EvaluationOptions(4))
 
 
 LATE = dict(name="late", strengths=[0.01], terms={"action_latency": "strength"})

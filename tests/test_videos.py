@@ -4,10 +4,13 @@ import io
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import imageio_ffmpeg
 import jax
@@ -18,15 +21,17 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from bounce_mjx.commands import play
 from bounce_mjx.errors import UserError
+from bounce_mjx.interrupt import Interrupted
 from bounce_mjx.runs.checkpoints import read_policy
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import pretrained_checkpoint
 from bounce_mjx.training.events import Event
 from bounce_mjx.training.video import EvaluationVideo
-from bounce_mjx.viewers import browser, offscreen, show
+from bounce_mjx.viewers import browser, offscreen, show, video
 from bounce_mjx.viewers.offscreen import choose_backend
 from bounce_mjx.viewers.simulation import Simulation
 from bounce_mjx.viewers.video import VideoWriter, find_ffmpeg
+from viewing import wait_until
 
 
 @pytest.fixture(autouse=True)
@@ -45,6 +50,39 @@ def test_a_video_needs_ffmpeg_of_the_extra_or_of_the_system(monkeypatch, tmp_pat
         VideoWriter(tmp_path / "a.mp4", (64, 64), None)
     (tmp_path / "ffmpeg").touch(mode=0o755)
     assert Path(find_ffmpeg()) == tmp_path / "ffmpeg"
+
+
+SLOW_ENCODER = """#!{python}
+import os, pathlib, sys, time
+sys.stdin.buffer.read()
+pathlib.Path("{folder}/read").write_text(str(os.getsid(0)))
+time.sleep(60.0)
+"""
+
+
+def test_ctrl_c_while_the_encoder_ends_leaves_no_file(tmp_path: Path, monkeypatch) -> None:
+    """A GIF is encoded when all pictures have come. The encoder is not the terminal's, whose Ctrl-C
+    would make it fail first."""
+    encoder, read = tmp_path / "ffmpeg", tmp_path / "read"
+    encoder.write_text(SLOW_ENCODER.format(python=sys.executable, folder=tmp_path))
+    encoder.chmod(0o755)
+    picture = np.zeros((64, 64, 3), np.uint8)
+    monkeypatch.setattr(video, "find_ffmpeg", lambda: str(encoder))
+    monkeypatch.setattr(video, "choose_opengl", lambda: None)
+    monkeypatch.setattr(video, "resample", lambda recording, dt, fps: recording)
+    monkeypatch.setattr(video, "draw_frames", lambda *_: iter([picture] * 3))
+
+    def press_ctrl_c() -> None:
+        wait_until(read.exists)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    (tmp_path / "out").mkdir()
+    writer = VideoWriter(tmp_path / "out/a.gif", (64, 64), None)
+    threading.Thread(target=press_ctrl_c).start()
+    with pytest.raises(Interrupted):
+        writer.write(SimpleNamespace(dt=0.01), None)
+    assert not os.listdir(tmp_path / "out")
+    assert int(read.read_text()) != os.getsid(0)
 
 
 def run(command: list[str], cwd: Path, **variables: str) -> subprocess.CompletedProcess:
@@ -84,7 +122,7 @@ def test_evaluations_are_filmed_for_tensorboard(opengl, tmp_path: Path) -> None:
     videos = []
     for event in log.Images("policy"):
         with Image.open(io.BytesIO(event.encoded_image_string)) as gif:
-            assert (gif.format, gif.size, gif.n_frames) == ("GIF", (64, 48), 6)
+            assert (gif.format, gif.size, gif.n_frames) == ("GIF", (64, 48), 7)
             videos.append([np.asarray(x.convert("RGB"), int) for x in ImageSequence.Iterator(gif)])
     good, still = np.array(videos)
     assert np.abs(good[-1] - good[0]).max() > 50
@@ -121,7 +159,8 @@ def test_video_shows_the_arm_and_a_moving_ball(tmp_path: Path, case: tuple) -> N
     assert set(os.listdir(tmp_path)) == {name, mine.name, planted.name}
     rate, frames = read_video(tmp_path / name)
     assert rate == fps
-    assert frames.shape == (round(0.6 * fps), 240, 320, 3)
+    # From the reset to the last step.
+    assert frames.shape == (round(0.6 * fps) + 1, 240, 320, 3)
     red, green, blue = np.moveaxis(frames[0].astype(int), -1, 0)
     orange = (red > 140) & (green < 140) & (blue < 90)
     assert 0.01 < orange.mean() < 0.2

@@ -24,7 +24,7 @@ from bounce_mjx.world.config import ActionConfig
 from bounce_mjx.world.named import read_world
 from bounce_mjx.world.randomization import TERMS
 
-TWICE = "twice the assumed"
+TWICE = "twice the assumed, or half"
 NAMES = ("ur5e_rtde", "panda_fci", "iiwa_fri", "fast_servo")
 WORLD = {
     "env": {"randomization": {"action_latency": [0.01, 0.02], "frame_drop": [0.0, 0.1]}},
@@ -125,8 +125,9 @@ def test_assumed_numbers_are_doubled_entry_by_entry() -> None:
     there, named = in_world(TrainConfig(), Path("fast_servo"))
     nominals = model_nominals(there.env)
     doubled = named.double_assumed(nominals)
-    assert doubled.keys() == set(named.assumed)
-    for key, settings in doubled.items():
+    assert doubled.keys() == {f"twice {key}" for key in named.assumed}
+    for name, settings in doubled.items():
+        key = name.removeprefix("twice ")
         term = key.removeprefix("randomization.")
         assert settings.keys() == {"randomization"} and settings["randomization"].keys() == {term}
         low, high = getattr(there.env.randomization, term)
@@ -160,12 +161,12 @@ def test_less_of_a_limit_is_harder(tmp_path: Path) -> None:
     sources = dict.fromkeys([*keys, "robot"], "An example.")
     path = written(tmp_path, env=env, sources=sources, assumed=keys)
     assert read_world(path).double_assumed({}) == {
-        "max_joint_velocity": {"max_joint_velocity": 2.0},
-        "action_scale": {"action_scale": 0.04},
-        "randomization.torque_limit": {"randomization": {"torque_limit": [10.0, 20.0]}},
-        "robot.servo_force_limit": {"robot": {"servo_force_limit": [40.0, 6.0]}},
-        "robot.limits.jerk": {"robot": {"limits": {"jerk": [2500.0]}}},
-        "robot.gravity_compensation": {"robot": {"gravity_compensation": 0.5}},
+        "half max_joint_velocity": {"max_joint_velocity": 2.0},
+        "twice action_scale": {"action_scale": 0.04},
+        "half randomization.torque_limit": {"randomization": {"torque_limit": [10.0, 20.0]}},
+        "half robot.servo_force_limit": {"robot": {"servo_force_limit": [40.0, 6.0]}},
+        "half robot.limits.jerk": {"robot": {"limits": {"jerk": [2500.0]}}},
+        "half robot.gravity_compensation": {"robot": {"gravity_compensation": 0.5}},
     }
 
 

@@ -39,7 +39,8 @@ class EvalCommand(WhichPolicy):
     seed: NonNegativeInt = evaluation.DEFAULT_SEED
     """Seed of the resets."""
     nominal: bool = False
-    """Evaluate without domain randomisation; else each episode samples a world, as in training."""
+    """Evaluate without domain randomisation, with the task's default commands; else each episode
+    samples its world and commands, as in training."""
     contacts: bool = False
     """Also count contacts of the arm with itself and the floor, which the physics leaves out, in
     the first 32 episodes."""
@@ -73,7 +74,6 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.training.setup import set_up_jax
 
     check_output(command.json_file, "--json")
-    no_run = {MIRROR_LAW.run, *map(resource_path, POLICIES.values())}
     console = stdout()
     checkpoint = command.choose(command.checkpoint, command.robot)
     check_one_world(command.nominal, command.world, command.randomization)
@@ -84,45 +84,64 @@ def main(args: Sequence[str]) -> None:
     commands = given_commands.checked(config.env)
     set_up_jax(evaluation.on_engine(config.env, command.physics))
     checkpoint, policy, actor = read_actor(checkpoint, config)
-    picture = Path("." if checkpoint.run in no_run else checkpoint.run) / "failures.png"
+    # Beside what is no run, nothing is written.
+    is_run = checkpoint.run not in {MIRROR_LAW.run, *map(resource_path, POLICIES.values())}
+    picture = (checkpoint.run if is_run else Path()) / "failures.png"
     steps = f" ({checkpoint.steps:,} steps)" if checkpoint.steps else ""
     print(f"checkpoint: {checkpoint.folder}{steps}")
     options = evaluation.EvaluationOptions(
-        command.episodes, command.seed, command.physics, command.nominal, commands
+        episodes=command.episodes,
+        seed=command.seed,
+        physics=command.physics,
+        nominal=command.nominal,
+        commands=commands,
     )
-    checks = [("contacts", arm_contacts, describe_contacts)] * command.contacts
-    checks += [("limits", limit_shares, describe_limits)] * command.limits
+    checks = []
+    if command.contacts:
+        checks.append(("contacts", arm_contacts, describe_contacts))
+    if command.limits:
+        checks.append(("limits", limit_shares, describe_limits))
     recorded = RECORDED_EPISODES if checks else 0
     with console.status("evaluating"):
         evaluated = evaluate_policy(policy, config.env, actor, options, recorded)
-    report, engine, warning = evaluated.report, evaluated.engine, evaluated.warning
+    report = evaluated.report
     length = f"{command.episodes:,} episodes of {config.env.episode_seconds:g} s"
-    print(f"physics: {engine}  {length}")
-    if warning is not None:
-        print(f"warning: {warning}")
+    print(f"physics: {evaluated.engine}  {length}")
+    if evaluated.warning is not None:
+        print(f"warning: {evaluated.warning}")
     console.print(results_table(report, "the results"))
     print(details_line(report))
-    found = {}
+    findings = {}
     for name, measure, describe in checks:
         entries = measure(config.env, report.recording)
         print(describe(entries, report.recording.running.shape[-1]))
-        found[name] = [entry._asdict() for entry in entries]
+        findings[name] = [entry._asdict() for entry in entries]
     if command.failures:
-        failures = failures_of(evaluated.conditions, evaluated.statistics)
-        found["failures"] = [failure._asdict() for failure in failures]
+        failures = failures_of(evaluated.setup, evaluated.statistics)
+        findings["failures"] = [failure._asdict() for failure in failures]
         terms = associations(evaluated.statistics, failures)
-        console.print(failures_table(failures, terms, command.episodes))
         if failures:
+            console.print(failures_table(failures, terms, command.episodes))
             print(*association_lines(terms), sep="\n")
+        else:
+            print(f"no episode of {command.episodes:,} failed")
         if failures and terms:
             write_output(picture, image(failures_figure(terms), "png"))
             print(f"picture: {picture}")
+        # A film is on the config's engine.
         if failures and command.physics == "config":
             first_to_end = min(failures, key=lambda failure: failure.seconds)
             shown = film_command(args, _NOT_OF_PLAY, "--episode", str(first_to_end.episode))
             print(f"film of one: {shown}")
     if command.json_file is not None:
-        plain = {"checkpoint": str(checkpoint.folder), "physics": engine, **report.to_dict()}
-        plain |= {"seed": command.seed, "commands": commands, "nominal": command.nominal, **found}
-        write_output(command.json_file, to_json(plain))
+        content = {
+            "checkpoint": str(checkpoint.folder),
+            "physics": evaluated.engine,
+            **report.to_dict(),
+            "seed": command.seed,
+            "commands": commands,
+            "nominal": command.nominal,
+            **findings,
+        }
+        write_output(command.json_file, to_json(content))
     sys.exit(0 if report.passed else 1)

@@ -32,6 +32,7 @@ def main(args: Sequence[str]) -> None:
     set_up_jax()
     checkpoint = choose_checkpoint(command.checkpoint, command.folder)
     print(f"checkpoint: {checkpoint.folder} ({checkpoint.steps:,} steps)")
+    # Refuses a run of a task in a file that --task does not name.
     command.config_of_run(checkpoint.run)
     content = export_onnx(checkpoint)
     write_output(command.onnx, content)

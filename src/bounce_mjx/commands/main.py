@@ -46,8 +46,9 @@ def main(args: Sequence[str] | None = None) -> None:
     # Python looks for garbage after so many new objects. Those of imports and of JAX's programs are
     # hardly ever garbage.
     gc.set_threshold(10_000)
-    # XLA would print a banner about a compilation that takes minutes on a busy machine. What fails
-    # in it is an exception too.
+    # After two minutes of a compilation, as on a busy machine, XLA would print a banner. What fails
+    # in it is an exception too. XLA reads this when JAX is imported, which a command does later; a
+    # Python program of the user's chooses itself.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     with exit_on_user_error():
         name, *rest = (sys.argv[1:] if args is None else args) or ["--help"]

@@ -73,7 +73,8 @@ def main(args: Sequence[str]) -> None:
         flags = {"--nominal": command.nominal, "--episodes": command.episodes}
         flags |= {"--condition": command.condition}
         if given := [flag for flag, value in flags.items() if value]:
-            raise UserError(f"{' and '.join(given)} of an evaluation need --episode; add it")
+            what = "is" if len(given) == 1 else "are"
+            raise UserError(f"{' and '.join(given)} {what} of an evaluation; add its --episode")
     else:
         _check_film(command, given_commands)
     # Before the seconds that imports and the compilation take.
@@ -88,11 +89,13 @@ def main(args: Sequence[str]) -> None:
 
     chosen = [command.choose(path, command.robot) for path in command.checkpoints or (None,)]
     configs = [_config(checkpoint, command) for checkpoint in chosen]
-    (commands, *_) = [given_commands.checked(config.env) for config in configs]
+    # All are of one task, which `show` checks, and so have the same commands.
+    for config in configs:
+        commands = given_commands.checked(config.env)
     set_up_jax(*(config.env for config in configs))
     shown = []
-    for checkpoint, config in zip(chosen, configs, strict=True):
-        checkpoint, policy, actor = read_actor(checkpoint, config)
+    for choice, config in zip(chosen, configs, strict=True):
+        checkpoint, policy, actor = read_actor(choice, config)
         print(f"checkpoint: {checkpoint.folder}")
         title = checkpoint.run.name
         if checkpoint is not MIRROR_LAW:
@@ -133,21 +136,24 @@ def _episode_finder(
     Raises:
       UserError: the suite has no such condition.
     """
-    from bounce_mjx.evaluation.policy_evaluation import InEvaluation, conditions_of
+    from bounce_mjx.evaluation.policy_evaluation import InEvaluation, setup_of
     from bounce_mjx.evaluation.robustness import find_episode
 
     options = EvaluationOptions(
-        _num_episodes(command), _evaluation_seed(command), "config", command.nominal, commands
+        episodes=_num_episodes(command),
+        seed=_evaluation_seed(command),
+        nominal=command.nominal,
+        commands=commands,
     )
     if command.condition is None:
         return lambda: InEvaluation(
-            conditions_of(config.env, options), options.episodes, command.episode
+            setup_of(config.env, options), options.episodes, command.episode
         )
-    path, conditions, _ = suite_conditions(command.suite, config, command.world)
+    suite, conditions, _ = suite_conditions(command.suite, config, command.world)
     labels = [condition.label for condition in conditions]
     if command.condition not in labels:
         advice = suggest(command.condition, labels) or f"give one such as {labels[-1]!r}"
-        raise UserError(f"{path} has no condition {command.condition!r}; {advice}")
+        raise UserError(f"{suite} has no condition {command.condition!r}; {advice}")
     index = labels.index(command.condition)
     return partial(find_episode, conditions, index, options, command.episode)
 
@@ -158,7 +164,9 @@ def _check_film(command: PlayCommand, given_commands: GivenCommands) -> None:
         raise UserError("--episode shows one episode of one policy; give one policy, one robot")
     changes = command.nominal or command.randomization.terms or given_commands.values
     if command.condition is not None and changes:
-        raise UserError("--condition is a whole world; omit other flags that change the world")
+        raise UserError(
+            "--condition is a whole world; omit --nominal, --randomization and the commands"
+        )
     episodes = _num_episodes(command)
     if command.episode >= episodes:
         raise UserError(

@@ -18,7 +18,7 @@ class PlotCommand(WhichPolicy):
     become one curve with a band, as do the seeds of one run. For a run of one seed, or one
     checkpoint in it, the evaluation is drawn too."""
     out: Path = Path("plots")
-    """Folder for the pictures: curves, rewards, what your own code registers and, for one run,
+    """Folder for the pictures: curves, rewards, what your task's file registers and, for one run,
     evaluation."""
     formats: Annotated[tuple[Literal["png", "svg"], ...], Field(min_length=1)] = ("png", "svg")
     """File formats of each picture."""
@@ -31,11 +31,14 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.reports import curves, figures, page
     from bounce_mjx.runs.files import writable, write_output
     from bounce_mjx.runs.folders import find_checkpoint, runs_of_seeds
+    from bounce_mjx.training.setup import set_up_jax
 
     runs = [command.choose_run(run) for run in command.runs or (None,)]
     seeds = [seed for run in runs for seed in runs_of_seeds(run)]
     checkpoints = [find_checkpoint(seed) for seed in seeds]
+    # Also imports the files of the tasks, which may register plots.
     configs = [command.config_of_run(checkpoint.run) for checkpoint in checkpoints]
+    set_up_jax(*(config.env for config in configs))
     groups = curves.group_runs([checkpoint.run for checkpoint in checkpoints])
     with writable(command.out, "choose another folder with --out"):
         command.out.mkdir(parents=True, exist_ok=True)

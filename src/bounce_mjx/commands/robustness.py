@@ -19,6 +19,9 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import config as evaluation
 from bounce_mjx.resources import POLICIES, resource_path
 
+# What is of the measurement alone; a name that ends with = has a value.
+_NOT_OF_PLAY = ("--assumed", "--out=", "--physics=")
+
 
 class RobustnessCommand(WhichPolicy):
     """Measures the results of a trained policy in perturbed worlds."""
@@ -28,9 +31,9 @@ class RobustnessCommand(WhichPolicy):
     world: Path | None = None
     """World that each condition changes, in place of the model's own: a YAML file, or the name of
     one in configs/worlds/ (ur5e_rtde, panda_fci, iiwa_fri or fast_servo). Twice each of its assumed
-    numbers is a condition too."""
+    numbers, or half where less is harder, is a condition too."""
     assumed: bool = False
-    """Only the world itself and twice each of its assumed numbers, without the suite."""
+    """Only the world itself and its assumed numbers doubled or halved, without the suite."""
     suite: Path = Path("robustness")
     """YAML file of the perturbations, or the name of one in configs/: robustness is version 1, and
     robustness_v2 is version 2."""
@@ -65,16 +68,16 @@ def main(args: Sequence[str]) -> None:
     console = stdout()
     checkpoint = command.choose(command.checkpoint, command.robot)
     config = command.config_of(checkpoint, command.robot)
-    path, conditions, doubled = suite_conditions(command.suite, config, command.world)
+    path, conditions, num_assumed = suite_conditions(command.suite, config, command.world)
     suite, version = str(path), read_suite(path).version
     if command.assumed:
         # The suite's own conditions follow.
-        conditions = conditions[: 1 + doubled]
-        suite, version = f"twice what {command.world} assumes", ""
+        conditions = conditions[: 1 + num_assumed]
+        suite, version = f"twice or half what {command.world} assumes", ""
     set_up_jax(*(evaluation.on_engine(condition.env, command.physics) for condition in conditions))
     checkpoint, policy, actor = read_actor(checkpoint, config)
-    no_run = checkpoint.run in {MIRROR_LAW.run, *map(resource_path, POLICIES.values())}
-    out = command.out or (Path("robustness") if no_run else checkpoint.run)
+    is_run = checkpoint.run not in {MIRROR_LAW.run, *map(resource_path, POLICIES.values())}
+    out = command.out or (checkpoint.run if is_run else Path("robustness"))
     # Fails before the measurement if its results could not be written.
     with writable(out, "choose another folder with --out"):
         out.mkdir(parents=True, exist_ok=True)
@@ -102,9 +105,9 @@ def main(args: Sequence[str]) -> None:
         write_output(out / name, content)
     print(*(out / name for name in files), sep="\n")
     lost = [outcome for outcome in outcomes if outcome.lost and outcome.physics != "mujoco"]
-    # Films are of the whole suite's programs, on the config's engine.
+    # A film simulates the programs of the whole suite (`find_episode`), on the config's engine.
     if lost and not command.assumed and command.physics == "config":
         worst = min(lost, key=lambda outcome: outcome.lasted)
         film = "--condition", worst.label, "--episode", str(worst.lost[0])
-        print(f"film of a lost ball: {film_command(args, ('--out=', '--physics='), *film)}")
+        print(f"film of a lost ball: {film_command(args, _NOT_OF_PLAY, *film)}")
     sys.exit(0 if report.passed else 1)

@@ -12,6 +12,7 @@ from bounce_mjx.task.registry import DEFAULT
 from bounce_mjx.viewers.options import ViewerOptions
 
 PROG = "bounce-mjx view"
+_TITLES = {"random": "random actions", "zero": "zero actions", "mirror": "mirror law"}
 
 
 class ViewCommand(StrictModel):
@@ -30,7 +31,8 @@ class ViewCommand(StrictModel):
 
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 2 on a mistake."""
-    # The task and the robot decide the other flags, which are those of the environment.
+    # The task and the robot, read first, decide which flags of the environment there are. The
+    # second reading gives the command's own flags again, and they are left out.
     command = parse(ViewCommand, args, prog=PROG, is_first=True)
     preset = Choice(config=(Path("default"),), robot=command.robot, task=command.task)
     layers = stack(preset)
@@ -54,5 +56,5 @@ def main(args: Sequence[str]) -> None:
     }
     env = observing(env) if command.actions == "mirror" else env
     set_up_jax(env)
-    shown = Shown(env, make_controller[command.actions], f"{command.actions} actions")
+    shown = Shown(env, make_controller[command.actions], _TITLES[command.actions])
     show([shown], command.viewing, commands={}, console=stdout())

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 
-from bounce_mjx.config.command_line import Flag
+from bounce_mjx.config.command_line import Flag, plain_words
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, suggest
@@ -92,7 +92,7 @@ def suite_conditions(
     suite: Path, config: TrainConfig, world: Path | None
 ) -> tuple[Path, list["Condition"], int]:
     """The file of a suite, its conditions for a policy, and how many of them, after the nominal
-    one, double what the world assumes.
+    one, double or halve what the world assumes.
 
     Args:
       suite: a file, or the name of one in configs/.
@@ -121,18 +121,20 @@ def film_command(args: Sequence[str], omitted: Sequence[str], *film: str) -> str
       omitted: its flags that `play` lacks; a name that ends with = has a value.
       film: the flags of the episode.
     """
+    without_value = {flag for flag in omitted if not flag.endswith("=")}
+    without_value |= {flag.replace("--", "--no-", 1) for flag in without_value}
     kept = []
-    words = iter(args)
+    words = iter(plain_words(args))
     for word in words:
         if f"{word}=" in omitted:
             next(words, None)
-        elif word not in omitted and f"{word.partition('=')[0]}=" not in omitted:
+        elif word not in without_value and f"{word.partition('=')[0]}=" not in omitted:
             kept.append(word)
     return shlex.join(["bounce-mjx", "play", *kept, *film])
 
 
 class WhichPolicy(StrictModel):
-    """Which policy a command is about: in whose runs it is looked for. A command adds the flags
+    """Where a command looks for its policy: a task's runs, or a folder. A command adds the flags
     for its paths, and for the robot and the world if it simulates."""
 
     task: str | None = None

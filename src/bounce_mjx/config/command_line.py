@@ -66,38 +66,45 @@ def parse(
     Args:
       description: what the command does; by default, the type's docstring.
       default: values for the flags that are not given; by default, the type's own default values.
-      is_first: reads the flags that must be known before the others, which it leaves alone.
+      is_first: whether other flags may follow, which a later call reads; these decide which there
+        are.
 
     Raises:
       UserError: a flag is unknown or has a bad value.
     """
-    values = {} if default is None else flat(default.model_dump())
     fields = fields_in(command_class)
+    defaults = command_class.model_construct() if default is None else default
     given = read_flags(
         fields,
         args,
         prog=prog,
         # Python's option -OO leaves out docstrings.
         description=description or command_class.__doc__ or "",
-        defaults=values or flat(command_class.model_construct().model_dump()),
+        defaults=flat(defaults.model_dump()),
         is_first=is_first,
     )
-    return typed(command_class, values | given, flag_names(fields), prog)
+    below = {} if default is None else default.model_dump()
+    return typed(command_class, given, flag_names(fields), prog, below)
 
 
 def typed(
-    command_class: type[CommandT], given: Mapping[str, Any], flags: Mapping[str, str], prog: str
+    command_class: type[CommandT],
+    given: Mapping[str, Any],
+    flags: Mapping[str, str],
+    prog: str,
+    below: Mapping[str, Any] = types.MappingProxyType({}),
 ) -> CommandT:
     """A command line from the given values.
 
     Args:
       given: by the dotted keys of the settings; those of other settings are left out.
       flags: the flag of each setting by its dotted key, for errors.
+      below: nested values for settings that are not given.
 
     Raises:
       UserError: a value is out of range.
     """
-    values: dict[str, Any] = {}
+    values = dict(below)
     for key in given.keys() & fields_in(command_class).keys():
         values = merged(values, nested(key, given[key]))
     try:
@@ -125,7 +132,7 @@ def read_flags(
       defaults: values for the help, by dotted key.
       shown: dotted keys of the flags that --help lists; by default, all.
       epilog: the end of the help.
-      is_first: reads the flags that must be known before the others, which it leaves alone.
+      is_first: see `parse`.
 
     Raises:
       UserError: a flag is unknown or lacks its value.
@@ -140,11 +147,7 @@ def read_flags(
         formatter_class=lambda prog: argparse.HelpFormatter(prog, max_help_position=26, width=100),
     )
     _add_arguments(parser, fields, defaults, shown)
-    # Also --num_envs, --report=true and --report=false.
-    words = [re.sub(r"^--[^=]+", lambda flag: flag[0].replace("_", "-"), word) for word in args]
-    words = [re.sub(r"^--(.+)=false$", r"--no-\1", word, flags=re.I) for word in words]
-    words = [re.sub(r"^(--.+)=true$", r"\1", word, flags=re.I) for word in words]
-    given, unknown = parser.parse_known_intermixed_args(words)
+    given, unknown = parser.parse_known_intermixed_args(plain_words(args))
     if unknown and not is_first:
         advice = _near_flag(unknown[0].partition("=")[0], fields)
         parser.error(f"unknown argument {unknown[0]}" + (advice and f"; {advice}"))
@@ -154,6 +157,24 @@ def read_flags(
         if isinstance(values[key], list) and dict in types_in(fields[key].annotation):
             values[key] = _pairs(values[key], flag_names(fields)[key], parser)
     return values
+
+
+def plain_words(args: Sequence[str]) -> list[str]:
+    """The words of a command line with each flag in one spelling: --num-envs for --num_envs,
+    --report for --report=true, and --no-report for --report=false."""
+    return [_plain_word(word) for word in args]
+
+
+def _plain_word(word: str) -> str:
+    if not word.startswith("--"):
+        return word
+    flag, equals, value = word.partition("=")
+    flag = flag.replace("_", "-")
+    if value.lower() == "true":
+        return flag
+    if value.lower() == "false":
+        return _negated(flag)
+    return f"{flag}{equals}{value}"
 
 
 def _near_flag(word: str, fields: Mapping[str, FieldInfo]) -> str:
@@ -170,7 +191,8 @@ def _pairs(words: list[str | None], flag: str, parser: "_Parser") -> dict[str | 
     Raises:
       UserError: there is none, a name lacks its value, or a name appears twice.
     """
-    names, values = words[::2], words[1::2]
+    names = words[::2]
+    values = words[1::2]
     if not words or len(names) != len(values):
         parser.error(f"{flag} needs pairs of a name and its value, such as NAME 0.5")
     pairs = dict(zip(names, values, strict=True))
@@ -192,15 +214,17 @@ def flag_names(fields: Mapping[str, FieldInfo]) -> dict[str, str]:
     """The flag of each setting by its dotted key: --reset.joint-angles of env.reset.joint_angles.
     Where another setting has that flag, the later one has the whole key, such as --env.seed,
     because a task's author may give a setting or a command any name."""
-    flags, taken = {}, {"--help", "--help-all"}
+    flags: dict[str, str] = {}
+    taken = {"--help", "--help-all"}
     # A setting that stands in no group keeps its flag.
     for key in sorted(fields, key=lambda key: "." in key):
-        group, _, name = key.rpartition(".")
-        whole = f"{group}." if group else ""
-        whole = flag_of(whole + (_mark(fields[key]).name or name))
+        group, dot, name = key.rpartition(".")
+        whole = flag_of(group + dot + (_mark(fields[key]).name or name))
         short = re.sub(r"^--(env|ppo|viewing|commands)\.", "--", whole)
         flag = whole if short in taken else short
-        taken |= {flag, _negated(flag)} if fields[key].annotation is bool else {flag}
+        taken.add(flag)
+        if fields[key].annotation is bool:
+            taken.add(_negated(flag))
         flags[key] = flag
     return flags
 
@@ -216,33 +240,49 @@ def _add_arguments(
     shown: Sequence[str] | None,
 ) -> None:
     """Adds the arguments, in groups; `defaults` are by dotted name."""
-    parser.usage, groups, flags = f"{parser.prog} [FLAGS]", {}, flag_names(fields)
+    parser.usage = f"{parser.prog} [FLAGS]"
+    flags = flag_names(fields)
+    groups = {}
     for key, field in fields.items():
         mark = _mark(field)
-        text = " ".join((field.description or "").split()).replace("%", "%%")
-        # A short help has the first sentence only.
-        text = text if shown is None else re.split(r"(?<=[\w)])[.;] ", text)[0].rstrip(".")
-        if (value := defaults.get(key)) is not False and value not in (None, ()):
-            words = " ".join(map(str, value)) if isinstance(value, tuple) else value
-            text += f" (default: {words})"
-        own = {"help": text if shown is None or key in shown else argparse.SUPPRESS}
-        if field.annotation is bool:
-            own["action"] = argparse.BooleanOptionalAction
-        else:
-            own["metavar"] = mark.metavar or _form(field.annotation)
-            if mark.is_repeated:
-                own["action"] = "append"
-            elif _is_list(field.annotation):
-                own["nargs"] = "*"
-            elif mark.is_positional and not field.is_required():
-                own["nargs"] = "?"
+        options = _options_of(field, mark)
+        options["help"] = argparse.SUPPRESS
+        if shown is None or key in shown:
+            options["help"] = _help_of(field, defaults.get(key), is_short=shown is not None)
         name = key.rpartition(".")[0] or "arguments"
-        group = groups[name] = groups.get(name) or parser.add_argument_group(name)
+        if name not in groups:
+            groups[name] = parser.add_argument_group(name)
         if mark.is_positional:
-            parser.usage += f" {own['metavar']}"
-            group.add_argument(key, **own)
+            parser.usage += f" {options['metavar']}"
+            groups[name].add_argument(key, **options)
         else:
-            group.add_argument(flags[key], dest=key, **own)
+            groups[name].add_argument(flags[key], dest=key, **options)
+
+
+def _help_of(field: FieldInfo, default: Any, is_short: bool) -> str:
+    """A flag's help: the docstring of its setting, of which a short help has the first sentence,
+    and the default value."""
+    text = " ".join((field.description or "").split()).replace("%", "%%")
+    if is_short:
+        text = re.split(r"(?<=[\w)])[.;] ", text)[0].rstrip(".")
+    if default is False or default in (None, ()):
+        return text
+    words = " ".join(map(str, default)) if isinstance(default, tuple) else default
+    return f"{text} (default: {words})"
+
+
+def _options_of(field: FieldInfo, mark: Flag) -> dict[str, Any]:
+    """What argparse must know of a flag's value."""
+    if field.annotation is bool:
+        return {"action": argparse.BooleanOptionalAction}
+    options = {"metavar": mark.metavar or _form(field.annotation)}
+    if mark.is_repeated:
+        options["action"] = "append"
+    elif _is_list(field.annotation):
+        options["nargs"] = "*"
+    elif mark.is_positional and not field.is_required():
+        options["nargs"] = "?"
+    return options
 
 
 def _is_list(kind: Any) -> bool:
@@ -255,21 +295,26 @@ def _plain(kind: Any, given: bool | str | list[str]) -> Any:
     if isinstance(given, bool):
         return given
     kinds = set(types_in(kind))
-    parts = [
-        None if part == "None" and type(None) in kinds else part
-        for word in ([given] if isinstance(given, str) else given)
-        for part in (word.split(",") if _is_list(kind) and Path not in kinds else [word])
-    ]
-    return parts if _is_list(kind) and parts != [None] else parts[0]
+    is_list = _is_list(kind)
+    parts = []
+    for word in [given] if isinstance(given, str) else given:
+        parts += word.split(",") if is_list and Path not in kinds else [word]
+    if type(None) in kinds:
+        parts = [None if part == "None" else part for part in parts]
+    return parts if is_list and parts != [None] else parts[0]
 
 
 def _form(kind: Any) -> str:
     """The form of a setting's value, such as INT of tuple[int, ...]."""
-    kinds = [*types_in(kind)]
-    if choices := [kind for kind in kinds if isinstance(kind, str)]:
-        return f"{{{','.join(choices)}}}"
     hidden = {tuple, dict, type(None), types.UnionType, Annotated}
-    return " ".join(k.__name__.upper() for k in kinds if isinstance(k, type) and k not in hidden)
+    choices = []
+    names = []
+    for part in types_in(kind):
+        if isinstance(part, str):
+            choices.append(part)
+        elif isinstance(part, type) and part not in hidden:
+            names.append(part.__name__.upper())
+    return f"{{{','.join(choices)}}}" if choices else " ".join(names)
 
 
 def flags_of(fields: Mapping[str, FieldInfo]) -> list[str]:
@@ -277,7 +322,9 @@ def flags_of(fields: Mapping[str, FieldInfo]) -> list[str]:
     flags = []
     for key, flag in flag_names(fields).items():
         if not _mark(fields[key]).is_positional:
-            flags += [flag, _negated(flag)] if fields[key].annotation is bool else [flag]
+            flags.append(flag)
+            if fields[key].annotation is bool:
+                flags.append(_negated(flag))
     return flags
 
 

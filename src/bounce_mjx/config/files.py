@@ -27,9 +27,10 @@ class _Loader(yaml.SafeLoader):
         self._counts: dict[yaml.Node, int] = {}
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node:
-        before, is_alias = self._count, self.check_event(yaml.AliasEvent)
+        before = self._count
+        is_alias = self.check_event(yaml.AliasEvent)
         node = super().compose_node(parent, index)
-        # An alias inside its own anchor has no end.
+        # An alias inside its own anchor, whose values are not counted yet, has no end.
         self._count += self._counts.get(node, _MAX_VALUES) if is_alias else 1
         if self._count > _MAX_VALUES:
             raise yaml.YAMLError(f"it has more than {_MAX_VALUES:,} values")
@@ -41,7 +42,8 @@ class _Loader(yaml.SafeLoader):
         node = super().compose_mapping_node(anchor)
         first: dict[str, yaml.Node] = {}
         for key, _ in node.value:
-            if (other := first.setdefault(str(key.value), key)) is not key:
+            other = first.setdefault(str(key.value), key)
+            if other is not key:
                 lines = f"{other.start_mark.line + 1} and {key.start_mark.line + 1}"
                 raise yaml.YAMLError(
                     f"the key {key.value} appears twice, in lines {lines}; join the two"
@@ -94,10 +96,12 @@ def dump_with_sources(plain: dict[str, Any], sources: Mapping[str, str], prefix:
       sources: by dotted key.
       prefix: dotted key of the group, with a dot.
     """
-    lines, indent = [], "  " * prefix.count(".")
+    lines = []
+    indent = "  " * prefix.count(".")
     for name, value in plain.items():
         key = prefix + name
-        if key not in sources:
+        is_group = key not in sources
+        if is_group:
             lines.append(f"{indent}{name}:\n")
             lines.append(dump_with_sources(value, sources, f"{key}."))
         else:
@@ -110,8 +114,9 @@ def dump_with_sources(plain: dict[str, Any], sources: Mapping[str, str], prefix:
 
 def differing_keys(one: StrictModel, other: StrictModel) -> set[str]:
     """Dotted names of the settings in which two configs differ."""
-    a, b = flat(one.model_dump()), flat(other.model_dump())
-    return {key for key in a.keys() | b.keys() if a.get(key) != b.get(key)}
+    ours = flat(one.model_dump())
+    theirs = flat(other.model_dump())
+    return {key for key in ours.keys() | theirs.keys() if ours.get(key) != theirs.get(key)}
 
 
 def flat(plain: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -84,9 +84,10 @@ class StrictModel(pydantic.BaseModel):
     @classmethod
     def _refuse_switch(cls, value: Any, info: pydantic.ValidationInfo) -> Any:
         # pydantic would read true as 1.
-        kinds = {*types_in(cls.model_fields[info.field_name].annotation)}
+        kinds = set(types_in(cls.model_fields[info.field_name].annotation))
+        is_number = bool(kinds & {int, float}) and bool not in kinds
         parts = value if isinstance(value, list | tuple) else [value]
-        if kinds & {int, float} and bool not in kinds and any(isinstance(x, bool) for x in parts):
+        if is_number and any(isinstance(part, bool) for part in parts):
             raise PydanticKnownError("int_type" if int in kinds else "float_type")
         return value
 
@@ -97,12 +98,12 @@ class StrictModel(pydantic.BaseModel):
         those of its class."""
         if not isinstance(values, dict):
             return values
-        groups = {
-            name: field.default.model_dump(exclude_unset=True)
-            for name, field in cls.model_fields.items()
-            if isinstance(field.default, StrictModel) and isinstance(values.get(name), dict)
-        }
-        return values | {name: merged(own, values[name]) for name, own in groups.items()}
+        completed = dict(values)
+        for name, field in cls.model_fields.items():
+            if isinstance(field.default, StrictModel) and isinstance(values.get(name), dict):
+                default = field.default.model_dump(exclude_unset=True)
+                completed[name] = merged(default, values[name])
+        return completed
 
 
 class Layer(NamedTuple):
@@ -111,7 +112,7 @@ class Layer(NamedTuple):
     source: str
     """For people, such as configs/cpu.yaml."""
     values: dict[str, Any]
-    """Nested, with the keys of a larger config."""
+    """Nested, with the keys of `TrainConfig`."""
     is_world: bool = False
     """Whether it brings the whole randomisation: what a preset's curriculum says of other terms
     then ends, see `without_idle_curriculum`."""
@@ -128,9 +129,12 @@ def fields_in(group: type[pydantic.BaseModel], prefix: str = "") -> dict[str, Fi
     """The settings of a group and of the groups in it, by dotted name."""
     fields = {}
     for name, field in group.model_fields.items():
-        inner, key = field.annotation, prefix + name
-        is_group = isinstance(inner, type) and issubclass(inner, pydantic.BaseModel)
-        fields |= fields_in(inner, f"{key}.") if is_group else {key: field}
+        key = prefix + name
+        inner = field.annotation
+        if isinstance(inner, type) and issubclass(inner, pydantic.BaseModel):
+            fields |= fields_in(inner, f"{key}.")
+        else:
+            fields[key] = field
     return fields
 
 
@@ -145,6 +149,8 @@ def merged(values: dict[str, Any], others: dict[str, Any]) -> dict[str, Any]:
     """Nested mappings in which the others' keys win."""
     result = dict(values)
     for key, value in others.items():
-        both = isinstance(value, dict) and isinstance(result.get(key), dict)
-        result[key] = merged(result[key], value) if both else value
+        if isinstance(value, dict) and isinstance(result.get(key), dict):
+            result[key] = merged(result[key], value)
+        else:
+            result[key] = value
     return result

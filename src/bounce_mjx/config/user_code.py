@@ -99,9 +99,12 @@ def _run(source: bytes, path: Path) -> types.ModuleType:
     try:
         exec(compile(source, str(path), "exec"), vars(module))
     except Exception as error:
-        frames = traceback.extract_tb(error.__traceback__)
-        lines = [frame.lineno for frame in frames if frame.filename == str(path)]
-        line = getattr(error, "lineno", None) or (lines or [1])[-1]
+        line = 1
+        for frame in traceback.extract_tb(error.__traceback__):
+            if frame.filename == str(path):
+                line = frame.lineno
+        # A SyntaxError has its own.
+        line = getattr(error, "lineno", None) or line
         raise UserError(
             f"{path} cannot be imported ({type(error).__name__} in line {line}: "
             f"{shorten(str(error), 300)}); correct it"

@@ -51,22 +51,14 @@ def describe(
       flags: of a command line, the flag of each setting by its dotted name.
       group: dotted key, in `fields`, of what was validated.
     """
-    first, key = error.errors()[0], key_of(error, group)
+    first = error.errors()[0]
+    key = key_of(error, group)
     if first["type"] in ("extra_forbidden", "invalid_key"):
-        place, _, name = key.rpartition(".")
-        by_name = {other.rpartition(".")[2]: other for other in reversed(fields)}
-        near = [other for other in fields if other.rpartition(".")[2] == name]
-        groups = {x[:i] for x in fields for i, letter in enumerate(x) if letter == "."}
-        near += difflib.get_close_matches(key, [*fields, *sorted(groups)], n=1, cutoff=0.8)
-        near += [by_name[x] for x in difflib.get_close_matches(name, by_name, n=1, cutoff=0.8)]
-        place = f"{place}." if place else ""
-        here = {x.removeprefix(place).split(".")[0] for x in fields if x.startswith(place)}
-        advice = f"known keys here are {', '.join(sorted(here))}"
-        advice = f"did you mean {near[0]}?" if near else advice
-        return f"unknown key {shorten(key)}; {advice}"
+        return f"unknown key {shorten(key)}; {_advice_on(key, fields)}"
     if first["type"] == "value_error":
         reason = shorten(first["msg"].removeprefix("Value error, "), 500)
-        return ": ".join(filter(None, [key.rpartition(".")[2], reason]))
+        name = key.rpartition(".")[2]
+        return f"{name}: {reason}" if name else reason
     reason = first["msg"][0].lower() + first["msg"][1:]
     if first["type"] == "missing":
         reason = "an item is missing"
@@ -74,6 +66,31 @@ def describe(
         reason += f" {unit_of(fields[key].description or '')}".rstrip()
     given = shorten(str(first["input"]))
     return f"{flags.get(key, key)} is {given}, but {reason.replace('input should', 'must', 1)}"
+
+
+def _advice_on(key: str, fields: Mapping[str, FieldInfo]) -> str:
+    """What an unknown key may mean: the same name in another group, a key that is spelt like it, a
+    name that is; or which keys its group has."""
+    group, dot, name = key.rpartition(".")
+    by_name: dict[str, str] = {}
+    groups: set[str] = set()
+    here: set[str] = set()
+    for field in fields:
+        inner, _, last = field.rpartition(".")
+        by_name.setdefault(last, field)
+        while inner:
+            groups.add(inner)
+            inner = inner.rpartition(".")[0]
+        if field.startswith(group + dot):
+            here.add(field.removeprefix(group + dot).split(".")[0])
+    if name in by_name:
+        return f"did you mean {by_name[name]}?"
+    keys = [*fields, *sorted(groups)]
+    if near := difflib.get_close_matches(key, keys, n=1, cutoff=0.8):
+        return f"did you mean {near[0]}?"
+    if near := difflib.get_close_matches(name, by_name, n=1, cutoff=0.8):
+        return f"did you mean {by_name[near[0]]}?"
+    return f"known keys here are {', '.join(sorted(here))}"
 
 
 def key_of(error: pydantic.ValidationError, group: str = "") -> str:

@@ -1,5 +1,6 @@
 """Evaluation on MuJoCo's C engine: the same task and policy, with the physics in threads."""
 
+import copy
 import os
 
 import jax
@@ -34,7 +35,8 @@ def make_mujoco_evaluator(env: Env, actor: Actor, episodes: int, recorded: int =
 
     @jax.jit
     def decide(policy: Policy, states: State) -> tuple[jax.Array, Actuation, Control, jax.Array]:
-        now, actions = states.pipeline_state, actor.act(policy, states.obs.T).T
+        now = states.pipeline_state
+        actions = actor.act(policy, states.obs.T).T
         control, actuation = jax.vmap(env.control, in_axes=-1, out_axes=-1)(now, actions)
         targets = jax.vmap(servo_targets, in_axes=(-1, None))(control, env.config.num_substeps)
         return actions, actuation, control, targets
@@ -43,8 +45,8 @@ def make_mujoco_evaluator(env: Env, actor: Actor, episodes: int, recorded: int =
     def finish(
         now: Batch, actions: jax.Array, actuation: Actuation, physics: PhysicsState
     ) -> Batch:
-        halves = now.states, actions, actuation, physics
-        return add_step(env, now, jax.vmap(env.finish_step, in_axes=-1, out_axes=-1)(*halves))
+        finish_step = jax.vmap(env.finish_step, in_axes=-1, out_axes=-1)
+        return add_step(env, now, finish_step(now.states, actions, actuation, physics))
 
     def evaluate(policy: Policy, key: jax.Array, ranges: Ranges | None = None) -> Measured:
         now = start(key, ranges)
@@ -54,6 +56,7 @@ def make_mujoco_evaluator(env: Env, actor: Actor, episodes: int, recorded: int =
                 actions, actuation, control, targets = decide(policy, now.states)
                 after = physics.step(control, targets)
                 now = finish(now, actions, actuation, after)
+                # To look waits for the step, so that the next one would begin later.
                 if step % 100 == 99 and not np.any(now.statistics.running):
                     break
         return now.statistics, now.recording
@@ -69,11 +72,14 @@ class _Physics:
         Args:
           now: the episodes' first states, batch last.
         """
-        self._mj_model, self._pool, balls = env.mj_model, pool, env.addresses.balls
+        self._mj_model = env.mj_model
+        self._pool = pool
         self._models = episode_models(env, now.parameters)
         self._data = [mujoco.MjData(self._models[0]) for _ in range(_NUM_THREADS)]
         self._states = full_states(env.mj_model, now.physics)
+        balls = env.addresses.balls
         self._bodies = [ball.body for ball in balls]
+        self._masses = np.array([model.body_mass[self._bodies] for model in self._models])
         # A state begins with the time and the positions.
         self._velocities = 1 + env.mj_model.nq + np.array([ball.qvel[:3] for ball in balls])
 
@@ -84,16 +90,15 @@ class _Physics:
           control: that of the step [..., N].
           targets: its servo targets [N, substeps, nu].
         """
-        push, drag, targets = (
-            None if x is None else np.asarray(x, np.float64)
-            for x in (control.ball_push, control.air_drag, targets)
-        )
-        if push is not None:
+        targets = np.asarray(targets, np.float64)
+        if control.ball_push is not None:
+            push = np.asarray(control.ball_push, np.float64)
             push = push.reshape(-1, len(self._states)).T
             self._states[:, self._velocities.ravel()] += push
-        if drag is None:
+        if control.air_drag is None:
             self._advance(targets, _CTRL)
         else:
+            drag = np.asarray(control.air_drag, np.float64)
             # The drag needs the velocity in each physics step.
             for target in np.moveaxis(targets, 1, 0):
                 forces = self._drag_forces(drag).reshape(len(target), -1)
@@ -109,7 +114,7 @@ class _Physics:
 
     def _drag_forces(self, drag: np.ndarray) -> np.ndarray:
         """Forces and torques [N, bodies, 6] on the balls, from `Control.air_drag` [N]."""
-        mass = np.array([model.body_mass[self._bodies] for model in self._models])[:, :, None]
+        mass = self._masses[:, :, None]
         velocity = self._states[:, self._velocities]
         speed = np.linalg.norm(velocity, axis=2, keepdims=True)
         forces = np.zeros((len(velocity), self._mj_model.nbody, 6))
@@ -118,16 +123,25 @@ class _Physics:
 
 
 def episode_models(env: Env, parameters: PhysicsParameters) -> list[mujoco.MjModel]:
-    """One model for all episodes, or one model per episode where parameters [..., N] are given."""
+    """One model for all episodes, or one model per episode where parameters [..., N] are given.
+
+    What diverges in them stays so, which ends the episode (`Env.finish_step`); by default, MuJoCo
+    puts everything back to the model's own pose and goes on.
+    """
     parameters = jax.tree.map(np.asarray, parameters)
     given = jax.tree.leaves(parameters)
     if not given:
-        return [env.mj_model]
-    plain = world_model(env.config, visual=False)
-    return [
-        edited_model(plain, jax.tree.map(lambda array, i=i: array[..., i], parameters))
-        for i in range(given[0].shape[-1])
-    ]
+        models = [copy.copy(env.mj_model)]
+    else:
+        # Without what only pictures need, of which N copies would be large.
+        plain = world_model(env.config, visual=False)
+        models = [
+            edited_model(plain, jax.tree.map(lambda array, i=i: array[..., i], parameters))
+            for i in range(given[0].shape[-1])
+        ]
+    for model in models:
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    return models
 
 
 def full_states(mj_model: mujoco.MjModel, physics: PhysicsState) -> np.ndarray:
@@ -136,7 +150,7 @@ def full_states(mj_model: mujoco.MjModel, physics: PhysicsState) -> np.ndarray:
     mujoco.mj_getState(mj_model, mujoco.MjData(mj_model), fresh, _FULL_PHYSICS)
     coordinates = np.concatenate(jax.tree.leaves(physics)).T
     states = np.tile(fresh, (len(coordinates), 1))
-    # The order: time, positions, velocities, histories of sensors.
+    # The order: time, positions, velocities (no engine carries activations), histories of sensors.
     states[:, 1 : 1 + coordinates.shape[1]] = coordinates
     return states
 

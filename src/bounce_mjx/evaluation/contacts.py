@@ -36,7 +36,8 @@ def arm_contacts(config: WorldConfig, recording: Recording) -> list[ArmContact]:
     """
     checker = ContactChecker(config, _MARGIN)
     allowed = checker.touching(np.array(config.default_joint_angles))
-    joint_angles, running = (np.asarray(x) for x in (recording.joint_angles, recording.running))
+    joint_angles = np.asarray(recording.joint_angles)
+    running = np.asarray(recording.running)
     found: dict[tuple[str, ...], list[int]] = {}
     for step, episode in np.argwhere(running):
         for pair in checker.touching(joint_angles[step, :, episode]) - allowed:
@@ -64,20 +65,20 @@ class ContactChecker:
         """
         spec, path = scene_spec(config.mjcf, config.robot)
         heights = [0.0] if table_height is None else [0.0, table_height]
-        size, kind = [5.0, 5.0, 0.1], mujoco.mjtGeom.mjGEOM_PLANE
+        plane = mujoco.mjtGeom.mjGEOM_PLANE
         for height in heights:
-            spec.worldbody.add_geom(type=kind, size=size, pos=[0.0, 0.0, height])
-        self._model = model = compile_spec(spec, path)
-        self._addresses, self._data = find_addresses(model), mujoco.MjData(model)
-        own = (model.geom_type == kind) & (model.geom_bodyid == 0)
+            spec.worldbody.add_geom(type=plane, size=[5.0, 5.0, 0.1], pos=[0.0, 0.0, height])
+        model = compile_spec(spec, path)
+        self._model = model
+        self._data = mujoco.MjData(model)
+        self._addresses = find_addresses(model)
+        is_plane = (model.geom_type == plane) & (model.geom_bodyid == 0)
         # MuJoCo sorts the geoms by body, those of the world in the order of their addition.
-        self._planes = {int(g): -1 - i for i, g in enumerate(np.flatnonzero(own)[-len(heights) :])}
-        planes, balls = list(self._planes), {ball.body for ball in self._addresses.balls}
-        arm = [
-            geom
-            for geom in range(model.ngeom)
-            if model.geom_bodyid[geom] not in balls and not own[geom] and self._is_shape(geom)
-        ]
+        planes = np.flatnonzero(is_plane)[-len(heights) :].tolist()
+        self._planes = {geom: -1 - i for i, geom in enumerate(planes)}
+        is_ball = np.isin(model.geom_bodyid, [ball.body for ball in self._addresses.balls])
+        others = np.flatnonzero(~is_plane & ~is_ball).tolist()
+        arm = [geom for geom in others if self._is_shape(geom)]
         model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         model.geom_contype[:] = model.geom_conaffinity[:] = 0
         model.geom_contype[arm] = model.geom_conaffinity[arm] = 1
@@ -90,35 +91,46 @@ class ContactChecker:
     def _is_shape(self, geom: int) -> bool:
         """Whether a geom is a collision shape: if its body has hidden ones, these are."""
         model = self._model
-        own = model.geom_group[model.geom_bodyid == model.geom_bodyid[geom]]
-        return model.geom_group[geom] == HIDDEN_GROUP or HIDDEN_GROUP not in own
+        groups = model.geom_group[model.geom_bodyid == model.geom_bodyid[geom]]
+        return model.geom_group[geom] == HIDDEN_GROUP or HIDDEN_GROUP not in groups
 
     def touching(self, joint_angles: np.ndarray) -> set[tuple[int, int]]:
         """Pairs of parts that touch at joint angles [n], neighbours left out."""
-        model, data = self._model, self._data
+        model = self._model
+        data = self._data
         data.qpos[:] = model.qpos0
         data.qpos[list(self._addresses.arm_qpos)] = joint_angles
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_collision(model, data)
         balls = {ball.geom for ball in self._addresses.balls}
-        found = data.contact.geom[: data.ncon].tolist()
-        pairs = {tuple(sorted(map(self._part, pair))) for pair in found if not balls & set(pair)}
-        return {pair for pair in pairs if not self._are_neighbours(*pair)}
+        touching = set()
+        for geoms in data.contact.geom[: data.ncon].tolist():
+            one, other = sorted(map(self._part, geoms))
+            if balls.isdisjoint(geoms) and not self._are_neighbours(one, other):
+                touching.add((one, other))
+        return touching
 
     def _part(self, geom: int) -> int:
         return self._planes.get(geom, int(self._model.body_weldid[self._model.geom_bodyid[geom]]))
 
     def _are_neighbours(self, one: int, other: int) -> bool:
-        """Whether a joint connects two parts. A link that turns about a vertical axis on its base
-        comes no closer to a plane."""
+        """Whether a joint connects two parts; or one is a plane, to which the other comes no
+        closer.
+
+        Args:
+          one: the part with the smaller number.
+        """
         model = self._model
         parent = model.body_weldid[model.body_parentid[other]]
-        joint = model.body_jntadr[other]
         if one >= 0:
             return parent == one
-        vertical = joint >= 0 and abs(self._data.xaxis[joint][2]) > 0.999
-        return other == 0 or (parent == 0 and vertical)
+        if other <= 0:
+            return True
+        # A link on the base that turns about a vertical axis keeps its height.
+        joint = model.body_jntadr[other]
+        is_vertical = joint >= 0 and abs(self._data.xaxis[joint][2]) > 0.999
+        return parent == 0 and is_vertical
 
     def name(self, part: int) -> str:
         """A part's name in a message."""

@@ -15,11 +15,12 @@ from bounce_mjx.task.task import Recording
 from bounce_mjx.world.randomization import Ranges
 
 BLOCK = 64
-"""Episodes of a film's batch. An episode is the same bit for bit in a batch of any multiple of it
-on a CPU, whose vector instructions then have no remainder."""
+"""Batches of episodes are multiples of it: on a CPU, whose vector instructions then have no
+remainder, an episode is the same bit for bit in any of them."""
 
 Evaluator = Callable[..., Measured]
-"""Measures E deterministic episodes from a policy, a key and optional ranges."""
+"""Measures E deterministic episodes: (policy, key, optional ranges as for `reset_episodes`) ->
+`Measured`. A filmer measures one."""
 
 
 class Batch(NamedTuple):
@@ -35,8 +36,11 @@ class Batch(NamedTuple):
 def make_evaluator(env: Env, actor: Actor, episodes: int, recorded: int = 0) -> Evaluator:
     """A jitted evaluation of `episodes` episodes, each from its own reset (`reset_episodes`), with
     a recording of the first `recorded`. It stops when all episodes have ended or their time limit
-    is reached. They are simulated with copies of the last one, up to whole blocks, so that an
-    episode is the same in any number of them, and a film shows it as it was."""
+    is reached.
+
+    They are simulated in whole blocks (`_lanes`), so that on a CPU an episode is the same in any
+    number of them, and a film shows it as it was; fewer than a block in MJX are not.
+    """
     lanes = _lanes(env, episodes)
 
     def evaluate(policy: Policy, key: jax.Array, ranges: Ranges | None = None) -> Measured:
@@ -64,6 +68,7 @@ def make_filmer(env: Env, actor: Actor, episodes: int, episode: int) -> Evaluato
         first = episode // BLOCK * BLOCK
         simulated = simulated[first : first + BLOCK]
         place = episode - first
+    # A recording is of the first ones.
     recorded = place + 1
 
     def evaluate(policy: Policy, key: jax.Array, ranges: Ranges | None = None) -> Measured:
@@ -77,10 +82,11 @@ def make_filmer(env: Env, actor: Actor, episodes: int, episode: int) -> Evaluato
 
 
 def _lanes(env: Env, episodes: int) -> np.ndarray:
-    """Indices of the episodes, the last one repeated up to whole blocks."""
+    """Which episode each place of the batch simulates: all in order, then the last one again up to
+    whole blocks."""
     total = -(-episodes // BLOCK) * BLOCK
     if env.engine.name != "fused" and episodes < BLOCK:
-        # Copies in MJX take as long as its episodes.
+        # A copy in MJX takes as long as an episode. Without, the last bits may differ.
         total = episodes
     return np.minimum(np.arange(total), episodes - 1)
 
@@ -148,11 +154,14 @@ def reset_episodes(env: Env, key: jax.Array, episodes: int, ranges: Ranges | Non
 def _reset_lanes(
     env: Env, key: jax.Array, episodes: int, lanes: np.ndarray, ranges: Ranges | None
 ) -> State:
-    """`reset_episodes` of the episodes with some indices, which may repeat."""
+    """`reset_episodes` of the episodes with some indices, which may repeat.
+
+    With JAX's default keys, which are partitionable, the i-th is the same for any number of them.
+    """
     if ranges is None:
         return jax.vmap(env.reset, out_axes=-1)(jax.random.split(key, episodes)[lanes])
     conditions = len(jax.tree.leaves(ranges)[0])
-    each = episodes // conditions
-    keys = jax.random.split(key, each)[lanes % each]
-    ranges = jax.tree.map(lambda end: jnp.asarray(end)[lanes // each], ranges)
+    per_condition = episodes // conditions
+    keys = jax.random.split(key, per_condition)[lanes % per_condition]
+    ranges = jax.tree.map(lambda end: jnp.asarray(end)[lanes // per_condition], ranges)
     return jax.vmap(env.reset, out_axes=-1)(keys, ranges)

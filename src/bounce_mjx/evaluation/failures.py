@@ -10,7 +10,7 @@ import numpy as np
 from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.config import command_ranges
 from bounce_mjx.evaluation.episodes import make_filmer
-from bounce_mjx.evaluation.policy_evaluation import Conditions
+from bounce_mjx.evaluation.policy_evaluation import EpisodeSetup
 from bounce_mjx.evaluation.results import episodes_of, is_share
 from bounce_mjx.evaluation.statistics import Statistics
 from bounce_mjx.learning.policy import Actor, Policy
@@ -19,7 +19,6 @@ from bounce_mjx.task.task import Recording
 # Quantile of the normal distribution for 95% intervals.
 _Z = 1.959964
 _CAUSES = {"too_fast": "a joint too fast", "non_finite": "the physics"}
-_PARTS = 3
 
 
 class Failure(NamedTuple):
@@ -40,7 +39,7 @@ class Failure(NamedTuple):
 
 
 class Third(NamedTuple):
-    """Episodes whose value of a term is in one third of its range."""
+    """Episodes whose value of a term is in one third of the range of the values that occurred."""
 
     low: float
     high: float
@@ -69,26 +68,32 @@ class Association(NamedTuple):
         return max(shares) - min(shares) if shares else 0.0
 
 
-def failures_of(conditions: Conditions, statistics: Statistics) -> list[Failure]:
-    """The failed episodes of an evaluation."""
-    env, commands, _ = conditions
+def failures_of(setup: EpisodeSetup, statistics: Statistics) -> list[Failure]:
+    """The failed episodes of an evaluation, each judged alone: one that lasts may miss a result
+    that all together meet."""
+    env = setup.env
+    commands = command_ranges(env.config) | setup.commands
     s = jax.tree.map(np.asarray, statistics)
-    commands = command_ranges(env.config) | commands
     found = []
     for i in range(len(s.running)):
         alone = jax.tree.map(lambda figure, i=i: figure[i : i + 1], s)
         results = env.task.results(episodes_of(alone, commands))
         # A mean over all episodes says nothing of one of them.
         shares = [result for result in results if is_share(result.measured)]
-        failed = [result.name for result in shares if result.passed is False]
-        if not s.running[i]:
+        missed = [result for result in shares if result.passed is False]
+        lasted = bool(s.running[i])
+        if not lasted:
+            # One that ended before there was something to measure did not miss that.
+            missed = [result for result in missed if result.value is not None]
+        failed = [result.name for result in missed]
+        if not lasted:
             failed.insert(0, _cause(s.ended_by, i))
         if failed:
             found.append(
                 Failure(
                     episode=i,
                     seconds=float(s.steps[i]) * env.dt,
-                    lasted=bool(s.running[i]),
+                    lasted=lasted,
                     failed=tuple(failed),
                     command={name: float(x[i]) for name, x in s.command.items()},
                     world={name: x[i].astype(float).tolist() for name, x in s.world.items()},
@@ -98,7 +103,7 @@ def failures_of(conditions: Conditions, statistics: Statistics) -> list[Failure]
 
 
 def _cause(ended_by: dict[str, np.ndarray], index: int) -> str:
-    """Why an episode ended early, in words."""
+    """Why an episode ended early, in words; of two causes at once, the first by name."""
     causes = [_CAUSES[name] for name, ended in ended_by.items() if ended[index]]
     return causes[0] if causes else "ended by the task"
 
@@ -124,13 +129,23 @@ def associations(statistics: Statistics, failures: list[Failure]) -> list[Associ
 
 def _thirds(values: np.ndarray, has_failed: np.ndarray) -> tuple[Third, ...]:
     """The failures in the thirds of the range of values [E]."""
-    ends = np.linspace(values.min(), values.max(), _PARTS + 1)
-    part = np.clip(np.searchsorted(ends, values, "right") - 1, 0, _PARTS - 1)
+    ends = np.linspace(values.min(), values.max(), 4)
+    # The greatest value is in the last third.
+    third = np.minimum(np.searchsorted(ends, values, "right") - 1, 2)
     thirds = []
-    for i in range(_PARTS):
-        count, failed = int(np.sum(part == i)), int(np.sum(has_failed[part == i]))
-        interval = wilson_interval(failed, count)
-        thirds.append(Third(float(ends[i]), float(ends[i + 1]), count, failed, interval))
+    for i in range(3):
+        is_in = third == i
+        episodes = int(np.sum(is_in))
+        failed = int(np.sum(has_failed[is_in]))
+        thirds.append(
+            Third(
+                low=float(ends[i]),
+                high=float(ends[i + 1]),
+                episodes=episodes,
+                failed=failed,
+                interval=wilson_interval(failed, episodes),
+            )
+        )
     return tuple(thirds)
 
 
@@ -139,7 +154,8 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     statistical inference", 1927; (0, 1) without trials."""
     if not trials:
         return 0.0, 1.0
-    share, square = successes / trials, _Z**2
+    share = successes / trials
+    square = _Z**2
     centre = share + square / (2.0 * trials)
     half = _Z * math.sqrt((share * (1.0 - share) + square / (4.0 * trials)) / trials)
     whole = 1.0 + square / trials
@@ -157,7 +173,7 @@ class Film(NamedTuple):
 
 
 def film_episode(
-    conditions: Conditions,
+    setup: EpisodeSetup,
     actor: Actor,
     policy: Policy | None,
     episodes: int,
@@ -171,7 +187,7 @@ def film_episode(
       seed: of the evaluation's resets.
       episode: its number, from 0.
     """
-    run = make_filmer(conditions.env, actor, episodes, episode)
-    measured = run(policy, jax.random.PRNGKey(seed), conditions.ranges)
+    run = make_filmer(setup.env, actor, episodes, episode)
+    measured = run(policy, jax.random.PRNGKey(seed), setup.ranges)
     statistics, recording = jax.device_get(measured)
-    return Film(conditions.env, recording, statistics)
+    return Film(setup.env, recording, statistics)

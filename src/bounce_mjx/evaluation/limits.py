@@ -33,31 +33,40 @@ def limit_shares(config: WorldConfig, recording: Recording, rate: float = 1000) 
       rate: of the controller, Hz; rounded to whole commands in a control step.
     """
     limits = config.robot.limits
+    # In the order of their differences; an arm with one of them has those before it.
     given = {name: getattr(limits, name) for name in ("velocity", "acceleration", "jerk")}
     bounds = {name: np.array(bound)[:, None] for name, bound in given.items() if bound is not None}
     smoothing = joint_limits(limits).smoothing
     smoothing = None if smoothing is None else smoothing[:, None]
-    velocities, running = (np.asarray(x) for x in (recording.command_velocity, recording.running))
+    velocities = np.asarray(recording.command_velocity, np.float64)
+    running = np.asarray(recording.running)
     duration = config.control_dt
     count = max(1, round(duration * rate))
     tick = duration / count
+    times = tick * np.arange(1, count + 1)
     still = np.zeros(velocities.shape[1:])
-    start, sent = Setpoint(still, still, still), [still] * len(bounds)
+    start = Setpoint(still, still, still)
+    # A difference of order k needs k commands before the first one of a step.
+    earlier = [still] * len(bounds)
     largest = {name: still for name in bounds}
-    for after, counts in zip(velocities.astype(np.float64), running, strict=True):
+    for after, is_running in zip(velocities, running, strict=True):
         acceleration = (after - start.velocity) / duration
-        times = tick * np.arange(1, count + 1)
-        sent += [command(start, acceleration, time, np, smoothing) for time in times]
+        sent = [command(start, acceleration, time, np, smoothing) for time in times]
+        sent = [*earlier, *sent]
         change = np.array(sent)
         for name, bound in bounds.items():
             change = np.diff(change, axis=0) / tick
             most = np.max(np.abs(change[-count:]), axis=0) / bound
-            largest[name] = np.maximum(largest[name], np.where(counts, most, 0.0))
-        sent = sent[-len(bounds) :]
+            largest[name] = np.maximum(largest[name], np.where(is_running, most, 0.0))
+        earlier = sent[-len(bounds) :]
         position = start.position + 0.5 * (start.velocity + after) * duration
         start = Setpoint(position, after, acceleration)
-    each = {name: np.max(shares, axis=1) for name, shares in largest.items()}
-    return [LimitShare(name, float(x.max()), int(x.argmax()) + 1) for name, x in each.items()]
+    shares = []
+    for name, by_episode in largest.items():
+        by_joint = np.max(by_episode, axis=1)
+        joint = int(by_joint.argmax())
+        shares.append(LimitShare(name, share=float(by_joint[joint]), joint=joint + 1))
+    return shares
 
 
 def describe_limits(shares: Iterable[LimitShare], episodes: int) -> str:

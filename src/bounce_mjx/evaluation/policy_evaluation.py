@@ -24,20 +24,20 @@ from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import RandomizationConfig, Ranges
 
 
-class Conditions(NamedTuple):
-    """What an evaluation simulates."""
+class EpisodeSetup(NamedTuple):
+    """From what the episodes of an evaluation are sampled."""
 
     env: Env
     commands: dict[str, tuple[float, float]]
-    """Ranges of commands, where they are not the config's."""
+    """Ranges of commands; those left out have the config's."""
     ranges: Ranges | None
-    """Of one condition, as for `reset_episodes`; None for the config's."""
+    """Ranges of worlds and commands, as for `reset_episodes`; None for the config's."""
 
 
 class InEvaluation(NamedTuple):
-    """Where an evaluation simulates one of its episodes."""
+    """Where an evaluation simulates one of its episodes, for a film of it."""
 
-    conditions: Conditions
+    setup: EpisodeSetup
     episodes: int
     """Number of episodes that one call simulates."""
     episode: int
@@ -51,8 +51,9 @@ class PolicyEvaluation(NamedTuple):
     engine: str
     """fused, mjx or mujoco."""
     warning: str | None
-    """Why MuJoCo's C engine computes something else than the fused one; None if it does not."""
-    conditions: Conditions
+    """Why MuJoCo's C engine computes something else than the fused one; None if it does not, or was
+    not used."""
+    setup: EpisodeSetup
     statistics: Statistics
     """Figures of each episode, with its world."""
 
@@ -74,34 +75,39 @@ def evaluate_policy(
     Raises:
       UserError: the engine does not support the model.
     """
-    conditions = conditions_of(env_config, options)
-    env, commands, ranges = conditions
+    setup = setup_of(env_config, options)
+    env = setup.env
     on_c = options.physics == "mujoco"
     engine = "mujoco" if on_c else env.engine.name
     make = make_mujoco_evaluator if on_c else make_evaluator
     evaluate = make(env, actor(env), options.episodes, recorded)
-    statistics, recording = evaluate(policy, jax.random.PRNGKey(options.seed), ranges)
+    statistics, recording = evaluate(policy, jax.random.PRNGKey(options.seed), setup.ranges)
     warning = solver_warning(env.mj_model) if on_c else None
-    report = judge(env, statistics, recording, commands)
-    return PolicyEvaluation(report, engine, warning, conditions, jax.device_get(statistics))
+    report = judge(env, statistics, recording, setup.commands)
+    return PolicyEvaluation(report, engine, warning, setup, jax.device_get(statistics))
 
 
-def conditions_of(env_config: WorldConfig, options: EvaluationOptions) -> Conditions:
+def setup_of(env_config: WorldConfig, options: EvaluationOptions) -> EpisodeSetup:
     """The environment of an evaluation, and the ranges of its worlds and commands.
 
     Raises:
       UserError: the engine does not support the model.
     """
-    given = {name: (value, value) for name, value in options.commands.items()}
-    neutral = neutral_commands(env_config) if options.nominal else {}
-    own = command_ranges(env_config)
-    commands = {name: ends for name, ends in (neutral | given).items() if ends != own[name]}
-    world = env_config.randomization
+    trained = command_ranges(env_config)
+    commands = neutral_commands(env_config) if options.nominal else {}
+    commands |= {name: (value, value) for name, value in options.commands.items()}
+    # A range of the config's own is no input of the program.
+    commands = {name: ends for name, ends in commands.items() if ends != trained[name]}
+
+    randomization = env_config.randomization
     if options.nominal:
-        world = RandomizationConfig()
-    elif given.keys() >= own.keys():
-        # Nothing is left to change within an episode.
-        world = world.model_copy(update={"command_interval": None})
-    env = Env(on_engine(env_config.model_copy(update={"randomization": world}), options.physics))
+        randomization = RandomizationConfig()
+    elif options.commands.keys() >= trained.keys():
+        # Each command has one value, so that none changes within an episode.
+        randomization = randomization.model_copy(update={"command_interval": None})
+    world = env_config.model_copy(update={"randomization": randomization})
+    env = Env(on_engine(world, options.physics))
+    if not commands:
+        return EpisodeSetup(env, commands, ranges=None)
     ranges = jax.tree.map(lambda end: jnp.asarray(end, jnp.float32)[None], env.ranges() | commands)
-    return Conditions(env, commands, ranges if commands else None)
+    return EpisodeSetup(env, commands, ranges)

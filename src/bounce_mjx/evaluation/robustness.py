@@ -4,7 +4,7 @@ import json
 import os
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
 from bounce_mjx.evaluation.config import EvaluationOptions, Physics, command_ranges, on_engine
 from bounce_mjx.evaluation.episodes import make_evaluator
-from bounce_mjx.evaluation.policy_evaluation import Conditions, InEvaluation
+from bounce_mjx.evaluation.policy_evaluation import EpisodeSetup, InEvaluation
 from bounce_mjx.evaluation.results import is_share, judge
 from bounce_mjx.evaluation.statistics import Statistics
 from bounce_mjx.evaluation.suite import Condition, condition_label
@@ -25,13 +25,15 @@ from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import TERMS, RandomizationConfig, Ranges
 
-# Terms without a neutral value, or with a high cost in the physics: only the conditions that need
-# such a term are simulated with it.
+# Terms without a neutral value (the first two), or with a high cost in the physics: only the
+# conditions that need such a term are simulated with it.
 _SEPARATE_TERMS = frozenset(
-    ("camera_rate", "contact_friction", "torque_limit", "joint_frictionloss")
+    ("camera_rate", "torque_limit", "contact_friction", "joint_frictionloss")
 )
 # Episodes in one call: larger batches are not faster and would delay the progress report.
-_CPU_BATCH, _GPU_BATCH, _MUJOCO_BATCH_PER_CORE = 1024, 16_384, 128
+_CPU_BATCH = 1024
+_GPU_BATCH = 16_384
+_MUJOCO_BATCH_PER_CORE = 128
 
 
 class ConditionOutcome(pydantic.BaseModel):
@@ -117,8 +119,8 @@ def measure_conditions(
     """Measures the results of a deterministic policy, in the order of the conditions.
 
     One compiled program simulates all conditions with the same structure; their ranges are its
-    inputs. The episodes of all conditions start from the same keys. In place of the mjx engine,
-    which refuses dry friction, MuJoCo's C engine simulates it.
+    inputs. The episodes of all conditions start from the same keys. MuJoCo's C engine simulates
+    conditions with dry friction in place of the mjx engine, which refuses it.
 
     Args:
       actor: what acts with the policy, such as the networks of its training (`networks_of`).
@@ -130,22 +132,23 @@ def measure_conditions(
       UserError: the engine does not support the model.
     """
     outcomes: list[ConditionOutcome | None] = [None] * len(conditions)
+    key = jax.random.PRNGKey(options.seed)
     done = 0
     for indices in _programs(conditions):
         members = [conditions[index] for index in indices]
-        env, names, on_c = _program(members, options.physics)
-        engine = "mujoco" if on_c else env.engine.name
-        size = _batch_size(len(members), options.episodes, on_c)
-        make = make_mujoco_evaluator if on_c else make_evaluator
+        program = _program(members, options.physics)
+        env = program.env
+        size = _batch_size(len(members), options.episodes, program.on_c)
+        make = make_mujoco_evaluator if program.on_c else make_evaluator
         evaluate = make(env, actor(env), size * options.episodes)
         for start in range(0, len(members), size):
             batch = members[start : start + size]
-            ranges = _stack_ranges(names, _padded(batch, size))
-            statistics, _ = evaluate(policy, jax.random.PRNGKey(options.seed), ranges)
-            for i, condition in enumerate(batch):
-                its = slice(i * options.episodes, (i + 1) * options.episodes)
-                part = jax.tree.map(lambda x, its=its: x[its], statistics)
-                outcomes[indices[start + i]] = _outcome(env, condition, part, engine)
+            ranges = _stack_ranges(program.inputs, _padded(batch, size))
+            statistics, _ = evaluate(policy, key, ranges)
+            for place, condition in enumerate(batch):
+                its = slice(place * options.episodes, (place + 1) * options.episodes)
+                part = jax.tree.map(lambda figure, its=its: figure[its], statistics)
+                outcomes[indices[start + place]] = _outcome(program, condition, part)
             done += len(batch)
             progress(done)
     return outcomes
@@ -162,19 +165,20 @@ def find_episode(
     condition = conditions[index]
     (indices,) = [program for program in _programs(conditions) if index in program]
     members = [conditions[member] for member in indices]
-    env, names, on_c = _program(members, options.physics)
-    if on_c:
+    program = _program(members, options.physics)
+    if program.on_c:
         raise UserError(
             f"the condition {condition.label} is simulated on MuJoCo's C engine, which has no "
             "films; choose another condition"
         )
-    size = _batch_size(len(members), options.episodes, on_c)
+    size = _batch_size(len(members), options.episodes, program.on_c)
     place = indices.index(index)
     start = place // size * size
-    ranges = _stack_ranges(names, _padded(members[start : start + size], size))
-    place_in_call = (place - start) * options.episodes + episode
+    ranges = _stack_ranges(program.inputs, _padded(members[start : start + size], size))
     return InEvaluation(
-        Conditions(env, condition.commands, ranges), size * options.episodes, place_in_call
+        setup=EpisodeSetup(program.env, condition.commands, ranges),
+        episodes=size * options.episodes,
+        episode=(place - start) * options.episodes + episode,
     )
 
 
@@ -187,9 +191,18 @@ def _programs(conditions: Sequence[Condition]) -> list[list[int]]:
     return [*programs.values()]
 
 
-def _program(members: Sequence[Condition], physics: Physics) -> tuple[Env, list[str], bool]:
-    """The environment of conditions that share a program, the names of the ranges that are its
-    inputs, and whether MuJoCo's C engine simulates it."""
+class _Program(NamedTuple):
+    """What simulates conditions of one structure."""
+
+    env: Env
+    inputs: list[str]
+    """The terms and the commands whose ranges are inputs."""
+    on_c: bool
+    """Whether MuJoCo's C engine simulates it."""
+
+
+def _program(members: Sequence[Condition], physics: Physics) -> _Program:
+    """The program of all conditions that share it."""
     env = Env(_spanning_config(members, physics))
     is_dry = any("joint_frictionloss" in condition.ranges for condition in members)
     on_c = physics == "mujoco" or (env.engine.name == "mjx" and is_dry)
@@ -199,7 +212,7 @@ def _program(members: Sequence[Condition], physics: Physics) -> tuple[Env, list[
         for name, ends in command_ranges(env.config).items()
         if any(condition.commands[name] != ends for condition in members)
     ]
-    return env, [*env.config.randomization.terms, *changed], on_c
+    return _Program(env, [*env.config.randomization.terms, *changed], on_c)
 
 
 def _padded(batch: list[Condition], size: int) -> list[Condition]:
@@ -208,20 +221,19 @@ def _padded(batch: list[Condition], size: int) -> list[Condition]:
     return batch + [batch[-1]] * (size - len(batch))
 
 
-def _outcome(
-    env: Env, condition: Condition, statistics: Statistics, engine: str
-) -> ConditionOutcome:
+def _outcome(program: _Program, condition: Condition, statistics: Statistics) -> ConditionOutcome:
+    """The outcome of a condition, from the statistics of its own episodes."""
     # What a task judges may depend on the world, and the program's spans several.
     task = condition.config.task(condition.config)
-    task.geometry = env.task.geometry
-    report = judge(env, statistics, commands=condition.commands, task=task)
+    task.geometry = program.env.task.geometry
+    report = judge(program.env, statistics, commands=condition.commands, task=task)
     return ConditionOutcome(
         perturbation=condition.perturbation.name,
         group=condition.perturbation.group,
         unit=condition.perturbation.unit,
         strength=condition.strength,
         trained=condition.trained,
-        physics=engine,
+        physics="mujoco" if program.on_c else program.env.engine.name,
         values={result.name: result.value for result in report.results},
         failed=[result.name for result in report.results if result.passed is False],
         lasted=float(np.mean(statistics.running)),
@@ -233,28 +245,32 @@ def _outcome(
 
 def _spanning_config(conditions: Sequence[Condition], physics: Physics) -> WorldConfig:
     """Config with all terms of the conditions active, in ranges that contain all their ranges."""
-    env, spans = conditions[0].env, {}
-    for name in sorted(TERMS.keys() & {name for each in conditions for name in each.ranges}):
+    perturbed = TERMS.keys() & {name for condition in conditions for name in condition.ranges}
+    spans = {}
+    for name in sorted(perturbed):
         lows, highs = zip(*(condition.range(name) for condition in conditions), strict=True)
         spans[name] = float(np.min(lows)), float(np.max(highs))
-    # A program spans what its conditions, which are within the limits, do not: a term that one of
-    # them lacks.
+    # Not validated: a neutral value, such as an interval of 1e9 s, may lie beyond a term's limits.
     sampled = RandomizationConfig().model_copy(update=spans)
-    world = env.model_copy(update={"randomization": sampled})
+    world = conditions[0].env.model_copy(update={"randomization": sampled})
     return on_engine(world, physics)
 
 
 def _stack_ranges(names: Sequence[str], conditions: Sequence[Condition]) -> Ranges | None:
     """Ranges of C conditions, each end [C, ...]; None without names."""
-    each = [{name: condition.range(name) for name in names} for condition in conditions]
-    return jax.tree.map(lambda *ends: jnp.asarray(np.stack(ends), jnp.float32), *each) or None
+    if not names:
+        return None
+    of_conditions = [{name: condition.range(name) for name in names} for condition in conditions]
+    return jax.tree.map(lambda *ends: jnp.asarray(np.stack(ends), jnp.float32), *of_conditions)
 
 
 def _batch_size(conditions: int, episodes: int, on_c: bool) -> int:
     """Number of conditions in one call; calls have about equal sizes."""
-    accelerated = jax.default_backend() != "cpu"
-    batch = _GPU_BATCH if accelerated else _CPU_BATCH
     if on_c:
         batch = _MUJOCO_BATCH_PER_CORE * (os.cpu_count() or 1)
+    elif jax.default_backend() == "cpu":
+        batch = _CPU_BATCH
+    else:
+        batch = _GPU_BATCH
     calls = -(-conditions // max(1, batch // episodes))
     return -(-conditions // calls)

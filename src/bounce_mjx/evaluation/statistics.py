@@ -13,6 +13,7 @@ from bounce_mjx.env.env import Env, State
 from bounce_mjx.task.task import Moment, Recording, Tally
 
 RECORDED_EPISODES = 32
+"""Episodes that a report, a plot and the checks of an evaluation record."""
 
 
 class Statistics(NamedTuple):
@@ -27,7 +28,7 @@ class Statistics(NamedTuple):
     tally: Tally
     """Sums and greatest values of what the task tallies, each [E]."""
     ended_by: dict[str, jax.Array] = {}
-    """Whether the episode ended by each of `ENDS` [E], bool; the task ended the others."""
+    """Whether the episode ended by each of `ENDS` [E], bool; the task ends all others that end."""
     world: dict[str, jax.Array] = {}
     """World of the episode: its values of the active terms [E, ...]."""
     command: dict[str, jax.Array] = {}
@@ -56,7 +57,7 @@ def empty_statistics(env: Env, states: State) -> Statistics:
     """Statistics of E episodes (batch last) before their first step."""
     episodes = states.done.shape[-1]
     zeros = jnp.zeros(episodes)
-    tally = jax.eval_shape(lambda: _tally(env, states, jnp.int32(0)))
+    tally = jax.eval_shape(lambda: _tallies(env, states, jnp.int32(0)))
     start = states.pipeline_state
     return Statistics(
         running=jnp.ones(episodes, bool),
@@ -78,23 +79,29 @@ def accumulate(env: Env, statistics: Statistics, states: State, step: jax.Array)
       states: the states after the step.
       step: index of the step [], from 0.
     """
-    s, now, running = statistics, _tally(env, states, step), statistics.running
-    counted = jax.tree.map(lambda value: jnp.where(running, value, 0.0), now)
-    sums = jax.tree.map(jnp.add, s.tally.sums, counted.sums)
-    maxima = jax.tree.map(jnp.maximum, s.tally.maxima, counted.maxima)
+    running = statistics.running
+    tallied = _tallies(env, states, step)
+    counted = jax.tree.map(lambda figure: jnp.where(running, figure, 0.0), tallied)
+    before = statistics.tally
+    tally = Tally(
+        sums=jax.tree.map(jnp.add, before.sums, counted.sums),
+        maxima=jax.tree.map(jnp.maximum, before.maxima, counted.maxima),
+    )
     ended_by = {
-        name: ended | (running & (states.metrics[name] > 0)) for name, ended in s.ended_by.items()
+        name: ended | (running & (states.metrics[name] > 0))
+        for name, ended in statistics.ended_by.items()
     }
-    return s._replace(
+    return statistics._replace(
         running=running & (states.done == 0),
-        steps=s.steps + running,
-        episode_return=s.episode_return + jnp.where(running, states.reward, 0.0),
-        tally=Tally(sums, maxima),
+        steps=statistics.steps + running,
+        episode_return=statistics.episode_return + jnp.where(running, states.reward, 0.0),
+        tally=tally,
         ended_by=ended_by,
     )
 
 
-def _tally(env: Env, states: State, step: jax.Array) -> Tally:
+def _tallies(env: Env, states: State, step: jax.Array) -> Tally:
+    """What the task tallies of the step in each of E environments, [E]."""
     tally = lambda state: env.task.tally(moment(env, state, step))  # noqa: E731
     return jax.vmap(tally, in_axes=-1, out_axes=-1)(states)
 

@@ -16,6 +16,7 @@ from bounce_mjx.config.validation import validate
 from bounce_mjx.env.env import model_nominals
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.evaluation.config import command_ranges
+from bounce_mjx.physics.edited import NO_PAIR
 from bounce_mjx.task.registry import find_task
 from bounce_mjx.world.actuation import DEFAULT_PUSH_INTERVAL
 from bounce_mjx.world.config import WorldConfig
@@ -79,12 +80,15 @@ class Condition(NamedTuple):
     env: WorldConfig
     """World and task of the policy, without randomisation."""
     randomization: RandomizationConfig
-    """The perturbed terms, each with its range."""
+    """The active terms, each with its range; every episode samples all of them, whatever its
+    `share`."""
     ranges: dict[str, Bounds]
-    """Lower and upper ends of the ranges of all commands and of the perturbed terms, in the shapes
-    of the terms."""
+    """Lower and upper ends of the ranges of all commands and of the active terms, in the shapes of
+    the terms."""
     trained: bool
-    """Whether the training ranges of the policy contain the condition."""
+    """Whether the training ranges of the policy contain the condition: also the neutral values of
+    the terms that only the training has. Of these, a term without a neutral value does not count,
+    nor does an interval."""
 
     @property
     def label(self) -> str:
@@ -92,8 +96,15 @@ class Condition(NamedTuple):
         return condition_label(self.perturbation.name, self.strength, self.perturbation.unit)
 
     def range(self, name: str) -> Bounds:
-        """Range of a command, or of a term; a term that is not perturbed has its neutral one."""
-        return self.ranges.get(name) or neutral_range(name, self.env)
+        """Range of a command, or of a term; a term that is not active has its neutral one.
+
+        Raises:
+          UserError: it has none, because the model lacks a contact pair.
+        """
+        bounds = self.ranges.get(name) or neutral_range(name, self.env)
+        if bounds is None:
+            raise UserError(NO_PAIR)
+        return bounds
 
     @property
     def config(self) -> WorldConfig:
@@ -135,10 +146,11 @@ def load_suite(
 
     Args:
       trained: config of the policy's training; each condition replaces its randomisation.
-      world: config of the policy in a named world, which each condition changes; by default, the
-        policy's without randomisation.
-      assumed: nested settings of `env` by the name of the world's assumption that they double. Each
-        is a condition, after the nominal one.
+      world: config of the policy in a named world, which each condition changes, but for that with
+        `trained_ranges`; by default, the policy's without randomisation. Each episode samples all
+        its terms, whatever its `share`.
+      assumed: by the name of a condition, the nested settings of `env` that it changes in `world`
+        (`double_assumed`). These conditions follow the nominal one.
 
     Raises:
       UserError: the file is missing or invalid.
@@ -146,11 +158,13 @@ def load_suite(
     suite = read_suite(path)
     nominal = Perturbation(name=NOMINAL, group=NOMINAL)
     world = world or _unrandomized(trained)
-    names, conditions = {NOMINAL}, [_condition(nominal, None, trained, world, NOMINAL)]
-    for key, settings in (assumed or {}).items():
-        twice = Perturbation(name=f"twice {key}", group="twice the assumed")
-        doubled = validate(type(world), merged(world.model_dump(), settings), twice.name)
-        conditions.append(_condition(twice, None, trained, doubled, twice.name))
+    names = {NOMINAL}
+    training = _Training.of(trained)
+    conditions = [_condition(nominal, None, training, world, NOMINAL)]
+    for name, settings in (assumed or {}).items():
+        harder = Perturbation(name=name, group="twice the assumed, or half")
+        changed = validate(type(world), merged(world.model_dump(), settings), name)
+        conditions.append(_condition(harder, None, training, changed, name))
     for perturbation in suite.perturbations:
         source = f"{shorten(path.name, 30)}, perturbation {shorten(perturbation.name, 30)!r}"
         if perturbation.name in names:
@@ -165,7 +179,7 @@ def load_suite(
             place = source
             if strength is not None:
                 place += f" at {strength_text(strength, perturbation.unit)}"
-            conditions.append(_condition(perturbation, strength, trained, world, place))
+            conditions.append(_condition(perturbation, strength, training, world, place))
     return conditions
 
 
@@ -194,8 +208,8 @@ def neutral_commands(env: WorldConfig) -> dict[str, tuple[float, float]]:
     """Range of each command in a world without randomisation: the task's default range for all
     policies that were trained with it, so that those with wider ranges are measured like the
     others; else the policy's own."""
-    ranges, defaults = dict(env.commands), type(env)().commands
-    for name, default in defaults.items():
+    ranges = dict(env.commands)
+    for name, default in type(env)().commands.items():
         if ranges[name].low <= default.low and default.high <= ranges[name].high:
             ranges[name] = default
     return {name: (command.low, command.high) for name, command in ranges.items()}
@@ -204,7 +218,7 @@ def neutral_commands(env: WorldConfig) -> dict[str, tuple[float, float]]:
 def _condition(
     perturbation: Perturbation,
     strength: float | None,
-    trained: WorldConfig,
+    training: "_Training",
     world: WorldConfig,
     source: str,
 ) -> Condition:
@@ -212,8 +226,8 @@ def _condition(
     env = _with_changes(_unrandomized(world), _fill_in(perturbation.settings, value), source)
     commands = neutral_commands(env)
     if perturbation.trained_ranges:
-        sampled = trained.randomization
-        commands = command_ranges(trained)
+        sampled = training.config.randomization
+        commands = command_ranges(training.config)
     else:
         terms = {name: getattr(world.randomization, name) for name in world.randomization.terms}
         for name, entry in _fill_in(perturbation.terms, value).items():
@@ -232,10 +246,48 @@ def _condition(
     ranges = {
         name: _broadcast(name, env.num_joints, low, high) for name, (low, high) in ends.items()
     }
-    is_trained = not differing_keys(env, _unrandomized(trained)) and all(
-        _contains(trained, name, bounds) for name, bounds in ranges.items()
-    )
+    is_same = not differing_keys(env, _unrandomized(training.config))
+    is_trained = is_same and training.contains(ranges)
     return Condition(perturbation, strength, env, sampled, ranges, is_trained)
+
+
+class _Training(NamedTuple):
+    """The worlds of a policy's training."""
+
+    config: WorldConfig
+    neutral: dict[str, Bounds]
+    """Neutral range of each of its terms that has one; not of an interval, as the change that comes
+    after it may be none."""
+
+    @classmethod
+    def of(cls, config: WorldConfig) -> "_Training":
+        """The training with a config."""
+        neutral = {}
+        for name in config.randomization.terms:
+            bounds = neutral_range(name, config)
+            if bounds is not None and name not in _INTERVALS:
+                neutral[name] = bounds
+        return cls(config, neutral)
+
+    def contains(self, ranges: dict[str, Bounds]) -> bool:
+        """Whether it contains a condition with these ranges, whose other terms are neutral."""
+        needed = self.neutral | ranges
+        return all(self._contains(name, bounds) for name, bounds in needed.items())
+
+    def _contains(self, name: str, bounds: Bounds) -> bool:
+        """Whether it contains the range of a term or of a command."""
+        if name in self.config.commands:
+            return _is_within(bounds, command_ranges(self.config)[name])
+        randomization = self.config.randomization
+        sampled = getattr(randomization, name)
+        if sampled is None:
+            neutral = neutral_range(name, self.config)
+            return neutral is not None and _is_within(bounds, neutral)
+        share = (randomization.shares or {}).get(name, randomization.share)
+        if share < 1.0 and name in self.neutral and _is_within(bounds, self.neutral[name]):
+            # The other episodes have the neutral value.
+            return True
+        return _is_within(bounds, sampled)
 
 
 def _unrandomized(config: WorldConfig) -> WorldConfig:
@@ -280,13 +332,9 @@ def _broadcast(term: str, num_joints: int, low: Any, high: Any) -> Bounds:
     return tuple(np.broadcast_to(np.asarray(end, np.float64), shape) for end in (low, high))
 
 
-def _contains(trained: WorldConfig, term: str, bounds: Bounds) -> bool:
-    """Whether the training range of a term or of a command contains other bounds."""
-    if term in trained.commands:
-        sampled = trained.commands[term][:2]
-    else:
-        sampled = getattr(trained.randomization, term) or neutral_range(term, trained)
-    if sampled is None:
-        return False
-    (low, high), tolerance = map(np.asarray, sampled), 1e-9
-    return bool(np.all(low <= bounds[0] + tolerance) and np.all(bounds[1] <= high + tolerance))
+def _is_within(bounds: Bounds, sampled: tuple[Any, Any]) -> bool:
+    """Whether a range is within another one."""
+    low, high = map(np.asarray, sampled)
+    lowest, highest = bounds
+    tolerance = 1e-9
+    return bool(np.all(low <= lowest + tolerance) and np.all(highest <= high + tolerance))

@@ -94,6 +94,9 @@ class Problem(NamedTuple):
     sensors: Noise
     noise: Noise
     """What counts as noise: the sensors', or the model's own errors where they are larger."""
+    correlation: np.ndarray | float = 1.0
+    """Successive angles of each joint [n] that count as one measurement, as their errors are alike:
+    see `correlation_times`."""
     progress: Callable[[str], None] = lambda line: None
     """Called with a line about each step of a search."""
     has_lift: bool = False
@@ -101,8 +104,10 @@ class Problem(NamedTuple):
 
     @property
     def deviations(self) -> np.ndarray:
-        """The noise of each entry of a window's measurements [A n + 3 B]."""
-        of_angles = np.tile(self.noise.angles, self.windows.angles.shape[1])
+        """The noise of each entry of a window's measurements [A n + 3 B]; larger by the root of
+        the number of angles that count as one."""
+        of_one = self.noise.angles * np.sqrt(self.correlation)
+        of_angles = np.tile(of_one, self.windows.angles.shape[1])
         of_balls = np.tile(self.noise.balls, self.windows.balls.shape[1])
         return np.concatenate([of_angles, of_balls])
 
@@ -554,8 +559,34 @@ def _multiply(columns: np.ndarray) -> np.ndarray:
 
 def angle_weights(problem: Problem, predicted: np.ndarray) -> np.ndarray:
     """Weights [S, A, n] of the joint angles: less for outliers."""
-    size = np.abs(problem.windows.split(problem.whiten(predicted, problem.weights()))[0])
+    residuals = problem.windows.split(predicted)[0] - problem.windows.angles
+    size = np.abs(residuals) / problem.noise.angles
     return np.minimum(1.0, _HUBER / np.maximum(size, 1e-9))
+
+
+def correlation_times(residuals: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Number [n] of successive residuals that say as much as one: the integrated autocorrelation
+    time 1 + 2 sum rho_k, up to the first rho_k that is not positive (Sokal 1997, "Monte Carlo
+    methods in statistical mechanics").
+
+    It is 1 for the noise of a sensor, and hundreds for a model's error in a log at 1 kHz. With
+    every residual counted, such a log would outweigh the prior by that factor.
+
+    Args:
+      residuals: of each window and joint [S, A, n].
+      counts: which count [S, A].
+    """
+    counted = np.where(counts[:, :, None], residuals, 0.0)
+    length = counted.shape[1]
+    # Twice as long, as the transform's correlations are circular.
+    spectra = np.fft.rfft(counted, 2 * length, axis=1)
+    powers = np.sum(np.abs(spectra) ** 2, axis=0)
+    correlations = np.fft.irfft(powers, 2 * length, axis=0)[:length]
+    times = np.ones(residuals.shape[2])
+    for joint, along in enumerate((correlations / np.maximum(correlations[0], 1e-30)).T):
+        is_over = np.append(along[1:] <= 0.0, True)
+        times[joint] += 2.0 * np.sum(along[1 : 1 + np.argmax(is_over)])
+    return times
 
 
 def picture_weights(problem: Problem, predicted: np.ndarray) -> np.ndarray:

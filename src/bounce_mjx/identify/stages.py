@@ -18,6 +18,7 @@ from bounce_mjx.identify.fit import (
     Problem,
     angle_weights,
     certainty,
+    correlation_times,
     flight_errors,
     minimise,
     picture_weights,
@@ -62,6 +63,9 @@ _STIFF_DELAYS = (5e-4, 1e-3, 3e-3)
 # controller counts as carrying the arm's weight.
 _KEPT = 2
 _CARRIED = 10.0
+# Successive angles that count as one below which what is left is the noise of the sensors: then an
+# error of the simulation's step shows.
+_FEW_ALIKE = 3.0
 # Standard deviation of stamps about regular steps below which the steps count as regular, s.
 _JITTER = 5e-4
 _FEWEST_BOUNCES = 3
@@ -229,8 +233,8 @@ def identify(
     carried = own._replace(simulate=make_simulator(config, layout, log, windows, carried=1.0))
     progress(f"arm: {1e3 * following.delay:.1f} ms behind its commands")
     if does_move(log):
-        fits = [_search_arm(problem, config, delay, following) for problem in (own, carried)]
-        problem, fit = _choose(own, carried, fits)
+        searches = [_search_arm(problem, config, delay, following) for problem in (own, carried)]
+        problem, fit = _choose(own, carried, searches)
         problem, fit = _fit_arm(problem, fit)
         follower = _stiff_follower(problem, config, delay, following)
         is_follower = has_set_points or _explains_better(problem, follower, fit)
@@ -253,6 +257,11 @@ def identify(
         problem, fit, pictures = _fit_ball(problem, fit, lifted)
         stages = [*stages, "flight", "bounce"]
         states = None
+    if does_move(log) and not is_follower and np.max(problem.correlation) < _FEW_ALIKE:
+        lift = AIR_LIFT * problem.has_lift
+        finer = _halve_steps(config)
+        simulate = make_simulator(finer, layout, log, windows.finer(), share, lift)
+        problem = problem._replace(simulate=simulate)
     progress("all")
     angles = angle_weights(problem, problem.predict(fit.vector, fit.starts))
     fit = minimise(problem, fit, stages, problem.weights(pictures, seen, angles), 3, states)
@@ -264,7 +273,7 @@ def identify(
     before = fit._replace(predicted=own.predict(nominal_vector, fit.starts))
     information, covariance = certainty(problem, fit)
     counts = np.any(windows.split(fit.weights)[1] > 0.0, axis=(1, 2))
-    by_sensor = problem._replace(noise=sensors)
+    by_sensor = problem._replace(noise=sensors, correlation=1.0)
     return Identified(
         layout=layout,
         windows=windows,
@@ -285,6 +294,15 @@ def identify(
         has_lift=problem.has_lift,
         stamp_age=least_age(log),
     )
+
+
+def _halve_steps(config: WorldConfig) -> WorldConfig:
+    """The robot in physics steps of half the length.
+
+    A real robot has no steps. With those of a training, gains and frictions would make good for the
+    length of a step, by up to four standard deviations of what a minute's log shows.
+    """
+    return config.model_copy(update={"physics_dt": 0.5 * config.physics_dt})
 
 
 def _held_out_rows(log: Log, windows: Windows) -> np.ndarray:
@@ -444,9 +462,9 @@ def _flies(problem: Problem, fit: Fit, flying: np.ndarray) -> bool:
 
 def _search_arm(
     problem: Problem, config: WorldConfig, delay: float, following: Following
-) -> tuple[Noise, Fit]:
+) -> tuple[Problem, Fit]:
     """The best fit to a few windows of the arm, from candidates that differ in what a search could
-    confuse; and the noise that it leaves.
+    confuse; and the problem in units of the errors that it leaves.
 
     Args:
       delay: time from a command to the angle, s.
@@ -472,7 +490,7 @@ def _search_arm(
     best = [Fit(vectors[i], windows.starts) for i in np.argsort(costs)[:_KEPT]]
     fits = [minimise(problem, fit, ["arm"], few, 2, windows.arm_state) for fit in best]
     fit = min(fits, key=lambda fit: fit.cost)
-    return _residual_noise(problem, fit), fit
+    return _in_units_of_errors(problem, fit), fit
 
 
 def _with_offsets(problem: Problem, fit: Fit) -> Fit:
@@ -564,20 +582,24 @@ def _explains_better(problem: Problem, simple: Fit, fit: Fit) -> bool:
 
 
 def _choose(
-    own: Problem, carried: Problem, fits: Sequence[tuple[Noise, Fit]]
+    own: Problem, carried: Problem, searches: Sequence[tuple[Problem, Fit]]
 ) -> tuple[Problem, Fit]:
     """Whether the controller carries the arm's weight: the log decides, by the costs of both fits
     in units of the smaller errors."""
-    noise = own.noise._replace(angles=np.min([noise.angles for noise, _ in fits], axis=0))
-    choices = [problem._replace(noise=noise) for problem in (own, carried)]
-    tried = [
-        minimise(problem, fit, ["arm"], fit.weights, 4, problem.windows.arm_state)
-        for problem, (_, fit) in zip(choices, fits, strict=True)
-    ]
-    chosen = int(tried[0].cost - tried[1].cost > _CARRIED)
-    if chosen:
+    noise = own.noise._replace(angles=np.min([p.noise.angles for p, _ in searches], axis=0))
+    correlation = np.min([problem.correlation for problem, _ in searches], axis=0)
+    choices = []
+    for problem in (own, carried):
+        problem = problem._replace(noise=noise, correlation=correlation)
+        # Also from the fit of the other: the search for one of the two may have ended too early.
+        states = problem.windows.arm_state
+        tried = [minimise(problem, fit, ["arm"], fit.weights, 4, states) for _, fit in searches]
+        choices.append((problem, min(tried, key=lambda fit: fit.cost)))
+    (_, of_own), (_, of_carried) = choices
+    is_carried = of_own.cost - of_carried.cost > _CARRIED
+    if is_carried:
         own.progress("the controller carries the arm's weight")
-    return choices[chosen], tried[chosen]
+    return choices[int(is_carried)]
 
 
 def _fit_arm(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
@@ -587,16 +609,24 @@ def _fit_arm(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
     seen = _training(problem)
     fit = minimise(problem, fit, ["arm"], problem.weights(0.0, seen), 8, states)
     for _ in range(2):
-        problem = problem._replace(noise=_residual_noise(problem, fit))
+        problem = _in_units_of_errors(problem, fit)
         angles = angle_weights(problem, problem.predict(fit.vector, fit.starts))
         fit = minimise(problem, fit, ["arm"], problem.weights(0.0, seen, angles), 4, states)
     return problem, fit
 
 
-def _residual_noise(problem: Problem, fit: Fit) -> Noise:
-    """The sensors' noise, or the model's errors of the angles where they are larger."""
-    errors = _joint_errors(problem.windows, fit)
-    return problem.noise._replace(angles=np.maximum(problem.sensors.angles, errors))
+def _in_units_of_errors(problem: Problem, fit: Fit) -> Problem:
+    """The problem in units of the sensors' noise, or of the model's errors of the angles where they
+    are larger, and with as many angles as their correlation leaves."""
+    windows = problem.windows
+    errors = _joint_errors(windows, fit)
+    angles = np.maximum(problem.sensors.angles, errors)
+    residuals = windows.split(fit.predicted)[0] - windows.angles
+    counts = np.any(windows.split(fit.weights)[0] > 0.0, axis=2)
+    return problem._replace(
+        noise=problem.noise._replace(angles=angles),
+        correlation=correlation_times(residuals, counts),
+    )
 
 
 def _shift_flights(problem: Problem, fit: Fit, latency: float, friction: float) -> Fit:

@@ -76,6 +76,10 @@ class Windows(NamedTuple):
     dt: float
     """A physics step, s."""
 
+    def finer(self) -> "Windows":
+        """The same windows in physics steps of half the length."""
+        return self._replace(first=2 * self.first, steps=2 * self.steps, dt=0.5 * self.dt)
+
     @property
     def zero(self) -> np.ndarray:
         """Time [S] at which each starts, s."""

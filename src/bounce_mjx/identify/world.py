@@ -217,19 +217,26 @@ def total_delay(found: Identified, model: mujoco.MjModel) -> str:
     servos = list(find_addresses(model).actuators)
     own = -model.actuator_biasprm[servos, 2] / model.actuator_gainprm[servos, 0]
 
-    def total(vector: np.ndarray) -> float:
+    delay = layout.slices["delay"].start
+
+    def delay_and_servos(vector: np.ndarray) -> float:
+        """With the mean delay of a lag in place of the lag, which is longer by half a step at most:
+        their sum does not depend on how uncertain the lag is."""
         world = layout.world(vector)
         of_servos = np.mean(own * world["servo_damping"] / world["servo_gain"])
-        return float(world["action_latency"] + world["servo_lag"] + of_servos)
+        return float(vector[delay] + of_servos)
 
     vector = found.fit.vector
     steps = 1e-3 * layout.deviation
-    moved = [total(vector + step) for step in np.diag(steps)]
-    slope = (np.array(moved) - total(vector)) / steps
+    moved = [delay_and_servos(vector + step) for step in np.diag(steps)]
+    slope = (np.array(moved) - delay_and_servos(vector)) / steps
     covariance = np.linalg.inv(found.information + np.diag(layout.deviation**-2.0))
-    width = _HALF_WIDTH * misfit(found) * float(np.sqrt(slope @ covariance @ slope))
-    late = 1e3 * total(vector)
-    return f"total delay: {late:.1f} +- {1e3 * width:.1f} ms, of latency, lag and servos"
+    # As much wider than for independent residuals as the interval of the delay.
+    wider = found.deviation[delay] / np.sqrt(covariance[delay, delay])
+    width = _HALF_WIDTH * misfit(found) * wider * float(np.sqrt(slope @ covariance @ slope))
+    world = layout.world(vector)
+    late = delay_and_servos(vector) - vector[delay] + world["action_latency"] + world["servo_lag"]
+    return f"total delay: {1e3 * late:.1f} +- {1e3 * width:.1f} ms, of latency, lag and servos"
 
 
 def _describe_mistakes(found: Identified, joint_names: Sequence[str]) -> list[str]:

@@ -84,17 +84,18 @@ def read_curves(run: Path) -> RunCurves:
     # Those of an earlier version first, as a run may have been resumed with this one.
     for tag in sorted(log.Tags()["scalars"], key=lambda tag: tag not in _EARLIER_TAGS):
         # A resumed run may have logged a step twice; the later value belongs to the final policy.
-        values = {e.step: e.value for e in log.Scalars(tag) if math.isfinite(e.value)}
+        values = {event.step: event.value for event in log.Scalars(tag)}
         logged.setdefault(_EARLIER_TAGS.get(tag, tag), {}).update(values)
     curves = {}
     for name, values in logged.items():
-        if values:
-            steps, points = zip(*sorted(values.items()), strict=True)
+        finite = {step: value for step, value in values.items() if math.isfinite(value)}
+        if finite:
+            steps, points = zip(*sorted(finite.items()), strict=True)
             curves[name] = LoggedCurve(np.array(steps), np.array(points))
     if not curves:
         raise UserError(
-            f"{run} has no learning curves, as its training ended before its first block; "
-            "start again, or give another run"
+            f"{run} has no learning curves, as its training ended before its first block or "
+            "diverged; start again, or give another run"
         )
     results = load_results(run)
     return RunCurves(run, curves, results.solved_steps if results else None)
@@ -107,28 +108,35 @@ def group_runs(runs: Sequence[Path]) -> list[Group]:
       UserError: a run has no config or no scalars.
     """
     configs = [load_run_config(run) for run in runs]
-    # The settings that affect the training, by dotted name.
-    settings = [flat(x.model_dump(mode="json", exclude=set(_FREE_KEYS))) for x in configs]
-    for own, run in zip(settings, runs, strict=True):
-        # The paths of the run's own copies would put every run in a separate group.
-        copies = {key: read_source(own[key]) for key in ("task", "algorithm") if is_file(own[key])}
-        if own["env.mjcf"] is not None:
-            copies["env.mjcf"] = (run / ROBOT / MANIFEST_FILE).read_bytes()
-        own |= {key: f"{Path(own[key]).name} {zlib.crc32(x):08x}" for key, x in copies.items()}
-        if "algorithm" in copies:
-            own |= _own_settings(run, own)
+    settings = [_settings(run, config) for run, config in zip(runs, configs, strict=True)]
     shown = _telling_first(settings)
     groups: dict[str, list[int]] = {}
-    for i, each in enumerate(settings):
-        groups.setdefault(json.dumps(each), []).append(i)
+    for i, of_run in enumerate(settings):
+        groups.setdefault(json.dumps(of_run), []).append(i)
     return [
         Group(
-            _label(configs[members[0]], _chosen(settings[members[0]], shown), len(members)),
-            [read_curves(runs[i]) for i in members],
-            configs[members[0]].env.task.curves,
+            label=_label(configs[members[0]], _chosen(settings[members[0]], shown), len(members)),
+            runs=[read_curves(runs[i]) for i in members],
+            task_curves=configs[members[0]].env.task.curves,
         )
         for members in groups.values()
     ]
+
+
+def _settings(run: Path, config: TrainConfig) -> dict[str, Any]:
+    """The settings of a run that affect its training, by dotted name; files by their content, as
+    the paths of the run's own copies would put every run in a separate group."""
+    settings = flat(config.model_dump(mode="json", exclude=set(_FREE_KEYS)))
+    contents = {
+        key: read_source(settings[key]) for key in ("task", "algorithm") if is_file(settings[key])
+    }
+    if settings["env.mjcf"] is not None:
+        contents["env.mjcf"] = (run / ROBOT / MANIFEST_FILE).read_bytes()
+    for key, content in contents.items():
+        settings[key] = f"{Path(settings[key]).name} {zlib.crc32(content):08x}"
+    if "algorithm" in contents:
+        settings |= _own_settings(run, settings)
+    return settings
 
 
 def _own_settings(run: Path, settings: dict[str, Any]) -> dict[str, Any]:

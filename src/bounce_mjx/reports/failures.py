@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
+from rich.markup import escape
 from rich.table import Column, Table
 
 from bounce_mjx.evaluation.failures import Association, Failure
@@ -34,7 +35,7 @@ def failures_table(
     for failure in ordered[:_SHOWN_EPISODES]:
         values = [f"{_value(failure, name):.3g}" for name in names]
         end = "-" if failure.lasted else f"{failure.seconds:.2f}"
-        table.add_row(str(failure.episode), end, *values, ", ".join(failure.failed))
+        table.add_row(str(failure.episode), end, *values, escape(", ".join(failure.failed)))
     if len(ordered) > _SHOWN_EPISODES:
         table.caption = f"and {len(ordered) - _SHOWN_EPISODES} more"
     return table
@@ -57,7 +58,11 @@ def association_lines(associations: Sequence[Association]) -> list[str]:
 
 
 def failures_figure(associations: Sequence[Association]) -> Figure:
-    """The share of failures by third of the ranges of the terms that go with it the most."""
+    """The share of failures by third of the ranges of the terms that go with it the most.
+
+    Args:
+      associations: at least one.
+    """
     shown = list(associations[:_PANELS])
     with style():
         figure, axes = make_panels(len(shown), 3, 2.4)

@@ -104,7 +104,8 @@ _TAKEN_NAMES = frozenset((*RUN_PLOTS, EVALUATION))
 
 
 def run_plot(name: str, title: str | None) -> Callable[[Draw], Draw]:
-    """Registers a function as a `RunPlot`, in place of one that was registered with this name.
+    """Registers a function as a `RunPlot`, in place of one that was registered with this name. It
+    belongs into the task's file, which is imported before anything is drawn.
 
     Raises:
       UserError: the name is that of a picture of the package.
@@ -186,7 +187,7 @@ def _draw_curves(
     for axes, curve in zip(panels, shown, strict=True):
         _draw_curve(axes, groups, curve)
     # A panel whose curve has no points yet would have its own steps.
-    last_step = max(axes.get_xlim()[1] for axes in panels)
+    last_step = max((axes.get_xlim()[1] for axes in panels), default=0.0)
     for axes in panels:
         axes.set_xlim(0, last_step)
     add_legend(figure)

@@ -26,7 +26,7 @@ from bounce_mjx.runs.files import write_output
 from bounce_mjx.runs.folders import Checkpoint, best_checkpoint
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.task.task import Recording
-from bounce_mjx.viewers.page import replay_first_and_worst
+from bounce_mjx.viewers.page import replay_first_and_worst, worst_episode
 
 # Panels side by side in a figure that fits a phone, and its width in inches.
 _COLUMNS = 2
@@ -67,23 +67,27 @@ def write_report(run: Path, recording: Recording | None = None) -> Path:
     if robustness is not None:
         drawn.append(("Perturbed worlds", robustness_figure(robustness)))
     robot = "Peitian AIR4-560" if config.env.mjcf is None else config.env.mjcf.stem
-    replay, report = replay_first_and_worst(env, recording), results.best
+    replay = replay_first_and_worst(env, recording)
+    report = results.best
     num_recorded = recording.running.shape[-1]
+    worst = "the worst" if worst_episode(recording) == 0 else "and in the worst"
     seconds = results.seconds | {"total": sum(results.seconds.values())}
     phases = [[name, f"{value:.1f}"] for name, value in seconds.items()]
     resets = "fresh resets" if results.fresh_resets else "the resets of the selection"
-    body = f"""<h1>{report.summary}</h1>
+    body = f"""<h1>{html.escape(report.summary)}</h1>
 <p>Run <code>{html.escape(str(run))}</code>, seed {config.seed}, task {html.escape(config.task)} on
 the robot {html.escape(robot)}. The best of {len(results.evaluations)} evaluations,
 after {results.best_steps:,} of {results.trained_steps:,} environment steps, on {resets}:
 {html.escape(details_line(report))}.</p>
-<p>Trained on {html.escape(results.device)} with bounce_mjx {html.escape(results.version or "?")};
-{env.engine.name} physics, MuJoCo {mujoco.__version__}, JAX {jax.__version__}.</p>
+<p>Trained on {html.escape(results.device)} with bounce_mjx {html.escape(results.version or "?")}.
+Replayed and drawn with {env.engine.name} physics, MuJoCo {mujoco.__version__}, JAX
+{jax.__version__}.</p>
 {table(["result", "measured", "value", "bound", ""], map(result_cells, report.results))}
-<h2>The policy in its first recorded episode, and in the worst of {num_recorded}</h2>
+<h2>The policy in its first recorded episode, {worst} of {num_recorded}</h2>
 <iframe title="Replay" src="{data_url("text/html", replay.encode())}"></iframe>
 <p>In the learning curves, lines are the training, whose actions are sampled (exploration); points
-are evaluations, whose actions are not. Errors rise first: sampled actions scatter most then.</p>
+are evaluations, whose actions are not. Errors may rise first, when sampled actions scatter
+most.</p>
 {figures_html(drawn)}
 <h2>Reward terms</h2>
 <p>Weighted, the mean of a control step, over environment steps. The dotted line is the first

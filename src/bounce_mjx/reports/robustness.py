@@ -82,7 +82,7 @@ def _figure_cell(outcome: ConditionOutcome, result: str) -> str:
 
 def result_letters(report: RobustnessReport) -> dict[str, str]:
     """A letter for each result."""
-    return dict(zip(report.outcomes[0].values, string.ascii_uppercase, strict=False))
+    return dict(zip(report.outcomes[0].values, string.ascii_letters.swapcase(), strict=False))
 
 
 @style()

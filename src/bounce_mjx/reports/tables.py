@@ -35,12 +35,16 @@ def results_table(report: Report, title: str) -> Table:
     """The results as a table."""
     value = Column("value", justify="right")
     table = plain_table(title, "result", "measured", value, "bound", "")
+    not_judged = []
     for result in report.results:
         bound, _, condition = result.bound.partition(" (")
         if result.passed is None:
-            table.caption = f"{result.name}: not judged" + (condition and f" ({condition}")
+            not_judged.append(f"{result.name}: not judged" + (condition and f" ({condition}"))
         colour = {True: "[green]pass", False: "[red]FAIL", None: "-"}[result.passed]
-        table.add_row(result.name, result.measured, figure_text(result.value), bound, colour)
+        texts = [result.name, result.measured, figure_text(result.value), bound]
+        table.add_row(*map(escape, texts), colour)
+    if not_judged:
+        table.caption = escape("\n".join(not_judged))
     return table
 
 
@@ -53,7 +57,7 @@ def seeds_table(reports: dict[int, Report | None]) -> Table:
     """
     known = [report for report in reports.values() if report is not None]
     headers = "seed", *(result.name for result in known[0].results), "all met"
-    columns = [Column(header.replace(" ", "\n"), justify="right") for header in headers]
+    columns = [Column(escape(header.replace(" ", "\n")), justify="right") for header in headers]
     table = plain_table("best checkpoint of each seed", *columns)
     for seed, report in reports.items():
         if report is None:
@@ -96,6 +100,6 @@ def details_line(report: Report) -> str:
         title, unit = (part.replace("_", " ") for part in _NAME.fullmatch(name).groups(""))
         unit = unit.replace(" ", "/")
         if name != "episodes":
-            rounded = value and float(f"{value:.4g}")
+            rounded = None if value is None else float(f"{value:.4g}")
             parts.append(f"{title} {figure_text(rounded, 'g')} {unit}".rstrip())
     return f"{report.details['episodes']:.0f} episodes: {', '.join(parts)}"

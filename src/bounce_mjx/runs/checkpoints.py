@@ -38,15 +38,18 @@ from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config, ru
 from bounce_mjx.runs.files import plain_path, seal, to_plain
 from bounce_mjx.runs.records import RECORD, Checkpoint, DamagedCheckpoint, Record, verify
 
-POLICY, TRAINING, NETWORKS = "policy", "training", "networks"
-"""Items of a checkpoint: what acts; what a training continues from; both networks, with which
-another training can start."""
+POLICY = "policy"
+"""Item of a checkpoint: what acts."""
+TRAINING = "training"
+"""Item of a checkpoint: what a training continues from."""
+NETWORKS = "networks"
+"""Item of a checkpoint: both networks, with which another training can start."""
 
 NETWORK_KEYS = ("hidden_layers", "critic_layers", "shared_critic", "activation")
 """Keys of `ppo` that shape the networks."""
 
-# Keys that may differ between a checkpoint and the training that resumes from it. All other keys
-# shape the training's state.
+# Keys that may differ between a checkpoint and the training that resumes from it. All others must
+# be the same.
 RESUMABLE_KEYS = frozenset(
     "total_steps eval_every save_every eval_episodes screening_episodes eval_seed "
     "stop_when_solved log_dir num_devices".split()
@@ -82,8 +85,11 @@ def read_policy(checkpoint: Checkpoint, config: TrainConfig) -> Policy:
 def read_actor(
     checkpoint: Checkpoint, config: TrainConfig
 ) -> tuple[Checkpoint, Policy | None, Callable[[Env], Actor]]:
-    """The policy of a checkpoint and what acts with it, or the mirror law, which has no policy; and
-    the checkpoint that was read: the next one, if a training replaces it meanwhile."""
+    """The checkpoint that was read, its policy, and what acts with it.
+
+    It is another one than the given one if a training replaces that meanwhile. The mirror law has
+    no policy.
+    """
     if checkpoint is folders.MIRROR_LAW:
         return checkpoint, None, MirrorLaw
     while True:
@@ -120,20 +126,26 @@ def read_networks(
     """Restores both networks of a checkpoint, the statistics of their inputs, and the names of the
     critic metrics among these."""
     read_record(checkpoint)
-    items = [item for item in (NETWORKS, TRAINING) if (checkpoint.folder / item).is_dir()]
-    if not items:
+    if (checkpoint.folder / NETWORKS).is_dir():
+        item = NETWORKS
+    elif checkpoint.is_old and (checkpoint.folder / TRAINING).is_dir():
+        # Version 0.1.0 has both networks in its state alone.
+        item = TRAINING
+    else:
         raise UserError(
             f"{checkpoint.folder} is without its value network; give robust_small, or a run"
         )
-    size, names = config.env.layout.size, names_of_critic_metrics(config.ppo, Env(config.env))
+    size = config.env.layout.size
+    names = names_of_critic_metrics(config.ppo, Env(config.env))
     networks = make_networks(config.ppo, size, config.env.num_joints, len(names))
 
     def initial() -> dict[str, Any]:
-        params = Params(*(network.init(jax.random.PRNGKey(0)) for network in networks[:2]))
+        key = jax.random.PRNGKey(0)
+        params = Params(networks[0].init(key), networks[1].init(key))
         return {"params": params, "statistics": init_statistics(size + len(names))}
 
     try:
-        stored = _read_arrays(checkpoint, items[0], jax.eval_shape(initial))
+        stored = _read_arrays(checkpoint, item, jax.eval_shape(initial))
     except DamagedCheckpoint as error:
         if not is_file(config.algorithm):
             raise
@@ -162,9 +174,11 @@ def read_start(config: TrainConfig, env: Env) -> tuple[Params, RunningStatistics
         )
     checkpoint = folders.choose_checkpoint(config.warm_start, runs_folder(config.env.task))
     own = load_run_config(checkpoint.run)
-    networks = [[getattr(ppo, key) for key in NETWORK_KEYS] for ppo in (own.ppo, config.ppo)]
-    same = networks[0] == networks[1] and policy_shapes(own) == policy_shapes(config)
-    if own.env.layout != config.env.layout or not same:
+    keys = set(NETWORK_KEYS)
+    has_same_networks = own.ppo.model_dump(include=keys) == config.ppo.model_dump(include=keys)
+    has_same_shapes = policy_shapes(own) == policy_shapes(config)
+    has_same_layout = own.env.layout == config.env.layout
+    if not (has_same_networks and has_same_shapes and has_same_layout):
         raise UserError(
             f"the policy {config.warm_start} has another observation, other actions or other "
             "hidden layers than this training; leave out the flags that change them"
@@ -177,8 +191,10 @@ def read_start(config: TrainConfig, env: Env) -> tuple[Params, RunningStatistics
         array = np.asarray(array)
         size = len(array) - len(names)
         known = dict(zip(names, array[size:], strict=True))
-        new = (known.get(name, np.full_like(array[0], default)) for name in wanted)
-        return np.stack([*array[:size], *new])
+        rows = list(array[:size])
+        for name in wanted:
+            rows.append(known.get(name, np.full_like(array[0], default)))
+        return np.stack(rows)
 
     count, mean, summed_variance, std = statistics
     seen = RunningStatistics(
@@ -191,7 +207,8 @@ def read_start(config: TrainConfig, env: Env) -> tuple[Params, RunningStatistics
 
 def read_record(checkpoint: Checkpoint) -> Record:
     """Verifies every file of a checkpoint and reads its plain data."""
-    run_config, record = load_run_config(checkpoint.run), verify(checkpoint)
+    run_config = load_run_config(checkpoint.run)
+    record = verify(checkpoint)
     try:
         config = type(run_config).model_validate(earlier.present_settings(record.config))
     # Pydantic's own is one.
@@ -221,9 +238,11 @@ def _read_arrays(checkpoint: Checkpoint, item: str, template: Any) -> Any:
 def _read_item(folder: Path, template: Any) -> Any:
     ocp = _orbax()
     handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=_alone())
-    expected, stored = _forms(template), _forms(handler.metadata(folder).tree)
+    expected = _forms(template)
+    stored = _forms(handler.metadata(folder).tree)
     for name in sorted(expected.keys() | stored.keys()):
-        given, wanted = (forms.get(name, "missing") for forms in (stored, expected))
+        given = stored.get(name, "missing")
+        wanted = expected.get(name, "missing")
         if given != wanted:
             raise ValueError(f"{folder.name}.{name} is {given}, and should be {wanted}")
     as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), template)
@@ -233,10 +252,11 @@ def _read_item(folder: Path, template: Any) -> Any:
 
 def _forms(tree: Any) -> dict[str, str]:
     """The dtype and the shape of each array, by its path."""
-    return {
-        jax.tree_util.keystr(path, simple=True, separator="."): f"{leaf.dtype}{list(leaf.shape)}"
-        for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
-    }
+    forms = {}
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        name = jax.tree_util.keystr(path, simple=True, separator=".")
+        forms[name] = f"{leaf.dtype}{list(leaf.shape)}"
+    return forms
 
 
 def write_run(config: TrainConfig, steps: int, policy: Policy) -> Path:
@@ -290,7 +310,10 @@ def save_checkpoint(
         unfinished.mkdir()
         _check_room(unfinished, items)
         others = folders.stored_checkpoints(run)
-        number = max([steps, *(other.number + 1 for other in others)])
+        number = steps
+        for other in others:
+            # The newest checkpoint has the largest number.
+            number = max(number, other.number + 1)
         plain = config.model_dump(mode="json")
         record = Record(steps=steps, config=plain, progress=progress or {}, report=report)
         _write(unfinished / str(number), items, record)
@@ -320,20 +343,20 @@ def _check_room(folder: Path, items: dict[str, Any]) -> None:
 
 def _write(folder: Path, items: dict[str, Any], record: Record) -> None:
     """Writes a checkpoint's folder, and checks that its arrays are read as they were given."""
-    ocp, alone = _orbax(), _alone()
+    ocp = _orbax()
+    alone = _alone()
     composite = ocp.CompositeOptions(multiprocessing_options=alone)
     handler = ocp.CompositeCheckpointHandler(composite_options=composite)
-    items = {
-        name: jax.tree.map(np.asarray, tree)
-        for name, tree in items.items()
-        if jax.tree.leaves(tree)
-    }
-    arguments = {name: ocp.args.StandardSave(tree) for name, tree in items.items()}
-    arguments[RECORD] = ocp.args.JsonSave(to_plain(record.model_dump()))
+    arrays = {}
+    arguments = {RECORD: ocp.args.JsonSave(to_plain(record.model_dump()))}
+    for name, tree in items.items():
+        if jax.tree.leaves(tree):
+            arrays[name] = jax.tree.map(np.asarray, tree)
+            arguments[name] = ocp.args.StandardSave(arrays[name])
     with plain_path(folder.parent) as place:
         with ocp.Checkpointer(handler, multiprocessing_options=alone) as writer:
             writer.save(place / folder.name, args=ocp.args.Composite(**arguments))
-        for name, tree in items.items():
+        for name, tree in arrays.items():
             stored = _read_item(place / folder.name / name, tree)
             jax.tree.map(np.testing.assert_array_equal, stored, tree)
     seal(folder)

@@ -81,8 +81,8 @@ class TrainConfig(StrictModel):
     """Seed of the evaluations during training."""
     stop_when_solved: bool = False
     """End once an evaluation meets all results with a margin. Then 64 other episodes should meet
-    them too. It ends at the latest after 1.5 times the steps of the first one, after step 0, that
-    meets all."""
+    them too. It ends at the latest with the evaluation after 1.5 times the steps of the first
+    one, after step 0, that meets all."""
     warm_start: Path | None = None
     """Run, or policy of the package, from whose networks and environment the training starts."""
     log_dir: Path = Field(default_factory=_default_log_dir)
@@ -145,8 +145,8 @@ class TrainConfig(StrictModel):
     @pydantic.field_validator("ppo", mode="before")
     @classmethod
     def _read_ppo(cls, ppo: Any, info: pydantic.ValidationInfo) -> Any:
-        """Whatever acts with a policy needs no settings of its own algorithm, whose code is not
-        run."""
+        """Plain values of an algorithm of the user's, as in a run's config, lose its own settings:
+        its code does not run here, and whatever acts with a policy needs none of them."""
         if isinstance(ppo, dict) and is_file(info.data.get("algorithm", PPO_NAME)):
             return {key: ppo[key] for key in ppo if key in PPOConfig.model_fields}
         return ppo
@@ -174,9 +174,13 @@ def fields_of(
       env: the settings of the task.
       algorithm: the settings of the algorithm.
     """
-    groups, fields = {"env": env, "ppo": algorithm}, {}
+    groups = {"env": env, "ppo": algorithm}
+    fields = {}
     for name, field in TrainConfig.model_fields.items():
-        fields |= fields_in(groups[name], f"{name}.") if name in groups else {name: field}
+        if name in groups:
+            fields |= fields_in(groups[name], f"{name}.")
+        else:
+            fields[name] = field
     return fields
 
 
@@ -199,6 +203,7 @@ def load_run_config(
     values.pop(BASE, None)
     sources = _sources_in(values.pop(SOURCES, None))
     its_task = _task_of_run(values["task"], run, task)
+    # Here, as the name may stand for code that the user has named otherwise.
     env = validate(its_task.Config, values.get("env", {}), str(path), "env")
     values = values | {"env": env}
     if algorithm is not None:
@@ -231,8 +236,11 @@ def _sources_in(stored: Any) -> dict[str, str]:
     """The source of each key, from the keys of each source; none from a run without them."""
     if not isinstance(stored, dict):
         return {}
-    lists = {source: keys for source, keys in stored.items() if isinstance(keys, list)}
-    return {str(key): str(source) for source, keys in lists.items() for key in keys}
+    sources = {}
+    for source, keys in stored.items():
+        if isinstance(keys, list):
+            sources |= dict.fromkeys(map(str, keys), str(source))
+    return sources
 
 
 def _task_of_run(name: str, run: Path, given: str | None) -> type[Task]:

@@ -153,7 +153,8 @@ def seal(folder: Path) -> None:
 def check_integrity(folder: Path) -> None:
     """Raises OSError or ValueError if a file does not match the manifest."""
     manifest = Manifest.model_validate_json((folder / MANIFEST_FILE).read_bytes())
-    found, expected = _describe_files(folder), manifest.files
+    found = _describe_files(folder)
+    expected = manifest.files
     for name in sorted(found.keys() | expected.keys()):
         if found.get(name) != expected.get(name):
             raise ValueError(f"{name} is {'not as it was written' if name in found else 'missing'}")

@@ -120,7 +120,8 @@ def copy_robot(mjcf: Path, run: Path) -> Path:
     """
     from bounce_mjx.robot.arm import locate
 
-    mjcf, folder = locate(mjcf), run / ROBOT
+    mjcf = locate(mjcf)
+    folder = run / ROBOT
     files = _files_of(mjcf)
     root = Path(os.path.commonpath([path.parent for path in files]))
     for path in files:
@@ -149,8 +150,11 @@ def write_config(run: Path, config: TrainConfig) -> None:
 
 def runs_of_seeds(run: Path) -> list[Path]:
     """Existing folders of a run's seeds, such as seed_003; the run itself if it has one seed."""
-    seeds = (path for path in run.glob("seed_*") if re.fullmatch("seed_[0-9]+", path.name))
-    return sorted(path for path in seeds if not path.is_symlink()) or [run]
+    seeds = []
+    for path in run.glob("seed_*"):
+        if re.fullmatch("seed_[0-9]+", path.name) and not path.is_symlink():
+            seeds.append(path)
+    return sorted(seeds) or [run]
 
 
 @contextlib.contextmanager
@@ -236,7 +240,7 @@ def find_checkpoint(path: str | Path) -> Checkpoint:
 
 
 def latest_checkpoint(run: Path, place: Path | None = None) -> Checkpoint:
-    """Newest intact checkpoint of a run, from which its training resumes.
+    """Newest checkpoint of a run that is intact, or its only one, from which its training resumes.
 
     Args:
       place: folder of the run in which it lies; that of a checkpoint finds this one.
@@ -279,7 +283,8 @@ def _intact_checkpoints(
         stored = [checkpoint for checkpoint in stored if checkpoint.number <= newest.number]
     if len(stored) == 1:
         return {stored[0]: None}
-    intact, damaged = {}, []
+    intact: dict[Checkpoint, Record | None] = {}
+    damaged: list[DamagedCheckpoint] = []
     for checkpoint in stored:
         try:
             intact[checkpoint] = verify(checkpoint)
@@ -312,8 +317,12 @@ def set_damaged_aside(run: Path) -> list[Path]:
 
 def _free_name(path: str) -> Path:
     """The path if there is nothing, or else with the first number that is free, from _2."""
-    names = itertools.chain([path], (f"{path}_{number}" for number in itertools.count(2)))
-    return next(Path(name) for name in names if not os.path.lexists(name))
+    free = path
+    number = 2
+    while os.path.lexists(free):
+        free = f"{path}_{number}"
+        number += 1
+    return Path(free)
 
 
 def pretrained_checkpoint(name: str = PRETRAINED) -> Checkpoint:
@@ -343,12 +352,11 @@ def find_choice(path: Path | None, log_dir: Path) -> tuple[Checkpoint, str | Non
     try:
         run = named_run(path, log_dir)
     except UserError:
-        policies = {DEFAULT: PRETRAINED} | {task: task for task in TASK_POLICIES}
-        folders = {runs_folder(find_task(task)): policy for task, policy in policies.items()}
-        if path is not None or log_dir not in folders:
+        policy = _policy_of_folder(log_dir)
+        if path is not None or policy is None:
             raise
         choice = f"no run in {log_dir}: using the policy that comes with the package"
-        return pretrained_checkpoint(folders[log_dir]), choice
+        return pretrained_checkpoint(policy), choice
     if not os.path.isdir(run) and (near := suggest(str(path), POLICIES)):
         raise UserError(f"there is no checkpoint folder and no policy {path}; {near}")
     choice = None
@@ -359,20 +367,34 @@ def find_choice(path: Path | None, log_dir: Path) -> tuple[Checkpoint, str | Non
     return find_checkpoint(run), choice
 
 
+def _policy_of_folder(log_dir: Path) -> str | None:
+    """Name of the package's policy of the task whose default folder of runs this is."""
+    policies = {DEFAULT: PRETRAINED}
+    for task in TASK_POLICIES:
+        policies[task] = task
+    for task, policy in policies.items():
+        if log_dir == runs_folder(find_task(task)):
+            return policy
+    return None
+
+
 def stored_checkpoints(run: Path) -> list[Checkpoint]:
     """Checkpoints of a run."""
-    folder, paths = Path(os.path.abspath(run / CHECKPOINTS)), []
+    folder = Path(os.path.abspath(run / CHECKPOINTS))
+    paths = []
     with contextlib.suppress(OSError), os.scandir(folder) as entries:
         # One look, as a training may remove them meanwhile.
         paths = [folder / entry.name for entry in entries if entry.name.isdecimal()]
-    paths = paths or [*earlier.checkpoints_in(folder)]
+    if not paths:
+        paths = earlier.checkpoints_in(folder)
     return [Checkpoint(run, path, int(path.name)) for path in paths if path.is_dir()]
 
 
 def _checkpoints_in(run: Path, place: Path) -> list[Checkpoint]:
     """The checkpoints of a run in one of its folders, at least one."""
     place = Path(os.path.abspath(place))
-    inside = [x for x in stored_checkpoints(run) if x.folder.is_relative_to(place)]
+    stored = stored_checkpoints(run)
+    inside = [checkpoint for checkpoint in stored if checkpoint.folder.is_relative_to(place)]
     if not inside:
         raise UserError(
             f"{place} has no checkpoint, as its training ended before the first one; start again"
@@ -382,6 +404,9 @@ def _checkpoints_in(run: Path, place: Path) -> list[Checkpoint]:
 
 def _best_seed(run: Path) -> Path:
     """Folder of a run's best seed; the run itself if it has one seed."""
-    results = {seed: load_results(seed) for seed in runs_of_seeds(run) if seed != run}
-    scores = {seed: found.best.score for seed, found in results.items() if found}
+    scores = {}
+    for seed in runs_of_seeds(run):
+        results = None if seed == run else load_results(seed)
+        if results is not None:
+            scores[seed] = results.best.score
     return max(scores, key=scores.get, default=run)

@@ -48,7 +48,8 @@ def preset_files(config: Sequence[Path], task: str, machine: Path | None = None)
 
     Args:
       config: YAML files, or names of files in configs/. A task may have its own preset of a name,
-        in the folder of configs/ that has the task's name.
+        in the folder of configs/ that has the task's name. A file in configs/ is a preset, also if
+        it is given as a path.
       machine: the machine's preset; None asks JAX, which starts its devices.
 
     Raises:

@@ -37,12 +37,17 @@ class Progress(pydantic.BaseModel):
     """Of each, the value of each result by its name, its `steps`, whether it `passed`, and whether
     the policy failed the `screening`, so that no full evaluation followed."""
 
+    def copy_so_far(self) -> "Progress":
+        """A copy to which no later evaluation is added."""
+        return self.model_copy(update={"evaluations": list(self.evaluations)})
+
     @property
-    def solved(self) -> bool:
+    def wait_is_over(self) -> bool:
         """Whether a margin has come, or the wait for it is over."""
         if self.margin_steps is not None:
             return True
-        # Not the policy of a warm start, as the wait would be over before the first step.
+        # A warm start with a margin needs no training. One without it has to be trained, as the
+        # wait would be over before the first step.
         met = [e["steps"] for e in self.evaluations if e["passed"] and e["steps"] > 0]
         return bool(met) and self.evaluations[-1]["steps"] >= PATIENCE * met[0]
 
@@ -78,7 +83,7 @@ class Progress(pydantic.BaseModel):
 def are_solved(seeds: Sequence[Progress]) -> bool:
     """Whether `stop_when_solved` ends the training of these seeds. Those that have diverged do not
     count."""
-    return all(seed.solved for seed in seeds if seed.fault is None)
+    return all(seed.wait_is_over for seed in seeds if seed.fault is None)
 
 
 class Results(Progress):

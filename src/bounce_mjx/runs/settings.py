@@ -422,7 +422,8 @@ class Stack:
         return key
 
     def _go_on(self, user: Layer) -> list[Layer]:
-        """Of a run that ended as it had met all results, if more steps are asked for."""
+        """A layer for a run that has met all results, where a number of steps is asked for: it goes
+        on to that number."""
         if self.resume is None or "total_steps" not in user.values:
             return []
         from bounce_mjx.runs.folders import find_run, latest_checkpoint
@@ -460,7 +461,8 @@ class _Mistake(Exception):
 
 
 def _merge(layers: Sequence[Layer]) -> tuple[dict[str, Any], dict[str, str]]:
-    """The values of the layers, the last one's first; and the source of each by its dotted key."""
+    """The values of the layers, of which a later one wins; and the source of each by its dotted
+    key."""
     values: dict[str, Any] = {}
     sources: dict[str, str] = {}
     for layer in layers:

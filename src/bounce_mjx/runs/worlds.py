@@ -69,7 +69,7 @@ def env_in_world(trained: WorldConfig, world: Path) -> tuple[WorldConfig, NamedW
     if named.robot is not None:
         values = merged(values, _layer_of_same_robot(trained, named, path).values["env"])
     values = merged(values, named.settings)
-    return validate(type(trained), values, f"the world {path}"), named
+    return validate(type(trained), values, f"the world {shown_file(path)}", "env"), named
 
 
 def _layer_of_world(task: type[Task], world: NamedWorld, path: Path) -> Layer:

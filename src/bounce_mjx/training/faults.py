@@ -20,12 +20,14 @@ MAX_REWARD = 1e4
 
 def first_block_fault(metrics: BlockMetrics, config: TrainConfig) -> str | None:
     """What is wrong with the first block, as a sentence; None if it can be learned from. Settings
-    that no policy can learn with show there, before anything is saved, and in every seed.
+    that no policy can learn with show there, before anything that was trained is saved, and in
+    every seed.
 
     Args:
       metrics: each [S, I], as from `Trainer.run`.
     """
-    # What follows an iteration that diverged is not due to the settings: up to and with the first.
+    # The iterations of each seed up to its first fault, with it: what follows is not due to the
+    # settings.
     faults = metrics["fault"] != 0
     until_fault = np.cumsum(faults, axis=1) <= faults
     rewards = {name: values for name, values in metrics.items() if name.startswith("reward/")}

@@ -84,7 +84,8 @@ def agree(config: TrainConfig, resume: Path | None) -> None:
     for i, other in enumerate(others, start=1):
         for key in sorted(first.keys() | other.keys()):
             if first.get(key) != other.get(key):
-                ours, theirs = (shorten(json.dumps(given.get(key))) for given in (first, other))
+                ours = shorten(json.dumps(first.get(key)))
+                theirs = shorten(json.dumps(other.get(key)))
                 raise UserError(
                     f"processes 0 and {i} differ in {key}, {ours} and {theirs}; give equal flags"
                 )
@@ -92,15 +93,18 @@ def agree(config: TrainConfig, resume: Path | None) -> None:
 
 def exchange(value: Any) -> list[Any]:
     """The values of all processes, by number; every process must call this at the same point. They
-    are plain data, and go through JAX's coordination service: the devices may still compile in
-    another process, and would not wait for longer than 30 s."""
-    client, count = distributed.global_state.client, distributed.global_state.num_processes
-    if client is None:
+    are plain data, and go through JAX's coordination service: another process may still compile,
+    for which the devices would wait for 30 s at most."""
+    processes = distributed.global_state
+    if processes.client is None:
         return [value]
     name = f"bounce_mjx/{next(_exchanges)}"
-    client.key_value_set(f"{name}/{distributed.global_state.process_id}", json.dumps(value))
-    texts = [client.blocking_key_value_get(f"{name}/{i}", _NO_LIMIT) for i in range(count)]
-    return list(map(json.loads, texts))
+    processes.client.key_value_set(f"{name}/{processes.process_id}", json.dumps(value))
+    values = []
+    for i in range(processes.num_processes):
+        text = processes.client.blocking_key_value_get(f"{name}/{i}", _NO_LIMIT)
+        values.append(json.loads(text))
+    return values
 
 
 @contextlib.contextmanager

@@ -3,8 +3,10 @@
 It is the same for every algorithm whose trainer is a `Trainer`.
 
 From a signal to its checkpoint: `StopRequest` notes the signal, the block goes on to its end
-(`train_block`), `is_stopping` ends the loop, and `finish` saves the state, waits until it is
-written, and raises `TrainingStopped` with the command that resumes the run.
+(`train_block`), an evaluation that is due is left out (on several hosts it is done, as a process
+that stopped alone would keep the others waiting), `is_stopping` ends the loop, and `finish` saves
+the state, waits until it is written, and raises `TrainingStopped` with the command that resumes
+the run.
 """
 
 import concurrent.futures
@@ -78,7 +80,7 @@ def train(
         failed, the training diverged, or its final state could not be saved.
       TrainingStopped: SIGINT, SIGTERM or SIGHUP came; the state is saved.
       Interrupted: the signal came before the first block, or before the policy of a warm start was
-        evaluated, and there is no run.
+        evaluated; a new run's folder is removed.
     """
     hosts.agree(config, resume)
     with contextlib.ExitStack() as stack:
@@ -196,7 +198,7 @@ class Job:
     steps: int = 0
     """Environment steps of each seed so far."""
     needs_save: bool = False
-    """Whether the current state is still to be saved."""
+    """Whether no save of the current state has been started."""
     is_ended: bool = False
     """Whether a callback has ended the training."""
     state: Any = None
@@ -229,6 +231,9 @@ class Job:
     def read_state(self, resume: Path) -> None:
         """Reads the checkpoint from which the resumed run continues.
 
+        Its state has all that a block needs: networks, optimizer, environments and random keys. So
+        the training goes on bit for bit, on as many devices and with the same compiled programs.
+
         Args:
           resume: the run's folder, or a checkpoint in it.
         """
@@ -237,9 +242,9 @@ class Job:
         self.steps = record.steps
         evaluated = record.progress.get("seeds", [record.progress])
         for seed, plain in zip(self.seeds, evaluated, strict=True):
-            seed.progress = Progress.model_validate(plain)
-            # What was trained after a checkpoint that the user named does not count any more. The
-            # folder of one of several seeds has no other policy than its best one.
+            seed.recall(Progress.model_validate(plain))
+            # With one seed, what was trained after a checkpoint that the user named does not count
+            # any more. A seed's own folder has its best policy alone.
             seed.recall_best(newest=checkpoint if seed.run == self.run else None)
         # Every process has read what the leader renames.
         hosts.wait_for_all()
@@ -319,7 +324,8 @@ class Job:
 
     def evaluation_is_due(self) -> bool:
         """Whether the current policies are to be evaluated."""
-        # The best checkpoint of a resumed run may be damaged.
+        # The best checkpoint of a resumed run may be damaged; a training that goes on finds another
+        # best policy.
         if self.is_finished() and any(seed.best is None for seed in self.healthy()):
             return True
         # The policy of a warm start is the one to beat.
@@ -385,7 +391,7 @@ class Job:
         started = time.perf_counter()
         block = self.pool.submit(self.trainer.run)
         if not self.stop.wait_for(block):
-            self.say("stopping after this block; the same signal again ends it at once")
+            self.say("stopping after this block; Ctrl-C or SIGTERM ends it at once")
         metrics = block.result()
         seconds = time.perf_counter() - started
         if self.steps == 0 and (wrong := faults.first_block_fault(metrics, self.config)):
@@ -406,13 +412,18 @@ class Job:
         rate = len(self.seeds) * self.block_steps / seconds
         metrics["speed/steps_per_second"] = np.full((len(self.seeds), 1), rate)
         points = events.block_points(metrics)
-        left = self.time_left()
+        is_first = "train" not in self.clock.seconds
+        left = None if is_first else self.clock.left(self.steps, self.config.total_steps)
+        if is_first:
+            # Other programs were compiled meanwhile.
+            self.clock.restart_estimate(self.steps)
         self.say(events.block_line(self.config, self.steps, seconds, left, points))
         if total := int(sum(point["task/non_finite"] for point in points)):
             self.say(f"states that were not finite, whose environments were reset: {total:,}")
         pairs = zip(self.seeds, points, strict=True)
         self.tell([self.event(seed, seed_points) for seed, seed_points in pairs])
         self.end_diverged(block_faults)
+        # With the callbacks.
         self.clock.lap("train")
 
     def finish(self) -> None:
@@ -434,7 +445,7 @@ class Job:
             raise Interrupted
         if self.needs_save:
             self.save()
-        self.end_last_save()
+        self.end_last_save("the end of the training is lost")
         if not stopping and not self.evaluate_best():
             stopping = True
             where = ", before the final evaluation"
@@ -453,13 +464,17 @@ class Job:
         if reports is None:
             return False
         for seed, report in zip(self.seeds, reports, strict=True):
+            # For results.json and what is printed; the checkpoint has the report that chose it.
             seed.progress.best = report if seed.best else None
         self.saver.start(None, self.steps, self.about(fresh_resets=True))
-        self.end_last_save()
+        self.end_last_save("the final results are not saved")
         return True
 
-    def end_last_save(self) -> None:
+    def end_last_save(self, loss: str) -> None:
         """Waits for a save that no other follows.
+
+        Args:
+          loss: what is lost if it failed.
 
         Raises:
           UserError: it failed.
@@ -468,8 +483,7 @@ class Job:
         self.clock.lap("save")
         if problem:
             raise UserError(
-                f"{self.run} cannot be written ({problem}), so the end of the training is lost; "
-                f"make room, and {self.advice}"
+                f"{self.run} cannot be written ({problem}), so {loss}; make room, and {self.advice}"
             )
 
     # What is known of the training
@@ -520,15 +534,6 @@ class Job:
         if self.snapshot is None:
             self.snapshot = self.trainer.snapshot()
         return self.snapshot
-
-    def time_left(self) -> float | None:
-        """Estimated time to the last step, s. None after the first block of this process, during
-        which other programs are still compiled."""
-        is_first_block = "train" not in self.clock.seconds
-        if is_first_block:
-            self.clock.restart_estimate(self.steps)
-            return None
-        return self.clock.left(self.steps, self.config.total_steps)
 
     def about(self, fresh_resets: bool = False) -> dict[str, Any]:
         """What the results say of the training, see `Results`."""

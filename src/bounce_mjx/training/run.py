@@ -184,13 +184,23 @@ def train(
       UserError: a setting is wrong; or as `job.train`.
       TrainingStopped: the user stopped the training.
     """
-    whole = config if isinstance(config, TrainConfig) else None
-    files = () if whole else (config,) if isinstance(config, str | Path) else tuple(config)
-    said = settings | {"task": task, "warm_start": warm_start}
-    said = {key: value for key, value in said.items() if key in settings or value is not None}
-    deciding = {k: said[k] for k in ("task", "algorithm", "warm_start", "log_dir") if k in said}
-    given = {"config": files, "robot": robot, "world": world, "resume": resume}
-    layers = stack(validate(Choice, given | deciding, PYTHON), whole=whole)
+    choice: dict[str, Any] = {"robot": robot, "world": world, "resume": resume}
+    whole = None
+    if isinstance(config, TrainConfig):
+        whole = config
+    elif isinstance(config, str | Path):
+        choice["config"] = (config,)
+    else:
+        choice["config"] = tuple(config)
+    said = dict(settings)
+    if task is not None:
+        said["task"] = task
+    if warm_start is not None:
+        said["warm_start"] = warm_start
+    for key in ("task", "algorithm", "warm_start", "log_dir"):
+        if key in said:
+            choice[key] = said[key]
+    layers = stack(validate(Choice, choice, PYTHON), whole=whole)
     config = layers.config(said)
     set_up_jax(config.env)
     console = stdout(quiet=quiet or not hosts.is_leader())
@@ -231,13 +241,14 @@ def notes_on_starts(config: TrainConfig) -> list[str]:
 
 def print_results(seeds: Sequence[job.SeedRun], console: Console) -> job.SeedRun:
     """Prints the results of a training run; returns the best seed."""
-    reports = {s.config.seed: s.progress.best for s in seeds}
-    best = max((s for s in seeds if s.progress.best), key=lambda s: s.progress.best.score)
-    report, steps = best.progress.best, best.progress.best_steps
+    reports = {seed.config.seed: seed.progress.best for seed in seeds}
+    evaluated = [seed for seed in seeds if seed.progress.best is not None]
+    best = max(evaluated, key=lambda seed: seed.progress.best.score)
+    report = best.progress.best
     if len(seeds) > 1:
         console.print(seeds_table(reports))
     else:
-        console.print(results_table(report, f"best checkpoint, {steps:,} steps"))
+        console.print(results_table(report, f"best checkpoint, {best.progress.best_steps:,} steps"))
         say(console, details_line(report))
     if unsolved := unsolved_line(report):
         say(console, unsolved)

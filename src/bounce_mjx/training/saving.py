@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from bounce_mjx.errors import reason_of
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.runs import checkpoints
 from bounce_mjx.runs.config import TrainConfig
@@ -45,9 +46,9 @@ class Outcome:
 class Saver:
     """Writes checkpoints and results in the background, one save after another.
 
-    A save that fails is lost, as the next one has newer data. It is said once, at the next
-    evaluation or save, and so is the next one that succeeds. On several hosts the leader alone
-    writes, and all know what was written.
+    A save that fails is lost, with a best policy in it, as the next one has newer data. It is said
+    once, at the next evaluation or save, and so is the next one that succeeds. On several hosts the
+    leader alone writes, and all know what was written.
     """
 
     def __init__(
@@ -109,7 +110,10 @@ class Saver:
         # The leader's, as it alone writes.
         numbers, problem = hosts.exchange([outcome.numbers, outcome.problem])[0]
         for seed in self._seeds:
-            seed.end_save(numbers.get(seed.run.name), has_failed=problem is not None)
+            number = numbers.get(seed.run.name)
+            # The state of all seeds has the evaluations of each.
+            is_saved = number is not None or self._run.name in numbers
+            seed.end_save(number, is_saved, has_failed=problem is not None)
         return problem
 
     def _say_change(self, problem: str | None) -> None:
@@ -180,5 +184,5 @@ def _write(saves: Sequence[Save], results: dict[Path, str]) -> Outcome:
     except checkpoints.NotSavedError as error:
         return Outcome(numbers, error.reason)
     except OSError as error:
-        return Outcome(numbers, error.strerror)
+        return Outcome(numbers, error.strerror or reason_of(error))
     return Outcome(numbers)

@@ -39,6 +39,8 @@ class SeedRun:
     best: Best | None = None
     saved: Best | None = None
     """The best policy of those that were saved."""
+    saved_progress: Progress = dataclasses.field(default_factory=Progress)
+    """The evaluations that were saved."""
 
     @property
     def has_unsaved_best(self) -> bool:
@@ -57,17 +59,31 @@ class SeedRun:
         if is_best:
             self.best = Best(policy, report, steps)
 
-    def end_save(self, number: int | None, has_failed: bool) -> None:
-        """Takes note of a save; a policy that could not be saved is not the best one.
+    def end_save(self, number: int | None, is_saved: bool, has_failed: bool) -> None:
+        """Takes note of a save. What could not be saved counts no more: neither the best policy nor
+        an evaluation, which might end the training.
 
         Args:
           number: that of the seed's checkpoint, if one was written.
+          is_saved: whether the evaluations so far are in a checkpoint that was written.
           has_failed: whether something could not be written.
         """
         if number is not None and self.has_unsaved_best:
-            self.saved = self.best = dataclasses.replace(self.best, number=number)
+            self.best = dataclasses.replace(self.best, number=number)
+            self.saved = self.best
+        if is_saved:
+            self.saved_progress = self.progress.copy_so_far()
+        elif has_failed:
+            fault = self.progress.fault
+            self.progress = self.saved_progress.copy_so_far()
+            self.progress.fault = fault
         if has_failed:
             self._take_best(self.saved)
+
+    def recall(self, progress: Progress) -> None:
+        """Takes over the evaluations of a checkpoint from which a training resumes."""
+        self.progress = progress
+        self.saved_progress = progress.copy_so_far()
 
     def recall_best(self, newest: Checkpoint | None) -> None:
         """Takes for the best what the best intact checkpoint of the run says. Where there is none,

@@ -31,7 +31,8 @@ class Trainer(Protocol):
 
     The job makes one by calling a class, or a function (`make_trainer` of `training.job.train`),
     with the run's config and its environment; it may raise a UserError there. Then it calls
-    `compile`, `start` once, and `run` for each block; after a block it may ask for a `snapshot`.
+    `compile`, `start` once, and `run` for each block. It may ask for `state_template` at any time,
+    and after `start` for a `snapshot`.
     """
 
     checked: Sequence[str]

@@ -60,6 +60,7 @@ class TrainingPage:
         try:
             cpu = jax.default_device(jax.devices("cpu")[0])
             with cpu, open_server(*self._address) as server:
+                self._address = self._address._replace(port=server.get_port())
                 say(self._console, f"watch: {self._address.url}")
                 side = server.gui.add_panel()
                 with side.add_tab("training", viser.Icon.SCHOOL):

@@ -97,6 +97,7 @@ def run_page(
         if controls.num_shown != scene.num_envs:
             scene.show(controls.num_shown)
         plots.history.extend(frames)
+        # Without a step, there may be a reset, or a new target.
         scene.update(frames or [simulation.frame])
         if time.monotonic() >= next_plot:
             # Also in a pause, in which a user may reset, or let a value be sampled again.

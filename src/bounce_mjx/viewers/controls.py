@@ -27,7 +27,7 @@ _SAMPLED = "sampled at each reset"
 
 class _Setting:
     """A slider, or a choice by names, for a value that is sampled as long as `sampled` is on: a
-    command has a checkbox of its own, and all terms of the world have one."""
+    command has a checkbox of its own, and all terms of the world share one."""
 
     def __init__(
         self,
@@ -65,7 +65,7 @@ class _Setting:
             shown = min(int(value), len(self._names) - 1)
         else:
             shown = round(round(value / self._handle.step) * self._handle.step, _DECIMALS)
-        # A user may be moving it.
+        # Set only for a new value, as a user may be moving it.
         if shown != self._shown:
             self._shown = shown
             self._handle.value = self._names[shown] if self._names else shown

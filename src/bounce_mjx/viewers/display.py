@@ -47,7 +47,8 @@ NO_METRICS: Mapping[str, float] = defaultdict(float)
 
 
 class Display:
-    """A model for display, and the poses of its parts for given coordinates."""
+    """A model for display, and the poses of its parts for given coordinates. The terms of a sampled
+    world, such as the paddle's tilt, are not drawn."""
 
     def __init__(self, env: Env):
         self._task = env.task
@@ -61,8 +62,8 @@ class Display:
         command: dict[str, float],
         metrics: Mapping[str, float] = NO_METRICS,
     ) -> None:
-        """Moves `data` to generalised positions [nq], and the markers to those of the commands and
-        of the last step's metrics."""
+        """Moves `data` to generalised positions [nq], and the markers to their places for the
+        commands and the last step's metrics; their sizes and colours stay."""
         self.data.qpos[:] = qpos
         for marker in self._task.markers(command, metrics):
             body = self.model.body(marker_body(marker.name))
@@ -83,7 +84,7 @@ def _with_markers(config: WorldConfig, markers: Sequence[Marker]) -> mujoco.MjMo
     add_balls(spec, config.num_balls)
     names = {marker.name for marker in markers}
     for site in spec.sites:
-        # The project's own file has markers of one task.
+        # All sites of the project's own file are markers of one task.
         if site.name in names or config.mjcf is None:
             site.group = _SHOWN_GROUPS
     for name, position, size, rgba, shape in markers:
@@ -194,12 +195,17 @@ class Trail:
         position comes several times. None before the first frame."""
 
     def add(self, frame: EnvFrame) -> None:
-        """Adds a frame's positions."""
+        """Adds a frame's positions; those of an environment that is still in its last frame, as in
+        a pause, are there already."""
         if self.points is None:
             self.points = np.tile(frame.balls, (self.length, 1, 1, 1))
             self._time = frame.time
-        self.points = np.concatenate([self.points[1:], frame.balls[None]])
-        restarted = frame.time < self._time
+        advanced = frame.time > self._time
+        self.points[:-1, advanced] = self.points[1:, advanced]
+        self.points[-1, advanced] = frame.balls[advanced]
+        # A reset after a reset is at the same time, with its balls elsewhere.
+        is_same = (frame.time == self._time) & np.all(frame.balls == self.points[-1], axis=(1, 2))
+        restarted = ~advanced & ~is_same
         self.points[:, restarted] = frame.balls[restarted]
         self._time = frame.time
 

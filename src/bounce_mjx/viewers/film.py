@@ -15,8 +15,8 @@ from bounce_mjx.viewers.world import WorldSlider, sliders_for, with_sliders
 
 
 class FilmPlayer(Simulation):
-    """Plays the frames of one episode again and again in place of a simulation; nothing that a user
-    sets or pushes changes it."""
+    """Plays the frames of one episode again and again; nothing that a user sets or pushes changes
+    it. It has the interface of a simulation, and nothing of its state."""
 
     is_film = True
 
@@ -25,6 +25,7 @@ class FilmPlayer(Simulation):
         self.env = film.env
         self.policy = None
         self.command = {}
+        # The controls then show the values that hold.
         self.world = None
         self.others = ()
         self._world = {name: np.asarray(value)[0] for name, value in film.statistics.world.items()}
@@ -75,7 +76,7 @@ class FilmPlayer(Simulation):
         return self._frame
 
     def record(self, seconds: float | None = None) -> EnvFrame:
-        """The frames of the whole episode, or of its first seconds."""
+        """The frames of the whole episode, or the first one and those of the following seconds."""
         count = None if seconds is None else round(seconds / self.env.dt) + 1
         return jax.tree.map(lambda values: values[:count], self.frames)
 
@@ -94,9 +95,9 @@ def film_player(
     """
 
     def simulate() -> FilmPlayer:
-        conditions, episodes, episode = find()
-        acting = actor(conditions.env)
-        return FilmPlayer(film_episode(conditions, acting, policy, episodes, seed, episode))
+        setup, episodes, episode = find()
+        acting = actor(setup.env)
+        return FilmPlayer(film_episode(setup, acting, policy, episodes, seed, episode))
 
     return simulate
 

@@ -61,6 +61,7 @@ def open_server(host: str, port: int, allowed: Collection[str] = ()) -> Iterator
     def guarded_serve(*args: Any, process_request: Callable[..., Any], **options: Any) -> Any:
         nonlocal server_thread
         server_thread = threading.current_thread()
+        # viser would print a traceback of each value that it cannot use.
         asyncio.get_running_loop().set_exception_handler(lambda loop, context: None)
 
         def answer(connection: ServerConnection, request: Request) -> Response | None:
@@ -123,7 +124,8 @@ def _stop(server: viser.ViserServer, server_thread: threading.Thread | None) -> 
 
 
 def _make_rule(host: str, allowed: Collection[str]) -> Callable[[Headers], bool]:
-    """A function of a request's headers: whether it is from the page itself, or of no browser."""
+    """A function of a request's headers: whether it is from the page itself, or of no browser. It
+    admits every program that reaches the port, as there is no login."""
     proxies = {name.lower() for name in allowed}
     names = proxies | {"localhost", host.lower(), socket.gethostname().lower()}
 
@@ -131,7 +133,8 @@ def _make_rule(host: str, allowed: Collection[str]) -> Callable[[Headers], bool]
         """Whether the page may be opened at a name, or at any address: a website can let its own
         name point to this machine, but no address."""
         with contextlib.suppress(ValueError):
-            return bool(ipaddress.ip_address(name))
+            ipaddress.ip_address(name)
+            return True
         return name in names
 
     def is_own(headers: Headers) -> bool:
@@ -176,7 +179,8 @@ def _is_valid(data: str | bytes) -> bool:
 
 
 def _is_number(text: str) -> bool:
-    """Whether viser would read a number, of any size, or a NaN from a text."""
+    """Whether viser, which converts a text to a control's type, would read a number of any size or
+    a NaN from it."""
     try:
         float(text)
     except ValueError:

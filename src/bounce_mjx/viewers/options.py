@@ -24,8 +24,8 @@ class ViewerOptions(StrictModel):
     html: Path | None = None
     """File for a page that replays the episode offline, instead of a viewer."""
     seconds: Positive | None = None
-    """Simulated time, s. The default is 10 for a recording, and the whole of an episode; a viewer
-    runs until it is closed."""
+    """Simulated time, s. The default is 10 for a recording, and with --episode the whole episode; a
+    viewer runs until it is closed."""
     num_envs: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 1
     """Robots side by side, on the live page and in the replay."""
     fps: Annotated[int, Field(ge=1, le=240)] | None = None

@@ -9,7 +9,7 @@ from bounce_mjx.env.env import Env
 from bounce_mjx.task.task import Recording
 from bounce_mjx.viewers.film import episode_frames
 from bounce_mjx.viewers.guard import open_server
-from bounce_mjx.viewers.scene import Scene
+from bounce_mjx.viewers.scene import ANNOUNCED_SECONDS, Scene
 from bounce_mjx.viewers.simulation import EnvFrame, frame_at, resample
 
 SUFFIXES = (".html",)
@@ -62,9 +62,12 @@ def replay(
     fps = fps or _DEFAULT_FPS
     frames = resample(recording, env.dt, fps)
     with open_server("127.0.0.1", 0) as server:
-        scene = Scene(server, env, frames.time.shape[1], names)
+        scene = Scene(server, env, frames.time.shape[1], names, 1.0 / fps)
         recorder = server.get_scene_serializer()
         for i in range(len(frames.time)):
             scene.update([frame_at(frames, i)])
             recorder.insert_sleep(1.0 / fps)
+        if frames.lost[-1].any():
+            # The page begins again, which would hide it at once.
+            recorder.insert_sleep(ANNOUNCED_SECONDS)
         return recorder.as_html().replace(_VISER_TITLE, "<title>bounce_mjx</title>", 1)

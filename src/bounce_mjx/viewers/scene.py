@@ -23,7 +23,8 @@ _SPACING = np.array([1.3, 0.9, 0.0])
 _LABEL_HEIGHT = 0.74
 # Distance of a label above its target, which the ball may exceed.
 _LABEL_DISTANCE = 0.14
-_ANNOUNCED_SECONDS = 1.5
+ANNOUNCED_SECONDS = 1.5
+"""Time for which a label says that an episode was lost, s."""
 _BACKGROUND = np.array([222.0, 228.0, 235.0])
 # Where there are more robots than this, their labels are short.
 _MAX_LONG_LABELS = 4
@@ -40,14 +41,17 @@ class Scene:
         env: Env,
         num_envs: int,
         names: Sequence[str] | None = None,
+        dt: float | None = None,
     ):
         """
         Args:
           names: a name of each environment for its label; by default their numbers.
+          dt: time between two frames, s; None for a control step.
         """
         self._server = server
         self._env = env
         self._names = names
+        self._dt = dt or env.dt
         self._display = Display(env)
         self.show(num_envs)
         # After the scene is built: a page that is there already is welcomed at once.
@@ -78,7 +82,7 @@ class Scene:
             )
             for body, shapes in body_scenes(model)
         }
-        self._trail = Trail(self._env.dt)
+        self._trail = Trail(self._dt)
         num_lines = num_envs * self._env.config.num_balls
         segments = self._trail.length - 1
         age = np.linspace(1.0, 0.0, self._trail.length)[:, None, None]
@@ -122,6 +126,7 @@ class Scene:
             self._trail.add(frame)
             over = frame.over[: self.num_envs]
             self._lost = np.where(over, frame.lost[: self.num_envs], self._lost)
+        frame = frames[-1]
         with self._server.atomic():
             for i, label in enumerate(self._labels):
                 qpos, command, metrics = environment_pose(frame, i)
@@ -135,6 +140,7 @@ class Scene:
                 height = max(_LABEL_HEIGHT, top + _LABEL_DISTANCE)
                 label.position = self._label_places[i] + (0.0, 0.0, height)
             for body, handle in self._bodies.items():
+                # What moves: a joint's body, or a marker.
                 if display.model.body_weldid[body]:
                     handle.batched_positions = positions[:, body] + self._offsets
                     handle.batched_wxyzs = rotations[:, body]
@@ -142,14 +148,14 @@ class Scene:
             self._line.points = np.stack([path[:-1], path[1:]], axis=3).reshape(-1, 2, 3)
 
     def _label(self, frame: EnvFrame, index: int) -> str:
-        """An environment's name if there are several, and the task's readings or the loss of its
-        ball."""
+        """An environment's name if there are several, and the task's readings, or that its episode
+        is lost."""
         name = "" if self.num_envs == 1 else f"{index + 1}:  "
         if self._names is not None:
             name = f"{self._names[index]}:  "
         short = self.num_envs > _MAX_LONG_LABELS
-        if self._lost[index] and (frame.over[index] or frame.time[index] < _ANNOUNCED_SECONDS):
-            return f"{name}LOST" if short else f"{name}BALL LOST"
+        if self._lost[index] and (frame.over[index] or frame.time[index] < ANNOUNCED_SECONDS):
+            return f"{name}LOST"
         readings = frame_readings(self._env, frame, index)
         if short:
             return name + next(iter(readings.values()), "")

@@ -29,7 +29,8 @@ class Shown(NamedTuple):
     title: str
     policy: Policy | None = None
     film: Callable[[], FilmPlayer] | None = None
-    """Simulates an episode of an evaluation, which is shown in place of new ones."""
+    """Simulates an episode of an evaluation, which is shown in place of new ones. Called once, when
+    the files and the port are checked."""
 
 
 def show(
@@ -135,10 +136,11 @@ def _serve(
     from bounce_mjx.viewers.guard import open_server
 
     port = free_port(options.host, options.port)
-    address = Address(options.host, port, options.allow_host)
     simulation = simulate()
-    opening = open_server(address.host, address.port, address.allowed)
+    opening = open_server(options.host, port, options.allow_host)
     with StopRequest() as stop, opening as server:
+        # Another program may have taken the port meanwhile; viser then takes the next one.
+        address = Address(options.host, server.get_port())
         say = partial(console.out, f"viewer: {address.url}  (Ctrl-C ends it)", highlight=False)
         run_page(server, simulation, start, lambda: stop.requested, say, options.seconds)
 
@@ -159,7 +161,7 @@ def _simulate(
     # The page's slider goes up to the simulated number. On a CPU, MJX is too slow for 16.
     if has_sliders and len(shown) == 1 and envs[0].engine.name == "fused":
         num_envs = MAX_ENVS
-    # Policies side by side are compared in one world: where one of them has none to sample, in the
+    # Policies side by side are compared in one world: where the config of one samples none, in the
     # nominal one.
     is_sampled = all(one.config.randomization.terms for one in shown)
     world = None if is_sampled else {}

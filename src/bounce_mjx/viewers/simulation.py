@@ -1,5 +1,6 @@
 """Episodes as NumPy frames: stepped live for a viewer, or recorded."""
 
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -114,8 +115,8 @@ class Simulation:
         self.command: dict[str, float] = {}
         """Commands of all environments that are set; the others are sampled."""
         self.world: dict[str, Sequence[float]] | None = None
-        """Entries of some terms of the world that are on, in all environments, with the others
-        nominal; None for a world sampled at each reset."""
+        """Entries of terms of the world, in all environments; those that are not named are nominal.
+        None for a world sampled at each reset."""
         self.others: Sequence[Simulation] = ()
         """Simulations of the same robot that are shown with this one, after its environments, and
         have its commands and its world."""
@@ -124,8 +125,8 @@ class Simulation:
         self._key = jax.random.PRNGKey(seed)
         self._push = np.zeros(3, np.float32)
         self._steps = np.zeros(num_envs, np.int32)
-        nothing = jax.eval_shape(self._fresh_states, self._key)
-        self._states = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), nothing)
+        shapes = jax.eval_shape(self._fresh_states, self._key)
+        self._states = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
         over = np.ones(num_envs, bool)
         restart = jax.jit(self._restart).lower(self._key, self._states, self._steps, over)
         advance = jax.jit(self._advance).lower(*self._inputs())
@@ -180,6 +181,7 @@ class Simulation:
         self._push = np.zeros(3, np.float32)
         self._key, self._states, self._steps, frame = self._step_program(*inputs)
         self._frame = jax.device_get(frame)
+        # The last frame of an episode stays until the next step.
         if self._frame.over.any():
             self._reset(self._frame.over)
         return self.frame
@@ -197,9 +199,11 @@ class Simulation:
         command = {name: np.float32(self.command.get(name, np.nan)) for name in config.commands}
         world = {}
         for name in config.randomization.terms:
+            # A term without a nominal value stays sampled.
             if name in self.env.nominals:
                 shape = TERMS[name].shape(self.env.action_size)
                 entries = self._entries(name)
+                # A number has the shape (), and its entries may be a tuple of one.
                 world[name] = np.full(shape or 1, entries, np.float32).reshape(shape)
         return self.policy, self._key, self._states, self._steps, command, self._push, world
 
@@ -271,21 +275,20 @@ def in_real_time(
 def resample(recording: EnvFrame, dt: float, fps: float) -> EnvFrame:
     """A recording [T, N, ...] at another rate.
 
-    Positions are interpolated in time, but not across a reset; other values come from the last
-    control step.
+    Positions are interpolated in time, but not across a reset; `over` and `lost` tell what came
+    since the frame before; other values come from the last control step.
 
     Args:
       dt: time between the frames of the recording, s.
       fps: desired frames per second.
 
     Returns:
-      The frames at 0, 1/fps, 2/fps, ... s, as long as the recording lasts, at least the first:
-      [F, N, ...].
+      The frames at 0, 1/fps, 2/fps, ... s up to the last one of the recording: [F, N, ...].
     """
     last = len(recording.time) - 1
-    num_frames = max(1, int(last * dt * fps + 1e-6))
-    steps = np.arange(num_frames) / (fps * dt)
-    before = np.minimum(steps.astype(int), last)
+    num_frames = 1 + math.ceil(last * dt * fps - 1e-6)
+    steps = np.minimum(np.arange(num_frames) / (fps * dt), last)
+    before = steps.astype(int)
     after = np.minimum(before + 1, last)
     fraction = (steps - before)[:, None] * ~recording.over[before]
     frames = jax.tree.map(lambda values: values[before], recording)
@@ -294,8 +297,13 @@ def resample(recording: EnvFrame, dt: float, fps: float) -> EnvFrame:
         # Transposed, a share for each frame and environment fits values of any further axes.
         return (values[before].T + fraction.T * (values[after] - values[before]).T).T
 
+    def happened(values: np.ndarray) -> np.ndarray:
+        counts = np.cumsum(values, axis=0)[before]
+        return values[before] | (np.diff(counts, axis=0, prepend=0) > 0)
+
     moving = "time", "qpos", "balls", "paddle"
-    return frames._replace(**{name: blend(getattr(recording, name)) for name in moving})
+    blended = {name: blend(getattr(recording, name)) for name in moving}
+    return frames._replace(**blended, over=happened(recording.over), lost=happened(recording.lost))
 
 
 def _change(env: Env, states: State, command: World, push: jax.Array, world: World) -> State:

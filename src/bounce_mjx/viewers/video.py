@@ -27,6 +27,7 @@ SUFFIXES = (".mp4", ".webp", ".gif")
 # A GIF counts time in 1/100 s, and browsers show at most 50 frames per second.
 _DEFAULT_FPS = {".mp4": 60, ".webp": 25, ".gif": 25}
 _MAX_GIF_FPS = 50
+_POLL_SECONDS = 0.1
 _ENCODINGS = {
     ".mp4": "-c:v libx264 -pix_fmt yuv420p -crf 20 -movflags +faststart".split(),
     ".webp": "-c:v libwebp_anim -q:v 60 -loop 0".split(),
@@ -107,22 +108,38 @@ class VideoWriter:
             # It reads pictures from its standard input.
             command = [self._ffmpeg, "-y", "-loglevel", "error", *pictures.split(), *encoding]
             encoder = subprocess.Popen(
-                [*command, str(new)], stdin=subprocess.PIPE, stderr=subprocess.PIPE
+                [*command, str(new)],
+                stdin=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                # A terminal would send Ctrl-C to it too.
+                start_new_session=True,
             )
             try:
-                # A broken pipe means that the encoder failed; it prints the reason.
-                with contextlib.suppress(BrokenPipeError), StopRequest() as stop:
-                    for picture in shown:
-                        if stop.requested:
-                            raise Interrupted
-                        encoder.stdin.write(picture.tobytes())
-                _, errors = encoder.communicate()
+                with StopRequest() as stop:
+                    # A broken pipe means that the encoder failed; it prints the reason.
+                    with contextlib.suppress(BrokenPipeError):
+                        for picture in shown:
+                            if stop.requested:
+                                break
+                            encoder.stdin.write(picture.tobytes())
+                    errors = _wait(encoder, stop)
+                if stop.requested:
+                    raise Interrupted
                 if encoder.returncode:
                     reason = " ".join(errors.decode(errors="replace").split())
                     raise UserError(f"{self._path} cannot be written ({reason[-200:]}); {advice}")
             finally:
                 encoder.kill()
                 encoder.communicate()
+
+
+def _wait(encoder: subprocess.Popen, stop: StopRequest) -> bytes:
+    """Waits until the encoder has written its file, or a stop is requested; what it printed."""
+    while not stop.requested:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            _, errors = encoder.communicate(timeout=_POLL_SECONDS)
+            return errors
+    return b""
 
 
 def draw_frames(
@@ -148,7 +165,7 @@ def draw_frames(
 
 def caption(picture: np.ndarray, readings: dict[str, str], height: float) -> np.ndarray:
     """A picture [height, width, 3] with a caption: the task's readings, the first one large, and
-    the ball's height, m."""
+    the first ball's height, m."""
     image = Image.fromarray(picture)
     draw = ImageDraw.Draw(image, "RGBA")
     unit = max(16, image.height // 26)

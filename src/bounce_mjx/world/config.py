@@ -42,7 +42,8 @@ class Command(NamedTuple):
     step: float = 0.05
     """Change by a key of a viewer."""
     names: tuple[str, ...] = ()
-    """Names of the values 0 to 1, 1 to 2, ..., if they are choices; a user may give a name."""
+    """Names of the values 0 to 1, 1 to 2, ..., if they are choices; a user may give a name. None is
+    a number, which would be taken for a value."""
     hidden: bool = False
     """Whether the policy need not see it, because it acts through other commands."""
 

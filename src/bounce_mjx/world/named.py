@@ -79,7 +79,8 @@ class NamedWorld(StrictModel):
         return self.env.model_dump(exclude_unset=True)
 
     def double_assumed(self, nominals: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-        """For each assumed key, the nested settings of `env` in which alone its number is doubled.
+        """For each assumed key, as "twice KEY" or "half KEY", the nested settings of `env` in which
+        alone its number is doubled.
 
         A term of the randomisation goes twice as far from its nominal value, within its bounds. A
         number of which less is harder is halved instead: a term without a nominal value
@@ -91,7 +92,12 @@ class NamedWorld(StrictModel):
           nominals: the values of all terms without randomisation (`env.env.model_nominals`).
         """
         numbers = flat(self.settings)
-        return {key: nested(key, _double(key, numbers[key], nominals)) for key in self.assumed}
+        doubled = {}
+        for key in self.assumed:
+            factor = _factor(key, nominals)
+            name = f"half {key}" if factor < 1.0 else f"twice {key}"
+            doubled[name] = nested(key, _double(key, numbers[key], factor, nominals))
+        return doubled
 
 
 def without_idle_curriculum(randomization: dict[str, Any]) -> dict[str, Any]:
@@ -132,25 +138,29 @@ def _can_be_doubled(key: str, value: Any) -> bool:
     return True
 
 
-def _double(key: str, value: Any, nominals: Mapping[str, Any]) -> Any:
+def _factor(key: str, nominals: Mapping[str, Any]) -> float:
+    """By how much `double_assumed` multiplies an assumed setting, or how far a term goes from its
+    nominal value."""
+    group, _, name = key.rpartition(".")
+    if group == "randomization":
+        is_less_harder = name not in nominals
+    else:
+        is_less_harder = group == "robot.limits" or key in _LESS_IS_HARDER
+    return 0.5 if is_less_harder else 2.0
+
+
+def _double(key: str, value: Any, factor: float, nominals: Mapping[str, Any]) -> Any:
     """The value of an assumed setting in `double_assumed`."""
     group, _, name = key.rpartition(".")
     if group == "randomization":
-        return [_double_end(name, end, nominals) for end in value]
-    less_is_harder = group == "robot.limits" or key in _LESS_IS_HARDER
-    factor = 0.5 if less_is_harder else 2.0
+        return [_double_end(name, end, factor, nominals) for end in value]
     return (factor * np.array(value)).tolist()
 
 
-def _double_end(term: str, end: Any, nominals: Mapping[str, Any]) -> Any:
+def _double_end(term: str, end: Any, factor: float, nominals: Mapping[str, Any]) -> Any:
     """An end of a term's range in `double_assumed`; one number for all entries becomes one for
     each, because each has its own nominal value."""
-    if term in nominals:
-        centre = nominals[term]
-        factor = 2.0
-    else:
-        centre = 0.0
-        factor = 0.5
+    centre = nominals.get(term, 0.0)
     doubled = centre + factor * (np.array(end) - centre)
     least, greatest = TERMS[term].bounds
     return np.clip(doubled, least, greatest).tolist()
