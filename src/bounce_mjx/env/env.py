@@ -493,7 +493,6 @@ class Env:
         )
         result = jax.eval_shape(lambda: self.task.step(state.task, step))
         check_metrics(result.metrics, self.task)
-        check_tags(self.task, result.metrics)
         rewards = [f"reward/{name}" for name in result.reward]
         metrics = dict.fromkeys([*rewards, *result.metrics, *ENDS], zero)
         metrics |= self._privileged_metrics(state.world, truth)
@@ -503,6 +502,8 @@ class Env:
                 named.add(curve.over)
             # A curve may not name an unknown metric, and need not name them all.
             check_names(f"the curve {curve.tag}", "metric", metrics.keys() | named, metrics)
+        # After the names, as a mistyped metric leaves another one without its curve.
+        check_tags(self.task, result.metrics)
         return metrics
 
     def kinematics(self, state: EnvState) -> Kinematics:
