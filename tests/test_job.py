@@ -344,8 +344,18 @@ def test_an_error_in_a_callback_ends_the_training(tmp_path: Path) -> None:
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_a_signal_saves_and_says_how_to_resume(tmp_path: Path, number: signal.Signals) -> None:
     signalled = before(2, lambda: os.kill(os.getpid(), number))
+    num_evaluations = 0
+
+    class Counted(Scores):
+        def select(self, policies):
+            nonlocal num_evaluations
+            num_evaluations += 1
+            return super().select(policies)
+
     with pytest.raises(job.TrainingStopped) as stopped:
-        train(tmp_path, RETURNS, trainer=signalled)
+        train(tmp_path, RETURNS, trainer=signalled, scores=Counted)
+    # None is begun whose end nobody waits for.
+    assert num_evaluations == 1
     (run,) = tmp_path.iterdir()
     continues = f"stopped after 128 steps; continue with: bounce-mjx train --resume {run}"
     assert continues in str(stopped.value)

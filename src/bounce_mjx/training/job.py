@@ -596,9 +596,12 @@ class Job:
         self, evaluate: Callable[[list[Policy]], list[Report]], policies: list[Policy]
     ) -> list[Report] | None:
         """A report of each seed, or None if a stop was requested meanwhile."""
-        evaluating = self.pool.submit(evaluate, policies)
         # On several hosts, a process that stopped on its own would keep the others waiting.
-        if not self.stop.wait_for(evaluating) and jax.process_count() == 1:
+        may_leave = jax.process_count() == 1
+        if may_leave and self.stop.requested:
+            return None
+        evaluating = self.pool.submit(evaluate, policies)
+        if not self.stop.wait_for(evaluating) and may_leave:
             return None
         reports = evaluating.result()
         self.clock.lap("evaluate")
