@@ -78,7 +78,7 @@ class Condition(NamedTuple):
     strength: float | None
     """Strength in the perturbation's unit; None for a perturbation without strengths."""
     env: WorldConfig
-    """World and task of the policy, without randomisation."""
+    """World and task of the condition, without randomisation."""
     randomization: RandomizationConfig
     """The active terms, each with its range; every episode samples all of them, whatever its
     `share`."""

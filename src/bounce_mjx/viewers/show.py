@@ -161,8 +161,8 @@ def _simulate(
     # The page's slider goes up to the simulated number. On a CPU, MJX is too slow for 16.
     if has_sliders and len(shown) == 1 and envs[0].engine.name == "fused":
         num_envs = MAX_ENVS
-    # Policies side by side are compared in one world: where the config of one samples none, in the
-    # nominal one.
+    # Policies side by side are compared in the nominal world if the config of one samples none;
+    # otherwise each samples its own.
     is_sampled = all(one.config.randomization.terms for one in shown)
     world = None if is_sampled else {}
     simulations = []

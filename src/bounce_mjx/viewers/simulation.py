@@ -61,8 +61,8 @@ class EnvFrame(NamedTuple):
     """Whether the episode ended or timed out on this step [N]; the next frame then starts a new
     episode."""
     lost: np.ndarray
-    """Whether the episode ended on this step [N], because the ball was lost or an arm joint was too
-    fast."""
+    """Whether the episode ended on this step [N] before its time limit: the ball was lost, an arm
+    joint was too fast, or what else ends an episode."""
 
 
 def at_index(values: dict[str, np.ndarray], index: int) -> dict[str, float]:
