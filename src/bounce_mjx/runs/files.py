@@ -20,8 +20,8 @@ ModelT = TypeVar("ModelT", bound=pydantic.BaseModel)
 
 
 class Manifest(pydantic.BaseModel):
-    """manifest.json: size and SHA-256 of every other file in a checkpoint, by name, but for those that begin
-    with a dot, such as a file system's own."""
+    """manifest.json: size and SHA-256 of every other file in a checkpoint, by name, but for
+    those that begin with a dot, such as a file system's own."""
 
     format: int = 1
     files: dict[str, dict[str, int | str]]
