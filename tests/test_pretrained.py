@@ -125,9 +125,7 @@ def test_a_shipped_policy_is_shipped_again_as_it_is(tmp_path: Path) -> None:
     checkpoint, config = best_checkpoint(folder), load_run_config(folder)
     shipped = json.loads((folder / "results.json").read_text(encoding="utf-8"))
     report = pydantic.TypeAdapter(Report).validate_python(shipped)
-    evaluation = PolicyEvaluation(
-        report, engine="fused", warning=None, conditions=None, statistics=None
-    )
+    evaluation = PolicyEvaluation(report, engine="fused", warning=None, setup=None, statistics=None)
     write_policy(checkpoint, config, evaluation, tmp_path / "again", "track")
     again = json.loads((tmp_path / "again" / "results.json").read_text(encoding="utf-8"))
     for machine in ("device", "jax"):
