@@ -14,7 +14,12 @@ from bounce_mjx.viewers.browser import reward_bars
 from bounce_mjx.viewers.display import TRAIL_SECONDS, Display, Trail, body_scenes
 from bounce_mjx.viewers.page import replay
 from bounce_mjx.viewers.scene import ANNOUNCED_SECONDS, Scene
-from bounce_mjx.viewers.simulation import EnvFrame, make_random_controller, resample
+from bounce_mjx.viewers.simulation import (
+    EnvFrame,
+    frame_at,
+    make_random_controller,
+    resample,
+)
 from viewing import watch
 
 
@@ -94,6 +99,11 @@ def test_a_replay_shows_the_path_and_the_loss_for_as_long_as_the_live_page(
         assert scene._trail.length == max(1, round(TRAIL_SECONDS * fps))
         assert scene._labels[0].text == "LOST"
         np.testing.assert_allclose(sum(seconds), len(scenes) / fps + ANNOUNCED_SECONDS)
+    # A reset after the next episode has begun is no loss.
+    begun = frame_at(lost, 0)
+    scene.update([begun._replace(time=np.array([2.0 * ANNOUNCED_SECONDS]))])
+    scene.update([begun._replace(time=np.array([0.0]))])
+    assert scene._labels[0].text != "LOST"
 
 
 SHAPES = """<mujoco><worldbody>

@@ -288,3 +288,9 @@ def test_pushes_follow_the_camera(case) -> None:
     view, towards, expected = case
     expected = np.array(expected) / np.linalg.norm(expected)
     np.testing.assert_allclose(direction(towards, np.array(view)), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("lasted", [True, False])
+def test_a_film_tells_a_failure_in_the_last_step_of_an_episode(lasted: bool) -> None:
+    frames = viewing.film_of(viewing.mirrored(), 3, lasted).frames
+    assert frames.lost[:, 0].tolist() == [False, False, not lasted]

@@ -71,8 +71,9 @@ def _exchangeable() -> Simulation:
     return Simulation(env, controller, 2, seed=0, policy=np.float32(0.0))
 
 
-def film_of(simulation: Simulation, steps: int) -> FilmPlayer:
-    """A film of the next steps of a simulation's first robot."""
+def film_of(simulation: Simulation, steps: int, lasted: bool = True) -> FilmPlayer:
+    """A film of the next steps of a simulation's first robot, as one of an episode of so many,
+    which lasted or failed in the last of them."""
     frames = simulation.record(steps * simulation.env.dt)
     recording = Recording(
         joint_angles=None,
@@ -83,7 +84,7 @@ def film_of(simulation: Simulation, steps: int) -> FilmPlayer:
         qpos=frames.qpos[1:, :1].transpose(0, 2, 1),
         metrics={name: values[1:, :1] for name, values in frames.metrics.items()},
     )
-    statistics = Statistics(np.ones(1, bool), np.full(1, steps), np.zeros(1), Tally({}, {}))
+    statistics = Statistics(np.array([lasted]), np.full(1, steps), np.zeros(1), Tally({}, {}))
     return FilmPlayer(Film(simulation.env, recording, statistics))
 
 

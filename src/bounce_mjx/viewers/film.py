@@ -31,6 +31,8 @@ class FilmPlayer(Simulation):
         self._world = {name: np.asarray(value)[0] for name, value in film.statistics.world.items()}
         self.frames = episode_frames(film.env, film.recording)
         """Every frame of the episode [T, 1, ...]."""
+        # The recording does not tell whether an episode failed in the last step that it may have.
+        self.frames.lost[-1] = ~np.asarray(film.statistics.running, bool)
         self._next = 0
         self.reset()
 

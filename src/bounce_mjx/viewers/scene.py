@@ -126,6 +126,8 @@ class Scene:
             self._trail.add(frame)
             over = frame.over[: self.num_envs]
             self._lost = np.where(over, frame.lost[: self.num_envs], self._lost)
+            # Only for so long, as a reset begins an episode without a loss before it.
+            self._lost &= over | (frame.time[: self.num_envs] < ANNOUNCED_SECONDS)
         frame = frames[-1]
         with self._server.atomic():
             for i, label in enumerate(self._labels):
