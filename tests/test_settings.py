@@ -185,6 +185,20 @@ def test_a_warm_start_is_alike_in_a_file(folder: Path) -> None:
     assert any("the warm start robust_small wins over configs/randomized.yaml" in x for x in notes)
 
 
+def test_what_is_brought_whole_has_no_part_of_a_mapping_below() -> None:
+    """The environment of a policy, a whole config, and a group that Python gives."""
+    own = load_run_config(pretrained_checkpoint("robust_small").run)
+    transfer = read_preset(Path("transfer"))
+    config = read_command("--config transfer --warm-start robust_small".split()).config
+    assert config.env == own.env
+    assert config.sources["env.randomization.shares"] == "the warm start robust_small"
+    randomization = transfer.env.randomization.model_copy(update={"shares": {"push_speed": 0.4}})
+    config = python(config="transfer", randomization=randomization)
+    assert config.env.randomization == randomization
+    config = python(config=config, warm_start="robust_small")
+    assert config.env.randomization == randomization
+
+
 def test_a_whole_config_stands_alone_below_what_python_says() -> None:
     whole = read_preset(Path("seed")).model_copy(update={"seed": 7})
     config = python(config=whole, seed=5, num_envs=64)

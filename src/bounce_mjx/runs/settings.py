@@ -183,7 +183,7 @@ def _layers_of_files(files: Iterable[Path | None]) -> list[Layer]:
 
 
 def _layer_of(config: TrainConfig) -> Layer:
-    return Layer("config", config.model_dump())
+    return Layer("config", config.model_dump(), whole=("env", "ppo"))
 
 
 def _last(layers: Sequence[Layer], key: str) -> Any:
@@ -302,7 +302,8 @@ class _Policy(NamedTuple):
             del env["randomization"]
         networks = self.config.ppo.model_dump(include={*NETWORK_KEYS, "critic_metrics"})
         values = {"task": self.config.task, "env": env, "ppo": networks}
-        return Layer(f"the warm start {self.start}", values)
+        whole = tuple(f"env.{key}" for key in env)
+        return Layer(f"the warm start {self.start}", values, whole=whole)
 
 
 def _policy(choice: Choice, files: Sequence[Layer], whole: TrainConfig | None) -> _Policy | None:
@@ -385,7 +386,7 @@ class Stack:
           UserError: a key is unknown, a value is out of range, or it must be that of the resumed
             run. The error names the layer that set it.
         """
-        user = Layer(PYTHON if flags is None else FLAGS, self._nested(said or {}))
+        user = self._layer_of_user(PYTHON if flags is None else FLAGS, said or {})
         above = [*self._go_on(user), user]
         layers = [*self.layers, *above]
         values, sources = _merge(layers)
@@ -406,13 +407,18 @@ class Stack:
         config.set_sources(sources)
         return config
 
-    def _nested(self, said: Mapping[str, Any]) -> dict[str, Any]:
+    def _layer_of_user(self, source: str, said: Mapping[str, Any]) -> Layer:
         """The user's values in their groups."""
         values: dict[str, Any] = {}
+        whole = []
         for key, value in said.items():
-            plain = value.model_dump() if isinstance(value, pydantic.BaseModel) else value
-            values = merged(values, nested(self._full_key(key), plain))
-        return values
+            full_key = self._full_key(key)
+            plain = value
+            if isinstance(value, pydantic.BaseModel):
+                plain = value.model_dump()
+                whole.append(full_key)
+            values = merged(values, nested(full_key, plain))
+        return Layer(source, values, whole=tuple(whole))
 
     def _full_key(self, key: str) -> str:
         """The dotted key of a setting or a group that stands alone; an unknown one stays."""
@@ -466,6 +472,8 @@ def _merge(layers: Sequence[Layer]) -> tuple[dict[str, Any], dict[str, str]]:
     values: dict[str, Any] = {}
     sources: dict[str, str] = {}
     for layer in layers:
+        for key in layer.whole:
+            values = merged(values, nested(key, None))
         values = merged(values, layer.values)
         if layer.is_world:
             randomization = without_idle_curriculum(values["env"]["randomization"])
