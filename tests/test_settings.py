@@ -250,6 +250,11 @@ def test_a_mistake_names_the_layer_that_has_it(folder: Path, refused) -> None:
     refused("train --config b.yaml --seed -1", "--seed is -1", "(see bounce-mjx train --help)")
     (folder / "c.yaml").write_text("ppo: {num_envs: 0}")
     refused("train --config c.yaml --seed 1", "error: c.yaml: ppo.num_envs is 0, but")
+    # A warm start is looked for before the config is validated.
+    (folder / "d.yaml").write_text("warm_start: no")
+    refused("train --config d.yaml", "error: d.yaml: warm_start is False, but must be a path")
+    (folder / "e.yaml").write_text("warm_start: robust_small\nlog_dir: 5")
+    refused("train --config e.yaml", "error: e.yaml: log_dir is 5, but must be a path")
 
 
 @pytest.mark.parametrize("key", ["on", "1", "null", "0.5"])

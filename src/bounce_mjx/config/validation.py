@@ -62,6 +62,8 @@ def describe(
     reason = first["msg"][0].lower() + first["msg"][1:]
     if first["type"] == "missing":
         reason = "an item is missing"
+    if first["type"] == "path_type":
+        reason = "must be a path"
     if first["type"].startswith(("greater_than", "less_than")) and key in fields:
         reason += f" {unit_of(fields[key].description or '')}".rstrip()
     given = shorten(str(first["input"]))

@@ -33,7 +33,7 @@ from bounce_mjx.config.command_line import Flag
 from bounce_mjx.config.files import differing_keys, flat
 from bounce_mjx.config.settings import Layer, StrictModel, merged, nested
 from bounce_mjx.config.user_code import is_file, is_same_code
-from bounce_mjx.config.validation import describe, key_of
+from bounce_mjx.config.validation import describe, key_of, validate
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.learning.config import PPO_NAME, PPOConfig
 from bounce_mjx.learning.registry import find_algorithm
@@ -191,6 +191,19 @@ def _last(layers: Sequence[Layer], key: str) -> Any:
     return next((layer.values[key] for layer in reversed(layers) if key in layer.values), None)
 
 
+def _last_path(layers: Sequence[Layer], key: str) -> Path | None:
+    """`_last` of a path of the config, which is needed before the config is validated.
+
+    Raises:
+      UserError: it is no path.
+    """
+    layer = next((layer for layer in reversed(layers) if key in layer.values), None)
+    if layer is None or layer.values[key] is None:
+        return None
+    config = validate(TrainConfig, {key: layer.values[key]}, layer.source)
+    return getattr(config, key)
+
+
 def _task(
     choice: Choice,
     files: Sequence[Layer],
@@ -316,7 +329,7 @@ def _policy(choice: Choice, files: Sequence[Layer], whole: TrainConfig | None) -
         path = choice.warm_start
     else:
         # A whole config has its environment already.
-        path = _last(files, "warm_start") if whole is None else None
+        path = _last_path(files, "warm_start") if whole is None else None
     if path is None:
         return None
     if choice.robot:
@@ -328,12 +341,12 @@ def _policy(choice: Choice, files: Sequence[Layer], whole: TrainConfig | None) -
     task = choice.task or _last(files, "task")
     if choice.task is None and task is not None and is_file(task) and whole is None:
         raise unnamed_code(_sources_of(files), "task", task)
-    log_dir = choice.log_dir or _last(files, "log_dir")
-    if log_dir is None or not runs_in(Path(log_dir)):
+    log_dir = choice.log_dir or _last_path(files, "log_dir")
+    if log_dir is None or not runs_in(log_dir):
         log_dir = runs_folder(whole.env.task if whole else find_task(task or DEFAULT))
-    checkpoint, note = find_choice(Path(path), Path(log_dir))
+    checkpoint, note = find_choice(path, log_dir)
     config = load_run_config(checkpoint.run, task)
-    start = Path(path) if policy_folder(path) else checkpoint.folder
+    start = path if policy_folder(path) else checkpoint.folder
     return _Policy(start, config, () if note is None else (note,))
 
 
