@@ -250,6 +250,13 @@ def test_a_mistake_names_the_layer_that_has_it(folder: Path, refused) -> None:
     refused("train --config b.yaml --seed -1", "--seed is -1", "(see bounce-mjx train --help)")
     (folder / "c.yaml").write_text("ppo: {num_envs: 0}")
     refused("train --config c.yaml --seed 1", "error: c.yaml: ppo.num_envs is 0, but")
+    # As a flag and in Python a key may have dots.
+    (folder / "dots.yaml").write_text("ppo.num_envs: 8")
+    nested = "error: dots.yaml: unknown key ppo.num_envs; nest it: ppo: {num_envs: ...}"
+    refused("train --config dots.yaml", nested)
+    refused("train --config dots.yaml --num-envs 8", nested)
+    (folder / "dots.yaml").write_text("reward.height.weight: 1")
+    refused("train --config dots.yaml", "nest it: env: {reward: {height: {weight: ...}}}")
     # A warm start is looked for before the config is validated.
     (folder / "d.yaml").write_text("warm_start: no")
     refused("train --config d.yaml", "error: d.yaml: warm_start is False, but must be a path")

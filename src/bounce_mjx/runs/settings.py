@@ -33,7 +33,7 @@ from bounce_mjx.config.command_line import Flag
 from bounce_mjx.config.files import differing_keys, flat
 from bounce_mjx.config.settings import Layer, StrictModel, merged, nested
 from bounce_mjx.config.user_code import is_file, is_same_code
-from bounce_mjx.config.validation import describe, key_of, validate
+from bounce_mjx.config.validation import describe, path_of, validate
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.learning.config import PPO_NAME, PPOConfig
 from bounce_mjx.learning.registry import find_algorithm
@@ -407,7 +407,7 @@ class Stack:
         try:
             config = self._validated(values)
         except _Mistake as mistake:
-            source = _source_of(mistake.key, layers)
+            source = _source_of(mistake.path, layers)
             if flags is not None and source == FLAGS:
                 text = describe(mistake.error, self.fields, flags, mistake.group)
                 raise UserError(f"{text} (see {prog} --help)") from mistake.error
@@ -476,7 +476,7 @@ class _Mistake(Exception):
     def __init__(self, error: pydantic.ValidationError, group: str):
         self.error = error
         self.group = group
-        self.key = key_of(error, group)
+        self.path = path_of(error, group)
 
 
 def _merge(layers: Sequence[Layer]) -> tuple[dict[str, Any], dict[str, str]]:
@@ -497,14 +497,26 @@ def _merge(layers: Sequence[Layer]) -> tuple[dict[str, Any], dict[str, str]]:
     return values, {key: source for key, source in sources.items() if key in remaining}
 
 
-def _source_of(key: str, layers: Sequence[Layer]) -> str:
+def _source_of(path: Sequence[str], layers: Sequence[Layer]) -> str:
     """The last layer that set a key; a guess for a rule that joins several settings of a group: the
     last layer with any of them."""
     for layer in reversed(layers):
-        for other in flat(layer.values):
-            if not key or f"{other}.".startswith(f"{key}.") or key.startswith(f"{other}."):
-                return layer.source
+        if _sets(layer.values, path):
+            return layer.source
     return layers[-1].source
+
+
+def _sets(values: dict[str, Any], path: Sequence[str]) -> bool:
+    """Whether nested values have one at a path, or in the group there."""
+    part: Any = values
+    for name in path:
+        if not isinstance(part, dict):
+            # The mistake is in a part of this value.
+            return True
+        if name not in part:
+            return False
+        part = part[name]
+    return not isinstance(part, dict) or bool(flat(part))
 
 
 def _check_resumable(resumed: TrainConfig, config: TrainConfig) -> None:
