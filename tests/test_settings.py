@@ -250,6 +250,10 @@ def test_a_mistake_names_the_layer_that_has_it(folder: Path, refused) -> None:
     refused("train --config b.yaml --seed -1", "--seed is -1", "(see bounce-mjx train --help)")
     (folder / "c.yaml").write_text("ppo: {num_envs: 0}")
     refused("train --config c.yaml --seed 1", "error: c.yaml: ppo.num_envs is 0, but")
+    # A world changes the curriculum before the config is validated.
+    (folder / "shares.yaml").write_text("env: {randomization: {shares: 0.5}}")
+    shares = "error: shares.yaml: env.randomization.shares is 0.5, but"
+    refused("train --config shares.yaml --world fast_servo", shares)
     # As a flag and in Python a key may have dots.
     (folder / "dots.yaml").write_text("ppo.num_envs: 8")
     nested = "error: dots.yaml: unknown key ppo.num_envs; nest it: ppo: {num_envs: ...}"
