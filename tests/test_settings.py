@@ -250,6 +250,10 @@ def test_a_mistake_names_the_layer_that_has_it(folder: Path, refused) -> None:
     refused("train --config b.yaml --seed -1", "--seed is -1", "(see bounce-mjx train --help)")
     (folder / "c.yaml").write_text("ppo: {num_envs: 0}")
     refused("train --config c.yaml --seed 1", "error: c.yaml: ppo.num_envs is 0, but")
+    (folder / "empty.yaml").write_text("foo: {}")
+    refused("train --config empty.yaml --seed 1", "error: empty.yaml: unknown key foo;")
+    (folder / "own.py").write_text(OWN.replace("own_cost: float = 0.5", 'own_cost: int = "a"'))
+    refused("train --algorithm own.py:Own --seed 1", "error: default: ppo.own_cost is a, but")
     # A world changes the curriculum before the config is validated.
     (folder / "shares.yaml").write_text("env: {randomization: {shares: 0.5}}")
     shares = "error: shares.yaml: env.randomization.shares is 0.5, but"

@@ -40,6 +40,7 @@ from bounce_mjx.learning.registry import find_algorithm
 from bounce_mjx.resources import policy_folder
 from bounce_mjx.runs.config import (
     CONFIG_FILE,
+    DEFAULT_SOURCE,
     TrainConfig,
     fields_of,
     load_run_config,
@@ -499,15 +500,17 @@ def _merge(layers: Sequence[Layer]) -> tuple[dict[str, Any], dict[str, str]]:
 
 def _source_of(path: Sequence[str], layers: Sequence[Layer]) -> str:
     """The last layer that set a key; a guess for a rule that joins several settings of a group: the
-    last layer with any of them."""
-    for layer in reversed(layers):
-        if _sets(layer.values, path):
-            return layer.source
-    return layers[-1].source
+    last layer with any of them. Without such a layer, it is the default that is wrong."""
+    # An unknown key may be an empty group.
+    for may_be_empty in (False, True):
+        for layer in reversed(layers):
+            if _has(layer.values, path, may_be_empty):
+                return layer.source
+    return DEFAULT_SOURCE
 
 
-def _sets(values: dict[str, Any], path: Sequence[str]) -> bool:
-    """Whether nested values have one at a path, or in the group there."""
+def _has(values: dict[str, Any], path: Sequence[str], may_be_empty: bool) -> bool:
+    """Whether nested values have a value at a path, or a group there, which may be empty."""
     part: Any = values
     for name in path:
         if not isinstance(part, dict):
@@ -516,7 +519,7 @@ def _sets(values: dict[str, Any], path: Sequence[str]) -> bool:
         if name not in part:
             return False
         part = part[name]
-    return not isinstance(part, dict) or bool(flat(part))
+    return may_be_empty or not isinstance(part, dict) or bool(flat(part))
 
 
 def _check_resumable(resumed: TrainConfig, config: TrainConfig) -> None:
