@@ -185,6 +185,20 @@ def test_a_warm_start_is_alike_in_a_file(folder: Path) -> None:
     assert any("the warm start robust_small wins over configs/randomized.yaml" in x for x in notes)
 
 
+def test_what_is_brought_whole_has_no_part_of_a_mapping_below() -> None:
+    """The environment of a policy, a whole config, and a group that Python gives."""
+    own = load_run_config(pretrained_checkpoint("robust_small").run)
+    transfer = read_preset(Path("transfer"))
+    config = read_command("--config transfer --warm-start robust_small".split()).config
+    assert config.env == own.env
+    assert config.sources["env.randomization.shares"] == "the warm start robust_small"
+    randomization = transfer.env.randomization.model_copy(update={"shares": {"push_speed": 0.4}})
+    config = python(config="transfer", randomization=randomization)
+    assert config.env.randomization == randomization
+    config = python(config=config, warm_start="robust_small")
+    assert config.env.randomization == randomization
+
+
 def test_a_whole_config_stands_alone_below_what_python_says() -> None:
     whole = read_preset(Path("seed")).model_copy(update={"seed": 7})
     config = python(config=whole, seed=5, num_envs=64)
@@ -236,6 +250,26 @@ def test_a_mistake_names_the_layer_that_has_it(folder: Path, refused) -> None:
     refused("train --config b.yaml --seed -1", "--seed is -1", "(see bounce-mjx train --help)")
     (folder / "c.yaml").write_text("ppo: {num_envs: 0}")
     refused("train --config c.yaml --seed 1", "error: c.yaml: ppo.num_envs is 0, but")
+    (folder / "empty.yaml").write_text("foo: {}")
+    refused("train --config empty.yaml --seed 1", "error: empty.yaml: unknown key foo;")
+    (folder / "own.py").write_text(OWN.replace("own_cost: float = 0.5", 'own_cost: int = "a"'))
+    refused("train --algorithm own.py:Own --seed 1", "error: default: ppo.own_cost is a, but")
+    # A world changes the curriculum before the config is validated.
+    (folder / "shares.yaml").write_text("env: {randomization: {shares: 0.5}}")
+    shares = "error: shares.yaml: env.randomization.shares is 0.5, but"
+    refused("train --config shares.yaml --world fast_servo", shares)
+    # As a flag and in Python a key may have dots.
+    (folder / "dots.yaml").write_text("ppo.num_envs: 8")
+    nested = "error: dots.yaml: unknown key ppo.num_envs; nest it: ppo: {num_envs: ...}"
+    refused("train --config dots.yaml", nested)
+    refused("train --config dots.yaml --num-envs 8", nested)
+    (folder / "dots.yaml").write_text("reward.height.weight: 1")
+    refused("train --config dots.yaml", "nest it: env: {reward: {height: {weight: ...}}}")
+    # A warm start is looked for before the config is validated.
+    (folder / "d.yaml").write_text("warm_start: no")
+    refused("train --config d.yaml", "error: d.yaml: warm_start is False, but must be a path")
+    (folder / "e.yaml").write_text("warm_start: robust_small\nlog_dir: 5")
+    refused("train --config e.yaml", "error: e.yaml: log_dir is 5, but must be a path")
 
 
 @pytest.mark.parametrize("key", ["on", "1", "null", "0.5"])

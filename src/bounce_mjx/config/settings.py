@@ -116,6 +116,9 @@ class Layer(NamedTuple):
     is_world: bool = False
     """Whether it brings the whole randomisation: what a preset's curriculum says of other terms
     then ends, see `without_idle_curriculum`."""
+    whole: tuple[str, ...] = ()
+    """Dotted keys of what it brings whole: also of a mapping, such as `shares`, nothing remains of
+    the layers below."""
 
 
 def types_in(kind: Any) -> Iterator[Any]:

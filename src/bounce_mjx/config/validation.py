@@ -62,6 +62,8 @@ def describe(
     reason = first["msg"][0].lower() + first["msg"][1:]
     if first["type"] == "missing":
         reason = "an item is missing"
+    if first["type"] == "path_type":
+        reason = "must be a path"
     if first["type"].startswith(("greater_than", "less_than")) and key in fields:
         reason += f" {unit_of(fields[key].description or '')}".rstrip()
     given = shorten(str(first["input"]))
@@ -69,8 +71,8 @@ def describe(
 
 
 def _advice_on(key: str, fields: Mapping[str, FieldInfo]) -> str:
-    """What an unknown key may mean: the same name in another group, a key that is spelt like it, a
-    name that is; or which keys its group has."""
+    """What an unknown key may mean: one that is not nested but has dots, the same name in another
+    group, a key that is spelt like it, a name that is; or which keys its group has."""
     group, dot, name = key.rpartition(".")
     by_name: dict[str, str] = {}
     groups: set[str] = set()
@@ -83,6 +85,11 @@ def _advice_on(key: str, fields: Mapping[str, FieldInfo]) -> str:
             inner = inner.rpartition(".")[0]
         if field.startswith(group + dot):
             here.add(field.removeprefix(group + dot).split(".")[0])
+    for known in (*fields, *groups):
+        if group and f".{known}".endswith(f".{key}"):
+            *parents, last = known.split(".")
+            opened = "".join(f"{parent}: {{" for parent in parents)
+            return f"nest it: {opened}{last}: ...{'}' * len(parents)}"
     if name in by_name:
         return f"did you mean {by_name[name]}?"
     keys = [*fields, *sorted(groups)]
@@ -95,8 +102,13 @@ def _advice_on(key: str, fields: Mapping[str, FieldInfo]) -> str:
 
 def key_of(error: pydantic.ValidationError, group: str = "") -> str:
     """The dotted key of the first mistake; that of a group for a rule that joins its settings."""
-    parts = [part for part in error.errors()[0]["loc"] if isinstance(part, str)]
-    return ".".join([group, *parts] if group else parts)
+    return ".".join(path_of(error, group))
+
+
+def path_of(error: pydantic.ValidationError, group: str = "") -> list[str]:
+    """The names of `key_of`, of which an unknown one may have dots itself."""
+    parents = group.split(".") if group else []
+    return parents + [part for part in error.errors()[0]["loc"] if isinstance(part, str)]
 
 
 def unit_of(text: str) -> str:

@@ -33,13 +33,14 @@ from bounce_mjx.config.command_line import Flag
 from bounce_mjx.config.files import differing_keys, flat
 from bounce_mjx.config.settings import Layer, StrictModel, merged, nested
 from bounce_mjx.config.user_code import is_file, is_same_code
-from bounce_mjx.config.validation import describe, key_of
+from bounce_mjx.config.validation import describe, path_of, validate
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.learning.config import PPO_NAME, PPOConfig
 from bounce_mjx.learning.registry import find_algorithm
 from bounce_mjx.resources import policy_folder
 from bounce_mjx.runs.config import (
     CONFIG_FILE,
+    DEFAULT_SOURCE,
     TrainConfig,
     fields_of,
     load_run_config,
@@ -183,12 +184,25 @@ def _layers_of_files(files: Iterable[Path | None]) -> list[Layer]:
 
 
 def _layer_of(config: TrainConfig) -> Layer:
-    return Layer("config", config.model_dump())
+    return Layer("config", config.model_dump(), whole=("env", "ppo"))
 
 
 def _last(layers: Sequence[Layer], key: str) -> Any:
     """The value of a key in the last layer that has it; None without one."""
     return next((layer.values[key] for layer in reversed(layers) if key in layer.values), None)
+
+
+def _last_path(layers: Sequence[Layer], key: str) -> Path | None:
+    """`_last` of a path of the config, which is needed before the config is validated.
+
+    Raises:
+      UserError: it is no path.
+    """
+    layer = next((layer for layer in reversed(layers) if key in layer.values), None)
+    if layer is None or layer.values[key] is None:
+        return None
+    config = validate(TrainConfig, {key: layer.values[key]}, layer.source)
+    return getattr(config, key)
 
 
 def _task(
@@ -302,7 +316,8 @@ class _Policy(NamedTuple):
             del env["randomization"]
         networks = self.config.ppo.model_dump(include={*NETWORK_KEYS, "critic_metrics"})
         values = {"task": self.config.task, "env": env, "ppo": networks}
-        return Layer(f"the warm start {self.start}", values)
+        whole = tuple(f"env.{key}" for key in env)
+        return Layer(f"the warm start {self.start}", values, whole=whole)
 
 
 def _policy(choice: Choice, files: Sequence[Layer], whole: TrainConfig | None) -> _Policy | None:
@@ -315,7 +330,7 @@ def _policy(choice: Choice, files: Sequence[Layer], whole: TrainConfig | None) -
         path = choice.warm_start
     else:
         # A whole config has its environment already.
-        path = _last(files, "warm_start") if whole is None else None
+        path = _last_path(files, "warm_start") if whole is None else None
     if path is None:
         return None
     if choice.robot:
@@ -327,12 +342,12 @@ def _policy(choice: Choice, files: Sequence[Layer], whole: TrainConfig | None) -
     task = choice.task or _last(files, "task")
     if choice.task is None and task is not None and is_file(task) and whole is None:
         raise unnamed_code(_sources_of(files), "task", task)
-    log_dir = choice.log_dir or _last(files, "log_dir")
-    if log_dir is None or not runs_in(Path(log_dir)):
+    log_dir = choice.log_dir or _last_path(files, "log_dir")
+    if log_dir is None or not runs_in(log_dir):
         log_dir = runs_folder(whole.env.task if whole else find_task(task or DEFAULT))
-    checkpoint, note = find_choice(Path(path), Path(log_dir))
+    checkpoint, note = find_choice(path, log_dir)
     config = load_run_config(checkpoint.run, task)
-    start = Path(path) if policy_folder(path) else checkpoint.folder
+    start = path if policy_folder(path) else checkpoint.folder
     return _Policy(start, config, () if note is None else (note,))
 
 
@@ -385,7 +400,7 @@ class Stack:
           UserError: a key is unknown, a value is out of range, or it must be that of the resumed
             run. The error names the layer that set it.
         """
-        user = Layer(PYTHON if flags is None else FLAGS, self._nested(said or {}))
+        user = self._layer_of_user(PYTHON if flags is None else FLAGS, said or {})
         above = [*self._go_on(user), user]
         layers = [*self.layers, *above]
         values, sources = _merge(layers)
@@ -393,7 +408,7 @@ class Stack:
         try:
             config = self._validated(values)
         except _Mistake as mistake:
-            source = _source_of(mistake.key, layers)
+            source = _source_of(mistake.path, layers)
             if flags is not None and source == FLAGS:
                 text = describe(mistake.error, self.fields, flags, mistake.group)
                 raise UserError(f"{text} (see {prog} --help)") from mistake.error
@@ -406,13 +421,18 @@ class Stack:
         config.set_sources(sources)
         return config
 
-    def _nested(self, said: Mapping[str, Any]) -> dict[str, Any]:
+    def _layer_of_user(self, source: str, said: Mapping[str, Any]) -> Layer:
         """The user's values in their groups."""
         values: dict[str, Any] = {}
+        whole = []
         for key, value in said.items():
-            plain = value.model_dump() if isinstance(value, pydantic.BaseModel) else value
-            values = merged(values, nested(self._full_key(key), plain))
-        return values
+            full_key = self._full_key(key)
+            plain = value
+            if isinstance(value, pydantic.BaseModel):
+                plain = value.model_dump()
+                whole.append(full_key)
+            values = merged(values, nested(full_key, plain))
+        return Layer(source, values, whole=tuple(whole))
 
     def _full_key(self, key: str) -> str:
         """The dotted key of a setting or a group that stands alone; an unknown one stays."""
@@ -457,7 +477,7 @@ class _Mistake(Exception):
     def __init__(self, error: pydantic.ValidationError, group: str):
         self.error = error
         self.group = group
-        self.key = key_of(error, group)
+        self.path = path_of(error, group)
 
 
 def _merge(layers: Sequence[Layer]) -> tuple[dict[str, Any], dict[str, str]]:
@@ -466,6 +486,8 @@ def _merge(layers: Sequence[Layer]) -> tuple[dict[str, Any], dict[str, str]]:
     values: dict[str, Any] = {}
     sources: dict[str, str] = {}
     for layer in layers:
+        for key in layer.whole:
+            values = merged(values, nested(key, None))
         values = merged(values, layer.values)
         if layer.is_world:
             randomization = without_idle_curriculum(values["env"]["randomization"])
@@ -476,14 +498,28 @@ def _merge(layers: Sequence[Layer]) -> tuple[dict[str, Any], dict[str, str]]:
     return values, {key: source for key, source in sources.items() if key in remaining}
 
 
-def _source_of(key: str, layers: Sequence[Layer]) -> str:
+def _source_of(path: Sequence[str], layers: Sequence[Layer]) -> str:
     """The last layer that set a key; a guess for a rule that joins several settings of a group: the
-    last layer with any of them."""
-    for layer in reversed(layers):
-        for other in flat(layer.values):
-            if not key or f"{other}.".startswith(f"{key}.") or key.startswith(f"{other}."):
+    last layer with any of them. Without such a layer, it is the default that is wrong."""
+    # An unknown key may be an empty group.
+    for may_be_empty in (False, True):
+        for layer in reversed(layers):
+            if _has(layer.values, path, may_be_empty):
                 return layer.source
-    return layers[-1].source
+    return DEFAULT_SOURCE
+
+
+def _has(values: dict[str, Any], path: Sequence[str], may_be_empty: bool) -> bool:
+    """Whether nested values have a value at a path, or a group there, which may be empty."""
+    part: Any = values
+    for name in path:
+        if not isinstance(part, dict):
+            # The mistake is in a part of this value.
+            return True
+        if name not in part:
+            return False
+        part = part[name]
+    return may_be_empty or not isinstance(part, dict) or bool(flat(part))
 
 
 def _check_resumable(resumed: TrainConfig, config: TrainConfig) -> None:

@@ -110,7 +110,8 @@ def without_idle_curriculum(randomization: dict[str, Any]) -> dict[str, Any]:
         acting.pop("share", None)
         if acting.get("first_command_range", 1.0) == 1.0:
             acting.pop("warmup_steps", None)
-    if acting.get("shares"):
+    # Values of a file, which are validated later.
+    if isinstance(acting.get("shares"), dict):
         acting["shares"] = {name: p for name, p in acting["shares"].items() if name in terms}
     return acting
 
