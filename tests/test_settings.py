@@ -254,6 +254,17 @@ def test_a_mistake_names_the_layer_that_has_it(folder: Path, refused) -> None:
     refused("train --config empty.yaml --seed 1", "error: empty.yaml: unknown key foo;")
     (folder / "own.py").write_text(OWN.replace("own_cost: float = 0.5", 'own_cost: int = "a"'))
     refused("train --algorithm own.py:Own --seed 1", "error: default: ppo.own_cost is a, but")
+    # It would end the preset's group, unseen below the flag.
+    (folder / "empty.yaml").write_text("ppo:")
+    refused(
+        "train --config empty.yaml --num-envs 8 --print-config",
+        "error: empty.yaml: ppo is None, but must be",
+    )
+    (folder / "empty.yaml").write_text("env: {reward: 3}")
+    refused(
+        "train --config empty.yaml --reward.height.weight 1 --print-config",
+        "error: empty.yaml: env.reward is 3",
+    )
     # A world changes the curriculum before the config is validated.
     (folder / "shares.yaml").write_text("env: {randomization: {shares: 0.5}}")
     shares = "error: shares.yaml: env.randomization.shares is 0.5, but"

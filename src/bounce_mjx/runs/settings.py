@@ -403,6 +403,8 @@ class Stack:
         user = self._layer_of_user(PYTHON if flags is None else FLAGS, said or {})
         above = [*self._go_on(user), user]
         layers = [*self.layers, *above]
+        for layer in layers:
+            self._check_groups(layer)
         values, sources = _merge(layers)
         values = merged(values, self.decided)
         try:
@@ -420,6 +422,29 @@ class Stack:
             sources = self.resumed.sources | changed
         config.set_sources(sources)
         return config
+
+    def _check_groups(self, layer: Layer) -> None:
+        """A group that is one value, such as `ppo:` with nothing below it, would end the group of
+        the layers below, unseen where a later layer has keys of it.
+
+        Raises:
+          UserError: a group is one value.
+        """
+        for field in self.fields:
+            group = ""
+            part: Any = layer.values
+            for name in field.split(".")[:-1]:
+                group = f"{group}.{name}" if group else name
+                if name not in part:
+                    break
+                part = part[name]
+                if isinstance(part, pydantic.BaseModel):
+                    break
+                if not isinstance(part, dict):
+                    raise UserError(
+                        f"{shorten(layer.source)}: {group} is {shorten(str(part))}, but must be a "
+                        "group of settings; remove it, or nest keys in it"
+                    )
 
     def _layer_of_user(self, source: str, said: Mapping[str, Any]) -> Layer:
         """The user's values in their groups."""
