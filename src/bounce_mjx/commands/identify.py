@@ -45,6 +45,7 @@ def main(args: Sequence[str]) -> None:
     command = parse(IdentifyCommand, args, prog="bounce-mjx identify")
     if not command.logs:
         raise UserError("no log is given; name the CSV files or bags to identify from")
+    from bounce_mjx.env.env import world_model
     from bounce_mjx.identify.doctor import describe, examine
     from bounce_mjx.identify.reading import read_log
     from bounce_mjx.identify.stages import identify, join
@@ -57,7 +58,7 @@ def main(args: Sequence[str]) -> None:
         total_delay,
     )
     from bounce_mjx.reports.identification import identification_page, inspection_page
-    from bounce_mjx.robot.model import joint_names, load_model
+    from bounce_mjx.robot.model import joint_names
     from bounce_mjx.runs.files import check_output, write_output
     from bounce_mjx.training.setup import set_up_jax
     from bounce_mjx.world.named import read_world
@@ -71,13 +72,7 @@ def main(args: Sequence[str]) -> None:
         # Its ranges are of this robot's joints.
         ranges = known.settings.get("randomization", {})
         validate(type(config), config.model_dump() | {"randomization": ranges}, str(command.check))
-    model = load_model(
-        config.mjcf,
-        config.physics_dt,
-        visual=False,
-        robot=config.robot,
-        num_balls=config.num_balls,
-    )
+    model = world_model(config, visual=False)
     names = joint_names(model)
     logs = [read_log(path, model, command.topics, command.joint_names) for path in command.logs]
     log = join(logs)

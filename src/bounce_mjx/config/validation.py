@@ -2,7 +2,7 @@
 
 import difflib
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import Any, TypeVar
 
@@ -70,19 +70,26 @@ def describe(
     return f"{flags.get(key, key)} is {given}, but {reason.replace('input should', 'must', 1)}"
 
 
+def groups_of(fields: Iterable[str]) -> set[str]:
+    """The dotted keys of the groups in which settings are, such as env and env.reward."""
+    groups = set()
+    for field in fields:
+        group = field.rpartition(".")[0]
+        while group:
+            groups.add(group)
+            group = group.rpartition(".")[0]
+    return groups
+
+
 def _advice_on(key: str, fields: Mapping[str, FieldInfo]) -> str:
     """What an unknown key may mean: one that is not nested but has dots, the same name in another
     group, a key that is spelt like it, a name that is; or which keys its group has."""
     group, dot, name = key.rpartition(".")
     by_name: dict[str, str] = {}
-    groups: set[str] = set()
+    groups = groups_of(fields)
     here: set[str] = set()
     for field in fields:
-        inner, _, last = field.rpartition(".")
-        by_name.setdefault(last, field)
-        while inner:
-            groups.add(inner)
-            inner = inner.rpartition(".")[0]
+        by_name.setdefault(field.rpartition(".")[2], field)
         if field.startswith(group + dot):
             here.add(field.removeprefix(group + dot).split(".")[0])
     for known in (*fields, *groups):

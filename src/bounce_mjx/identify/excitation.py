@@ -7,9 +7,10 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from bounce_mjx.env.env import world_model
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.contacts import ContactChecker
-from bounce_mjx.robot.model import find_addresses, joint_names, joint_ranges, load_model
+from bounce_mjx.robot.model import find_addresses, joint_names, joint_ranges
 from bounce_mjx.world.config import WorldConfig
 
 MARGIN = 0.01
@@ -63,13 +64,7 @@ def excite(
     Raises:
       UserError: the start pose has a contact with the floor or the table, or a joint cannot move.
     """
-    model = load_model(
-        config.mjcf,
-        config.physics_dt,
-        visual=False,
-        robot=config.robot,
-        num_balls=config.num_balls,
-    )
+    model = world_model(config, visual=False)
     n = config.num_joints
     dt = config.control_dt
     home = np.array(config.default_joint_angles)

@@ -33,7 +33,7 @@ from bounce_mjx.config.command_line import Flag
 from bounce_mjx.config.files import differing_keys, flat
 from bounce_mjx.config.settings import Layer, StrictModel, merged, nested
 from bounce_mjx.config.user_code import is_file, is_same_code
-from bounce_mjx.config.validation import describe, path_of, validate
+from bounce_mjx.config.validation import describe, groups_of, path_of, validate
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.learning.config import PPO_NAME, PPOConfig
 from bounce_mjx.learning.registry import find_algorithm
@@ -430,21 +430,16 @@ class Stack:
         Raises:
           UserError: a group is one value.
         """
-        for field in self.fields:
-            group = ""
+        # In this order, a group comes before those in it.
+        for group in sorted(groups_of(self.fields)):
             part: Any = layer.values
-            for name in field.split(".")[:-1]:
-                group = f"{group}.{name}" if group else name
-                if name not in part:
-                    break
-                part = part[name]
-                if isinstance(part, pydantic.BaseModel):
-                    break
-                if not isinstance(part, dict):
-                    raise UserError(
-                        f"{shorten(layer.source)}: {group} is {shorten(str(part))}, but must be a "
-                        "group of settings; remove it, or nest keys in it"
-                    )
+            for name in group.split("."):
+                part = part.get(name, {}) if isinstance(part, dict) else {}
+            if not isinstance(part, dict | pydantic.BaseModel):
+                raise UserError(
+                    f"{shorten(layer.source)}: {group} is {shorten(str(part))}, but must be a "
+                    "group of settings; remove it, or nest keys in it"
+                )
 
     def _layer_of_user(self, source: str, said: Mapping[str, Any]) -> Layer:
         """The user's values in their groups."""
