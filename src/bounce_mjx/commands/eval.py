@@ -20,7 +20,6 @@ from bounce_mjx.config.command_line import Flag, stdout
 from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import config as evaluation
-from bounce_mjx.resources import POLICIES, resource_path
 from bounce_mjx.world.randomization import RandomizationConfig
 
 # What is of the evaluation alone; a name that ends with = has a value.
@@ -70,7 +69,7 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.reports.tables import details_line, results_table
     from bounce_mjx.runs.checkpoints import read_actor
     from bounce_mjx.runs.files import check_output, to_json, write_output
-    from bounce_mjx.runs.folders import MIRROR_LAW
+    from bounce_mjx.runs.folders import is_users_run
     from bounce_mjx.training.setup import set_up_jax
 
     check_output(command.json_file, "--json")
@@ -85,8 +84,7 @@ def main(args: Sequence[str]) -> None:
     set_up_jax(evaluation.on_engine(config.env, command.physics))
     checkpoint, policy, actor = read_actor(checkpoint, config)
     # Beside what is no run, nothing is written.
-    is_run = checkpoint.run not in {MIRROR_LAW.run, *map(resource_path, POLICIES.values())}
-    picture = (checkpoint.run if is_run else Path()) / "failures.png"
+    picture = (checkpoint.run if is_users_run(checkpoint.run) else Path()) / "failures.png"
     steps = f" ({checkpoint.steps:,} steps)" if checkpoint.steps else ""
     print(f"checkpoint: {checkpoint.folder}{steps}")
     options = evaluation.EvaluationOptions(

@@ -17,7 +17,6 @@ from bounce_mjx.config.command_line import parse, stdout
 from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import config as evaluation
-from bounce_mjx.resources import POLICIES, resource_path
 
 # What is of the measurement alone; a name that ends with = has a value.
 _NOT_OF_PLAY = ("--assumed", "--out=", "--physics=")
@@ -58,7 +57,7 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.reports.figures import image
     from bounce_mjx.runs.checkpoints import read_actor
     from bounce_mjx.runs.files import to_json, writable, write_output
-    from bounce_mjx.runs.folders import MIRROR_LAW
+    from bounce_mjx.runs.folders import is_users_run
     from bounce_mjx.training.setup import set_up_jax
 
     if command.assumed and command.world is None:
@@ -76,8 +75,8 @@ def main(args: Sequence[str]) -> None:
         suite, version = f"twice or half what {command.world} assumes", ""
     set_up_jax(*(evaluation.on_engine(condition.env, command.physics) for condition in conditions))
     checkpoint, policy, actor = read_actor(checkpoint, config)
-    is_run = checkpoint.run not in {MIRROR_LAW.run, *map(resource_path, POLICIES.values())}
-    out = command.out or (checkpoint.run if is_run else Path("robustness"))
+    own_folder = checkpoint.run if is_users_run(checkpoint.run) else Path("robustness")
+    out = command.out or own_folder
     # Fails before the measurement if its results could not be written.
     with writable(out, "choose another folder with --out"):
         out.mkdir(parents=True, exist_ok=True)

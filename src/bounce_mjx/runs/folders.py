@@ -60,6 +60,12 @@ MIRROR_LAW = Checkpoint(Path("mirror law"), Path("mirror law"), 0)
 """In place of a checkpoint, the baseline `baselines.mirror`."""
 
 
+def is_users_run(run: Path) -> bool:
+    """Whether this is the folder of a run of the user's, beside whose files others may be written;
+    no policy of the package, and not the mirror law."""
+    return run not in {MIRROR_LAW.run, *map(resource_path, POLICIES.values())}
+
+
 def create_run(config: TrainConfig) -> Path:
     """Creates a new run's folder, named after the current time (UTC), with the config in it.
 
