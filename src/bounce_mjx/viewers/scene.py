@@ -126,7 +126,7 @@ class Scene:
             self._trail.add(frame)
             over = frame.over[: self.num_envs]
             self._lost = np.where(over, frame.lost[: self.num_envs], self._lost)
-            # Only for so long, as a reset begins an episode without a loss before it.
+            # Said for so long; a reset begins an episode without a loss before it.
             self._lost &= over | (frame.time[: self.num_envs] < ANNOUNCED_SECONDS)
         frame = frames[-1]
         with self._server.atomic():
@@ -156,7 +156,7 @@ class Scene:
         if self._names is not None:
             name = f"{self._names[index]}:  "
         short = self.num_envs > _MAX_LONG_LABELS
-        if self._lost[index] and (frame.over[index] or frame.time[index] < ANNOUNCED_SECONDS):
+        if self._lost[index]:
             return f"{name}LOST"
         readings = frame_readings(self._env, frame, index)
         if short:
