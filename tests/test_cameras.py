@@ -199,21 +199,47 @@ def test_a_policy_plays_from_rendered_pictures(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("side_light", [False, True])
-def test_a_background_that_was_drawn_before_changes_no_pixel(opengl, side_light) -> None:
+def test_a_background_that_was_drawn_before_changes_no_pixel(
+    opengl, monkeypatch, side_light
+) -> None:
     mjcf = str(resource_path("mjcf/bounce_ball.xml"))
     model = rendered_cameras.make_model(mjcf, "orange", side_light, quick=True)
-    rendered = rendered_cameras.RenderedCameras(model, rendered_cameras.true_cameras())
+    lenses = [rendered_cameras._Lens(camera) for camera in rendered_cameras.true_cameras()]
+    sheet = rendered_cameras._Sheet(model, lenses)
     rng = np.random.default_rng(0)
     data = mujoco.MjData(model)
-    for _ in range(8):
+    sub_frames = range(len(rendered_cameras.SHIFTS))
+    for _ in range(4):
         data.qpos[:] = model.qpos0 + rng.uniform(-1.0, 1.0, model.nq)
         data.joint("ball_link").qpos[:3] = rng.uniform((0.3, -0.3, 0.03), (0.8, 0.3, 0.9))
         mujoco.mj_forward(model, data)
-        for view in rendered._views:
-            picture = view.render(data)
-            assert np.array_equal(picture, view._draw(data, arm=True, room=True))
-            assert not np.array_equal(picture, view._background)
-    rendered.close()
+        for sub_frame in sub_frames:
+            sheet.draw(data, sub_frame)
+        quick = np.array(sheet.read())
+        for sub_frame in sub_frames:
+            sheet._render(data, sub_frame, arm=True, room=True)
+        with monkeypatch.context() as patch:
+            patch.setattr(sheet, "_empty_room", None)
+            assert np.array_equal(quick, sheet.read())
+        assert np.mean(quick[:, 0] != quick[:, -1]) > 0.03
+    sheet.close()
+
+
+def test_a_sub_frame_is_shifted_by_pixels_to_the_right_and_down(opengl, monkeypatch) -> None:
+    np.testing.assert_allclose(np.mean(rendered_cameras.SHIFTS, axis=0), 0.0)
+    monkeypatch.setattr(rendered_cameras, "SHIFTS", np.array([(0.0, 0.0), (3.0, 2.0)]))
+    mjcf = str(resource_path("mjcf/bounce_ball.xml"))
+    model = rendered_cameras.make_model(mjcf)
+    lenses = [rendered_cameras._Lens(camera) for camera in rendered_cameras.true_cameras()]
+    sheet = rendered_cameras._Sheet(model, lenses)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    for sub_frame in range(2):
+        sheet.draw(data, sub_frame)
+    for straight, shifted in sheet.read():
+        assert np.mean(shifted[2:, 3:] != straight[:-2, :-3]) < 0.01
+        assert np.mean(shifted != straight) > 0.03
+    sheet.close()
 
 
 class DrawnCameras:
