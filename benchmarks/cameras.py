@@ -245,8 +245,8 @@ def main() -> None:
     print(f"played in {time.monotonic() - begun:.0f} s")
     print_seeing(played)
     print(f"first calibration: {played[0].calibration}")
-    alarms = [p.alarm for p in played if p.alarm]
-    print(f"{len(alarms)} alarms {' '.join(sorted(set(alarms)))}".strip())
+    alarms = [f"episode {i}: {p.alarm}" for i, p in enumerate(played) if p.alarm]
+    print(f"{len(alarms)} alarms; {', '.join(alarms) or 'none'}")
     report = judge_episodes(env, states, played)
     for result in report.results:
         print(f"{result.name}: {result.value} ({result.measured}; {result.bound}), {result.passed}")
