@@ -31,7 +31,7 @@ FOCAL_LENGTH = 560.0
 DISTORTION = np.array([-0.12, 0.03, 0.0005, -0.0005, 0.0])
 PLACES = ((1.45, 0.85, 0.75), (1.45, -0.85, 0.75))
 """Where the cameras stand in the robot's frame, m."""
-GAZE = (0.59, 0.0, 0.33)
+GAZE = (0.59, 0.0, 0.48)
 """The point at which both look, m."""
 SHIFTS = np.array([(-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375)])
 """A picture is the mean of these sub-frames: shifts to the right and down, pixels, by which edges

@@ -42,6 +42,8 @@ _RADII = (3.0, 40.0)
 # Weight of the expected radius beside one edge point, and how much smaller than the ball's a circle
 # through the centres of its outermost pixels is, pixels.
 _RADIUS_WEIGHT = 4.0
+# Keeps the least squares of points on a short arc solvable; a point counts 1.
+_DAMPING = 1e-9
 _RADIUS_OF_PIXELS = 0.4
 # Share of the expected radius by which a measured one may differ.
 _RADIUS_TOLERANCE = 0.3
@@ -233,21 +235,23 @@ def fit_circle(
     last_tolerance = 0.5 * _EDGE_TOLERANCE if length < 1.0 else _EDGE_TOLERANCE
     for tolerance in np.linspace(_EDGE_TOLERANCE + 0.5 * length, last_tolerance, 8):
         offsets = edge - _nearest_on_path(edge, centre, blur)
-        distances = np.linalg.norm(offsets, axis=1)
+        distances = np.hypot(offsets[:, 0], offsets[:, 1])
         # A point at the centre itself shows no direction.
         is_near = (np.abs(distances - radius) < tolerance) & (distances > 0.0)
         if np.count_nonzero(is_near) < 8:
             return None
         # Gauss-Newton: a shift of the centre changes a distance by its component along the offset.
         normals = offsets[is_near] / distances[is_near, None]
-        jacobian = np.column_stack([normals, np.ones(len(normals))])
-        residuals = distances[is_near] - radius
+        jacobian = np.ones((len(normals), 3))
+        jacobian[:, :2] = normals
+        information = jacobian.T @ jacobian
+        gradient = jacobian.T @ (distances[is_near] - radius)
         if expected_radius is not None:
             # Where an arc alone is seen, the radius is better known from the distance.
-            jacobian = np.vstack([jacobian, [0.0, 0.0, _RADIUS_WEIGHT]])
             known = expected_radius - _RADIUS_OF_PIXELS - radius
-            residuals = np.append(residuals, _RADIUS_WEIGHT * known)
-        change, *_ = np.linalg.lstsq(jacobian, residuals, rcond=None)
+            information[2, 2] += _RADIUS_WEIGHT**2
+            gradient[2] += _RADIUS_WEIGHT**2 * known
+        change = np.linalg.solve(information + _DAMPING * np.eye(3), gradient)
         centre = centre + change[:2]
         radius = radius + change[2]
     if not radii[0] <= radius <= radii[1]:
@@ -300,8 +304,9 @@ def _most_supported_circle(
     if not len(centres):
         return None
     tolerance = _EDGE_TOLERANCE + 0.5 * np.linalg.norm(blur)
-    offsets = edge[None] - centres[:, None]
-    distances = np.sqrt(np.sum(offsets * offsets, axis=2))
+    columns = edge[None, :, 0] - centres[:, None, 0]
+    rows = edge[None, :, 1] - centres[:, None, 1]
+    distances = np.hypot(columns, rows)
     is_near = np.abs(distances - circle_radii[:, None]) < tolerance
     # A large circle has more edge; its share counts.
     support = np.count_nonzero(is_near, axis=1) / circle_radii
@@ -481,8 +486,44 @@ _PIXEL_NOISE = 0.3
 _BAD_RATIO = 4.0
 # Parts into which the poses are divided to measure the error with poses that were not used.
 _FOLDS = 4
+# How far over its target an apex may be, m.
+_OVERSHOOT = 0.1
 # Half of the paddle's thickness, m.
 _HALF_THICKNESS = 0.0035
+
+
+def highest_seen(cameras: Sequence[Camera], size: tuple[int, int], place: np.ndarray) -> float:
+    """Greatest height of the ball (m) straight above a place [3] at which all pictures show all of
+    it.
+
+    Args:
+      size: width and height of the pictures, pixels.
+    """
+    heights = np.arange(0.0, 2.0, 0.005)
+    positions = place + heights[:, None] * np.array([0.0, 0.0, 1.0])
+    is_seen = np.ones(len(heights), bool)
+    for camera in cameras:
+        pixels = camera.project(positions)
+        radii = np.array([camera.radius_at(position) for position in positions])[:, None]
+        is_seen &= np.all((pixels > radii) & (pixels < np.array(size) - radii), axis=1)
+    if not np.any(is_seen):
+        raise SystemExit(f"no place above {np.round(place, 3)} m is in all pictures; aim higher")
+    return float(np.max(positions[is_seen, 2]))
+
+
+def report_height(cameras: Sequence[Camera], size: tuple[int, int], metadata) -> str:
+    """In words, whether the cameras see as high as a policy plays."""
+    home = paddle_position(metadata, np.array(metadata.default_joint_angles))
+    highest = highest_seen(cameras, size, home)
+    text = f"all cameras see the ball up to a height of {highest:.2f} m"
+    target = metadata.commands.get("target_height")
+    if target is None:
+        return text
+    apex = target.range[1]
+    text += f"; the policy's apexes are at {apex:.2f} m at most"
+    if highest < apex + _OVERSHOOT:
+        text += f": aim higher, or play with targets of at most {highest - _OVERSHOOT:.2f} m"
+    return text
 
 
 def ball_positions(metadata, joint_angles: np.ndarray, ball: np.ndarray) -> np.ndarray:
@@ -534,7 +575,7 @@ def plan_poses(
     if len(angles) < count:
         raise SystemExit(
             f"both cameras see the paddle in {len(angles)} of 20,000 poses around the start pose, "
-            f"but {count} are needed; move them so that both see the paddle and 40 cm over it"
+            f"but {count} are needed; move them so that both see the paddle and 90 cm over it"
         )
     chosen = [int(np.argmin(np.linalg.norm(places - home_place, axis=1)))]
     distances = np.linalg.norm(places - places[chosen[0]], axis=1)
@@ -778,6 +819,7 @@ def calibrate_by_hand(args: argparse.Namespace) -> None:
             )
     calibration = calibrate(metadata, rough, poses, pixels)
     print(calibration.report())
+    print(report_height(calibration.cameras, sources.size, metadata))
     save_cameras(args.cameras, calibration.cameras)
 
 
@@ -812,7 +854,7 @@ def main() -> None:
     place = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
     by_hand.add_argument("--first", **place, default=(1.45, 0.85, 0.75), help="by tape, m")
     by_hand.add_argument("--second", **place, default=(1.45, -0.85, 0.75), help="by tape, m")
-    by_hand.add_argument("--gaze", **place, default=(0.59, 0.0, 0.33), help="where both look, m")
+    by_hand.add_argument("--gaze", **place, default=(0.59, 0.0, 0.48), help="where both look, m")
     by_hand.add_argument("--field-of-view", type=float, default=60.0, help="horizontal, degrees")
     args = parser.parse_args()
     args.function(args)

@@ -22,7 +22,7 @@ import rendered_cameras  # noqa: E402
 import two_cameras as cameras  # noqa: E402
 
 SIZE = 640, 480
-GAZE = (0.59, 0.0, 0.33)
+GAZE = (0.59, 0.0, 0.48)
 PLACES = (1.45, 0.85, 0.75), (1.45, -0.85, 0.75)
 SEEN = np.array([[x, y, z] for x in (0.5, 0.7) for y in (-0.1, 0.1) for z in (0.15, 0.4, 0.7)])
 
@@ -149,6 +149,24 @@ def test_a_pose_that_does_not_fit_is_named() -> None:
     found = cameras.calibrate(metadata, rough, poses, pixels)
     assert found.bad == (7,)
     assert "18 poses" in found.report() and "pose 8" in found.report()
+
+
+def test_how_high_the_cameras_see_is_told_beside_how_high_the_policy_plays() -> None:
+    metadata = load_policy("robust").metadata
+    home = cameras.paddle_position(metadata, np.array(metadata.default_joint_angles))
+    for gaze, is_too_low in ((0.33, True), (0.48, False)):
+        pair = [cameras.rough_camera(place, (*home[:2], gaze), SIZE, 60.0) for place in PLACES]
+        # A camera without distortion: the upper edge's angle, less that of the ball's radius.
+        distance = np.hypot(*(np.array(PLACES[0][:2]) - home[:2]))
+        half_view = np.arctan(SIZE[1] / SIZE[0] * np.tan(np.radians(30.0)))
+        pitch = np.arctan2(gaze - PLACES[0][2], distance)
+        highest = PLACES[0][2] + distance * np.tan(pitch + half_view) - cameras.RADIUS
+        assert cameras.highest_seen(pair, SIZE, home) == pytest.approx(highest, abs=0.02)
+        text = cameras.report_height(pair, SIZE, metadata)
+        assert "apexes are at 0.80 m at most" in text
+        assert ("aim higher" in text) == is_too_low
+    assert "apex" not in cameras.report_height(pair, SIZE, load_policy("balance").metadata)
+    assert cameras.highest_seen(true_cameras(), SIZE, home) > 0.9
 
 
 def scene(place: np.ndarray | None, others: tuple = (), seed: int = 0) -> list[np.ndarray]:
