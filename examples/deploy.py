@@ -121,7 +121,8 @@ if __name__ == "__main__":
 
             model = rendered_cameras.make_model(str(MJCF), args.ball, args.side_light, args.quick)
             camera = rendered_cameras.seen_ball(model, robot.metadata, args.ball, args.camera_rate)
-            print(f"cameras calibrated with the arm: {camera.calibration.report()}", flush=True)
+            print(f"cameras calibrated with the arm: {camera.calibration.report()}")
+            print(rendered_cameras.how_high(camera.calibration, robot.metadata), flush=True)
             camera.film = rendered_cameras.Film() if args.film else None
         episodes = simulate(robot, camera, args.seconds, args.target_height, recorder, model)
         for count, lasted in episodes:

@@ -20,6 +20,7 @@ from two_cameras import (
     calibrate,
     find_fixed_ball,
     plan_poses,
+    report_height,
     rough_camera,
 )
 
@@ -465,6 +466,11 @@ def calibrate_with_arm(
                 metadata, rough[k], angles, picture, COLOURS[ball], background[k]
             )
     return calibrate(metadata, rough, joint_angles, pixels)
+
+
+def how_high(calibration: Calibration, metadata) -> str:
+    """In words, whether the rendered cameras see as high as a policy plays."""
+    return report_height(calibration.cameras, (WIDTH, HEIGHT), metadata)
 
 
 def _posed(
