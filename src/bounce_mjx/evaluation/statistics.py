@@ -152,6 +152,7 @@ def _row(env: Env, states: State, running: jax.Array, step: jax.Array) -> Record
             paddle=now.truth.paddle_position,
             command=now.command,
             running=running,
+            terminated=running & (state.done > 0),
             command_velocity=None if setpoint is None else setpoint.velocity,
             qpos=state.pipeline_state.physics.qpos,
             metrics=state.metrics,

@@ -114,6 +114,8 @@ class Recording(NamedTuple):
     """Commands after the step [T, K]."""
     running: jax.Array
     """Whether the episode had not ended before the step [T, K], bool."""
+    terminated: jax.Array
+    """Whether the episode ended on the step, and not by its time limit [T, K], bool."""
     command_velocity: jax.Array | None = None
     """Velocities of the joints' commands at the end of the step [T, n, K], rad/s; None if the
     commands do not move within limits."""
