@@ -99,6 +99,8 @@ target_height_range: [40, 60]                            # cm
 max_joint_velocity: true                                 # a switch is no number
 friction: true                                           # the same, where null is allowed
 target_height_range: [true, 2]                           # and in a list
+randomization: {restitution: [0.8, 0.9], shares: {restitution: true}}  # and in a mapping
+randomization: {paddle_tilt: [[false, 0.1], [0, 0.1]]}   # and in a list of lists
 """
 
 

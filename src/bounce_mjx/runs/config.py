@@ -142,15 +142,6 @@ class TrainConfig(StrictModel):
             return env
         return find_task(info.data["task"]).Config.model_validate(env)
 
-    @pydantic.field_validator("ppo", mode="before")
-    @classmethod
-    def _read_ppo(cls, ppo: Any, info: pydantic.ValidationInfo) -> Any:
-        """Plain values of an algorithm of the user's, as in a run's config, lose its own settings:
-        its code does not run here, and whatever acts with a policy needs none of them."""
-        if isinstance(ppo, dict) and is_file(info.data.get("algorithm", PPO_NAME)):
-            return {key: ppo[key] for key in ppo if key in PPOConfig.model_fields}
-        return ppo
-
 
 def _check_task(env: WorldConfig, name: str) -> None:
     """A task of a file is not looked for, as its code may not run.
@@ -206,9 +197,14 @@ def load_run_config(
     # Here, as the name may stand for code that the user has named otherwise.
     env = validate(its_task.Config, values.get("env", {}), str(path), "env")
     values = values | {"env": env}
+    ppo = values.get("ppo", {})
     if algorithm is not None:
         settings = find_algorithm(algorithm).Config
-        values |= {"ppo": validate(settings, values.get("ppo", {}), str(path), "ppo")}
+        values["ppo"] = validate(settings, ppo, str(path), "ppo")
+    elif isinstance(ppo, dict) and is_file(str(values.get("algorithm", PPO_NAME))):
+        # The code of the user's algorithm does not run here, and whatever acts with its policy
+        # needs none of its own settings.
+        values["ppo"] = {key: ppo[key] for key in ppo if key in PPOConfig.model_fields}
     config = validate(TrainConfig, values, str(path))
     config.set_sources(sources)
     if config.env.mjcf is not None and not is_packaged(config.env.mjcf):
