@@ -60,7 +60,8 @@ class Perturbation(StrictModel):
     settings: dict[str, Any] = {}
     """New values for settings of `env`, by dotted names."""
     trained_ranges: bool = False
-    """Samples from all ranges of the policy's training at once; replaces `terms`."""
+    """Samples from all ranges of the policy's training at once, in the training's own settings;
+    replaces `terms`."""
 
 
 class Suite(StrictModel):
@@ -78,7 +79,7 @@ class Condition(NamedTuple):
     strength: float | None
     """Strength in the perturbation's unit; None for a perturbation without strengths."""
     env: WorldConfig
-    """World and task of the condition, without randomisation."""
+    """Settings of the condition, without randomisation."""
     randomization: RandomizationConfig
     """The active terms, each with its range; every episode samples all of them, whatever its
     `share`."""
@@ -147,8 +148,8 @@ def load_suite(
     Args:
       trained: config of the policy's training; each condition replaces its randomisation.
       world: config of the policy in a named world, which each condition changes, but for that with
-        `trained_ranges`; by default, the policy's without randomisation. Each episode samples all
-        its terms, whatever its `share`.
+        `trained_ranges`, which is in the training's settings; by default, the policy's without
+        randomisation. Each episode samples all its terms, whatever its `share`.
       assumed: by the name of a condition, the nested settings of `env` that it changes in `world`
         (`double_assumed`). These conditions follow the nominal one.
 
@@ -223,7 +224,8 @@ def _condition(
     source: str,
 ) -> Condition:
     value = None if strength is None else strength * UNITS[perturbation.unit]
-    env = _with_changes(_unrandomized(world), _fill_in(perturbation.settings, value), source)
+    base = training.config if perturbation.trained_ranges else world
+    env = _with_changes(_unrandomized(base), _fill_in(perturbation.settings, value), source)
     commands = neutral_commands(env)
     if perturbation.trained_ranges:
         sampled = training.config.randomization
