@@ -225,7 +225,8 @@ def _padded(batch: list[Condition], size: int) -> list[Condition]:
 
 def _outcome(program: _Program, condition: Condition, statistics: Statistics) -> ConditionOutcome:
     """The outcome of a condition, from the statistics of its own episodes."""
-    # What a task judges may depend on the world, and the program's spans several.
+    # What a task judges may depend on the world, and the program's spans several. Its geometry is
+    # that of the settings, which all of them share.
     task = condition.config.task(condition.config)
     task.geometry = program.env.task.geometry
     report = judge(program.env, statistics, commands=condition.commands, task=task)

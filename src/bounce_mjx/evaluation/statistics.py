@@ -21,7 +21,7 @@ class Statistics(NamedTuple):
 
     running: jax.Array
     """Whether the episode has not ended [E], bool; of a whole evaluation, whether it lasted until
-    its time limit."""
+    its time limit. (That of a `Recording` is before the step.)"""
     steps: jax.Array
     """Steps of the episode [E]."""
     episode_return: jax.Array

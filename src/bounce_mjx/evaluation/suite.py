@@ -87,9 +87,9 @@ class Condition(NamedTuple):
     """Lower and upper ends of the ranges of all commands and of the active terms, in the shapes of
     the terms."""
     trained: bool
-    """Whether the training ranges of the policy contain the condition: also the neutral values of
-    the terms that only the training has. Of these, a term without a neutral value does not count,
-    nor does an interval."""
+    """Whether the policy's training has episodes in every world of the condition: no setting
+    differs, and the training's ranges contain those of the condition. They also contain the neutral
+    value of each term that the training alone has, but for intervals and terms without one."""
 
     @property
     def label(self) -> str:
@@ -187,10 +187,10 @@ def load_suite(
 def _check_content(perturbation: Perturbation, source: str) -> None:
     """Raises UserError unless a perturbation says what it changes, and what has its strengths."""
     changes = [perturbation.terms, perturbation.settings]
-    has_changes = any(changes)
+    has_one_content = any(changes) != perturbation.trained_ranges
     has_strengths = bool(perturbation.strengths)
     uses_strength = _fill_in(changes, 0.0) != changes
-    if has_changes == perturbation.trained_ranges or uses_strength != has_strengths:
+    if not has_one_content or uses_strength != has_strengths:
         raise UserError(
             f"{source}: give terms or settings, with the word strength in a value if and only "
             "if it has strengths, or trained_ranges: true"

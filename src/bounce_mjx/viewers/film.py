@@ -1,4 +1,4 @@
-"""An episode of an evaluation in the viewers, as it was: bit for bit on a CPU."""
+"""An episode of an evaluation in the viewers, as it was (bit for bit on a CPU: `make_filmer`)."""
 
 from collections.abc import Callable, Sequence
 
