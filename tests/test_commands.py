@@ -308,3 +308,12 @@ def test_a_policy_is_named_by_its_run_or_its_checkpoint(trained: Path, monkeypat
     ):
         found = choose_checkpoint(given, log_dir)
         assert found.folder.resolve() == trained / f"checkpoints/{steps}"
+
+
+@pytest.mark.parametrize("command", ["plot", "report"])
+def test_a_mistyped_run_is_told_before_what_draws_is_imported(
+    command: str, refused, monkeypatch
+) -> None:
+    for module in ("reports.figures", "reports.page", "viewers.page"):
+        monkeypatch.setitem(sys.modules, f"bounce_mjx.{module}", None)
+    refused(f"{command} nowhere", "there is no checkpoint folder nowhere; give a run's folder")

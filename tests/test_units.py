@@ -61,6 +61,7 @@ action: {max_lead: 0.3}                                  # does nothing with the
 randomization: {push_interval: [1, 2]}                   # does nothing without push_speed
 robot: {site: s, ball: {mass: 2.7}}                      # g
 robot: {site: s, paddle: {position: [0, 0, 190]}}        # mm
+robot: {site: s, paddle: {quaternion: [0, 0, 0, 0]}}     # no orientation
 robot: {site: s, servo_stiffness: [20e+6, 20e+6]}        # N mm/rad
 robot: {site: s, servo_damping: [2e+6, 2e+6]}            # N mm s/rad
 robot: {site: s, servo_force_limit: [150000, 150000]}    # N mm
