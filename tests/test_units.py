@@ -199,11 +199,11 @@ track: {home: [1.5, 0.5, 1], path_size: 0.5}
 
 
 def test_a_sensible_number_is_accepted_whatever_unit_was_meant() -> None:
-    """Of 87 wrong units, six cannot be told from a world that someone may want."""
+    """Of 90 wrong units and values, six cannot be told from a world that someone may want."""
     lines = ALLOWED.strip().splitlines()
     for line in lines:
         config("bounce", **yaml.safe_load(line))
-    assert (len(lines), len(WRONG.strip().splitlines())) == (6, 81)
+    assert (len(lines), len(WRONG.strip().splitlines())) == (6, 84)
 
 
 @pytest.mark.parametrize("case", re.findall(r"^\w[^#]+?\n(?=\w|#|$)", ACCEPTED, re.MULTILINE))

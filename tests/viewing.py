@@ -102,10 +102,15 @@ class Client:
     def __init__(self, address: str):
         protocol = Subprotocol(f"viser-v{viser.__version__}")
         self.address = address
+        # The page may send for ever, so that a close would wait for its answer in vain.
         self._socket = connect(
-            address.replace("http", "ws"), subprotocols=[protocol], compression=None, max_size=None,
+            address.replace("http", "ws"),
+            subprotocols=[protocol],
+            compression=None,
+            max_size=None,
             ping_interval=None,
-        )  # fmt: skip
+            close_timeout=0.1,
+        )
         self.send(CAMERA)
         self._controls: dict[str, str] = {}
         self._labels: list[str] = []
