@@ -38,6 +38,11 @@ def run(trained: Path, tmp_path: Path) -> Path:
 MISTAKES = (
     ("train --no-stop-if-solved", "did you mean --no-stop-when-solved?"),
     ("train --num-envs abc", "--num-envs is abc", "integer"),
+    # Also printed, since training refuses it.
+    (
+        "train --rollout-length 201 --training-episode-seconds 2 --print-config",
+        "rollout_length 201 is longer than an episode of 200 control steps; choose",
+    ),
     ("train --control-dt 0.0105", "control_dt 0.0105", "multiple of physics_dt"),
     (
         "train --num-envs 8 --rollout-length 8 --episode-seconds 0.05",

@@ -268,9 +268,7 @@ def test_a_second_start_compiles_nothing_and_trains_the_same(
     ((requests, hits),) = re.findall(r"^counts: (\d+) (\d+)$", process.said, re.MULTILINE)
     assert hits == requests != "0"
     (second,) = (tmp_path / "second").iterdir()
-    jax.tree.map(
-        np.testing.assert_array_equal, arrays(stopped), arrays(latest_checkpoint(second))
-    )
+    jax.tree.map(np.testing.assert_array_equal, arrays(stopped), arrays(latest_checkpoint(second)))
 
 
 @pytest.mark.slow

@@ -104,6 +104,12 @@ class TrainConfig(StrictModel):
         return sources
 
     @property
+    def training_episode_steps(self) -> int:
+        """Control steps after which the training truncates an episode."""
+        limit = self.ppo.training_episode_seconds or self.env.episode_seconds
+        return min(self.env.episode_steps, max(1, round(limit / self.env.control_dt)))
+
+    @property
     def starts_with_learning_rate(self) -> bool:
         """Whether `ppo.learning_rate` is only the start, as `target_kl` adapts it after each
         minibatch; an algorithm of the user's may have a schedule of its own."""
