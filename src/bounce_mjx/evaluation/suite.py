@@ -13,13 +13,13 @@ from pydantic import Field
 from bounce_mjx.config.files import differing_keys, read_mapping
 from bounce_mjx.config.settings import Finite, StrictModel, merged, nested
 from bounce_mjx.config.validation import validate
-from bounce_mjx.env.env import model_nominals
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.evaluation.config import command_ranges
 from bounce_mjx.physics.edited import NO_PAIR
 from bounce_mjx.task.registry import find_task
 from bounce_mjx.world.actuation import DEFAULT_PUSH_INTERVAL
 from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.model import model_nominals
 from bounce_mjx.world.randomization import MODEL, TERMS, RandomizationConfig
 
 _CONFIG_UNITS = "factor", "s", "Hz", "m", "m/s", "1/m", "rad", "rad/s", "kg", "N m", "N m s/rad"
