@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.signal import lfilter
 
-from bounce_mjx.env.env import world_model
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.unknowns import CAMERA_ROTATION, Layout
 from bounce_mjx.identify.windows import Windows
@@ -18,6 +17,7 @@ from bounce_mjx.physics import Control, PhysicsState, make_engine
 from bounce_mjx.physics.scalars import quaternion_matrix
 from bounce_mjx.robot.model import find_addresses, link_bodies, scatter
 from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.model import world_model
 from bounce_mjx.world.sampling import physics_parameters
 
 _LANES = 128
