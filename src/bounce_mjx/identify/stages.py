@@ -267,9 +267,13 @@ def identify(
     if does_move(log) and not is_follower and np.max(problem.correlation) < _FEW_ALIKE:
         lift = AIR_LIFT * problem.has_lift
         finer = _halve_steps(config)
+        # Latency and lag are the same; their delay and its variance depend on the lag's steps.
+        world = layout.world(fit.vector)
+        layout = Layout(config.num_joints, with_ball, finer.physics_dt, camera_rotation)
+        fit = fit._replace(vector=layout.vector(world))
         at_once = problem.leaves_at_once
         simulate = make_simulator(finer, layout, log, windows.finer(), share, lift, at_once)
-        problem = problem._replace(simulate=simulate)
+        problem = problem._replace(simulate=simulate, layout=layout)
     progress("all")
     angles = angle_weights(problem, problem.predict(fit.vector, fit.starts))
     fit = minimise(problem, fit, stages, problem.weights(pictures, seen, angles), 3, states)
@@ -277,7 +281,7 @@ def identify(
     fit = minimise(problem, unseen, stages, problem.weights(pictures, 1.0, angles), 3, states)
     nominals = model_nominals(config)
     known = {name: nominals[name] for name in layout.terms if name in nominals}
-    nominal_vector = layout.vector(known)
+    nominal_vector = own.layout.vector(known)
     before = fit._replace(predicted=own.predict(nominal_vector, fit.starts))
     information, covariance = certainty(problem, fit)
     counts = np.any(windows.split(fit.weights)[1] > 0.0, axis=(1, 2))
