@@ -346,6 +346,7 @@ def measure(config: WorldConfig, hidden: Hidden, path: Path) -> dict[str, Any]:
         "outside": [label for label, holds in inside.items() if not holds],
         "widths": widths(found),
         "dropped": found.dropped,
+        "leaves at once": found.leaves_at_once,
         "notes": list(log.notes),
     }
 

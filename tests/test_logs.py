@@ -622,6 +622,29 @@ def test_a_spike_is_left_out_and_counted(tmp_path: Path) -> None:
     np.testing.assert_array_equal(log.times, np.delete(whole.times, 49))
 
 
+@pytest.mark.parametrize("speed, overshoot", [(-2.0, 0.0), (0.0, 0.3)])
+def test_a_quick_answer_to_a_step_of_the_command_is_no_spike(
+    speed: float, overshoot: float, tmp_path: Path
+) -> None:
+    """Neither the last rows of the motion before it, nor those beyond its end; a spike beside it
+    is."""
+    names = ("a", "b")
+    random = np.random.default_rng(0)
+    path = tmp_path / "log.csv"
+    with Recorder(path, names) as recorder:
+        for k in range(200):
+            since = 0.01 * k - 0.904
+            before = speed * min(since, 0.0)
+            moved = 1.0 - np.exp(-max(since, 0.0) / 0.008)
+            swing = overshoot * np.sin(np.pi * np.clip(since / 0.03, 0.0, 1.0))
+            angles = [before + 0.7 * (moved + swing), 0.5 * (k == 95)]
+            step = [before + 0.7 * (k >= 90), 0.0]
+            noise = 1e-3 * random.normal(size=2)
+            recorder.step({"time": 0.01 * k, "joint_angles": angles + noise}, step)
+    (note,) = read_csv(path, names).notes
+    assert "1 of the 200 joint angles" in note and "row 97 is a spike" in note
+
+
 def test_a_far_ball_beside_a_repeated_one_is_left_out(tmp_path: Path) -> None:
     good, path = recorded(tmp_path / "good.csv"), tmp_path / "log.csv"
     lines = good.read_text().splitlines()

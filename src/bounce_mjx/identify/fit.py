@@ -101,6 +101,8 @@ class Problem(NamedTuple):
     """Called with a line about each step of a search."""
     has_lift: bool = False
     """Whether spin lifts the ball; the spin after a bounce then is as free as that before it."""
+    leaves_at_once: bool = False
+    """Whether the ball does not stay on the paddle in a bounce, as the model's does."""
 
     @property
     def deviations(self) -> np.ndarray:

@@ -24,10 +24,11 @@ _FAR_IN_TIME = 3600.0
 _COARSE_STAMP = 2e-3
 _ROUNDED = 2e-4
 # Rows whose median an angle is compared with; distance from it beyond which it is a spike, rad, and
-# in multiples of what is usual about it.
+# in multiples of what is usual about it; and time for which a step of the command explains one, s.
 _SPIKE_ROWS = 7
 _SPIKE = 0.03
 _SPIKE_FACTOR = 10.0
+_AFTER_STEP = 0.3
 # Two pictures closer than this are one, s.
 _SAME_PICTURE = 1e-4
 # Stretches of a log in which the youngest picture is looked for; drift (s) over the log below which
@@ -131,7 +132,7 @@ def make_log(source: str, angles: Rows, targets: Rows, balls: Rows) -> Log:
     angles = _in_order(angles, notes)
     targets = _in_order(targets, notes)
     angles = angles.without(
-        _find_spikes(angles.values), "is a spike: the joint is elsewhere before and after", notes
+        _find_spikes(angles, targets), "is a spike: the joint is elsewhere before and after", notes
     )
     balls = balls.chosen(np.argsort(balls.times, kind="stable"))
     # An arm may have been recorded alone, with a tracker that saw no ball. Trackers, and logs of
@@ -211,14 +212,46 @@ def _check_digits(rows: Rows) -> None:
         )
 
 
-def _find_spikes(angles: np.ndarray) -> np.ndarray:
-    """Which rows [R] of joint angles [R, n] no joint can have: far from the median of the rows
-    about them, although those agree with theirs."""
-    if len(angles) < _SPIKE_ROWS:
-        return np.zeros(len(angles), bool)
-    off = np.abs(angles - median_filter(angles, (_SPIKE_ROWS, 1), mode="nearest"))
-    around = median_filter(off, (2 * _SPIKE_ROWS + 1, 1), mode="nearest")
-    return np.any(off > np.maximum(_SPIKE, _SPIKE_FACTOR * around), axis=1)
+def _find_spikes(angles: Rows, targets: Rows) -> np.ndarray:
+    """Which rows [R] of joint angles no joint can have: far from the median of the rows about them,
+    although those agree with theirs, and beyond the rows before and after.
+
+    A quick servo that answers a step of its command is as far from that median, between two rests,
+    or beyond the second one by less than the step.
+    """
+    values = angles.values
+    spikes = np.zeros(len(values), bool)
+    if len(values) < _SPIKE_ROWS:
+        return spikes
+    off = values - median_filter(values, (_SPIKE_ROWS, 1), mode="nearest")
+    around = median_filter(np.abs(off), (2 * _SPIKE_ROWS + 1, 1), mode="nearest")
+    limits = np.maximum(_SPIKE, _SPIKE_FACTOR * around)
+    for joint in np.flatnonzero(np.any(np.abs(off) > limits, axis=0)):
+        far = np.flatnonzero(np.abs(off[:, joint]) > limits[:, joint])
+        is_next = (np.diff(far) == 1) & (np.diff(np.sign(off[far, joint])) == 0.0)
+        for rows in np.split(far, np.flatnonzero(~is_next) + 1):
+            height = _height_beyond_neighbours(values[:, joint], rows)
+            step = _largest_step(targets, joint, angles.times[rows[0]])
+            if height > max(np.max(limits[rows, joint]), step):
+                spikes[rows] = True
+    return spikes
+
+
+def _height_beyond_neighbours(values: np.ndarray, rows: np.ndarray) -> float:
+    """The least distance by which all of successive rows of values [R] lie above, or below, both
+    the row before and the row after them; negative if some lies between."""
+    neighbours = values[[max(rows[0] - 1, 0), min(rows[-1] + 1, len(values) - 1)]]
+    above = np.min(values[rows]) - np.max(neighbours)
+    below = np.min(neighbours) - np.max(values[rows])
+    return float(max(above, below))
+
+
+def _largest_step(targets: Rows, joint: int, time: float) -> float:
+    """The largest change from one command of a joint to the next, rad, of those that it may still
+    be answering at a time (s)."""
+    first, last = np.searchsorted(targets.times, [time - _AFTER_STEP, time], side="right")
+    sent = targets.values[max(first - 1, 0) : last, joint]
+    return float(np.max(np.abs(np.diff(sent)), initial=0.0))
 
 
 def align_clocks(log: Log) -> Log:

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import mujoco
@@ -44,25 +45,29 @@ from bounce_mjx.world.model import model_nominals, world_model
 
 # Every fifth window is held out of the search until its last stage.
 _HELD_OUT = 5
-# Latencies and lags of the first candidates, s, and frictions of the ball.
-_LATENCIES = (0.002, 0.01, 0.02, 0.03, 0.04, 0.055)
+# Latencies of the ball, s, and its frictions, of the first candidates.
 _BALL_LATENCIES = np.arange(-0.004, 0.05, 0.008)
 _FRICTIONS = (0.01, 0.2)
 # Windows in which the first candidates are compared.
 _FEW = 13
-_LAGS = (0.001, 0.008, 0.016, 0.026, 0.038)
-# Servos that make a joint follow as late as measured: their gains, the share of the delay that is
-# the servo's own, and the share of the rest that is a lag.
+# The model's own servos, and others, that make a joint follow as late as measured: the shares of
+# the rest of the delay that are a lag; the others' gains, and the shares of the delay that are
+# theirs.
+_OWN_LAG_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
 _GAINS = (1.0, 2.0, 4.0, 8.0, 30.0)
 _SERVO_SHARES = (0.1, 0.3, 0.6, 0.9)
 _LAG_SHARES = (0.0, 0.3, 0.6)
 # Gains and longest own delays (s) of servos that are too stiff to matter.
 _STIFF_GAINS = (30.0, 100.0)
 _STIFF_DELAYS = (5e-4, 1e-3, 3e-3)
-# Candidates from which a search over a few windows begins, and decrease of the cost from which the
+# Candidates with the model's own servos, and with others, from each of which a search over a few
+# windows begins: a servo that is slow and a lag that is long delay alike, and only a search tells
+# them apart. Decrease of the cost from which the
 # controller counts as carrying the arm's weight.
 _KEPT = 2
 _CARRIED = 10.0
+# The same, from which the ball counts as one that leaves the paddle at once.
+_SHORT_CONTACT = 10.0
 # Successive angles that count as one below which what is left is the noise of the sensors: then an
 # error of the simulation's step shows.
 _FEW_ALIKE = 3.0
@@ -110,6 +115,8 @@ class Identified(NamedTuple):
     servos explained windows that the search had not seen no better."""
     has_lift: bool = False
     """Whether the flights show lift by spin."""
+    leaves_at_once: bool = False
+    """Whether the bounces show a ball that does not stay on the paddle, as the model's does."""
     stamp_age: float = 0.0
     """Time from a picture's stamp to its arrival, s: `ball_latency` in the fit is without it."""
 
@@ -253,15 +260,20 @@ def identify(
     pictures = np.ones_like(windows.picture_weights)
     seen = _training(problem)
     if with_ball:
-        lifted = make_simulator(config, layout, log, windows, share, AIR_LIFT)
-        problem, fit, pictures = _fit_ball(problem, fit, lifted)
+        make = partial(make_simulator, config, layout, log, windows, share)
+        problem, fit, pictures = _fit_ball(problem, fit, make)
         stages = [*stages, "flight", "bounce"]
         states = None
     if does_move(log) and not is_follower and np.max(problem.correlation) < _FEW_ALIKE:
         lift = AIR_LIFT * problem.has_lift
         finer = _halve_steps(config)
-        simulate = make_simulator(finer, layout, log, windows.finer(), share, lift)
-        problem = problem._replace(simulate=simulate)
+        # Latency and lag are the same; their delay and its variance depend on the lag's steps.
+        world = layout.world(fit.vector)
+        layout = Layout(config.num_joints, with_ball, finer.physics_dt, camera_rotation)
+        fit = fit._replace(vector=layout.vector(world))
+        at_once = problem.leaves_at_once
+        simulate = make_simulator(finer, layout, log, windows.finer(), share, lift, at_once)
+        problem = problem._replace(simulate=simulate, layout=layout)
     progress("all")
     angles = angle_weights(problem, problem.predict(fit.vector, fit.starts))
     fit = minimise(problem, fit, stages, problem.weights(pictures, seen, angles), 3, states)
@@ -269,7 +281,7 @@ def identify(
     fit = minimise(problem, unseen, stages, problem.weights(pictures, 1.0, angles), 3, states)
     nominals = model_nominals(config)
     known = {name: nominals[name] for name in layout.terms if name in nominals}
-    nominal_vector = layout.vector(known)
+    nominal_vector = own.layout.vector(known)
     before = fit._replace(predicted=own.predict(nominal_vector, fit.starts))
     information, covariance = certainty(problem, fit)
     counts = np.any(windows.split(fit.weights)[1] > 0.0, axis=(1, 2))
@@ -292,6 +304,7 @@ def identify(
         gravity_compensation=share,
         is_follower=is_follower,
         has_lift=problem.has_lift,
+        leaves_at_once=problem.leaves_at_once,
         stamp_age=least_age(log),
     )
 
@@ -367,11 +380,14 @@ def _check_frame(windows: Windows, config: WorldConfig, source: str) -> None:
         )
 
 
-def _fit_ball(problem: Problem, fit: Fit, lifted: Simulate) -> tuple[Problem, Fit, np.ndarray]:
+def _fit_ball(
+    problem: Problem, fit: Fit, make: Callable[[float, bool], Simulate]
+) -> tuple[Problem, Fit, np.ndarray]:
     """The ball's flights, then its bounces; and the weights of the pictures [S, B].
 
     Args:
-      lifted: the simulation with a ball that its spin lifts, which counts where flights show it.
+      make: (lift, whether the ball leaves the paddle at once) -> the simulation with such a ball,
+        which counts where flights and bounces show it.
     """
     windows = problem.windows
     states = ~problem.windows.arm_state
@@ -382,7 +398,9 @@ def _fit_ball(problem: Problem, fit: Fit, lifted: Simulate) -> tuple[Problem, Fi
     if _flies(problem, plain, flying):
         fit = plain
     else:
-        spinning = problem._replace(simulate=lifted, has_lift=True)
+        # A ball with spin is a real one.
+        real = make(AIR_LIFT, True)
+        spinning = problem._replace(simulate=real, has_lift=True, leaves_at_once=True)
         guess = _guess_spins(spinning, fit)
         spinning = spinning._replace(noise=_flight_noise(spinning, guess, flying))
         turned = minimise(spinning, guess, ["flight"], problem.weights(flying, seen), 8, states)
@@ -401,11 +419,29 @@ def _fit_ball(problem: Problem, fit: Fit, lifted: Simulate) -> tuple[Problem, Fi
     for kept, iterations in ((4, 1), (1, 2)):
         found = [minimise(problem, x, stages, few, iterations, states) for x in tried]
         tried = sorted(found, key=lambda fit: fit.cost)[:kept]
-    fit = minimise(problem, tried[0], stages, problem.weights(1.0, seen), 5, states)
+    fit = tried[0]
+    if not problem.leaves_at_once:
+        problem, fit = _choose_contact(problem, fit, make, few)
+    fit = minimise(problem, fit, stages, problem.weights(1.0, seen), 5, states)
     fit = minimise(problem, fit, [], problem.weights(1.0, 1.0 - seen), 3, states)
     pictures = picture_weights(problem, problem.predict(fit.vector, fit.starts))
     fit = minimise(problem, fit, stages, problem.weights(pictures, seen), 6, states)
     return problem, fit, pictures
+
+
+def _choose_contact(
+    problem: Problem, fit: Fit, make: Callable[[float, bool], Simulate], few: np.ndarray
+) -> tuple[Problem, Fit]:
+    """Whether the ball leaves the paddle at once, as a real one does, or later, as the model's: the
+    log decides, by the costs of both fits to `few` windows (their weights [S, M])."""
+    stages = ["flight", "bounce"]
+    states = ~problem.windows.arm_state
+    real = problem._replace(simulate=make(0.0, True), leaves_at_once=True)
+    of_model, of_real = (minimise(x, fit, stages, few, 3, states) for x in (problem, real))
+    if of_model.cost - of_real.cost < _SHORT_CONTACT:
+        return problem, of_model
+    problem.progress("the ball leaves the paddle at once")
+    return real, of_real
 
 
 def _guess_spins(problem: Problem, fit: Fit) -> Fit:
@@ -473,7 +509,8 @@ def _search_arm(
     windows = problem.windows
     rough = np.hypot(problem.sensors.angles, following.errors)
     problem = problem._replace(noise=problem.noise._replace(angles=rough))
-    vectors = np.concatenate([_own_servos(layout), _late_servos(layout, config, delay)])
+    of_model = _own_servos(layout, config, delay)
+    vectors = np.concatenate([of_model, _late_servos(layout, config, delay)])
     few = problem.weights(0.0, _sample(problem, np.any(windows.angle_weights > 0.0, axis=1)))
     used = np.any(few > 0.0, axis=1)
     starts = np.repeat(windows.starts[None], len(vectors), axis=0)
@@ -487,8 +524,13 @@ def _search_arm(
         vector[layout.slices["servo_offset"]] = offsets
         left = np.where(is_angle, residuals - offsets, 0.0) / rough
         costs.append(np.sum(left**2) if np.all(np.isfinite(left)) else np.inf)
-    best = [Fit(vectors[i], windows.starts) for i in np.argsort(costs)[:_KEPT]]
-    fits = [minimise(problem, fit, ["arm"], few, 2, windows.arm_state) for fit in best]
+    is_of_model = np.arange(len(vectors)) < len(of_model)
+    ranked = np.argsort(costs)
+    best = [*ranked[is_of_model[ranked]][:_KEPT], *ranked[~is_of_model[ranked]][:_KEPT]]
+    fits = [
+        minimise(problem, Fit(vectors[i], windows.starts), ["arm"], few, 2, windows.arm_state)
+        for i in best
+    ]
     fit = min(fits, key=lambda fit: fit.cost)
     return _in_units_of_errors(problem, fit), fit
 
@@ -503,11 +545,14 @@ def _with_offsets(problem: Problem, fit: Fit) -> Fit:
     return fit._replace(vector=vector)
 
 
-def _own_servos(layout: Layout) -> np.ndarray:
-    """Candidates [C, P] with the model's own servos."""
-    pairs = itertools.product(_LATENCIES, _LAGS)
+def _own_servos(layout: Layout, config: WorldConfig, delay: float) -> np.ndarray:
+    """Candidates [C, P] with the model's own servos, late as measured (s) by latency and lag."""
+    rest = max(delay - float(np.mean(_servo_delays(config))), 0.0)
     return np.stack(
-        [layout.vector({"action_latency": late, "servo_lag": lag}) for late, lag in pairs]
+        [
+            layout.vector({"action_latency": (1.0 - share) * rest, "servo_lag": share * rest})
+            for share in _OWN_LAG_SHARES
+        ]
     )
 
 

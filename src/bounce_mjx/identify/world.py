@@ -154,6 +154,11 @@ def sentences(found: Identified, joint_names: Sequence[str]) -> list[str]:
             "A delay and a constant offset of each joint explain the angles in windows that the "
             "search had not seen no worse than servos do: the world has these, and stiff servos."
         )
+    if found.leaves_at_once:
+        said.append(
+            "The ball leaves the paddle at once, as a real one does; in the world it stays for the "
+            "model's contact, and leaves as fast."
+        )
     if found.dropped and found.dropped <= _MOST_FLY * np.sum(found.windows.has_ball):
         said.append(
             f"In {found.dropped} of {int(np.sum(found.windows.has_ball))} windows, the ball was "
