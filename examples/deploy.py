@@ -82,7 +82,7 @@ def simulate(
     recorder: Recorder | None = None,
     model: mujoco.MjModel | None = None,
 ) -> list[tuple[int, float]]:
-    """Bounces for a time, again from the start after each lost ball.
+    """Bounces for a time, again from the start after each stop.
 
     Args:
       policy: the result of `load_policy`.
