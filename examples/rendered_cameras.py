@@ -34,9 +34,10 @@ PLACES = ((1.45, 0.85, 0.75), (1.45, -0.85, 0.75))
 """Where the cameras stand in the robot's frame, m."""
 GAZE = (0.59, 0.0, 0.48)
 """The point at which both look, m."""
-SHIFTS = np.array([(-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375)])
+SHIFTS = np.array([(-0.125, 0.375), (0.375, -0.375), (-0.375, -0.125), (0.125, 0.125)])
 """A picture is the mean of these sub-frames: shifts to the right and down, pixels, by which edges
-become smooth."""
+become smooth; in the order of time, with which they hardly rise or fall, as that would blur a
+moving ball."""
 SHADOW_SIZE = 1024
 """Width of a shadow's map, pixels; MuJoCo's own, 4096, takes three times as long for edges that the
 blur of a picture hides."""
@@ -142,20 +143,29 @@ class RenderedCameras:
         self._random = np.random.default_rng(seed)
         self._lenses = tuple(_Lens(camera) for camera in cameras)
         self._sheet = _Sheet(model, self._lenses)
+        self._model = model
+        self._drawn = mujoco.MjData(model)
         self._begun = 0
         self._times: list[float] = []
         self._places: list[np.ndarray] = []
 
     def look(self, data: mujoco.MjData) -> Picture | None:
-        """Sees one instant; call it after each physics step. Returns a pair when its exposure ends.
+        """Sees one instant, of which `time` and `qpos` count; call it after each physics step.
+        Returns a pair after its last sub-frame.
 
-        The sub-frames of an exposure are taken at the physics steps that are due.
+        A sub-frame is due in the middle of each fourth of the exposure, and is taken at the first
+        physics step from then on.
         """
         start = self._begun / self.rate
-        due = start + len(self._times) / len(SHIFTS) * self.exposure
+        due = start + (len(self._times) + 0.5) / len(SHIFTS) * self.exposure
         if data.time < due - 1e-9:
             return None
-        self._sheet.draw(data, sub_frame=len(self._times))
+        # After a step, the data's geoms and lights are still where they were before it.
+        self._drawn.qpos[:] = data.qpos
+        mujoco.mj_kinematics(self._model, self._drawn)
+        mujoco.mj_comPos(self._model, self._drawn)
+        mujoco.mj_camlight(self._model, self._drawn)
+        self._sheet.draw(self._drawn, sub_frame=len(self._times))
         self._times.append(data.time)
         self._places.append(data.joint("ball_link").qpos[:3].copy())
         if len(self._times) < len(SHIFTS):
@@ -237,8 +247,8 @@ class _Lens:
 
 
 class _Sheet:
-    """The sub-frames of a pair of pictures side by side in one buffer, as to read it waits for the
-    GPU: a column for each camera, a row for each sub-frame."""
+    """The sub-frames of a pair of pictures side by side in one buffer, as each reading waits for
+    the GPU: a column for each camera, a row for each sub-frame."""
 
     def __init__(self, model: mujoco.MjModel, lenses: Sequence[_Lens]):
         """Draws the empty room, if the model is a quick one."""
@@ -430,15 +440,15 @@ class SeenBall:
         """Frees the renderer."""
         self._cameras.close()
 
-    def measure(self, time: float) -> dict:
+    def measure(self, now: float) -> dict:
         """The newest place of the ball that has arrived, if any, and its velocity from two."""
-        arrived = [entry for entry in self._measured if entry[0] <= time + 1e-6]
+        arrived = [entry for entry in self._measured if entry[0] <= now + 1e-6]
         if not arrived:
             return {}
         _, taken, position = arrived[-1]
         _, before, last_position = arrived[max(len(arrived) - 2, 0)]
         velocity = (position - last_position) / max(taken - before, 1e-3)
-        return {"ball_position": position, "ball_velocity": velocity, "ball_age": time - taken}
+        return {"ball_position": position, "ball_velocity": velocity, "ball_age": now - taken}
 
 
 def calibrate_with_arm(
