@@ -60,9 +60,11 @@ _INSIDE = 0.85 * np.sqrt((_SEEDS[:, None] + 0.5) / 25.0)
 _INSIDE = _INSIDE * np.column_stack([np.cos(2.4 * _SEEDS), np.sin(2.4 * _SEEDS)])
 # Distance between a circle's centre and the projection of the triangulated ball, pixels.
 _MAX_REPROJECTION = 3.0
-# Largest change of the ball's velocity at a bounce, m/s, upward and sideways (by friction, and by a
-# paddle that is tilted by 0.2 rad), and what is added to the distance from the predicted place, m.
-_MAX_VELOCITY_CHANGE = 9.0
+# Largest changes of the ball's velocity at a bounce, m/s: upward; downward, where a paddle gives
+# none and the velocity of two pictures is a little off; sideways (by friction, and by a paddle that
+# is tilted by 0.2 rad). And what is added to the distance from the predicted place, m.
+_MAX_UPWARD_CHANGE = 9.0
+_MAX_DOWNWARD_CHANGE = 1.5
 _MAX_SIDEWAYS_CHANGE = 2.5
 _PLACE_TOLERANCE = 0.02
 # So many pairs in a row without a ball are searched around the predicted place; later ones whole.
@@ -422,13 +424,21 @@ class Tracker:
     def _best_fix(
         self, circles: list[list[Circle]], taken: float, predicted: np.ndarray | None
     ) -> Fix | None:
-        """The pair of circles whose rays meet best, if it can be the ball."""
+        """The place of the most complete pair of circles that can be the ball.
+
+        The rays of two other things of its colour may meet better by chance.
+        """
         best = None
+        best_score = 0.0
         for first in circles[0]:
             for second in circles[1]:
+                score = min(first.score, second.score)
+                if score <= best_score:
+                    continue
                 fix = self._fix((first, second), taken, predicted)
-                if fix is not None and (best is None or fix.error < best.error):
+                if fix is not None:
                     best = fix
+                    best_score = score
         return best
 
     def _fix(
@@ -447,11 +457,15 @@ class Tracker:
         if predicted is not None:
             since = taken - self.fixes[-1].time
             sideways = np.linalg.norm(position[:2] - predicted[:2])
-            upward = abs(position[2] - predicted[2])
-            if (
-                sideways > _PLACE_TOLERANCE + _MAX_SIDEWAYS_CHANGE * since
-                or upward > _PLACE_TOLERANCE + _MAX_VELOCITY_CHANGE * since
-            ):
+            upward = position[2] - predicted[2]
+            # A single picture shows no velocity: the ball may fall as fast as it may rise.
+            is_velocity_known = len(self.fixes) > 1
+            downward_change = _MAX_DOWNWARD_CHANGE if is_velocity_known else _MAX_UPWARD_CHANGE
+            if sideways > _PLACE_TOLERANCE + _MAX_SIDEWAYS_CHANGE * since:
+                return None
+            if upward > _PLACE_TOLERANCE + _MAX_UPWARD_CHANGE * since:
+                return None
+            if -upward > _PLACE_TOLERANCE + downward_change * since:
                 return None
         return Fix(taken, position, error)
 

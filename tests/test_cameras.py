@@ -197,6 +197,27 @@ def test_a_pose_that_does_not_fit_is_named() -> None:
     assert "18 poses" in found.report() and "pose 8" in found.report()
 
 
+def test_what_lies_below_a_falling_ball_is_not_it() -> None:
+    """Such as the paddle's corner: a bounce throws a ball up, and never down."""
+    tracker = cameras.Tracker(true_cameras(), cameras.COLOURS["orange"])
+    start, velocity = np.array([0.6, 0.02, 0.5]), np.array([0.1, -0.1, -1.0])
+    for k in range(12):
+        time = k / 120.0
+        place = start + velocity * time + 0.5 * cameras.GRAVITY * time**2
+        pictures = scene(place, (), k)
+        if k >= 3:
+            below = place - np.array([0.0, 0.0, 0.085])
+            for picture, camera in zip(pictures, true_cameras(), strict=True):
+                centre = tuple(int(pixel) for pixel in camera.project(below[None])[0])
+                radius = round(camera.radius_at(below))
+                cv2.circle(picture, centre, radius, (10, 115, 250), -1, cv2.LINE_AA)
+                # A part of the ball itself is hidden.
+                x, y = (int(pixel) for pixel in camera.project(place[None])[0])
+                cv2.rectangle(picture, (x - 20, y + 5), (x + 20, y + 12), (110, 110, 110), -1)
+        fix = tracker.update(pictures, time)
+        assert fix is not None and np.linalg.norm(fix.position - place) < 5e-3
+
+
 def test_how_high_the_cameras_see_is_told_beside_how_high_the_policy_plays() -> None:
     metadata = load_policy("robust").metadata
     home = cameras.paddle_position(metadata, np.array(metadata.default_joint_angles))
