@@ -28,11 +28,11 @@ import numpy as np
 
 from bounce_mjx import load_policy
 from bounce_mjx.deploy.motion import paddle_position
-from bounce_mjx.env.env import world_model
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import POLICIES, resource_path
 from bounce_mjx.robot.model import BALLS_APART, find_addresses
 from bounce_mjx.runs.config import load_run_config
+from bounce_mjx.world.model import world_model
 
 RATE = 500.0
 """Of the commands, Hz."""

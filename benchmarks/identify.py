@@ -19,7 +19,6 @@ import numpy as np
 
 from bounce_mjx import load_policy
 from bounce_mjx.deploy.recorder import Recorder
-from bounce_mjx.env.env import model_nominals, world_model
 from bounce_mjx.identify.excitation import excite
 from bounce_mjx.identify.reading import read_csv
 from bounce_mjx.identify.stages import Identified, identify
@@ -30,6 +29,7 @@ from bounce_mjx.robot.model import find_addresses, joint_names
 from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.training.setup import set_up_jax
 from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.model import model_nominals, world_model
 from bounce_mjx.world.randomization import RandomizationConfig
 from bounce_mjx.world.sampling import physics_parameters, sample_world
 

@@ -27,7 +27,6 @@ import numpy as np
 from numpy.polynomial.polynomial import polyfit
 from scipy.optimize import brentq, least_squares
 
-from bounce_mjx.env.env import world_model
 from bounce_mjx.errors import UserError
 from bounce_mjx.identify.doctor import examine
 from bounce_mjx.identify.following import (
@@ -48,6 +47,7 @@ from bounce_mjx.robot.model import find_addresses, joint_names
 from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.training.setup import set_up_jax
 from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.model import world_model
 from bounce_mjx.world.sampling import physics_parameters
 
 # Largest error of a flight that counts as explained, root mean square of an axis, m.

@@ -12,12 +12,12 @@ import mujoco
 import numpy as np
 from mujoco import sysid
 
-from bounce_mjx.env.env import world_model
 from bounce_mjx.identify.following import SETTLING
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.simulation import make_targets
 from bounce_mjx.robot.model import find_addresses, joint_names, scene_spec
 from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.model import world_model
 
 # First value, and bounds, of each joint's unknowns.
 _OF_JOINTS = {

@@ -12,33 +12,41 @@ from brax.training.agents.apg import train as apg
 
 from bounce_mjx.adapters import brax as adapter
 
+SETTINGS = dict(
+    policy_updates=300,
+    num_evals=10,
+    num_envs=64,
+    num_eval_envs=64,
+    episode_length=100,
+    # 0.2 s: a gradient over many bounces grows fast. brax clips each of its components to 1.
+    horizon_length=20,
+    learning_rate=3e-3,
+    normalize_observations=True,
+    max_devices_per_host=1,
+)
+"""Arguments of brax's `apg.train`."""
+
 
 def main(**settings: Any) -> list[dict]:
     """Trains for the first bounce; the metrics of the evaluations.
 
     Args:
-      settings: arguments of brax's `apg.train` that replace the ones below.
+      settings: arguments of brax's `apg.train` in place of those of `SETTINGS`.
     """
     history = []
-    given = dict(
-        policy_updates=300,
-        num_evals=10,
-        num_envs=64,
-        num_eval_envs=64,
-        episode_length=100,
-        horizon_length=20,
-        learning_rate=3e-3,
-        normalize_observations=True,
-        max_devices_per_host=1,
-    )
+
+    def progress(num_steps: int, metrics: dict) -> None:
+        history.append(metrics)
+
+    # Of a newer JAX, brax misses a function.
     with adapter.device_put_replicated():
         apg.train(
-            get_environment(adapter.ENV_NAME),
+            environment=get_environment(adapter.ENV_NAME),
             network_factory=functools.partial(
                 networks.make_apg_networks, hidden_layer_sizes=(64, 64)
             ),
-            progress_fn=lambda step, metrics: history.append(metrics),
-            **(given | settings),
+            progress_fn=progress,
+            **SETTINGS | settings,
         )
     return history
 

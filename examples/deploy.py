@@ -18,85 +18,132 @@ from bounce_mjx.errors import exit_on_user_error
 from bounce_mjx.resources import resource_path
 
 MJCF = resource_path("mjcf/bounce_ball.xml")
+BOX = ((0.2, -0.5, -0.2), (1.0, 0.5, 0.6))
+"""The lowest and the highest x, y and z that the paddle may reach, m."""
+SECONDS_OF_A_TARGET_HEIGHT = 3.0
+# Times are sums of steps, which rounding makes a little too small or too large.
+TIME_TOLERANCE = 1e-6
+"""s."""
 
 
 class Camera:
     """Pictures of the ball: their rate (Hz), noise (m) and delay (s)."""
 
     def __init__(self, rate: float = 120.0, noise: float = 0.002, delay: float = 0.020):
-        self.rate, self.noise, self.delay = rate, noise, delay
+        self.rate = rate
+        self.noise = noise
+        self.delay = delay
         self.random = np.random.default_rng(0)
         self.pictures: list[tuple[float, np.ndarray]] = []
+        """When each was taken, s, and where it shows the ball [3], m."""
 
     def look(self, data: mujoco.MjData) -> None:
         """Takes a picture of the ball if one is due."""
-        if data.time * self.rate > len(self.pictures) - 1e-6:
-            ball = data.joint("ball_link").qpos[:3]
-            noise = self.noise * self.random.standard_normal(3)
-            self.pictures.append((data.time, ball + noise))
+        due = len(self.pictures) / self.rate
+        if data.time > due - TIME_TOLERANCE:
+            position = data.joint("ball_link").qpos[:3]
+            error = self.noise * self.random.standard_normal(3)
+            self.pictures.append((data.time, position + error))
 
     def measure(self, time: float) -> dict:
         """Newest picture that has arrived, if any, and the velocity from the last two."""
-        arrived = [p for p in self.pictures if p[0] < time - self.delay + 1e-6]
+        newest_arrival = time - self.delay + TIME_TOLERANCE
+        arrived = [picture for picture in self.pictures if picture[0] < newest_arrival]
         if not arrived:
             return {}
         taken, position = arrived[-1]
-        before, last_position = arrived[max(len(arrived) - 2, 0)]
-        velocity = (position - last_position) / max(taken - before, 1e-3)
+        if len(arrived) == 1:
+            velocity = np.zeros(3)
+        else:
+            taken_before, position_before = arrived[-2]
+            velocity = (position - position_before) / (taken - taken_before)
         return {"ball_position": position, "ball_velocity": velocity, "ball_age": time - taken}
+
+
+class BounceCounter:
+    """Counts how often the ball turns from falling to rising."""
+
+    def __init__(self):
+        self.bounces = 0
+        self.is_falling = False
+
+    def watch(self, ball_velocity_z: float) -> None:
+        """Looks at the ball once each physics step; its vertical velocity is in m/s."""
+        if self.is_falling and ball_velocity_z > 0.0:
+            self.bounces += 1
+        self.is_falling = ball_velocity_z < 0.0
 
 
 def simulate(
     policy,
     camera: Camera,
     seconds: float,
-    heights: list[float],
+    target_heights: list[float],
     recorder: Recorder | None = None,
     model: mujoco.MjModel | None = None,
 ) -> list[tuple[int, float]]:
-    """Bounces and length (s) of each episode, each from a new start; a target height lasts 3 s."""
+    """Bounces for a time, again from the start after each stop.
+
+    Args:
+      policy: the result of `load_policy`.
+      target_heights: each lasts 3 s, m.
+      recorder: of the log, if there is to be one.
+      model: of the arm and the ball; None for the one of `MJCF`.
+
+    Returns:
+      Bounces and length (s) of each episode.
+    """
     if model is None:
         model = mujoco.MjModel.from_xml_path(str(MJCF))
     data = mujoco.MjData(model)
     joints = [data.joint(name) for name in policy.metadata.joint_names]
-    ball = data.joint("ball_link")
-    held = ball.qpos.copy()
     for joint, angle in zip(joints, policy.metadata.default_joint_angles, strict=True):
         joint.qpos = angle
+    ball = data.joint("ball_link")
+    ball_start = ball.qpos.copy()
+
     policy.reset()
+    arm = policy.supervise(rate=1.0 / model.opt.timestep, box=BOX)
     camera.look(data)
-    arm = policy.supervise(rate=1.0 / model.opt.timestep, box=((0.2, -0.5, -0.2), (1.0, 0.5, 0.6)))
-    episodes, begun, bounces, falling = [], 0.0, 0, False
-    while data.time < seconds - 1e-6:
-        measured = {
+    counter = BounceCounter()
+    episode_start = 0.0
+    episodes = []
+    while data.time < seconds - TIME_TOLERANCE:
+        target = int(data.time / SECONDS_OF_A_TARGET_HEIGHT) % len(target_heights)
+        measurements = {
             "joint_angles": [joint.qpos[0] for joint in joints],
             "joint_velocities": [joint.qvel[0] for joint in joints],
-            "target_height": heights[int(data.time / 3.0) % len(heights)],
+            "target_height": target_heights[target],
             "time": data.time,
             **camera.measure(data.time),
         }
-        commands = arm.commands(measured)
+        commands = arm.commands(measurements)
         if recorder is not None:
-            recorder.step(measured, commands[-1])
-        if arm.state == "ready" and "ball_position" in measured:
+            recorder.step(measurements, commands[-1])
+
+        if arm.state == "ready" and "ball_position" in measurements:
             arm.start()
-            begun, bounces, falling = data.time, 0, False
+            counter = BounceCounter()
+            episode_start = data.time
         elif arm.state == "stopped":
-            episodes.append((bounces, data.time - begun))
+            episodes.append((counter.bounces, data.time - episode_start))
             arm.restart()
+
         for command in commands:
             data.ctrl[:] = command
             mujoco.mj_step(model, data)
-            if arm.state != "running" and arm.state != "braking":
+            if arm.state not in ("running", "braking"):
                 # Somebody holds the ball until the arm is ready.
-                ball.qpos[:], ball.qvel[:] = held, 0.0
-            bounces += falling and ball.qvel[2] > 0.0
-            falling = ball.qvel[2] < 0.0
+                ball.qpos[:] = ball_start
+                ball.qvel[:] = 0.0
+            counter.watch(ball.qvel[2])
             camera.look(data)
-    return [*episodes, (int(bounces), data.time - begun)] if arm.state == "running" else episodes
+    if arm.state == "running":
+        episodes.append((counter.bounces, data.time - episode_start))
+    return episodes
 
 
-if __name__ == "__main__":
+def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("policy", nargs="?", default="robust", help="name, file or run")
     parser.add_argument("--seconds", type=float, default=20.0)
@@ -108,25 +155,49 @@ if __name__ == "__main__":
     parser.add_argument("--film", help="of --cameras: what they see, a .webp or .gif file")
     parser.add_argument("--side-light", action="store_true", help="light --cameras from one side")
     parser.add_argument("--quick", action="store_true", help="render --cameras without shadows")
-    args = parser.parse_args()
-    with exit_on_user_error(), contextlib.ExitStack() as files:
-        robot, recorder = load_policy(args.policy), None
-        if args.log:
-            joints = robot.metadata.joint_names
-            recorder = files.enter_context(Recorder(args.log, joints, {"target_height": "m"}))
-        camera, model = Camera(), None
-        if args.cameras:
-            # Before MuJoCo renders; a second import of it changes nothing.
-            import rendered_cameras
+    return parser.parse_args()
 
-            model = rendered_cameras.make_model(str(MJCF), args.ball, args.side_light, args.quick)
-            camera = rendered_cameras.seen_ball(model, robot.metadata, args.ball, args.camera_rate)
-            print(f"cameras calibrated with the arm: {camera.calibration.report()}", flush=True)
-            camera.film = rendered_cameras.Film() if args.film else None
-        episodes = simulate(robot, camera, args.seconds, args.target_height, recorder, model)
-        for count, lasted in episodes:
-            print(f"{count} bounces in {lasted:.1f} s of {args.seconds:g} s")
-        if args.cameras:
-            print(camera.report())
-            if args.film:
-                camera.film.save(args.film)
+
+def rendered_camera(policy, arguments: argparse.Namespace):
+    """The model with what its two cameras see, and the camera of its rendered pictures."""
+    # Before MuJoCo renders; a second import of it changes nothing.
+    import rendered_cameras
+
+    model = rendered_cameras.make_model(
+        str(MJCF), arguments.ball, arguments.side_light, arguments.quick
+    )
+    camera = rendered_cameras.seen_ball(
+        model, policy.metadata, arguments.ball, arguments.camera_rate
+    )
+    print(f"cameras calibrated with the arm: {camera.calibration.report()}")
+    print(rendered_cameras.how_high(camera.calibration, policy.metadata), flush=True)
+    if arguments.film:
+        camera.film = rendered_cameras.Film()
+    return model, camera
+
+
+def main() -> None:
+    arguments = parse_arguments()
+    policy = load_policy(arguments.policy)
+    log = contextlib.nullcontext()
+    if arguments.log:
+        log = Recorder(arguments.log, policy.metadata.joint_names, commands={"target_height": "m"})
+    with log as recorder:
+        model = None
+        camera = Camera()
+        if arguments.cameras:
+            model, camera = rendered_camera(policy, arguments)
+        episodes = simulate(
+            policy, camera, arguments.seconds, arguments.target_height, recorder, model
+        )
+    for bounces, duration in episodes:
+        print(f"{bounces} bounces in {duration:.1f} s of {arguments.seconds:g} s")
+    if arguments.cameras:
+        print(camera.report())
+        if arguments.film:
+            camera.film.save(arguments.film)
+
+
+if __name__ == "__main__":
+    with exit_on_user_error():
+        main()

@@ -8,6 +8,9 @@ import jax.numpy as jnp
 
 from bounce_mjx import task
 
+SETTLING_SECONDS = 2.0
+"""The start of an episode, which the results leave out."""
+
 
 class Inputs(NamedTuple):
     """What the reward terms depend on."""
@@ -72,7 +75,8 @@ class Config(task.WorldConfig):
 
     @property
     def commands(self) -> dict[str, task.Command]:
-        return {"apex": task.Command(*self.apex_range, "m", least=0.01, step=0.005)}
+        low, high = self.apex_range
+        return {"apex": task.Command(low, high, "m", least=0.01, step=0.005)}
 
 
 class Dribble(task.Task):
@@ -82,36 +86,48 @@ class Dribble(task.Task):
     curves = (task.Curve("task/apex_error", "apex_error", "apexes", "|apex − wish|, cm", 100.0),)
 
     def reset(self, start: task.Start) -> jax.Array:
-        # The task's state: whether the ball rose after the last step.
+        # The task's state: whether the ball rose after the last step [], bool.
         return jnp.zeros((), bool)
 
     def step(self, rose: jax.Array, step: task.Step) -> task.TaskStep:
-        ball, speed = step.truth.ball_position, step.truth.ball_velocity[2]
-        height = ball[2] - step.truth.paddle_position[2] - self.geometry.rest_height
-        distance = task.horizontal_distance(ball, self.config.ball_init_pos)
-        wish = step.command["apex"]
-        inputs = Inputs(height + jnp.square(speed) / (2.0 * 9.81), wish, distance)
-        apex = rose & (speed <= 0.0)
+        ball_position = step.truth.ball_position
+        velocity_z = step.truth.ball_velocity[2]
+        height_over_paddle = ball_position[2] - step.truth.paddle_position[2]
+        height = height_over_paddle - self.geometry.rest_height
+        distance = task.horizontal_distance(ball_position, self.config.ball_init_pos)
+        target = step.command["apex"]
+        # The height at which the ball's speed would be 0.
+        reach = height + jnp.square(velocity_z) / (2.0 * task.GRAVITY)
+        inputs = Inputs(reach=reach, target=target, distance=distance)
+        is_apex = rose & (velocity_z <= 0.0)
+        is_low = (height > 0.05) & (height < 0.1)
+        is_lost = (height < -0.03) | (height > 0.5) | (distance > 0.3)
         return task.TaskStep(
-            state=speed > 0.0,
+            state=velocity_z > 0.0,
             reward=task.weighted_terms(self.config.reward, inputs),
-            ended=(height < -0.03) | (height > 0.5) | (distance > 0.3),
+            ended=is_lost,
             metrics={
-                "apexes": apex,
-                "apex_error": jnp.where(apex, jnp.abs(height - wish), 0.0),
-                "low_apexes": apex & (height > 0.05) & (height < 0.1),
+                "apexes": is_apex,
+                "apex_error": jnp.where(is_apex, jnp.abs(height - target), 0.0),
+                "low_apexes": is_apex & is_low,
             },
         )
 
     def tally(self, moment: task.Moment) -> task.Tally:
-        settled = moment.seconds > 2.0
-        counted = {name: moment.metrics[name] * settled for name in ("apexes", "low_apexes")}
-        return task.Tally({**counted, "seconds": settled * self.config.control_dt})
+        has_settled = moment.seconds > SETTLING_SECONDS
+        sums = {
+            "apexes": moment.metrics["apexes"] * has_settled,
+            "low_apexes": moment.metrics["low_apexes"] * has_settled,
+            "seconds": self.config.control_dt * has_settled,
+        }
+        return task.Tally(sums)
 
     def results(self, episodes: task.Episodes) -> tuple[task.Result, ...]:
-        apexes, low, seconds = (episodes.sums[n] for n in ("apexes", "low_apexes", "seconds"))
+        apexes = episodes.sums["apexes"]
+        low_apexes = episodes.sums["low_apexes"]
+        seconds = episodes.sums["seconds"]
         return (
-            task.share_of_events("height", "apexes 5 to 10 cm high", low, apexes, 0.95),
+            task.share_of_events("height", "apexes 5 to 10 cm high", low_apexes, apexes, 0.95),
             task.mean_of_events("rate", "apexes a second", apexes, seconds, (3.0, math.inf)),
             task.share_of_episodes("stable", "episodes that last 20 s", episodes.lasted, 0.99),
         )

@@ -1,36 +1,60 @@
 """Evosax: a linear policy evolves on 1,024 environments (`pip install evosax`)."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from evosax.algorithms import Open_ES
 
 from bounce_mjx import BounceBall
 
+env = BounceBall()
+
+
+def episode_return(weights: jax.Array, key: jax.Array, num_steps: int) -> jax.Array:
+    """The sum [] of the rewards of an episode up to its end, or of this number of steps.
+
+    Args:
+      weights: of the observation and of a constant 1 in each action [A, N + 1].
+      key: of the reset; consumed.
+    """
+
+    def step(carry, _):
+        state, is_alive = carry
+        action = jnp.tanh(weights @ jnp.append(state.obs, 1.0))
+        state = env.step(state, action)
+        reward = jnp.where(is_alive, state.reward, 0.0)
+        # The environment goes on after the end; what it does then does not count.
+        is_alive = is_alive & (state.done == 0.0)
+        return (state, is_alive), reward
+
+    start = (env.reset(key), jnp.ones((), bool))
+    _, rewards = jax.lax.scan(step, start, length=num_steps)
+    return jnp.sum(rewards)
+
 
 def main(population: int = 1024, generations: int = 200, steps: int = 200) -> list[float]:
     """The best return of each generation."""
-    env = BounceBall()
-    zeros = jnp.zeros((env.action_size, env.observation_size + 1))
-    search = Open_ES(population_size=population, solution=zeros)
+    start = jnp.zeros((env.action_size, env.observation_size + 1))
+    es = Open_ES(population_size=population, solution=start)
+    params = es.default_params
+    evaluate = functools.partial(episode_return, num_steps=steps)
 
-    def episode_return(weights: jax.Array, key: jax.Array) -> jax.Array:
-        def act(state, _):
-            state = env.step(state, jnp.tanh(weights @ jnp.append(state.obs, 1.0)))
-            return state, (state.reward, 1.0 - state.done)
-
-        _, (rewards, alive) = jax.lax.scan(act, env.reset(key), length=steps)
-        return jnp.sum(rewards * jnp.cumprod(alive))
-
-    def generation(state, key: jax.Array):
+    def generation(state, key):
         keys = jax.random.split(key, population + 2)
-        weights, state = search.ask(keys[0], state, search.default_params)
-        returns = jax.vmap(episode_return)(weights, keys[2:])
-        state, _ = search.tell(keys[1], weights, -returns, state, search.default_params)
+        key_ask = keys[0]
+        key_tell = keys[1]
+        episode_keys = keys[2:]
+        candidates, state = es.ask(key_ask, state, params)
+        returns = jax.vmap(evaluate)(candidates, episode_keys)
+        # Evosax minimises.
+        state, _ = es.tell(key_tell, candidates, -returns, state, params)
         return state, returns.max()
 
-    state = search.init(jax.random.key(0), zeros, search.default_params)
-    keys = jax.random.split(jax.random.key(1), generations)
-    return jax.lax.scan(generation, state, keys)[1].tolist()
+    state = es.init(jax.random.key(0), start, params)
+    generation_keys = jax.random.split(jax.random.key(1), generations)
+    _, best_returns = jax.lax.scan(generation, state, generation_keys)
+    return best_returns.tolist()
 
 
 if __name__ == "__main__":

@@ -18,6 +18,11 @@ from bounce_mjx import Run
 from bounce_mjx.adapters.playground import PlaygroundBounceBall
 from bounce_mjx.viewers.video import find_ffmpeg
 
+TARGET_HEIGHT = 0.5
+"""m."""
+BALL_Z = -5
+"""Place of the ball's height in `qpos`, which ends with its position and its quaternion."""
+
 
 def main(
     policy: str = "robust",
@@ -26,21 +31,28 @@ def main(
     num_envs: int = 4,
 ) -> jax.Array:
     """Bounces the ball in several worlds and films the first; the final heights [B], m."""
-    overrides = {"task.target_height_range": [0.5, 0.5]}
+    overrides = {"task.target_height_range": [TARGET_HEIGHT, TARGET_HEIGHT]}
     env = PlaygroundBounceBall(policy=policy, config_overrides=overrides)
-    randomizer = functools.partial(
-        registry.get_domain_randomizer("BounceBall"),
-        rng=jax.random.split(jax.random.PRNGKey(0), num_envs),
+    randomization_rng = jax.random.split(jax.random.PRNGKey(0), num_envs)
+    randomization_fn = functools.partial(
+        registry.get_domain_randomizer("BounceBall"), rng=randomization_rng
     )
-    worlds = wrapper.wrap_for_brax_training(env, randomization_fn=randomizer)
-    state = jax.jit(worlds.reset)(jax.random.split(jax.random.PRNGKey(1), num_envs))
-    act, step, states = Run(policy).policy_in(env), jax.jit(worlds.step), []
+    batched_env = wrapper.wrap_for_brax_training(env, randomization_fn=randomization_fn)
+    act = Run(policy).policy_in(env)
+
+    jit_reset = jax.jit(batched_env.reset)
+    jit_step = jax.jit(batched_env.step)
+    state = jit_reset(jax.random.split(jax.random.PRNGKey(1), num_envs))
+    rollout = []
     for _ in range(steps):
-        state = step(state, act(state.obs))
-        states.append(jax.tree.map(lambda x: x[0], state))
+        state = jit_step(state, act(state.obs))
+        first_world = jax.tree.map(lambda x: x[0], state)
+        rollout.append(first_world)
+
+    frames = env.render(rollout, height=240, width=320, camera="overview")
     mediapy.set_ffmpeg(find_ffmpeg())
-    mediapy.write_video(video, env.render(states, 240, 320, camera="overview"), fps=1.0 / env.dt)
-    return state.data.qpos[:, -5]
+    mediapy.write_video(video, frames, fps=1.0 / env.dt)
+    return state.data.qpos[:, BALL_Z]
 
 
 if __name__ == "__main__":

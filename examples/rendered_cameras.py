@@ -20,6 +20,7 @@ from two_cameras import (
     calibrate,
     find_fixed_ball,
     plan_poses,
+    report_height,
     rough_camera,
 )
 
@@ -31,8 +32,15 @@ FOCAL_LENGTH = 560.0
 DISTORTION = np.array([-0.12, 0.03, 0.0005, -0.0005, 0.0])
 PLACES = ((1.45, 0.85, 0.75), (1.45, -0.85, 0.75))
 """Where the cameras stand in the robot's frame, m."""
-GAZE = (0.59, 0.0, 0.33)
+GAZE = (0.59, 0.0, 0.48)
 """The point at which both look, m."""
+SHIFTS = np.array([(-0.125, 0.375), (0.375, -0.375), (-0.375, -0.125), (0.125, 0.125)])
+"""A picture is the mean of these sub-frames: shifts to the right and down, pixels, by which edges
+become smooth; in the order of time, with which they hardly rise or fall, as that would blur a
+moving ball."""
+SHADOW_SIZE = 1024
+"""Width of a shadow's map, pixels; MuJoCo's own, 4096, takes three times as long for edges that the
+blur of a picture hides."""
 FLOOR_GROUP = 4
 """Group of a floor that is drawn once."""
 HIDDEN_GROUP = 5
@@ -83,17 +91,19 @@ def make_model(
     """The arm's model with the ball's colour and the lights of a laboratory.
 
     Args:
-      quick: without shadows and smooth edges, which take 9 of 10 parts of the time where no GPU
-        renders. `RenderedCameras` then draws the floor and the sky once.
+      quick: without shadows, which take 5 of 6 parts of the time where no GPU renders.
+        `RenderedCameras` then draws the floor and the sky once.
     """
     spec = mujoco.MjSpec.from_file(mjcf)
+    # Sub-frames that are shifted within a pixel smooth the edges in place of samples.
+    spec.visual.quality.offsamples = 0
+    spec.visual.quality.shadowsize = SHADOW_SIZE
     if quick:
         spec.visual.quality.shadowsize = 0
-        spec.visual.quality.offsamples = 0
         spec.geom("floor").group = FLOOR_GROUP
     spec.material("celluloid").rgba = BALL_COLOURS[ball]
-    spec.visual.global_.offwidth = 2 * WIDTH
-    spec.visual.global_.offheight = 2 * HEIGHT
+    spec.visual.global_.offwidth = len(PLACES) * WIDTH
+    spec.visual.global_.offheight = len(SHIFTS) * HEIGHT
     # Markers are for people.
     for site in spec.sites:
         site.group = HIDDEN_GROUP
@@ -117,12 +127,12 @@ class RenderedCameras:
         exposure: float = 0.004,
         transport: float = 0.004,
         noise: float = 3.0,
-        sub_frames: int = 4,
         seed: int = 0,
     ):
         """Args:
+        model: see `make_model`.
         rate: pictures in a second, Hz.
-        exposure: time of exposure, s; its picture is the mean of `sub_frames`.
+        exposure: time of exposure, s; its picture is the mean of sub-frames.
         transport: time from the end of the exposure until a program has the picture, s.
         noise: standard deviation of a pixel, of 255.
         """
@@ -130,77 +140,75 @@ class RenderedCameras:
         self.exposure = exposure
         self.transport = transport
         self.noise = noise
-        self.sub_frames = sub_frames
-        self._cameras = tuple(cameras)
         self._random = np.random.default_rng(seed)
-        try:
-            self._renderer = mujoco.Renderer(model, HEIGHT, WIDTH)
-        except mujoco.FatalError as error:
-            raise UserError(
-                "pictures cannot be rendered here; without a display, set MUJOCO_GL=egl or "
-                "MUJOCO_GL=osmesa"
-            ) from error
-        self._views = [_View(camera, self._renderer, model) for camera in cameras]
+        self._lenses = tuple(_Lens(camera) for camera in cameras)
+        self._sheet = _Sheet(model, self._lenses)
+        self._model = model
+        self._drawn = mujoco.MjData(model)
         self._begun = 0
-        self._sums: list[np.ndarray] = []
         self._times: list[float] = []
         self._places: list[np.ndarray] = []
 
     def look(self, data: mujoco.MjData) -> Picture | None:
-        """Sees one instant; call it after each physics step. Returns a pair when its exposure ends.
+        """Sees one instant, of which `time` and `qpos` count; call it after each physics step.
+        Returns a pair after its last sub-frame.
 
-        The sub-frames of an exposure are taken at the physics steps that are due.
+        A sub-frame is due in the middle of each fourth of the exposure, and is taken at the first
+        physics step from then on.
         """
         start = self._begun / self.rate
-        due = start + len(self._times) / self.sub_frames * self.exposure
+        due = start + (len(self._times) + 0.5) / len(SHIFTS) * self.exposure
         if data.time < due - 1e-9:
             return None
-        for k, view in enumerate(self._views):
-            frame = view.render(data)
-            if not self._times:
-                self._sums.append(frame.astype(np.float32))
-            else:
-                self._sums[k] += frame
+        # After a step, the data's geoms and lights are still where they were before it.
+        self._drawn.qpos[:] = data.qpos
+        mujoco.mj_kinematics(self._model, self._drawn)
+        mujoco.mj_comPos(self._model, self._drawn)
+        mujoco.mj_camlight(self._model, self._drawn)
+        self._sheet.draw(self._drawn, sub_frame=len(self._times))
         self._times.append(data.time)
         self._places.append(data.joint("ball_link").qpos[:3].copy())
-        if len(self._times) < self.sub_frames:
+        if len(self._times) < len(SHIFTS):
             return None
-        pictures = tuple(
-            self._develop(total / self.sub_frames, view)
-            for total, view in zip(self._sums, self._views, strict=True)
-        )
         middle = float(np.mean(self._times))
         arrives = middle + 0.5 * self.exposure + self.transport
         ball = np.mean(self._places, axis=0)
-        self._sums = []
         self._times = []
         self._places = []
         self._begun += 1
-        return Picture(middle, arrives, pictures, ball)
+        return Picture(middle, arrives, self._develop(), ball)
 
     def still(self, data: mujoco.MjData) -> tuple[np.ndarray, ...]:
         """A pair of pictures of something that rests."""
-        return tuple(
-            self._develop(view.render(data).astype(np.float32), view) for view in self._views
-        )
+        for sub_frame in range(len(SHIFTS)):
+            self._sheet.draw(data, sub_frame)
+        return self._develop()
 
-    def _develop(self, mean: np.ndarray, view: "_View") -> np.ndarray:
-        distorted = view.distort(mean)
-        # OpenCV's normal numbers take a third of the time of NumPy's, but have one state a process.
-        cv2.setRNGSeed(int(self._random.integers(2**31)))
-        noise = cv2.randn(np.empty_like(distorted), 0.0, self.noise)
-        return np.clip(distorted + noise, 0.0, 255.0).astype(np.uint8)
+    def _develop(self) -> tuple[np.ndarray, ...]:
+        """The pictures of the sub-frames that were drawn last."""
+        pictures = []
+        for lens, frames in zip(self._lenses, self._sheet.read(), strict=True):
+            total = frames[0].astype(np.float32)
+            for frame in frames[1:]:
+                cv2.accumulate(frame, total)
+            distorted = lens.distort(total / len(frames))
+            # OpenCV's normal numbers take a third of the time of NumPy's, but have one state a
+            # process.
+            cv2.setRNGSeed(int(self._random.integers(2**31)))
+            noise = cv2.randn(np.empty_like(distorted), 0.0, self.noise)
+            pictures.append(np.clip(distorted + noise, 0.0, 255.0).astype(np.uint8))
+        return tuple(pictures)
 
     def close(self) -> None:
         """Frees the renderer."""
-        self._renderer.close()
+        self._sheet.close()
 
 
-class _View:
-    """A camera in MuJoCo's renderer, which knows no lens distortion: a wider picture is rendered,
-    and the lens then bends it."""
+class _Lens:
+    """MuJoCo's renderer knows no lens distortion: a wider picture is rendered, and the lens then
+    bends it."""
 
-    def __init__(self, camera: Camera, renderer: mujoco.Renderer, model: mujoco.MjModel):
+    def __init__(self, camera: Camera):
         columns, rows = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
         pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2).astype(float)
         straight = cv2.undistortPoints(pixels, camera.matrix, camera.distortion).reshape(-1, 2)
@@ -211,51 +219,110 @@ class _View:
         self._columns = self._columns.astype(np.float32)
         self._rows = self._rows.astype(np.float32)
         self._camera = camera
-        self._renderer = renderer
-        self._background: np.ndarray | None = None
-        if model.geom("floor").group == FLOOR_GROUP:
-            data = mujoco.MjData(model)
-            mujoco.mj_forward(model, data)
-            self._background = self._draw(data, arm=False, room=True)
 
-    def render(self, data: mujoco.MjData) -> np.ndarray:
-        """The picture of a lens without distortion, BGR.
+    def aim(self, scene: mujoco.MjvScene, shift: np.ndarray) -> None:
+        """Has a scene seen from here, without distortion.
 
-        Nothing stands behind the sky or under the floor, so where both were drawn before, they are
-        seen wherever nothing else is drawn. That takes half the time.
+        Args:
+          shift: of the picture to the right and down [2], pixels.
         """
-        floor_hides_ball = data.joint("ball_link").qpos[2] < FLOOR_HEIGHT
-        if self._background is None or floor_hides_ball:
-            return self._draw(data, arm=True, room=True)
-        frame = self._draw(data, arm=True, room=False)
-        is_empty = cv2.inRange(frame, (0, 0, 0), (0, 0, 0))
-        cv2.copyTo(self._background, is_empty, frame)
-        return frame
-
-    def _draw(self, data: mujoco.MjData, arm: bool, room: bool) -> np.ndarray:
-        """The arm with the ball, the room (floor and sky), or both. What is empty is black."""
-        option = mujoco.MjvOption()
-        option.geomgroup[:FLOOR_GROUP] *= arm
-        option.geomgroup[FLOOR_GROUP] = room
-        self._renderer.update_scene(data, scene_option=option)
-        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = room
         near = 0.05
-        for gl_camera in self._renderer.scene.camera:
+        half_height = near * self._tangent
+        right, down = 2.0 * half_height / HEIGHT * shift
+        for gl_camera in scene.camera:
             gl_camera.pos[:] = self._camera.centre
             gl_camera.forward[:] = self._camera.rotation[2]
             gl_camera.up[:] = -self._camera.rotation[1]
             gl_camera.orthographic = 0
             gl_camera.frustum_near = near
             gl_camera.frustum_far = 10.0
-            gl_camera.frustum_center = 0.0
-            gl_camera.frustum_width = near * self._tangent * WIDTH / HEIGHT
-            gl_camera.frustum_bottom = -near * self._tangent
-            gl_camera.frustum_top = near * self._tangent
-        return cv2.cvtColor(self._renderer.render(), cv2.COLOR_RGB2BGR)
+            gl_camera.frustum_center = -right
+            gl_camera.frustum_width = half_height * WIDTH / HEIGHT
+            gl_camera.frustum_bottom = -half_height + down
+            gl_camera.frustum_top = half_height + down
 
     def distort(self, straight: np.ndarray) -> np.ndarray:
         """The picture of the real lens."""
         return cv2.remap(straight, self._columns, self._rows, cv2.INTER_LINEAR)
+
+
+class _Sheet:
+    """The sub-frames of a pair of pictures side by side in one buffer, as each reading waits for
+    the GPU: a column for each camera, a row for each sub-frame."""
+
+    def __init__(self, model: mujoco.MjModel, lenses: Sequence[_Lens]):
+        """Draws the empty room, if the model is a quick one."""
+        self._lenses = lenses
+        try:
+            self._renderer = mujoco.Renderer(model, len(SHIFTS) * HEIGHT, len(lenses) * WIDTH)
+        except mujoco.FatalError as error:
+            raise UserError(
+                "pictures cannot be rendered here; without a display, set MUJOCO_GL=egl or "
+                "MUJOCO_GL=osmesa"
+            ) from error
+        self._empty_room: np.ndarray | None = None
+        if model.geom("floor").group == FLOOR_GROUP:
+            data = mujoco.MjData(model)
+            mujoco.mj_forward(model, data)
+            for sub_frame in range(len(SHIFTS)):
+                self._render(data, sub_frame, arm=False, room=True)
+            self._empty_room = self._read()
+
+    def draw(self, data: mujoco.MjData, sub_frame: int) -> None:
+        """Draws what all cameras see.
+
+        Nothing stands behind the sky or under the floor, so where both were drawn before, they are
+        seen wherever nothing else is drawn. That takes half the time.
+        """
+        floor_hides_ball = data.joint("ball_link").qpos[2] < FLOOR_HEIGHT
+        room = self._empty_room is None or floor_hides_ball
+        self._render(data, sub_frame, arm=True, room=room)
+
+    def read(self) -> list[list[np.ndarray]]:
+        """For each camera its sub-frames that were drawn last, of a lens without distortion, BGR
+        [H, W, 3]."""
+        sheet = self._read()
+        if self._empty_room is not None:
+            is_empty = cv2.inRange(sheet, (0, 0, 0), (0, 0, 0))
+            cv2.copyTo(self._empty_room, is_empty, sheet)
+        pictures = []
+        for column in range(len(self._lenses)):
+            columns = slice(column * WIDTH, (column + 1) * WIDTH)
+            frames = []
+            for sub_frame in range(len(SHIFTS)):
+                rows = slice(sub_frame * HEIGHT, (sub_frame + 1) * HEIGHT)
+                # OpenGL's rows go up.
+                frames.append(cv2.flip(sheet[rows, columns], 0))
+            pictures.append(frames)
+        return pictures
+
+    def _render(self, data: mujoco.MjData, sub_frame: int, arm: bool, room: bool) -> None:
+        """Draws the arm with the ball, the room (floor and sky), or both. What is empty is
+        black."""
+        option = mujoco.MjvOption()
+        option.geomgroup[:FLOOR_GROUP] *= arm
+        option.geomgroup[FLOOR_GROUP] = room
+        renderer = self._renderer
+        renderer._gl_context.make_current()
+        renderer.update_scene(data, scene_option=option)
+        renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = room
+        for column, lens in enumerate(self._lenses):
+            lens.aim(renderer.scene, SHIFTS[sub_frame])
+            place = mujoco.MjrRect(column * WIDTH, sub_frame * HEIGHT, WIDTH, HEIGHT)
+            mujoco.mjr_render(place, renderer.scene, renderer._mjr_context)
+
+    def _read(self) -> np.ndarray:
+        """The whole sheet as it was drawn, BGR."""
+        renderer = self._renderer
+        renderer._gl_context.make_current()
+        sheet = np.empty((renderer.height, renderer.width, 3), np.uint8)
+        whole = mujoco.MjrRect(0, 0, renderer.width, renderer.height)
+        mujoco.mjr_readPixels(sheet, None, whole, renderer._mjr_context)
+        return cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR)
+
+    def close(self) -> None:
+        """Frees the renderer."""
+        self._renderer.close()
 
 
 class Film:
@@ -373,15 +440,15 @@ class SeenBall:
         """Frees the renderer."""
         self._cameras.close()
 
-    def measure(self, time: float) -> dict:
+    def measure(self, now: float) -> dict:
         """The newest place of the ball that has arrived, if any, and its velocity from two."""
-        arrived = [entry for entry in self._measured if entry[0] <= time + 1e-6]
+        arrived = [entry for entry in self._measured if entry[0] <= now + 1e-6]
         if not arrived:
             return {}
         _, taken, position = arrived[-1]
         _, before, last_position = arrived[max(len(arrived) - 2, 0)]
         velocity = (position - last_position) / max(taken - before, 1e-3)
-        return {"ball_position": position, "ball_velocity": velocity, "ball_age": time - taken}
+        return {"ball_position": position, "ball_velocity": velocity, "ball_age": now - taken}
 
 
 def calibrate_with_arm(
@@ -409,6 +476,11 @@ def calibrate_with_arm(
                 metadata, rough[k], angles, picture, COLOURS[ball], background[k]
             )
     return calibrate(metadata, rough, joint_angles, pixels)
+
+
+def how_high(calibration: Calibration, metadata) -> str:
+    """In words, whether the rendered cameras see as high as a policy plays."""
+    return report_height(calibration.cameras, (WIDTH, HEIGHT), metadata)
 
 
 def _posed(

@@ -20,21 +20,40 @@ parser.add_argument("--steps", type=int, default=40_000_000, help="of all enviro
 parser.add_argument("--out", type=Path, default=Path("runs/rsl_rl"))
 parser.add_argument("--seed", type=int, default=0)
 arguments = parser.parse_args()
-ROLLOUT = 32
+
+NUM_STEPS_PER_ENV = 32
+# A reward is up to 12 a step, which would be large for the value network.
+REWARD_SCALE = 0.1
 
 torch.manual_seed(arguments.seed)
 task = BounceBall()
-env = RslRlVecEnv(TorchVectorEnv(task, arguments.num_envs, seed=arguments.seed, reward_scale=0.1))
-# A policy of this project has SiLU between its layers.
-network = {"class_name": "MLPModel", "hidden_dims": [128, 128], "activation": "swish"}
-network["obs_normalization"] = True
-noise = {"class_name": "GaussianDistribution", "init_std": 0.4, "std_type": "log"}
-config = {
-    "num_steps_per_env": ROLLOUT,
+env = RslRlVecEnv(
+    TorchVectorEnv(task, arguments.num_envs, seed=arguments.seed, reward_scale=REWARD_SCALE)
+)
+
+train_cfg = {
+    "num_steps_per_env": NUM_STEPS_PER_ENV,
     "save_interval": 50,
+    # The critic sees the critic metrics too.
     "obs_groups": {"actor": ["policy"], "critic": ["policy", "critic"]},
-    "actor": network | {"distribution_cfg": noise},
-    "critic": network,
+    "actor": {
+        "class_name": "MLPModel",
+        "hidden_dims": [128, 128],
+        # rsl_rl's name of SiLU.
+        "activation": "swish",
+        "obs_normalization": True,
+        "distribution_cfg": {
+            "class_name": "GaussianDistribution",
+            "init_std": 0.4,
+            "std_type": "log",
+        },
+    },
+    "critic": {
+        "class_name": "MLPModel",
+        "hidden_dims": [128, 128],
+        "activation": "swish",
+        "obs_normalization": True,
+    },
     "algorithm": {
         "class_name": "PPO",
         "num_learning_epochs": 4,
@@ -47,14 +66,21 @@ config = {
     },
 }
 log_dir = arguments.out / "rsl_rl"
-runner = OnPolicyRunner(env, config, log_dir=str(log_dir), device=str(env.device))
-iterations = max(1, arguments.steps // (ROLLOUT * arguments.num_envs))
-runner.learn(iterations, init_at_random_ep_len=True)
+runner = OnPolicyRunner(env, train_cfg, log_dir=str(log_dir), device=str(env.device))
+num_iterations = max(1, arguments.steps // (NUM_STEPS_PER_ENV * arguments.num_envs))
+runner.learn(num_learning_iterations=num_iterations, init_at_random_ep_len=True)
 runner.export_policy_to_jit(str(log_dir))
 runner.export_policy_to_onnx(str(log_dir))
 
 actor = runner.alg.get_policy()
-seen = actor.obs_normalizer
-policy = to_policy(actor.mlp, seen.mean, seen.std + seen.eps, actor.distribution.log_std_param)
-steps = iterations * ROLLOUT * arguments.num_envs
-print("bounce-mjx eval", write_run(arguments.out, task, policy, steps, arguments.seed))
+normalizer = actor.obs_normalizer
+policy = to_policy(
+    actor.mlp,
+    mean=normalizer.mean,
+    # rsl_rl divides by this sum.
+    std=normalizer.std + normalizer.eps,
+    log_std=actor.distribution.log_std_param,
+)
+num_steps = num_iterations * NUM_STEPS_PER_ENV * arguments.num_envs
+run_folder = write_run(arguments.out, task, policy, num_steps, arguments.seed)
+print("bounce-mjx eval", run_folder)

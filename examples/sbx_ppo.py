@@ -14,6 +14,12 @@ parser.add_argument("--num-envs", type=int, default=256)
 parser.add_argument("--steps", type=int, default=8_000_000)
 arguments = parser.parse_args()
 
+
+def learning_rate(progress_remaining: float) -> float:
+    """The schedule, in which `progress_remaining` falls from 1 to 0."""
+    return 1e-3 * progress_remaining + 1e-5
+
+
 model = PPO(
     "MlpPolicy",
     Sb3VecEnv(arguments.num_envs),
@@ -21,7 +27,7 @@ model = PPO(
     batch_size=8 * arguments.num_envs,
     n_epochs=4,
     gamma=0.98,
-    learning_rate=lambda left: 1e-3 * left + 1e-5,
+    learning_rate=learning_rate,
     verbose=1,
     seed=0,
 )

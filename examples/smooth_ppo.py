@@ -11,6 +11,9 @@ from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.metrics import Metrics
 from bounce_mjx.learning.ppo import PPO, Params, Samples
 
+INPUT_NOISE = 0.05
+"""Noise of the inputs, in their standard deviations."""
+
 
 class SmoothConfig(PPOConfig):
     """PPO's settings, and that of the new term; it is a key of the config and a flag."""
@@ -25,10 +28,17 @@ class SmoothPPO(PPO):
     Config = SmoothConfig
 
     def loss(self, params: Params, samples: Samples) -> tuple[jax.Array, Metrics]:
-        total, metrics = super().loss(params, samples)
-        noise = 0.05 * jax.random.normal(jax.random.PRNGKey(0), samples.inputs.shape)
-        near = self.distribution(params, samples.inputs + noise, samples.noise_bound).mean
-        here = self.distribution(params, samples.inputs, samples.noise_bound).mean
-        change = jnp.mean(jnp.sum(jnp.square(near - here), axis=-1))
-        total += self.config.smoothness_cost * change
-        return total, metrics | {"loss/smoothness": change}
+        """PPO's loss and the new term, on a minibatch of samples [S, ...]."""
+        ppo_loss, metrics = super().loss(params, samples)
+        smoothness_loss = self.action_change(params, samples)
+        loss = ppo_loss + self.config.smoothness_cost * smoothness_loss
+        return loss, metrics | {"loss/smoothness": smoothness_loss}
+
+    def action_change(self, params: Params, samples: Samples) -> jax.Array:
+        """Mean squared change of the mean action under noise of its inputs []."""
+        # A minibatch has other samples each time, so the same noise for all of them will do.
+        noise = jax.random.normal(jax.random.key(0), samples.inputs.shape)
+        noisy_inputs = samples.inputs + INPUT_NOISE * noise
+        action = self.distribution(params, samples.inputs, samples.noise_bound).mean
+        noisy_action = self.distribution(params, noisy_inputs, samples.noise_bound).mean
+        return jnp.mean(jnp.sum(jnp.square(noisy_action - action), axis=-1))

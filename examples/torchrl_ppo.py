@@ -1,4 +1,4 @@
-"""TorchRL: its tutorial's PPO on 256 environments in one step.
+"""TorchRL: its tutorial's PPO, with its names, on 256 environments in one step.
 
 `python examples/torchrl_ppo.py` needs the extra `torchrl`.
 """
@@ -9,6 +9,7 @@ import gymnasium
 import torch
 from tensordict.nn import TensorDictModule
 from tensordict.nn.distributions import NormalParamExtractor
+from torch import nn
 from torchrl.collectors import Collector
 from torchrl.envs import GymWrapper
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
@@ -22,39 +23,62 @@ parser.add_argument("--num-envs", type=int, default=256)
 parser.add_argument("--steps", type=int, default=5_000_000)
 arguments = parser.parse_args()
 
-name = "bounce_mjx/BounceBall-v0"
-env = GymWrapper(gymnasium.make_vec(name, arguments.num_envs, autoreset_mode="Disabled"))
+ROLLOUT_STEPS = 32
+"""Steps of each environment in a batch."""
+GAMMA = 0.98
+LMBDA = 0.95
+CLIP_EPSILON = 0.2
+NUM_EPOCHS = 4
+NUM_SUB_BATCHES = 4
+LEARNING_RATE = 1e-3
+# A reward is up to 12 a step, which would be large for the value network.
+REWARD_SCALE = 0.1
 
+# TorchRL's collector resets the environments itself.
+envs = gymnasium.make_vec("bounce_mjx/BounceBall-v0", arguments.num_envs, autoreset_mode="Disabled")
+(num_observations,) = envs.single_observation_space.shape
+(num_actions,) = envs.single_action_space.shape
+env = GymWrapper(envs)
 
-def mlp(outputs: int, *last: torch.nn.Module) -> torch.nn.Module:
-    layers = torch.nn.Linear(29, 128), torch.nn.ELU(), torch.nn.Linear(128, outputs)
-    return torch.nn.Sequential(*layers, *last)
-
-
-actor = ProbabilisticActor(
-    TensorDictModule(mlp(12, NormalParamExtractor()), ["observation"], ["loc", "scale"]),
+# The network's outputs are a mean and a raw standard deviation of each action.
+actor_net = nn.Sequential(
+    nn.Linear(num_observations, 128),
+    nn.ELU(),
+    nn.Linear(128, 2 * num_actions),
+    NormalParamExtractor(),
+)
+policy_module = ProbabilisticActor(
+    TensorDictModule(actor_net, in_keys=["observation"], out_keys=["loc", "scale"]),
     in_keys=["loc", "scale"],
     distribution_class=TanhNormal,
     return_log_prob=True,
 )
-critic = ValueOperator(mlp(1), in_keys=["observation"])
-frames = 32 * arguments.num_envs
+value_net = nn.Sequential(nn.Linear(num_observations, 128), nn.ELU(), nn.Linear(128, 1))
+value_module = ValueOperator(value_net, in_keys=["observation"])
+
+frames_per_batch = ROLLOUT_STEPS * arguments.num_envs
 collector = Collector(
-    env, actor, frames_per_batch=frames, total_frames=max(frames, arguments.steps)
+    env,
+    policy_module,
+    frames_per_batch=frames_per_batch,
+    total_frames=max(frames_per_batch, arguments.steps),
 )
-advantage = GAE(gamma=0.98, lmbda=0.95, value_network=critic, average_gae=True)
-loss_module = ClipPPOLoss(actor, critic, clip_epsilon=0.2, entropy_coeff=0.0)
-optimizer = torch.optim.Adam(loss_module.parameters(), lr=1e-3)
-for number, batch in enumerate(collector):
-    batch["next", "reward"] *= 0.1
-    for _ in range(4):
-        advantage(batch)
-        flat = batch.reshape(-1)
-        for chosen in torch.randperm(len(flat)).chunk(4):
-            losses = loss_module(flat[chosen])
-            loss = losses["loss_objective"] + losses["loss_critic"]
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-    print(f"batch={number}, reward={10 * batch['next', 'reward'].mean():.3f}")
+advantage_module = GAE(gamma=GAMMA, lmbda=LMBDA, value_network=value_module, average_gae=True)
+loss_module = ClipPPOLoss(policy_module, value_module, clip_epsilon=CLIP_EPSILON, entropy_coeff=0.0)
+optim = torch.optim.Adam(loss_module.parameters(), lr=LEARNING_RATE)
+
+for number, tensordict_data in enumerate(collector):
+    mean_reward = tensordict_data["next", "reward"].mean()
+    tensordict_data["next", "reward"] *= REWARD_SCALE
+    for _ in range(NUM_EPOCHS):
+        # Anew in each epoch, because the value network has changed.
+        advantage_module(tensordict_data)
+        data_view = tensordict_data.reshape(-1)
+        for indices in torch.randperm(len(data_view)).chunk(NUM_SUB_BATCHES):
+            loss_vals = loss_module(data_view[indices])
+            loss_value = loss_vals["loss_objective"] + loss_vals["loss_critic"]
+            optim.zero_grad()
+            loss_value.backward()
+            optim.step()
+    print(f"batch={number}, reward={mean_reward:.3f}")
 collector.shutdown()

@@ -43,6 +43,8 @@ _RADII = (3.0, 40.0)
 # through the centres of its outermost pixels is, pixels.
 _RADIUS_WEIGHT = 4.0
 _RADIUS_OF_PIXELS = 0.4
+# Keeps the least squares of points on a short arc solvable; a point counts 1.
+_DAMPING = 1e-9
 # Share of the expected radius by which a measured one may differ.
 _RADIUS_TOLERANCE = 0.3
 # Distance of an edge point from the circle, pixels, and the share of the circle's directions in
@@ -63,8 +65,10 @@ _MAX_REPROJECTION = 3.0
 _MAX_VELOCITY_CHANGE = 9.0
 _MAX_SIDEWAYS_CHANGE = 2.5
 _PLACE_TOLERANCE = 0.02
-# Pictures without a ball after which the whole picture is searched, not the predicted place.
-_LOST_AFTER = 2
+# So many pairs in a row without a ball are searched around the predicted place; later ones whole.
+_SEARCHED_NEAR = 3
+# Pairs of pictures that may wait in the cameras' buffers.
+_BUFFERED = 4
 # How far the ball may be from where cameras that were measured with a tape expect it, pixels.
 _TAPE_MARGIN = 90.0
 
@@ -233,21 +237,23 @@ def fit_circle(
     last_tolerance = 0.5 * _EDGE_TOLERANCE if length < 1.0 else _EDGE_TOLERANCE
     for tolerance in np.linspace(_EDGE_TOLERANCE + 0.5 * length, last_tolerance, 8):
         offsets = edge - _nearest_on_path(edge, centre, blur)
-        distances = np.linalg.norm(offsets, axis=1)
+        distances = np.hypot(offsets[:, 0], offsets[:, 1])
         # A point at the centre itself shows no direction.
         is_near = (np.abs(distances - radius) < tolerance) & (distances > 0.0)
         if np.count_nonzero(is_near) < 8:
             return None
         # Gauss-Newton: a shift of the centre changes a distance by its component along the offset.
         normals = offsets[is_near] / distances[is_near, None]
-        jacobian = np.column_stack([normals, np.ones(len(normals))])
-        residuals = distances[is_near] - radius
+        jacobian = np.ones((len(normals), 3))
+        jacobian[:, :2] = normals
+        information = jacobian.T @ jacobian
+        gradient = jacobian.T @ (distances[is_near] - radius)
         if expected_radius is not None:
             # Where an arc alone is seen, the radius is better known from the distance.
-            jacobian = np.vstack([jacobian, [0.0, 0.0, _RADIUS_WEIGHT]])
             known = expected_radius - _RADIUS_OF_PIXELS - radius
-            residuals = np.append(residuals, _RADIUS_WEIGHT * known)
-        change, *_ = np.linalg.lstsq(jacobian, residuals, rcond=None)
+            information[2, 2] += _RADIUS_WEIGHT**2
+            gradient[2] += _RADIUS_WEIGHT**2 * known
+        change = np.linalg.solve(information + _DAMPING * np.eye(3), gradient)
         centre = centre + change[:2]
         radius = radius + change[2]
     if not radii[0] <= radius <= radii[1]:
@@ -300,8 +306,9 @@ def _most_supported_circle(
     if not len(centres):
         return None
     tolerance = _EDGE_TOLERANCE + 0.5 * np.linalg.norm(blur)
-    offsets = edge[None] - centres[:, None]
-    distances = np.sqrt(np.sum(offsets * offsets, axis=2))
+    columns = edge[None, :, 0] - centres[:, None, 0]
+    rows = edge[None, :, 1] - centres[:, None, 1]
+    distances = np.hypot(columns, rows)
     is_near = np.abs(distances - circle_radii[:, None]) < tolerance
     # A large circle has more edge; its share counts.
     support = np.count_nonzero(is_near, axis=1) / circle_radii
@@ -372,7 +379,7 @@ class Tracker:
           pictures: one of each camera, taken at once, BGR.
           taken: middle of the exposure, s.
         """
-        motion = self._predict(taken) if self._missed <= _LOST_AFTER else None
+        motion = self._predict(taken)
         circles = []
         for camera, picture, background in zip(
             self.cameras, pictures, self._backgrounds, strict=True
@@ -382,7 +389,7 @@ class Tracker:
         fix = self._best_fix(circles, taken, None if motion is None else motion[0])
         if fix is None:
             self._missed += 1
-            if self._missed > _LOST_AFTER:
+            if self._missed >= _SEARCHED_NEAR:
                 self.fixes = []
             return None
         self._missed = 0
@@ -390,7 +397,11 @@ class Tracker:
         return fix
 
     def _predict(self, taken: float) -> tuple[np.ndarray, np.ndarray] | None:
-        """Position and velocity [3] at a time, of a ball in free flight since the last picture."""
+        """Position and velocity [3] at a time, of a ball in free flight since the last picture.
+
+        None if the ball is lost. With one picture, it is taken to have been at rest there: the
+        gates of `_fix` bear the rest.
+        """
         if not self.fixes:
             return None
         last = self.fixes[-1]
@@ -453,15 +464,15 @@ class Calibration(NamedTuple):
     """Centre of the ball that was fixed to the paddle, from the paddle's centre [3], m, in the axes
     of the robot's frame at the joints' reference angles."""
     errors: np.ndarray
-    """Triangulated place less that of the forward kinematics [N, 3], m, of each pose while the
-    others alone were used; NaN where a camera saw no ball."""
+    """Triangulated place less that of the forward kinematics [N, 3], m, of each pose, by cameras
+    that were fitted without it and without the rest of its quarter; NaN for a pose that is not
+    used."""
     bad: tuple[int, ...]
     """Poses that do not fit the others, and were left out."""
 
     def report(self) -> str:
         """How well the cameras are known, in words."""
-        used = np.delete(self.errors, self.bad, axis=0)
-        used = used[np.all(np.isfinite(used), axis=1)]
+        used = self.errors[np.all(np.isfinite(self.errors), axis=1)]
         x, y, z = 1e3 * np.sqrt(np.mean(used**2, axis=0))
         text = f"{len(used)} poses; error x {x:.2f}, y {y:.2f}, z {z:.2f} mm (root mean square)"
         if self.bad:
@@ -481,8 +492,47 @@ _PIXEL_NOISE = 0.3
 _BAD_RATIO = 4.0
 # Parts into which the poses are divided to measure the error with poses that were not used.
 _FOLDS = 4
+# How far over its target an apex may be, m.
+_OVERSHOOT = 0.1
 # Half of the paddle's thickness, m.
 _HALF_THICKNESS = 0.0035
+
+
+def highest_seen(cameras: Sequence[Camera], size: tuple[int, int], place: np.ndarray) -> float:
+    """Height of the ball (m) up to which all pictures show all of it straight above a place [3].
+
+    Args:
+      size: width and height of the pictures, pixels.
+    """
+    heights = np.arange(0.0, 2.0, 0.005)
+    positions = place + heights[:, None] * np.array([0.0, 0.0, 1.0])
+    is_seen = np.ones(len(heights), bool)
+    for camera in cameras:
+        pixels = camera.project(positions)
+        radii = np.array([camera.radius_at(position) for position in positions])[:, None]
+        is_seen &= np.all((pixels > radii) & (pixels < np.array(size) - radii), axis=1)
+    if not np.any(is_seen):
+        raise SystemExit(f"no place above {np.round(place, 3)} m is in all pictures")
+    first = int(np.argmax(is_seen))
+    # A strong lens bends what is far outside back into the picture.
+    after = np.flatnonzero(~is_seen[first:])
+    last = first + int(after[0]) - 1 if len(after) else len(heights) - 1
+    return float(positions[last, 2])
+
+
+def report_height(cameras: Sequence[Camera], size: tuple[int, int], metadata) -> str:
+    """In words, whether the cameras see as high as a policy plays."""
+    home = paddle_position(metadata, np.array(metadata.default_joint_angles))
+    highest = highest_seen(cameras, size, home)
+    text = f"all cameras see the ball up to a height of {highest:.2f} m"
+    target = metadata.commands.get("target_height")
+    if target is None:
+        return text
+    apex = target.range[1]
+    text += f"; the policy's apexes are at {apex:.2f} m at most"
+    if highest < apex + _OVERSHOOT:
+        text += f": aim higher, or play with targets of at most {highest - _OVERSHOOT:.2f} m"
+    return text
 
 
 def ball_positions(metadata, joint_angles: np.ndarray, ball: np.ndarray) -> np.ndarray:
@@ -503,8 +553,8 @@ def plan_poses(
     """Joint angles [count, J] (rad) at which both cameras see the paddle, spread over their views.
 
     Of many random poses around the start pose, those are kept whose paddle is in both pictures, at
-    least 20 cm over the floor's height below home and with its upper face toward both cameras; then
-    each pose that is farthest from all chosen ones is added.
+    most 5 cm below its home, and with its upper face upward (within 53 degrees) and toward both
+    cameras; then each pose that is farthest from all chosen ones is added.
 
     Args:
       cameras: roughly known, such as `rough_camera` gives.
@@ -534,7 +584,7 @@ def plan_poses(
     if len(angles) < count:
         raise SystemExit(
             f"both cameras see the paddle in {len(angles)} of 20,000 poses around the start pose, "
-            f"but {count} are needed; move them so that both see the paddle and 40 cm over it"
+            f"but {count} are needed; move them so that both see the paddle around its home"
         )
     chosen = [int(np.argmin(np.linalg.norm(places - home_place, axis=1)))]
     distances = np.linalg.norm(places - places[chosen[0]], axis=1)
@@ -578,7 +628,10 @@ def find_fixed_ball(
 ) -> np.ndarray:
     """Pixel [2] of the ball that is fixed to the paddle at joint angles [J]; NaN if it is not seen.
 
-    The other arguments are those of `calibrate` and `find_circles`.
+    Args:
+      rough: this camera, roughly known.
+
+    The other arguments are those of `find_circles`.
     """
     place = ball_positions(metadata, joint_angles, _nominal_ball(metadata))
     radius = rough.radius_at(place)
@@ -603,7 +656,7 @@ def calibrate(
     Args:
       metadata: of the policy for this arm.
       rough: the cameras as `rough_camera` gives them; of these the intrinsics count.
-      joint_angles: measured [N, J], rad.
+      joint_angles: of the arm in each pose [N, J], rad.
       pixels: the ball's centre in each camera's pictures [2, N, 2]; NaN where it was not seen.
     """
     ball = _nominal_ball(metadata)
@@ -691,18 +744,28 @@ def _adjust(
     return cameras_of(unknowns), unknowns[-3:], np.where(used, distances, 0.0)
 
 
-def save_cameras(path: Path, cameras: Sequence[Camera]) -> None:
-    """Writes calibrated cameras."""
-    entries = [{name: value.tolist() for name, value in c._asdict().items()} for c in cameras]
-    path.write_text(json.dumps(entries, indent=1) + "\n")
+def save_cameras(path: Path, cameras: Sequence[Camera], size: tuple[int, int]) -> None:
+    """Writes calibrated cameras, and the width and height of their pictures, pixels."""
+    entries = []
+    for camera in cameras:
+        entries.append({name: value.tolist() for name, value in camera._asdict().items()})
+    text = json.dumps({"size": list(size), "cameras": entries}, indent=1)
+    path.write_text(text + "\n")
 
 
-def load_cameras(path: Path) -> tuple[Camera, ...]:
-    """Reads what `save_cameras` wrote."""
+def load_cameras(path: Path) -> tuple[tuple[Camera, ...], tuple[int, int]]:
+    """Reads what `save_cameras` wrote: the cameras, and the size of their pictures."""
     if not path.is_file():
         raise SystemExit(f"there is no file {path}; write it with two_cameras.py calibrate")
-    entries = json.loads(path.read_text())
-    return tuple(Camera(**{k: np.array(v) for k, v in entry.items()}) for entry in entries)
+    saved = json.loads(path.read_text())
+    if not isinstance(saved, dict):
+        raise SystemExit(
+            f"{path} does not tell the size of its pictures; calibrate the cameras again"
+        )
+    cameras = []
+    for entry in saved["cameras"]:
+        cameras.append(Camera(**{name: np.array(value) for name, value in entry.items()}))
+    return tuple(cameras), tuple(saved["size"])
 
 
 class Sources:
@@ -713,21 +776,32 @@ class Sources:
     times, and a ball of 4 m/s moves by 4 mm in each millisecond between them: wire the trigger.
     """
 
-    def __init__(self, sources: Sequence[str], rate: float, exposure: float, transport: float):
+    def __init__(
+        self,
+        sources: Sequence[str],
+        size: tuple[int, int],
+        rate: float,
+        exposure: float,
+        transport: float,
+    ):
         """Opens the cameras.
 
         Args:
           sources: numbers of cameras, or addresses such as rtsp://...
+          size: width and height of the pictures, pixels.
           rate: pictures in a second, Hz.
-          exposure: s.
+          exposure: as it is set in the cameras, s; it is not set here.
           transport: from the end of the exposure until a picture has arrived, s.
         """
+        self.size = size
         self._behind = transport + 0.5 * exposure
         self._captures = []
         for source in sources:
             capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
             if not capture.isOpened():
                 raise SystemExit(f"the camera {source} does not open; give its number or address")
+            capture.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
+            capture.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
             capture.set(cv2.CAP_PROP_FPS, rate)
             # An old picture in a buffer would be taken for a new one.
             capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
@@ -739,14 +813,21 @@ class Sources:
         if not all(capture.grab() for capture in self._captures):
             raise SystemExit("a camera gives no picture; check its cable")
         taken = time.monotonic() - self._behind
-        return tuple(capture.retrieve()[1] for capture in self._captures), taken
+        pictures = tuple(capture.retrieve()[1] for capture in self._captures)
+        for picture in pictures:
+            height, width = picture.shape[:2]
+            if (width, height) != self.size:
+                raise SystemExit(
+                    f"a camera gives pictures of {width} x {height}, not {self.size[0]} x "
+                    f"{self.size[1]}; set the camera, or calibrate with --size {width} {height}"
+                )
+        return pictures, taken
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height of the pictures, pixels."""
-        capture = self._captures[0]
-        width = capture.get(cv2.CAP_PROP_FRAME_WIDTH)
-        return int(width), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+    def read_newest(self) -> tuple[np.ndarray, ...]:
+        """A pair that was exposed after this call: older ones may wait in the cameras' buffers."""
+        for _ in range(_BUFFERED):
+            self.read()
+        return self.read()[0]
 
 
 def calibrate_by_hand(args: argparse.Namespace) -> None:
@@ -756,14 +837,15 @@ def calibrate_by_hand(args: argparse.Namespace) -> None:
             f"there is no folder {args.cameras.parent} for {args.cameras.name}; make it"
         )
     metadata = load_policy(args.policy).metadata
-    sources = Sources(args.sources, args.rate, args.exposure, args.transport)
+    size = tuple(args.size)
+    sources = Sources(args.sources, size, args.rate, args.exposure, args.transport)
     rough = [
-        rough_camera(place, args.gaze, sources.size, args.field_of_view)
+        rough_camera(place, args.gaze, size, args.field_of_view)
         for place in (args.first, args.second)
     ]
-    poses = plan_poses(metadata, rough, sources.size)
+    poses = plan_poses(metadata, rough, size)
     input("Take the ball away, keep the arm out of the pictures if you can, and press Enter.")
-    backgrounds, _ = sources.read()
+    backgrounds = sources.read_newest()
     print("Fix the ball to the middle of the paddle.")
     pixels = np.full((2, len(poses), 2), np.nan)
     for pose, angles in enumerate(poses):
@@ -771,20 +853,22 @@ def calibrate_by_hand(args: argparse.Namespace) -> None:
             f"{name} {angle:.3f}" for name, angle in zip(metadata.joint_names, angles, strict=True)
         )
         input(f"{pose + 1} of {len(poses)}: move the arm to {text} (rad), and press Enter.")
-        pictures, _ = sources.read()
+        pictures = sources.read_newest()
         for k, picture in enumerate(pictures):
             pixels[k, pose] = find_fixed_ball(
                 metadata, rough[k], angles, picture, COLOURS[args.ball], backgrounds[k]
             )
     calibration = calibrate(metadata, rough, poses, pixels)
     print(calibration.report())
-    save_cameras(args.cameras, calibration.cameras)
+    save_cameras(args.cameras, calibration.cameras, size)
+    print(report_height(calibration.cameras, size, metadata))
 
 
 def watch(args: argparse.Namespace) -> None:
     """Prints the ball's place for each pair of pictures."""
-    tracker = Tracker(load_cameras(args.cameras), COLOURS[args.ball], args.exposure)
-    sources = Sources(args.sources, args.rate, args.exposure, args.transport)
+    cameras, size = load_cameras(args.cameras)
+    tracker = Tracker(cameras, COLOURS[args.ball], args.exposure)
+    sources = Sources(args.sources, size, args.rate, args.exposure, args.transport)
     print("learning the background: keep the ball out of the pictures")
     tracker.learn_background([sources.read()[0] for _ in range(20)])
     while True:
@@ -812,7 +896,8 @@ def main() -> None:
     place = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
     by_hand.add_argument("--first", **place, default=(1.45, 0.85, 0.75), help="by tape, m")
     by_hand.add_argument("--second", **place, default=(1.45, -0.85, 0.75), help="by tape, m")
-    by_hand.add_argument("--gaze", **place, default=(0.59, 0.0, 0.33), help="where both look, m")
+    by_hand.add_argument("--gaze", **place, default=(0.59, 0.0, 0.48), help="where both look, m")
+    by_hand.add_argument("--size", nargs=2, type=int, default=(640, 480), help="pixels")
     by_hand.add_argument("--field-of-view", type=float, default=60.0, help="horizontal, degrees")
     args = parser.parse_args()
     args.function(args)

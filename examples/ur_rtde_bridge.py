@@ -12,7 +12,14 @@ import numpy as np
 
 from bounce_mjx import load_policy
 
-RATE, LOOKAHEAD, GAIN = 500.0, 0.03, 300
+RATE = 500.0
+"""Commands a second, Hz."""
+LOOKAHEAD_TIME = 0.03
+"""Of `servoJ`, s: the least that it accepts, for the least delay."""
+GAIN = 300
+"""Of `servoJ`, from 100 to 2000."""
+MAX_FIRST_BALL_AGE = 0.05
+"""An episode starts only with a newer picture of the ball, s."""
 # The order of RTDE's arrays.
 JOINTS = (
     "shoulder_pan_joint",
@@ -32,57 +39,97 @@ class Camera:
         self.socket.bind((address, port))
         self.socket.setblocking(False)
         self.newest: dict = {}
+        """The ball's position [3], m, and its age, s."""
         self.ignored = 0
         """Datagrams that were not four finite numbers."""
 
-    def measure(self, step: float) -> dict:
-        """Position and age of the ball; the age grows by a control step until the next datagram."""
-        age = self.newest.get("ball_age", np.inf) + step
+    def measure(self, control_dt: float) -> dict:
+        """Position and age of the ball, once each control step.
+
+        The age grows by a control step until the next datagram, and is infinite before the first.
+        """
+        age = self.newest.get("ball_age", np.inf) + control_dt
         self.newest = self.newest | {"ball_age": age}
         while True:
             try:
                 datagram = self.socket.recv(256)
             except BlockingIOError:
+                # No more have arrived.
                 return self.newest
-            try:
-                numbers = np.array(datagram.split(), float)
-            except ValueError:
-                numbers = np.zeros(0)
-            if numbers.shape == (4,) and np.all(np.isfinite(numbers)):
-                self.newest = {"ball_position": numbers[:3], "ball_age": float(numbers[3])}
-            else:
-                self.ignored += 1
+            self.take(datagram)
+
+    def take(self, datagram: bytes) -> None:
+        """Believes a datagram of four finite numbers, and counts any other."""
+        try:
+            numbers = np.array(datagram.split(), float)
+        except ValueError:
+            self.ignored += 1
+            return
+        if numbers.shape != (4,) or not np.all(np.isfinite(numbers)):
+            self.ignored += 1
+            return
+        self.newest = {"ball_position": numbers[:3], "ball_age": float(numbers[3])}
 
 
-def bounce(policy, control, receive, camera, commands: dict, seconds: float) -> list[str]:
-    """Bounces for a time, again after each lost ball, until another fault. Returns the reasons."""
-    arm, step, reasons = policy.supervise(RATE), policy.metadata.control_dt, []
-    for _ in range(round(seconds / step)):
-        joints = {"joint_angles": receive.getActualQ(), "joint_velocities": receive.getActualQd()}
-        time = {"time": receive.getTimestamp()}
-        ball = camera.measure(step)
-        targets = arm.commands(joints | ball | commands | time)
-        for command in targets:
-            period = control.initPeriod()
-            control.servoJ(command.tolist(), 0.0, 0.0, 1.0 / RATE, LOOKAHEAD, GAIN)
-            control.waitPeriod(period)
-        if not len(targets):
-            # The arm is where no command was given yet.
-            control.waitPeriod(control.initPeriod())
-        if arm.state == "ready" and ball.get("ball_age", np.inf) < 0.05:
+def bounce(policy, rtde_c, rtde_r, camera, task_commands: dict, seconds: float) -> list[str]:
+    """Bounces for a time, again after each lost ball, until another fault.
+
+    Args:
+      policy: the result of `load_policy`.
+      rtde_c: ur_rtde's `RTDEControlInterface`.
+      rtde_r: its `RTDEReceiveInterface`.
+      camera: its `measure` returns the ball's part of the measurements.
+      task_commands: such as the target height, m.
+
+    Returns:
+      Why the arm stopped, each time.
+    """
+    arm = policy.supervise(RATE)
+    control_dt = policy.metadata.control_dt
+    reasons = []
+    # A period begins before reading and computing, so that a control step lasts whole periods.
+    t_start = rtde_c.initPeriod()
+    for _ in range(round(seconds / control_dt)):
+        ball = camera.measure(control_dt)
+        measurements = {
+            "joint_angles": rtde_r.getActualQ(),
+            "joint_velocities": rtde_r.getActualQd(),
+            "time": rtde_r.getTimestamp(),
+            **ball,
+            **task_commands,
+        }
+        commands = arm.commands(measurements)
+        for joint_angles in commands:
+            servo(rtde_c, joint_angles)
+            rtde_c.waitPeriod(t_start)
+            t_start = rtde_c.initPeriod()
+        if len(commands) == 0:
+            # The first sample is not believed yet, and nothing is sent.
+            rtde_c.waitPeriod(t_start)
+            t_start = rtde_c.initPeriod()
+        if arm.state == "ready" and ball["ball_age"] < MAX_FIRST_BALL_AGE:
             arm.start()
         elif arm.state == "stopped":
             reasons.append(arm.reason)
             if arm.fault != "ball_lost":
                 break
             arm.restart()
-    control.servoStop()
+    rtde_c.servoStop()
     return reasons
 
 
-if __name__ == "__main__":
-    import rtde_control
-    import rtde_receive
+def servo(rtde_c, joint_angles: np.ndarray) -> None:
+    """Sends a command [6], rad, for the next period."""
+    # servoJ has these two arguments, and does not use them.
+    velocity = 0.0
+    acceleration = 0.0
+    rtde_c.servoJ(joint_angles.tolist(), velocity, acceleration, 1.0 / RATE, LOOKAHEAD_TIME, GAIN)
+
+
+def main() -> None:
+    # Here, so that the rest can be imported on a computer without ur_rtde.
+    from rtde_control import RTDEControlInterface
+    from rtde_receive import RTDEReceiveInterface
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("robot", help="address of the robot")
@@ -90,10 +137,18 @@ if __name__ == "__main__":
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--target-height", type=float, default=0.7, help="m")
     parser.add_argument("--listen", default="127.0.0.1", help="address for the ball's datagrams")
-    given = parser.parse_args()
-    rtde = rtde_control.RTDEControlInterface(given.robot, RATE)
-    state = rtde_receive.RTDEReceiveInterface(given.robot, RATE)
-    wished = {"target_height": given.target_height}
-    policy, camera = load_policy(given.policy, joint_names=JOINTS), Camera(address=given.listen)
-    print(*bounce(policy, rtde, state, camera, wished, given.seconds), sep="\n")
+    arguments = parser.parse_args()
+
+    rtde_c = RTDEControlInterface(arguments.robot, RATE)
+    rtde_r = RTDEReceiveInterface(arguments.robot, RATE)
+    policy = load_policy(arguments.policy, joint_names=JOINTS)
+    camera = Camera(address=arguments.listen)
+    task_commands = {"target_height": arguments.target_height}
+    reasons = bounce(policy, rtde_c, rtde_r, camera, task_commands, arguments.seconds)
+    for reason in reasons:
+        print(reason)
     print(f"{camera.ignored} datagrams were ignored")
+
+
+if __name__ == "__main__":
+    main()

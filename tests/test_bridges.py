@@ -81,7 +81,10 @@ def test_ur_rtde_bridge() -> None:
     bridge = runpy.run_path(str(EXAMPLES / "ur_rtde_bridge.py"))
 
     class Control:
+        in_period = False
+
         def initPeriod(self) -> int:
+            self.in_period = True
             return world.ticks
 
         def servoJ(self, q, speed, acceleration, dt, lookahead, gain) -> bool:
@@ -92,6 +95,7 @@ def test_ur_rtde_bridge() -> None:
 
         def waitPeriod(self, period: int) -> None:
             assert period == world.ticks
+            self.in_period = False
             knocked(world)
             world.tick(self.sent)
             world.watch(supervised[0])
@@ -101,6 +105,8 @@ def test_ur_rtde_bridge() -> None:
 
     class Receive:
         def getActualQ(self) -> list[float]:
+            # A period has the time of reading and computing too, or a control step is longer.
+            assert control.in_period
             return world.data.qpos[:6].tolist()
 
         broken = False
@@ -179,8 +185,9 @@ def test_ros2_bridge(monkeypatch: pytest.MonkeyPatch) -> None:
             return message(info=said.append)
 
     modules = {
-        "rclpy": {"time": message(Time=Time)},
+        "rclpy": {},
         "rclpy.node": {"Node": Node},
+        "rclpy.time": {"Time": Time},
         "geometry_msgs.msg": {"PointStamped": None},
         "sensor_msgs.msg": {"JointState": None},
         "std_msgs.msg": {"Empty": None, "Float64MultiArray": message},

@@ -1,5 +1,6 @@
 """The two cameras of examples/two_cameras.py: circles, geometry, the calibration, the tracker."""
 
+import json
 import os
 import subprocess
 import sys
@@ -22,7 +23,7 @@ import rendered_cameras  # noqa: E402
 import two_cameras as cameras  # noqa: E402
 
 SIZE = 640, 480
-GAZE = (0.59, 0.0, 0.33)
+GAZE = (0.59, 0.0, 0.48)
 PLACES = (1.45, 0.85, 0.75), (1.45, -0.85, 0.75)
 SEEN = np.array([[x, y, z] for x in (0.5, 0.7) for y in (-0.1, 0.1) for z in (0.15, 0.4, 0.7)])
 
@@ -104,6 +105,51 @@ def test_a_file_that_is_missing_is_named(tmp_path) -> None:
         cameras.load_cameras(tmp_path / "cameras.json")
 
 
+class Pictures:
+    """Stands in for `cv2.VideoCapture`: numbered pictures of its own size."""
+
+    def __init__(self, size: tuple[int, int]):
+        self.size = size
+        self.count = 0
+
+    def isOpened(self) -> bool:
+        return True
+
+    def set(self, name: int, value: float) -> bool:
+        return False
+
+    def grab(self) -> bool:
+        self.count += 1
+        return True
+
+    def retrieve(self) -> tuple[bool, np.ndarray]:
+        width, height = self.size
+        return True, np.full((height, width, 3), self.count, np.uint8)
+
+
+def test_cameras_of_another_size_than_the_calibrated_one_are_refused(tmp_path, monkeypatch) -> None:
+    file = tmp_path / "cameras.json"
+    cameras.save_cameras(file, true_cameras(), SIZE)
+    loaded, size = cameras.load_cameras(file)
+    assert size == SIZE
+    np.testing.assert_allclose(loaded[1].project(SEEN), true_cameras()[1].project(SEEN))
+    file.write_text(json.dumps(json.loads(file.read_text())["cameras"]))
+    with pytest.raises(SystemExit, match="does not tell the size of its pictures"):
+        cameras.load_cameras(file)
+    monkeypatch.setattr(cv2, "VideoCapture", lambda source: Pictures((1280, 720)))
+    wrong = cameras.Sources(["0", "1"], size, 120.0, 0.004, 0.004)
+    with pytest.raises(SystemExit, match="1280 x 720, not 640 x 480; .* --size 1280 720"):
+        wrong.read()
+
+
+def test_a_pose_is_seen_in_a_picture_that_no_buffer_held(monkeypatch) -> None:
+    monkeypatch.setattr(cv2, "VideoCapture", lambda source: Pictures(SIZE))
+    sources = cameras.Sources(["0", "1"], SIZE, 120.0, 0.004, 0.004)
+    sources.read()
+    first, second = sources.read_newest()
+    assert first[0, 0, 0] == second[0, 0, 0] >= 1 + 4
+
+
 def test_rays_and_projections_are_inverse() -> None:
     pair = true_cameras()
     for place in SEEN:
@@ -151,6 +197,24 @@ def test_a_pose_that_does_not_fit_is_named() -> None:
     assert "18 poses" in found.report() and "pose 8" in found.report()
 
 
+def test_how_high_the_cameras_see_is_told_beside_how_high_the_policy_plays() -> None:
+    metadata = load_policy("robust").metadata
+    home = cameras.paddle_position(metadata, np.array(metadata.default_joint_angles))
+    for gaze, is_too_low in ((0.33, True), (0.48, False)):
+        pair = [cameras.rough_camera(place, (*home[:2], gaze), SIZE, 60.0) for place in PLACES]
+        # A camera without distortion: the upper edge's angle, less that of the ball's radius.
+        distance = np.hypot(*(np.array(PLACES[0][:2]) - home[:2]))
+        half_view = np.arctan(SIZE[1] / SIZE[0] * np.tan(np.radians(30.0)))
+        pitch = np.arctan2(gaze - PLACES[0][2], distance)
+        highest = PLACES[0][2] + distance * np.tan(pitch + half_view) - cameras.RADIUS
+        assert cameras.highest_seen(pair, SIZE, home) == pytest.approx(highest, abs=0.02)
+        text = cameras.report_height(pair, SIZE, metadata)
+        assert "apexes are at 0.80 m at most" in text
+        assert ("aim higher" in text) == is_too_low
+    assert "apex" not in cameras.report_height(pair, SIZE, load_policy("balance").metadata)
+    assert cameras.highest_seen(true_cameras(), SIZE, home) > 0.9
+
+
 def scene(place: np.ndarray | None, others: tuple = (), seed: int = 0) -> list[np.ndarray]:
     """Pictures of both cameras: a ball, and other discs of its colour at pixels (x, y, radius)."""
     rng = np.random.default_rng(seed)
@@ -193,26 +257,79 @@ def test_a_policy_plays_from_rendered_pictures(tmp_path) -> None:
         [sys.executable, *arguments], cwd=EXAMPLES, env=environment, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-    assert "20 poses" in done.stdout and "36 pairs of pictures, 0 without a ball" in done.stdout
+    num_poses = int(done.stdout.split(" poses")[0].split()[-1])
+    assert num_poses >= 18 and "36 pairs of pictures, 0 without a ball" in done.stdout
     error = float(done.stdout.split("off by ")[1].split(" mm")[0])
     assert error < 4.0
 
 
 @pytest.mark.parametrize("side_light", [False, True])
-def test_a_background_that_was_drawn_before_changes_no_pixel(opengl, side_light) -> None:
+def test_a_background_that_was_drawn_before_changes_the_foot_of_the_arm_at_most(
+    opengl, monkeypatch, side_light
+) -> None:
     mjcf = str(resource_path("mjcf/bounce_ball.xml"))
     model = rendered_cameras.make_model(mjcf, "orange", side_light, quick=True)
-    rendered = rendered_cameras.RenderedCameras(model, rendered_cameras.true_cameras())
+    lenses = [rendered_cameras._Lens(camera) for camera in rendered_cameras.true_cameras()]
+    sheet = rendered_cameras._Sheet(model, lenses)
     rng = np.random.default_rng(0)
     data = mujoco.MjData(model)
-    for _ in range(8):
+    sub_frames = range(len(rendered_cameras.SHIFTS))
+    for _ in range(4):
         data.qpos[:] = model.qpos0 + rng.uniform(-1.0, 1.0, model.nq)
         data.joint("ball_link").qpos[:3] = rng.uniform((0.3, -0.3, 0.03), (0.8, 0.3, 0.9))
         mujoco.mj_forward(model, data)
-        for view in rendered._views:
-            picture = view.render(data)
-            assert np.array_equal(picture, view._draw(data, arm=True, room=True))
-            assert not np.array_equal(picture, view._background)
+        for sub_frame in sub_frames:
+            sheet.draw(data, sub_frame)
+        quick = np.array(sheet.read())
+        for sub_frame in sub_frames:
+            sheet._render(data, sub_frame, arm=True, room=True)
+        with monkeypatch.context() as patch:
+            patch.setattr(sheet, "_empty_room", None)
+            whole = np.array(sheet.read())
+        # Where the arm's foot meets the floor, either may be drawn.
+        assert np.mean(np.any(quick != whole, axis=-1)) < 1e-5
+        assert np.mean(quick[:, 0] != quick[:, -1]) > 0.03
+    sheet.close()
+
+
+def test_a_sub_frame_is_shifted_by_pixels_to_the_right_and_down(opengl, monkeypatch) -> None:
+    np.testing.assert_allclose(np.mean(rendered_cameras.SHIFTS, axis=0), 0.0)
+    monkeypatch.setattr(rendered_cameras, "SHIFTS", np.array([(0.0, 0.0), (3.0, 2.0)]))
+    mjcf = str(resource_path("mjcf/bounce_ball.xml"))
+    model = rendered_cameras.make_model(mjcf)
+    lenses = [rendered_cameras._Lens(camera) for camera in rendered_cameras.true_cameras()]
+    sheet = rendered_cameras._Sheet(model, lenses)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    for sub_frame in range(2):
+        sheet.draw(data, sub_frame)
+    for straight, shifted in sheet.read():
+        assert np.mean(shifted[2:, 3:] != straight[:-2, :-3]) < 0.01
+        assert np.mean(shifted != straight) > 0.03
+    sheet.close()
+
+
+def test_a_picture_shows_the_instant_of_its_qpos_in_the_light_of_the_room(opengl) -> None:
+    """Not what MuJoCo's step leaves behind: places of one step ago, lights without direction."""
+    mjcf = str(resource_path("mjcf/bounce_ball.xml"))
+    model = rendered_cameras.make_model(mjcf)
+    rendered = rendered_cameras.RenderedCameras(model, rendered_cameras.true_cameras(), noise=0.0)
+    data = mujoco.MjData(model)
+    data.joint("ball_link").qpos[:3] = 0.59, 0.0, 0.6
+    data.joint("ball_link").qvel[:3] = 0.0, 3.0, 0.0
+    for _ in range(10):
+        mujoco.mj_step(model, data)
+    here = data.qpos.copy()
+    picture = None
+    while picture is None:
+        data.time += 0.001
+        picture = rendered.look(data)
+    np.testing.assert_allclose(picture.ball, here[-7:-4])
+    fresh = mujoco.MjData(model)
+    fresh.qpos[:] = here
+    mujoco.mj_forward(model, fresh)
+    for drawn, right in zip(picture.pictures, rendered.still(fresh), strict=True):
+        assert np.array_equal(drawn, right)
     rendered.close()
 
 

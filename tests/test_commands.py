@@ -38,6 +38,11 @@ def run(trained: Path, tmp_path: Path) -> Path:
 MISTAKES = (
     ("train --no-stop-if-solved", "did you mean --no-stop-when-solved?"),
     ("train --num-envs abc", "--num-envs is abc", "integer"),
+    # Also printed, since training refuses it.
+    (
+        "train --rollout-length 201 --training-episode-seconds 2 --print-config",
+        "rollout_length 201 is longer than an episode of 200 control steps; choose",
+    ),
     ("train --control-dt 0.0105", "control_dt 0.0105", "multiple of physics_dt"),
     (
         "train --num-envs 8 --rollout-length 8 --episode-seconds 0.05",
@@ -308,3 +313,12 @@ def test_a_policy_is_named_by_its_run_or_its_checkpoint(trained: Path, monkeypat
     ):
         found = choose_checkpoint(given, log_dir)
         assert found.folder.resolve() == trained / f"checkpoints/{steps}"
+
+
+@pytest.mark.parametrize("command", ["plot", "report"])
+def test_a_mistyped_run_is_told_before_what_draws_is_imported(
+    command: str, refused, monkeypatch
+) -> None:
+    for module in ("reports.figures", "reports.page", "viewers.page"):
+        monkeypatch.setitem(sys.modules, f"bounce_mjx.{module}", None)
+    refused(f"{command} nowhere", "there is no checkpoint folder nowhere; give a run's folder")

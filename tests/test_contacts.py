@@ -23,7 +23,14 @@ def recording(joint_angles: np.ndarray, running: np.ndarray | None = None) -> Re
     steps = len(joint_angles)
     running = np.ones((steps, 2), bool) if running is None else running
     empty = np.zeros((steps, 3, 2))
-    return Recording(np.stack([joint_angles] * 2, axis=-1), empty, empty, {}, running)
+    return Recording(
+        joint_angles=np.stack([joint_angles] * 2, axis=-1),
+        ball=empty,
+        paddle=empty,
+        command={},
+        running=running,
+        terminated=np.zeros_like(running),
+    )
 
 
 def test_an_arm_that_folds_or_dives_touches() -> None:

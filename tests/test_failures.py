@@ -203,14 +203,23 @@ def test_the_terms_that_go_with_failure_are_named() -> None:
 
 
 def test_the_worst_episode_ends_first_or_has_the_lowest_return() -> None:
-    running = np.ones((4, 3), bool)
+    """Of four steps and more; one that ends on the last of them is worse than one that lasts."""
     reward = np.array([1.0, 0.5, 1.0]) * np.ones((4, 3))
-    # What follows the end of an episode does not count.
-    for ended, worst in (((), 1), ((2,), 2), ((0, 1), 1)):
-        lasts = running.copy()
-        lasts[2:, list(ended)] = False
-        values = np.where(lasts, reward, -100.0)
-        recording = Recording(None, None, None, {}, lasts, metrics={"reward/height": values})
+    for last_step, ended, worst in ((1, (), 1), (1, (2,), 2), (1, (0, 1), 1), (3, (2,), 2)):
+        terminated = np.zeros((4, 3), bool)
+        terminated[last_step, list(ended)] = True
+        running = np.cumsum(terminated, axis=0) - terminated == 0
+        # What follows the end of an episode does not count.
+        values = np.where(running, reward, -100.0)
+        recording = Recording(
+            joint_angles=None,
+            ball=None,
+            paddle=None,
+            command={},
+            running=running,
+            terminated=terminated,
+            metrics={"reward/height": values},
+        )
         assert worst_episode(recording) == worst
 
 

@@ -62,6 +62,9 @@ def test_the_end_of_every_episode_is_in_a_frame() -> None:
         frames = resample(short, dt=0.01, fps=30)
         np.testing.assert_array_equal(frames.balls, short.balls)
         assert frames.lost[-1].all()
+    # 3 pictures at 12 Hz are 10 steps of 25 ms, but for the rounding.
+    frames = resample(ramp(over=(10,)), dt=0.025, fps=12)
+    assert len(frames.time) == 4 and frames.lost[-1].all()
 
 
 def test_the_path_of_a_ball_has_each_of_its_positions_once() -> None:

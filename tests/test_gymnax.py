@@ -101,15 +101,28 @@ def test_gymnax_own_wrapper_logs_episodes(gymnax):
 
 @pytest.mark.slow
 def test_example_of_purejaxrl_trains():
+    """No random key of it is used twice, which JAX can tell."""
     main = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "purejaxrl.py"))["main"]
-    rewards = np.array(main(num_envs=8, rollout=4, updates=5))
+    with jax.debug_key_reuse(True):
+        rewards = np.array(main(num_envs=8, rollout=4, updates=5))
     assert rewards.shape == (5,) and np.all(np.isfinite(rewards)) and np.ptp(rewards) > 0.0
 
 
 @pytest.mark.slow
 def test_example_of_evosax_searches(need):
     need("evosax")
-    main = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "evosax_search.py"))["main"]
-    best = np.array(main(population=16, generations=3, steps=10))
+    names = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "evosax_search.py"))
+    best = np.array(names["main"](population=16, generations=3, steps=10))
     # The reward of the first steps lies near its bound, and no candidate exceeds it.
     assert best.shape == (3,) and np.all(np.isfinite(best)) and np.all(best > 0.0)
+    # A return has the reward of the step that ends the episode, and none of a later one.
+    weights = jnp.zeros((6, 30)).at[:, -1].set(-5.0)
+    step = jax.jit(names["env"].step)
+    state = names["env"].reset(jax.random.key(0))
+    rewards = []
+    while not state.done and len(rewards) < 100:
+        state = step(state, jnp.tanh(weights[:, -1]))
+        rewards.append(float(state.reward))
+    total = names["episode_return"](weights, jax.random.key(0), num_steps=2 * len(rewards))
+    assert state.done and abs(rewards[-1]) > 0.1
+    np.testing.assert_allclose(total, sum(rewards), rtol=1e-4)

@@ -11,7 +11,6 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import minimize
 
-from bounce_mjx.env.env import world_model
 from bounce_mjx.errors import UserError
 from bounce_mjx.identify.doctor import examine
 from bounce_mjx.identify.fit import (
@@ -61,6 +60,7 @@ from bounce_mjx.reports.identification import identification_page
 from bounce_mjx.robot.model import find_addresses, link_bodies
 from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.world.actuation import Actuators
+from bounce_mjx.world.model import world_model
 from bounce_mjx.world.named import read_world
 
 BENCHMARK = Path(__file__).parent.parent / "benchmarks" / "identify.py"

@@ -99,9 +99,10 @@ def before(iteration: int, act: Callable) -> type[CountingTrainer]:
 
 
 class Scores:
-    """Evaluations whose mean return is given by the number of iterations, or for each seed."""
+    """Evaluations whose mean return and margin are given by the number of iterations, or for each
+    seed."""
 
-    def __init__(self, returns: dict[int, float], margins: dict[int, float], screening: bool):
+    def __init__(self, returns: dict[int, float], margins: dict, screening: bool):
         self.returns, self.margins, self.screening = returns, margins, screening
 
     def __call__(self, config, env, mesh, pool) -> "Scores":
@@ -113,6 +114,8 @@ class Scores:
     def report(self, seed: int, policy) -> Report:
         iterations = int(np.ravel(jax.tree.leaves(policy)[0])[0])
         margin = self.margins.get(iterations)
+        if isinstance(margin, tuple):
+            margin = margin[seed]
         result = Result("stable", "episodes, %", 0.0, ">= 99", margin is not None, margin)
         mean_return = float(np.broadcast_to(self.returns[iterations], SEEDS)[seed])
         details = {"episodes": 1.0, "mean_length_s": 1.0, "mean_return": mean_return}
@@ -129,7 +132,7 @@ def train(
     *,
     trainer: type[CountingTrainer] = CountingTrainer,
     scores: type[Scores] = Scores,
-    margins: dict[int, float] | None = None,
+    margins: dict | None = None,
     screening: bool = False,
     callbacks=(),
     said: io.StringIO | None = None,
@@ -741,6 +744,22 @@ def test_a_seed_that_diverges_leaves_the_others(tmp_path: Path) -> None:
     evaluated = [evaluated_steps(run / f"seed_{i:03d}") for i in range(SEEDS)]
     assert evaluated == [[64, 128, 192, 256], [64, 128], [64, 128, 192, 256]]
     assert iterations_of(best_checkpoint(run / "seed_001")) == 2
+
+
+def test_a_seed_whose_save_failed_is_not_solved_as_the_others_diverge(
+    tmp_path: Path, monkeypatch
+) -> None:
+    """Whether the save succeeds is known only once it has ended."""
+
+    class DivergingLater(CountingTrainer):
+        faults = {(1, 3): 2, (2, 3): 2}
+
+    fail(monkeypatch, 1)
+    settings = {"num_seeds": SEEDS, "trainer": DivergingLater, "stop_when_solved": True}
+    settings |= {"margins": {2: (1.0, None, None)}, "eval_every": 2 * BLOCK}
+    run = train(tmp_path, RETURNS, **settings)
+    assert evaluated_steps(run / "seed_000") == [256]
+    assert iterations_of(best_checkpoint(run / "seed_000")) == 4
 
 
 def test_a_solved_run_goes_on_with_more_steps_also_beside_a_seed_that_diverged(

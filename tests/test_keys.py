@@ -27,7 +27,6 @@ from bounce_mjx.runs.config import TrainConfig, fields_of
 from bounce_mjx.task.registry import find_task
 from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.job import open_job
-from bounce_mjx.training.ppo_trainer import episode_steps
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import Term
 from test_ppo import TwoStates
@@ -159,7 +158,7 @@ def of_learning(config: TrainConfig) -> tuple:
     ppo = config.ppo.model_copy(update=small)
     trainer = PPO(ppo, TwoStates(1.0), episode_steps=1000)
     program = jax.jit(lambda key: trainer.run(trainer.init(key), 1)).trace(jax.random.key(0))
-    return text(program), episode_steps(config)
+    return text(program), config.training_episode_steps
 
 
 def of_run(config: TrainConfig) -> tuple:

@@ -196,7 +196,15 @@ def recorded(velocities: np.ndarray) -> Recording:
     running = np.arange(len(velocities))[:, None] < len(velocities) - 5
     empty = np.zeros((len(velocities), 3, 1))
     joint_angles = np.zeros((len(velocities), 6, 1))
-    return Recording(joint_angles, empty, empty, {}, running, velocities[..., None])
+    return Recording(
+        joint_angles=joint_angles,
+        ball=empty,
+        paddle=empty,
+        command={},
+        running=running,
+        terminated=np.zeros_like(running),
+        command_velocity=velocities[..., None],
+    )
 
 
 @pytest.mark.parametrize("smooth, rate", [(False, 1000), (True, 500)])

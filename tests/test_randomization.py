@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from against_c import XML, converged, differences, push_by_air
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.config.validation import validate
-from bounce_mjx.env.env import model_nominals
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.c_episodes import episode_models
 from bounce_mjx.learning.ppo import PPO
@@ -26,6 +25,7 @@ from bounce_mjx.robot.config import RobotConfig
 from bounce_mjx.robot.contact import damping_of_restitution, restitution_of_damping
 from bounce_mjx.robot.model import load_model
 from bounce_mjx.world.actuation import add_delay, start_actuation
+from bounce_mjx.world.model import model_nominals
 from bounce_mjx.world.randomization import TERMS, RandomizationConfig
 from bounce_mjx.world.sampling import nominal_values, physics_parameters, sample_world
 from test_ppo import TwoStates, two_state_config

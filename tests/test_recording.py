@@ -84,6 +84,9 @@ def test_a_recording_holds_the_first_episodes(evaluated, stepped) -> None:
     steps = int(statistics.steps.max())
     np.testing.assert_array_equal(recording.running[:steps], running[:steps])
     assert not recording.running[steps:].any()
+    np.testing.assert_array_equal(
+        recording.terminated[:steps], (running & (stepped.done > 0))[:steps]
+    )
     parts = {
         "joint_angles": recording.joint_angles,
         "ball_position": recording.ball,
@@ -116,6 +119,7 @@ def made_up(steps: int, episodes: int) -> Recording:
         paddle=np.zeros((steps, 3, episodes), np.float32),
         command={"target_height": np.zeros((steps, episodes), np.float32)},
         running=np.ones((steps, episodes), bool),
+        terminated=np.zeros((steps, episodes), bool),
         metrics={
             "bounced": np.zeros((steps, episodes), np.float32),
             "apex_offset": np.zeros((steps, episodes), np.float32),

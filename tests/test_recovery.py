@@ -90,19 +90,6 @@ def test_resumed_training_is_the_same(run: Path, straight: Path) -> None:
     assert_same_training(run, straight)
 
 
-@pytest.mark.slow
-def test_a_process_that_gets_a_signal_ends_with_0(tmp_path: Path) -> None:
-    """What it saves and says is in `test_job.py`; that what it saved resumes to the same training,
-    in `test_resumed_training_is_the_same` and, at any block, `test_killed_at_any_moment`."""
-    args = [*TINY, "--total-steps", 10**6, "--log-dir", tmp_path / "runs"]
-    with job(tmp_path / "log", *args) as training:
-        training.wait_until_said("evaluation at")
-        training.process.send_signal(signal.SIGTERM)
-        assert training.wait() == 0, training.said
-    assert "Traceback" not in training.said
-    assert "continue with: bounce-mjx train --resume" in training.said
-
-
 @pytest.mark.parametrize("pause", [0.0, 0.8], ids=["told twice", "second Ctrl-C"])
 def test_second_ctrl_c_ends_the_process_at_once(pause: float) -> None:
     code = (
@@ -154,11 +141,12 @@ def test_killed_at_any_moment(tmp_path: Path, straight: Path) -> None:
         stored = (x.number for run in log_dir.glob("*") for x in stored_checkpoints(run))
         return max(stored, default=0)
 
-    def wait_until(happens: Callable[[], bool]) -> None:
+    def wait_until(happens: Callable[[], bool], period: float = 0.02) -> None:
+        # Often enough for what happens; more would take a core from the training.
         deadline = time.monotonic() + TIMEOUT
         while not happens():
             assert process.is_alive() and time.monotonic() < deadline
-            time.sleep(0.0002)
+            time.sleep(period)
 
     for moment in ("start", "any", "*.orbax-checkpoint-tmp", "*[0-9]", "any"):
         before = written()
@@ -171,7 +159,8 @@ def test_killed_at_any_moment(tmp_path: Path, straight: Path) -> None:
             time.sleep(random_seconds(0.0, 1.0))
         else:
             wait_until(lambda before=before: written() != before)
-            wait_until(lambda end=moment: any(log_dir.glob(f"*/checkpoints/.unfinished/{end}")))
+            unfinished = f"*/checkpoints/.unfinished/{moment}"
+            wait_until(lambda path=unfinished: any(log_dir.glob(path)), period=0.0002)
         process.kill()
         process.join()
         if steps_saved():
@@ -260,17 +249,26 @@ print("counts:", *(events.count("/jax/compilation_cache/" + name) for name in na
 def test_a_second_start_compiles_nothing_and_trains_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """The process of the first one gets a signal, and ends with 0; what it saves and says is in
+    `test_job.py`. The second one trains for as long undisturbed."""
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "cache"))
-    flags = [*TINY, "--total-steps", "64", "--no-report", "--log-dir"]
-    runs = []
-    for name in ("first", "second"):
-        with job(tmp_path / f"{name}.log", *flags, tmp_path / name, code=COUNTED) as process:
-            assert process.wait() == 0, process.said
-        runs += (tmp_path / name).iterdir()
+    flags = [*TINY, "--eval-every", "64", "--no-report"]
+    args = [*flags, "--total-steps", 10**6, "--log-dir", tmp_path / "first"]
+    with job(tmp_path / "first.log", *args) as training:
+        training.wait_until_said("evaluation at")
+        training.process.send_signal(signal.SIGTERM)
+        assert training.wait() == 0, training.said
+    assert "Traceback" not in training.said
+    assert "continue with: bounce-mjx train --resume" in training.said
+    (first,) = (tmp_path / "first").iterdir()
+    stopped = latest_checkpoint(first)
+    args = [*flags, "--total-steps", stopped.number, "--log-dir", tmp_path / "second"]
+    with job(tmp_path / "second.log", *args, code=COUNTED) as process:
+        assert process.wait() == 0, process.said
     ((requests, hits),) = re.findall(r"^counts: (\d+) (\d+)$", process.said, re.MULTILINE)
     assert hits == requests != "0"
-    first, second = (arrays(latest_checkpoint(run)) for run in runs)
-    jax.tree.map(np.testing.assert_array_equal, first, second)
+    (second,) = (tmp_path / "second").iterdir()
+    jax.tree.map(np.testing.assert_array_equal, arrays(stopped), arrays(latest_checkpoint(second)))
 
 
 @pytest.mark.slow

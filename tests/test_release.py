@@ -2,6 +2,7 @@
 policy, evaluates and exports it, and another folder loads it."""
 
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -19,6 +20,15 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(shutil.which("uv") is None, reason="uv is not installed"),
 ]
+
+
+# Runs command lines in one process, which imports JAX once.
+COMMANDS = """
+import shlex, sys
+from bounce_mjx.commands.main import main
+for line in sys.argv[1:]:
+    main(shlex.split(line))
+"""
 
 
 def call(*words: object, folder: Path, status: int = 0, **variables: str) -> str:
@@ -81,13 +91,17 @@ def test_an_installed_release_trains_evaluates_exports_and_acts(
     said = call(command, "train", *TINY, "--total-steps", 128, "--log-dir", log_dir, folder=work)
     (run,) = log_dir.iterdir()
     assert "consecutive bounces" in said and (run / "report.html").is_file()
-    # An untrained policy misses results, which is status 1.
-    said = call(command, "eval", run, "--episodes", 4, folder=other, status=1)
-    assert "FAIL" in said
     assert "<iframe" in (run / "report.html").read_text(encoding="utf-8")
-    call(command, "play", run, "--video", "a.gif", "--seconds", 1, folder=other)
+    # An untrained policy misses results, which is status 1.
+    lines = (
+        "export {} --onnx policy.onnx",
+        "play {} --video a.gif --seconds 1",
+        "eval {} --episodes 4",
+    )
+    lines = [line.format(shlex.quote(str(run))) for line in lines]
+    said = call(python, "-c", COMMANDS, *lines, folder=other, status=1)
+    assert "FAIL" in said
     assert (other / "a.gif").read_bytes().startswith(b"GIF")
-    call(command, "export", run, "--onnx", other / "policy.onnx", folder=work)
     acts = (
         "import numpy, bounce_mjx; p = bounce_mjx.load_policy('policy.onnx')\n"
         "shapes = {'joint_angles': 6, 'joint_velocities': 6, 'target_height': ()}\n"

@@ -123,6 +123,11 @@ def test_the_trained_ranges_contain_a_condition_or_not(tmp_path: Path) -> None:
     assert conditions[-1].ranges.keys() == {"action_latency", "gravity_tilt", "target_height"}
     assert conditions[-1].commands == {"target_height": (0.3, 0.8)}
     assert conditions[0].commands == {"target_height": (0.4, 0.6)}
+    # In a named world, whose settings differ from the training's, it is the training's own.
+    world = EnvConfig(action_scale=0.02)
+    *others, own = load_suite(suite_file(tmp_path, late, everything), trained, world)
+    assert {condition.env.action_scale for condition in others} == {0.02}
+    assert own.env.action_scale == trained.action_scale and own.trained
     # Without randomisation, a training contains only conditions that leave the world unchanged.
     conditions = suite(tmp_path, late, tilt, both, everything)
     assert [c.trained for c in conditions] == [True, *[False] * 5]
@@ -255,6 +260,31 @@ def test_every_condition_gets_its_own_ranges_and_outcome(tmp_path: Path, monkeyp
         (4,),
         ("joint_frictionloss", 4),
     ]
+
+
+def test_conditions_that_differ_in_nothing_have_the_same_episodes(tmp_path, monkeypatch) -> None:
+    """And a film is that of the condition's own episode."""
+    slow = dict(strengths=[0.02], settings={"control_dt": "strength"})
+    path = suite_file(tmp_path, dict(name="slow", **slow), dict(name="slow again", **slow))
+    _, *conditions = load_suite(path, find_task("balance").Config())
+    calls = []
+
+    def make_evaluator(env, networks, count):
+        ones = np.ones(count)
+        measured = Statistics(ones > 0, ones, ones, Tally({"steps": ones, "squares": ones}))
+
+        def evaluate(policy, key, ranges):
+            calls.append((count, ranges, key.tolist()))
+            return measured, None
+
+        return evaluate
+
+    monkeypatch.setattr(robustness, "make_evaluator", make_evaluator)
+    options = EvaluationOptions(4)
+    measure_conditions(None, lambda env: None, conditions, options)
+    assert len(calls) == 2 and calls[0] == calls[1] == (4, None, calls[0][2])
+    found = robustness.find_episode(conditions, 1, options, 3)
+    assert (found.episodes, found.episode) == (4, 3)
 
 
 def test_each_condition_is_judged_as_an_evaluation_in_its_own_world(tmp_path, monkeypatch) -> None:

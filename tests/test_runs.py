@@ -13,10 +13,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pydantic
 import pytest
+from pydantic import Field
 
 from bounce_mjx import Run
 from bounce_mjx.commands import train as train_command
+from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.resources import resource_path
@@ -38,6 +41,7 @@ from bounce_mjx.runs.presets import preset_files
 from bounce_mjx.runs.progress import Progress, load_results
 from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.training import run as training_run
+from bounce_mjx.world.config import ActionConfig
 from tiny_runs import contents
 
 CATCH = resource_path("configs/catch/cpu.yaml")
@@ -346,6 +350,11 @@ def test_a_group_given_in_part_keeps_its_other_defaults(tmp_path: Path) -> None:
     assert env.action.base == "target" and env.action.max_lead == 0.2
     assert env.reward.fall.scale == 0.3 and env.reward.rest == default.reward.rest
     assert default.reward.rest.weight != type(default.reward.rest)().weight
+    # Also a default that is made anew.
+    made = Field(default_factory=lambda: ActionConfig(base="target", max_lead=0.3))
+    own = pydantic.create_model("Own", __base__=StrictModel, action=(ActionConfig, made))
+    action = own.model_validate({"action": {"max_lead": 0.2}}).action
+    assert action == ActionConfig(base="target", max_lead=0.2)
 
 
 def test_whole_numbers_may_have_an_exponent(tmp_path: Path) -> None:

@@ -168,6 +168,18 @@ def test_an_algorithms_own_default_wins_over_the_machines_preset_alone(folder: P
     )
 
 
+def test_a_default_that_an_algorithm_makes_or_leaves_out_is_a_default(folder: Path) -> None:
+    """It may make one anew for each config, and a narrower type needs none."""
+    own = OWN.replace("num_epochs: int = 1", "num_epochs: int = Field(default_factory=lambda: 1)")
+    (folder / "own.py").write_text(f"from pydantic import Field\n{own}        num_envs: int\n")
+    config = stack(Choice(algorithm="own.py:Own")).config()
+    assert (config.ppo.num_epochs, config.sources["ppo.num_epochs"]) == (
+        1,
+        "defaults of Own.Config",
+    )
+    assert (config.ppo.num_envs, config.sources["ppo.num_envs"]) == (512, "configs/cpu.yaml")
+
+
 def test_a_warm_start_is_alike_in_a_file(folder: Path) -> None:
     """It brings the environment too, and what the file says lies on it."""
     own = load_run_config(pretrained_checkpoint("robust_small").run)
@@ -325,6 +337,13 @@ def test_the_source_is_what_set_the_value_that_counts(folder: Path) -> None:
     (folder / "world.yaml").write_text(
         "env: {randomization: {command_interval: [2.0, 4.0]}}\nsources: {randomization: A test.}"
     )
+    # A flag has a part of a mapping that lies first in the preset's, which a file continues.
+    (folder / "shares.yaml").write_text(
+        "env: {randomization: {push_speed: [0.1, 0.1], shares: {push_speed: 0.5}}}"
+    )
+    line = "--config robust_small --config shares.yaml --randomization.shares action_latency 0.5"
+    config = read_command(line.split()).config
+    assert config.sources["env.randomization.shares"] == "flags"
     config = read_command("--config transfer --world world.yaml".split()).config
     for key in ("share", "warmup_steps"):
         default = type(config.env.randomization).model_fields[key].default
@@ -342,6 +361,9 @@ def test_a_config_that_disagrees_with_itself_is_refused(folder: Path) -> None:
         mixed = TrainConfig(algorithm=algorithm, ppo=settings_of_other)
         with pytest.raises(UserError, match="name the algorithm that has them"):
             bounce_mjx.train(config=mixed, quiet=True)
+    # Plain values are PPO's, as the code of a file does not run here.
+    with pytest.raises(ValueError, match="num_env"):
+        TrainConfig(algorithm="own.py:Own", ppo={"num_env": 8})
     with pytest.raises(ValueError, match="these are the settings of Bounce, and task is track"):
         TrainConfig(task="track", env=TrainConfig().env)
 

@@ -19,7 +19,7 @@ from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import pretrained_checkpoint
 from bounce_mjx.task.bounce import BounceConfig
 from bounce_mjx.task.bounce_rewards import BounceReward
-from bounce_mjx.viewers import show
+from bounce_mjx.viewers import page, show
 from bounce_mjx.viewers.controls import direction
 from bounce_mjx.viewers.display import Display, camera_pose, marker_body
 from bounce_mjx.viewers.options import ViewerOptions
@@ -291,6 +291,14 @@ def test_pushes_follow_the_camera(case) -> None:
 
 
 @pytest.mark.parametrize("lasted", [True, False])
-def test_a_film_tells_a_failure_in_the_last_step_of_an_episode(lasted: bool) -> None:
-    frames = viewing.film_of(viewing.mirrored(), 3, lasted).frames
-    assert frames.lost[:, 0].tolist() == [False, False, not lasted]
+def test_a_film_and_a_report_tell_a_failure_in_the_last_step_of_an_episode(
+    lasted: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    simulation = viewing.mirrored()
+    expected = [False, False, not lasted]
+    film = viewing.film_of(simulation, 3, lasted)
+    assert film.frames.lost[:, 0].tolist() == expected
+    replayed = []
+    monkeypatch.setattr(page, "replay", lambda _, frames, **__: replayed.append(frames))
+    page.replay_first_and_worst(simulation.env, viewing.recording_of(simulation, 3, lasted))
+    assert replayed[0].lost[:, 0].tolist() == expected

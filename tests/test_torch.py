@@ -266,8 +266,8 @@ def trained(request, tmp_path_factory) -> Trained:
     else:
 
         def act(observation: torch.Tensor) -> torch.Tensor:
-            inputs = {"observations": names["seen"](observation)}
-            return names["models"]["policy"].act(inputs)[1]["mean_actions"]
+            inputs = {"observations": names["preprocessor"](observation)}
+            return names["policy_model"].act(inputs)[1]["mean_actions"]
 
     return Trained(out, act)
 

@@ -61,6 +61,7 @@ action: {max_lead: 0.3}                                  # does nothing with the
 randomization: {push_interval: [1, 2]}                   # does nothing without push_speed
 robot: {site: s, ball: {mass: 2.7}}                      # g
 robot: {site: s, paddle: {position: [0, 0, 190]}}        # mm
+robot: {site: s, paddle: {quaternion: [0, 0, 0, 0]}}     # no orientation
 robot: {site: s, servo_stiffness: [20e+6, 20e+6]}        # N mm/rad
 robot: {site: s, servo_damping: [2e+6, 2e+6]}            # N mm s/rad
 robot: {site: s, servo_force_limit: [150000, 150000]}    # N mm
@@ -99,6 +100,8 @@ target_height_range: [40, 60]                            # cm
 max_joint_velocity: true                                 # a switch is no number
 friction: true                                           # the same, where null is allowed
 target_height_range: [true, 2]                           # and in a list
+randomization: {restitution: [0.8, 0.9], shares: {restitution: true}}  # and in a mapping
+randomization: {paddle_tilt: [[false, 0.1], [0, 0.1]]}   # and in a list of lists
 """
 
 
@@ -196,11 +199,11 @@ track: {home: [1.5, 0.5, 1], path_size: 0.5}
 
 
 def test_a_sensible_number_is_accepted_whatever_unit_was_meant() -> None:
-    """Of 87 wrong units, six cannot be told from a world that someone may want."""
+    """Of 90 wrong units and values, six cannot be told from a world that someone may want."""
     lines = ALLOWED.strip().splitlines()
     for line in lines:
         config("bounce", **yaml.safe_load(line))
-    assert (len(lines), len(WRONG.strip().splitlines())) == (6, 81)
+    assert (len(lines), len(WRONG.strip().splitlines())) == (6, 84)
 
 
 @pytest.mark.parametrize("case", re.findall(r"^\w[^#]+?\n(?=\w|#|$)", ACCEPTED, re.MULTILINE))

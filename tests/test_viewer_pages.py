@@ -92,7 +92,7 @@ def watch(browser: Browser) -> Iterator[Callable[[str], Watched]]:
     pages = []
 
     def watch(address: str) -> Watched:
-        watched = Watched(browser.new_page(viewport={"width": 900, "height": 560}))
+        watched = Watched(browser.new_page(viewport={"width": 900, "height": 380}))
         pages.append(watched.page)
         watched.page.goto(address)
         return watched

@@ -10,7 +10,6 @@ from bounce_mjx.commands.train import read_command
 from bounce_mjx.config.settings import merged
 from bounce_mjx.config.validation import validate
 from bounce_mjx.deploy.export import policy_metadata
-from bounce_mjx.env.env import model_nominals
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.suite import load_suite
 from bounce_mjx.resources import resource_path
@@ -21,6 +20,7 @@ from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.runs.worlds import in_world
 from bounce_mjx.task.catch import Catch
 from bounce_mjx.world.config import ActionConfig
+from bounce_mjx.world.model import model_nominals
 from bounce_mjx.world.named import read_world
 from bounce_mjx.world.randomization import TERMS
 

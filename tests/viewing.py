@@ -71,19 +71,27 @@ def _exchangeable() -> Simulation:
     return Simulation(env, controller, 2, seed=0, policy=np.float32(0.0))
 
 
-def film_of(simulation: Simulation, steps: int, lasted: bool = True) -> FilmPlayer:
-    """A film of the next steps of a simulation's first robot, as one of an episode of so many,
-    which lasted or failed in the last of them."""
+def recording_of(simulation: Simulation, steps: int, lasted: bool = True) -> Recording:
+    """The next steps of a simulation's first robot, as an episode of so many, which lasted or
+    failed in the last of them."""
     frames = simulation.record(steps * simulation.env.dt)
-    recording = Recording(
+    terminated = np.zeros((steps, 1), bool)
+    terminated[-1] = not lasted
+    return Recording(
         joint_angles=None,
         ball=None,
         paddle=frames.paddle[1:, :1].transpose(0, 2, 1),
         command={name: values[1:, :1] for name, values in frames.command.items()},
         running=np.ones((steps, 1), bool),
+        terminated=terminated,
         qpos=frames.qpos[1:, :1].transpose(0, 2, 1),
         metrics={name: values[1:, :1] for name, values in frames.metrics.items()},
     )
+
+
+def film_of(simulation: Simulation, steps: int, lasted: bool = True) -> FilmPlayer:
+    """A film of the episode of `recording_of`."""
+    recording = recording_of(simulation, steps, lasted)
     statistics = Statistics(np.array([lasted]), np.full(1, steps), np.zeros(1), Tally({}, {}))
     return FilmPlayer(Film(simulation.env, recording, statistics))
 
@@ -94,10 +102,15 @@ class Client:
     def __init__(self, address: str):
         protocol = Subprotocol(f"viser-v{viser.__version__}")
         self.address = address
+        # The page may send for ever, so that a close would wait for its answer in vain.
         self._socket = connect(
-            address.replace("http", "ws"), subprotocols=[protocol], compression=None, max_size=None,
+            address.replace("http", "ws"),
+            subprotocols=[protocol],
+            compression=None,
+            max_size=None,
             ping_interval=None,
-        )  # fmt: skip
+            close_timeout=0.1,
+        )
         self.send(CAMERA)
         self._controls: dict[str, str] = {}
         self._labels: list[str] = []

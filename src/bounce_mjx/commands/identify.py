@@ -45,7 +45,6 @@ def main(args: Sequence[str]) -> None:
     command = parse(IdentifyCommand, args, prog="bounce-mjx identify")
     if not command.logs:
         raise UserError("no log is given; name the CSV files or bags to identify from")
-    from bounce_mjx.env.env import world_model
     from bounce_mjx.identify.doctor import describe, examine
     from bounce_mjx.identify.reading import read_log
     from bounce_mjx.identify.stages import identify, join
@@ -61,6 +60,7 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.robot.model import joint_names
     from bounce_mjx.runs.files import check_output, write_output
     from bounce_mjx.training.setup import set_up_jax
+    from bounce_mjx.world.model import world_model
     from bounce_mjx.world.named import read_world
 
     known = None if command.check is None else read_world(command.check)

@@ -27,17 +27,20 @@ class PlotCommand(WhichPolicy):
 def main(args: Sequence[str]) -> None:
     """Runs the command line."""
     command = parse(PlotCommand, args, prog="bounce-mjx plot")
-    from bounce_mjx.env.env import Env
-    from bounce_mjx.reports import curves, figures, page
-    from bounce_mjx.runs.files import writable, write_output
     from bounce_mjx.runs.folders import find_checkpoint, runs_of_seeds
-    from bounce_mjx.training.setup import set_up_jax
 
     runs = [command.choose_run(run) for run in command.runs or (None,)]
     seeds = [seed for run in runs for seed in runs_of_seeds(run)]
     checkpoints = [find_checkpoint(seed) for seed in seeds]
     # Also imports the files of the tasks, which may register plots.
     configs = [command.config_of_run(checkpoint.run) for checkpoint in checkpoints]
+
+    # These take seconds, which a mistake in the words above should not.
+    from bounce_mjx.env.env import Env
+    from bounce_mjx.reports import curves, figures, page
+    from bounce_mjx.runs.files import writable, write_output
+    from bounce_mjx.training.setup import set_up_jax
+
     set_up_jax(*(config.env for config in configs))
     groups = curves.group_runs([checkpoint.run for checkpoint in checkpoints])
     with writable(command.out, "choose another folder with --out"):

@@ -18,10 +18,14 @@ class ReportCommand(WhichPolicy):
 def main(args: Sequence[str]) -> None:
     """Runs the command line."""
     command = parse(ReportCommand, args, prog="bounce-mjx report")
-    from bounce_mjx.reports.page import write_report
     from bounce_mjx.runs.folders import find_checkpoint
-    from bounce_mjx.training.setup import set_up_jax
 
     checkpoint = find_checkpoint(command.choose_run(command.run))
-    set_up_jax(command.config_of_run(checkpoint.run).env)
+    config = command.config_of_run(checkpoint.run)
+
+    # These take seconds, which a mistake in the words above should not.
+    from bounce_mjx.reports.page import write_report
+    from bounce_mjx.training.setup import set_up_jax
+
+    set_up_jax(config.env)
     print(write_report(checkpoint.run))

@@ -20,6 +20,9 @@ def main(args: Sequence[str]) -> None:
         if has_plugin() != has_accelerator():
             command = read_command(args)
         config = command.config
+        # A config that training refuses is no answer; what the devices and the robot's file allow
+        # is seen only as it starts.
+        config.ppo.check_rollout(config.training_episode_steps)
         print(dump_with_sources(config.model_dump(mode="json"), config.sources), end="")
         return
     import jax

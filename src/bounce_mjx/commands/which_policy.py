@@ -107,8 +107,8 @@ def suite_conditions(
     Raises:
       UserError: suite or world is missing or wrong.
     """
-    from bounce_mjx.env.env import model_nominals
     from bounce_mjx.evaluation.suite import load_suite
+    from bounce_mjx.world.model import model_nominals
 
     path = named_file(suite, "configs")
     if world is None:

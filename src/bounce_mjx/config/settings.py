@@ -86,8 +86,7 @@ class StrictModel(pydantic.BaseModel):
         # pydantic would read true as 1.
         kinds = set(types_in(cls.model_fields[info.field_name].annotation))
         is_number = bool(kinds & {int, float}) and bool not in kinds
-        parts = value if isinstance(value, list | tuple) else [value]
-        if is_number and any(isinstance(part, bool) for part in parts):
+        if is_number and any(isinstance(part, bool) for part in parts_of(value)):
             raise PydanticKnownError("int_type" if int in kinds else "float_type")
         return value
 
@@ -100,9 +99,11 @@ class StrictModel(pydantic.BaseModel):
             return values
         completed = dict(values)
         for name, field in cls.model_fields.items():
-            if isinstance(field.default, StrictModel) and isinstance(values.get(name), dict):
-                default = field.default.model_dump(exclude_unset=True)
-                completed[name] = merged(default, values[name])
+            if isinstance(values.get(name), dict):
+                default = default_of(field)
+                if isinstance(default, StrictModel):
+                    plain = default.model_dump(exclude_unset=True)
+                    completed[name] = merged(plain, values[name])
         return completed
 
 
@@ -126,6 +127,27 @@ def types_in(kind: Any) -> Iterator[Any]:
     yield typing.get_origin(kind) or kind
     for inner in typing.get_args(kind):
         yield from types_in(inner)
+
+
+def has_default(field: FieldInfo) -> bool:
+    """Whether a setting has a default, and not one that depends on the other settings."""
+    return not (field.is_required() or field.default_factory_takes_validated_data)
+
+
+def default_of(field: FieldInfo) -> Any:
+    """The default of a setting, also one that is made anew for each group; None without one."""
+    return field.get_default(call_default_factory=True) if has_default(field) else None
+
+
+def parts_of(value: Any) -> Iterator[Any]:
+    """The values in nested sequences and mappings; a value that is neither is its only part."""
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list | tuple):
+        for inner in value:
+            yield from parts_of(inner)
+    else:
+        yield value
 
 
 def fields_in(group: type[pydantic.BaseModel], prefix: str = "") -> dict[str, FieldInfo]:

@@ -37,11 +37,12 @@ from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.robot.actuators import largest_torques
 from bounce_mjx.robot.arm import joint_name
 from bounce_mjx.robot.config import is_packaged
-from bounce_mjx.robot.model import find_addresses, joint_names, load_model, upper_face
+from bounce_mjx.robot.model import find_addresses, joint_names, upper_face
 from bounce_mjx.runs.checkpoints import read_actor
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import Checkpoint
 from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.model import world_model
 from bounce_mjx.world.observation import ObservationConfig
 from bounce_mjx.world.randomization import RandomizationConfig, entries
 
@@ -131,7 +132,7 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
             f"the command {min(taken)} has the name of a measurement; give it another name in "
             f"the task {env.task.__name__}"
         )
-    m = load_model(env.mjcf, env.physics_dt, visual=False, robot=env.robot, num_balls=env.num_balls)
+    m = world_model(env, visual=False)
     addresses = find_addresses(m)
     chain, paddle, normal = _hinges(m, env.default_joint_angles)
     servos = list(addresses.actuators)

@@ -1,7 +1,6 @@
 """`Env`: one environment, which is a world and a task. It and `State` match brax's by structure."""
 
 import dataclasses
-import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -19,7 +18,7 @@ from bounce_mjx.env.checks import (
     check_tags,
     check_task,
 )
-from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, edited_model
+from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState
 from bounce_mjx.physics.engine import Engine, make_engine
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
 from bounce_mjx.robot import model as robot_model
@@ -28,6 +27,7 @@ from bounce_mjx.task.task import Start, Step, Task, TaskStep
 from bounce_mjx.world import noise
 from bounce_mjx.world.actuation import Actuation, Actuators
 from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.model import world_model
 from bounce_mjx.world.noise import Clock
 from bounce_mjx.world.observation import Kinematics
 from bounce_mjx.world.randomization import TERMS, Ranges, World
@@ -577,22 +577,6 @@ class Env:
             for i, entry in enumerate(jnp.ravel(value)):
                 metrics[f"{name}_{i}"] = entry
         return metrics
-
-
-def world_model(config: WorldConfig, visual: bool = True) -> mujoco.MjModel:
-    """Compiles the model of a world; `visual` and the errors are those of `load_model`."""
-    mj_model = robot_model.load_model(
-        config.mjcf, config.physics_dt, visual, config.robot, num_balls=config.num_balls
-    )
-    if config.friction is None:
-        return mj_model
-    return edited_model(mj_model, PhysicsParameters(contact_friction=np.float64(config.friction)))
-
-
-@functools.lru_cache(maxsize=8)
-def model_nominals(config: WorldConfig) -> dict[str, np.ndarray]:
-    """The `nominal_values` of all terms for a config, whose model it compiles."""
-    return nominal_values(world_model(config, visual=False), TERMS)
 
 
 def sample_commands(ranges: Ranges, draws: jax.Array) -> dict[str, jax.Array]:

@@ -9,12 +9,13 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from bounce_mjx.env.env import Env, EnvState, State, world_model
+from bounce_mjx.env.env import Env, EnvState, State
 from bounce_mjx.evaluation.episodes import Batch, Evaluator, add_step, begin, reset_episodes
 from bounce_mjx.evaluation.statistics import Measured
 from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, edited_model, servo_targets
 from bounce_mjx.world.actuation import Actuation
+from bounce_mjx.world.model import world_model
 from bounce_mjx.world.randomization import Ranges
 
 _FULL_PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS

@@ -39,7 +39,8 @@ def make_evaluator(env: Env, actor: Actor, episodes: int, recorded: int = 0) -> 
     is reached.
 
     They are simulated in whole blocks (`_lanes`), so that on a CPU an episode is the same in any
-    number of them, and a film shows it as it was; fewer than a block in MJX are not.
+    number of them, and a film shows it as it was. Fewer than a block in MJX are not filled up, and
+    their last bits may depend on their number.
     """
     lanes = _lanes(env, episodes)
 
@@ -53,11 +54,12 @@ def make_evaluator(env: Env, actor: Actor, episodes: int, recorded: int = 0) -> 
 
 
 def make_filmer(env: Env, actor: Actor, episodes: int, episode: int) -> Evaluator:
-    """A jitted evaluation of the block in which one of `episodes` episodes is, as `make_evaluator`
-    simulates it, with a recording of this episode alone [T, ..., 1].
+    """A jitted simulation of one of `episodes` episodes, as `make_evaluator` simulates it, with a
+    recording of this episode alone [T, ..., 1].
 
-    On a CPU it is the same bit for bit. On other devices the batch is the evaluation's own, but the
-    episode has another place in it, which may change the last bits of its actions.
+    On a CPU its block alone is simulated, and it is the same bit for bit. On other devices the
+    batch is the evaluation's own, but the episode has another place in it, which may change the
+    last bits of its actions.
     """
     lanes = _lanes(env, episodes)
     simulated = np.arange(len(lanes))
@@ -72,6 +74,7 @@ def make_filmer(env: Env, actor: Actor, episodes: int, episode: int) -> Evaluato
     recorded = place + 1
 
     def evaluate(policy: Policy, key: jax.Array, ranges: Ranges | None = None) -> Measured:
+        # All of them, as in the evaluation: a smaller batch may differ in the last bits.
         states = _reset_lanes(env, key, episodes, lanes, ranges)
         states = jax.tree.map(lambda x: x[..., simulated], states)
         statistics, recording = run_episodes(env, actor, policy, states, recorded)

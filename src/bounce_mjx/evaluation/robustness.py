@@ -139,7 +139,7 @@ def measure_conditions(
         members = [conditions[index] for index in indices]
         program = _program(members, options.physics)
         env = program.env
-        size = _batch_size(len(members), options.episodes, program.on_c)
+        size = _batch_size(program, len(members), options.episodes)
         make = make_mujoco_evaluator if program.on_c else make_evaluator
         evaluate = make(env, actor(env), size * options.episodes)
         for start in range(0, len(members), size):
@@ -161,8 +161,8 @@ def find_episode(
     """Where `measure_conditions` simulates an episode of one of the conditions.
 
     Raises:
-      UserError: MuJoCo's C engine simulates the condition (`--physics mujoco`, or its program has
-        dry friction in MJX).
+      UserError: MuJoCo's C engine simulates the condition: the options ask for it, or its program
+        has dry friction in MJX.
     """
     condition = conditions[index]
     (indices,) = [program for program in _programs(conditions) if index in program]
@@ -173,7 +173,7 @@ def find_episode(
             f"the condition {condition.label} is simulated on MuJoCo's C engine, which has no "
             "films; choose another condition"
         )
-    size = _batch_size(len(members), options.episodes, program.on_c)
+    size = _batch_size(program, len(members), options.episodes)
     place = indices.index(index)
     start = place // size * size
     ranges = _stack_ranges(program.inputs, _padded(members[start : start + size], size))
@@ -225,7 +225,8 @@ def _padded(batch: list[Condition], size: int) -> list[Condition]:
 
 def _outcome(program: _Program, condition: Condition, statistics: Statistics) -> ConditionOutcome:
     """The outcome of a condition, from the statistics of its own episodes."""
-    # What a task judges may depend on the world, and the program's spans several.
+    # What a task judges may depend on the world, and the program's spans several. Its geometry is
+    # that of the settings, which all of them share.
     task = condition.config.task(condition.config)
     task.geometry = program.env.task.geometry
     report = judge(program.env, statistics, commands=condition.commands, task=task)
@@ -266,9 +267,12 @@ def _stack_ranges(names: Sequence[str], conditions: Sequence[Condition]) -> Rang
     return jax.tree.map(lambda *ends: jnp.asarray(np.stack(ends), jnp.float32), *of_conditions)
 
 
-def _batch_size(conditions: int, episodes: int, on_c: bool) -> int:
+def _batch_size(program: _Program, conditions: int, episodes: int) -> int:
     """Number of conditions in one call; calls have about equal sizes."""
-    if on_c:
+    if not program.inputs:
+        # Without ranges, the episodes of a call all have different keys (`reset_episodes`).
+        return 1
+    if program.on_c:
         batch = _MUJOCO_BATCH_PER_CORE * (os.cpu_count() or 1)
     elif jax.default_backend() == "cpu":
         batch = _CPU_BATCH

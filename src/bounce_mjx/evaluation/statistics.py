@@ -21,7 +21,7 @@ class Statistics(NamedTuple):
 
     running: jax.Array
     """Whether the episode has not ended [E], bool; of a whole evaluation, whether it lasted until
-    its time limit."""
+    its time limit. (That of a `Recording` is before the step.)"""
     steps: jax.Array
     """Steps of the episode [E]."""
     episode_return: jax.Array
@@ -152,6 +152,7 @@ def _row(env: Env, states: State, running: jax.Array, step: jax.Array) -> Record
             paddle=now.truth.paddle_position,
             command=now.command,
             running=running,
+            terminated=running & (state.done > 0),
             command_velocity=None if setpoint is None else setpoint.velocity,
             qpos=state.pipeline_state.physics.qpos,
             metrics=state.metrics,

@@ -13,13 +13,13 @@ from pydantic import Field
 from bounce_mjx.config.files import differing_keys, read_mapping
 from bounce_mjx.config.settings import Finite, StrictModel, merged, nested
 from bounce_mjx.config.validation import validate
-from bounce_mjx.env.env import model_nominals
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.evaluation.config import command_ranges
 from bounce_mjx.physics.edited import NO_PAIR
 from bounce_mjx.task.registry import find_task
 from bounce_mjx.world.actuation import DEFAULT_PUSH_INTERVAL
 from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.model import model_nominals
 from bounce_mjx.world.randomization import MODEL, TERMS, RandomizationConfig
 
 _CONFIG_UNITS = "factor", "s", "Hz", "m", "m/s", "1/m", "rad", "rad/s", "kg", "N m", "N m s/rad"
@@ -60,7 +60,8 @@ class Perturbation(StrictModel):
     settings: dict[str, Any] = {}
     """New values for settings of `env`, by dotted names."""
     trained_ranges: bool = False
-    """Samples from all ranges of the policy's training at once; replaces `terms`."""
+    """Samples from all ranges of the policy's training at once, in the training's own settings;
+    replaces `terms`."""
 
 
 class Suite(StrictModel):
@@ -78,7 +79,7 @@ class Condition(NamedTuple):
     strength: float | None
     """Strength in the perturbation's unit; None for a perturbation without strengths."""
     env: WorldConfig
-    """World and task of the condition, without randomisation."""
+    """Settings of the condition, without randomisation."""
     randomization: RandomizationConfig
     """The active terms, each with its range; every episode samples all of them, whatever its
     `share`."""
@@ -86,9 +87,9 @@ class Condition(NamedTuple):
     """Lower and upper ends of the ranges of all commands and of the active terms, in the shapes of
     the terms."""
     trained: bool
-    """Whether the training ranges of the policy contain the condition: also the neutral values of
-    the terms that only the training has. Of these, a term without a neutral value does not count,
-    nor does an interval."""
+    """Whether the policy's training has episodes in every world of the condition: no setting
+    differs, and the training's ranges contain those of the condition. They also contain the neutral
+    value of each term that the training alone has, but for intervals and terms without one."""
 
     @property
     def label(self) -> str:
@@ -147,8 +148,8 @@ def load_suite(
     Args:
       trained: config of the policy's training; each condition replaces its randomisation.
       world: config of the policy in a named world, which each condition changes, but for that with
-        `trained_ranges`; by default, the policy's without randomisation. Each episode samples all
-        its terms, whatever its `share`.
+        `trained_ranges`, which is in the training's settings; by default, the policy's without
+        randomisation. Each episode samples all its terms, whatever its `share`.
       assumed: by the name of a condition, the nested settings of `env` that it changes in `world`
         (`double_assumed`). These conditions follow the nominal one.
 
@@ -186,10 +187,10 @@ def load_suite(
 def _check_content(perturbation: Perturbation, source: str) -> None:
     """Raises UserError unless a perturbation says what it changes, and what has its strengths."""
     changes = [perturbation.terms, perturbation.settings]
-    has_changes = any(changes)
+    has_one_content = any(changes) != perturbation.trained_ranges
     has_strengths = bool(perturbation.strengths)
     uses_strength = _fill_in(changes, 0.0) != changes
-    if has_changes == perturbation.trained_ranges or uses_strength != has_strengths:
+    if not has_one_content or uses_strength != has_strengths:
         raise UserError(
             f"{source}: give terms or settings, with the word strength in a value if and only "
             "if it has strengths, or trained_ranges: true"
@@ -223,7 +224,8 @@ def _condition(
     source: str,
 ) -> Condition:
     value = None if strength is None else strength * UNITS[perturbation.unit]
-    env = _with_changes(_unrandomized(world), _fill_in(perturbation.settings, value), source)
+    base = training.config if perturbation.trained_ranges else world
+    env = _with_changes(_unrandomized(base), _fill_in(perturbation.settings, value), source)
     commands = neutral_commands(env)
     if perturbation.trained_ranges:
         sampled = training.config.randomization

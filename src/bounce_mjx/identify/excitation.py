@@ -7,11 +7,11 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from bounce_mjx.env.env import world_model
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.contacts import ContactChecker
 from bounce_mjx.robot.model import find_addresses, joint_names, joint_ranges
 from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.model import world_model
 
 MARGIN = 0.01
 """Least distance between two parts of the arm, and from the arm to the floor or a table, m."""

@@ -11,7 +11,6 @@ import mujoco
 import numpy as np
 from scipy.signal import lfilter
 
-from bounce_mjx.env.env import world_model
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.unknowns import CAMERA_ROTATION, Layout
 from bounce_mjx.identify.windows import Windows
@@ -20,6 +19,7 @@ from bounce_mjx.physics.scalars import quaternion_matrix
 from bounce_mjx.robot.contact import stiffness_and_damping
 from bounce_mjx.robot.model import contact_pairs, find_addresses, link_bodies, scatter
 from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.model import world_model
 from bounce_mjx.world.sampling import physics_parameters
 
 _LANES = 128

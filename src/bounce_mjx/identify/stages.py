@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 from numpy.polynomial.polynomial import polyfit
 
-from bounce_mjx.env.env import model_nominals, world_model
 from bounce_mjx.errors import UserError
 from bounce_mjx.identify.fit import (
     AIR_LIFT,
@@ -42,6 +41,7 @@ from bounce_mjx.identify.unknowns import Layout
 from bounce_mjx.identify.windows import BEFORE_BOUNCE, GUESSED_DRAG, Windows, cut
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.model import model_nominals, world_model
 
 # Every fifth window is held out of the search until its last stage.
 _HELD_OUT = 5

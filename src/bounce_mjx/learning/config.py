@@ -6,6 +6,7 @@ import pydantic
 from pydantic import Field
 
 from bounce_mjx.config import settings
+from bounce_mjx.errors import UserError
 
 PPO_NAME = "ppo"
 """Name of the algorithm of this package."""
@@ -96,6 +97,18 @@ class PPOConfig(settings.StrictModel):
                 f"{self.rollout_length}); choose a divisor of {batch}"
             )
         return self
+
+    def check_rollout(self, episode_steps: int) -> None:
+        """Checks the rollout against the control steps after which an episode is truncated.
+
+        Raises:
+          UserError: a rollout is longer than an episode.
+        """
+        if self.rollout_length > episode_steps:
+            raise UserError(
+                f"rollout_length {self.rollout_length} is longer than an episode of "
+                f"{episode_steps} control steps; choose a shorter rollout or longer episodes"
+            )
 
     @property
     def batch_steps(self) -> int:

@@ -182,11 +182,7 @@ class PPO:
         Raises:
           UserError: a rollout is longer than an episode, or the environment lacks a critic metric.
         """
-        if config.rollout_length > episode_steps:
-            raise UserError(
-                f"rollout_length {config.rollout_length} is longer than an episode of "
-                f"{episode_steps} control steps; choose a shorter rollout or longer episodes"
-            )
+        config.check_rollout(episode_steps)
         self.config = config
         self.env = env
         self.episode_steps = episode_steps

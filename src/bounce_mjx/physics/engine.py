@@ -32,7 +32,7 @@ class Engine(NamedTuple):
 
 def is_fused(mj_model: mujoco.MjModel, choice: str, addresses: Addresses | None = None) -> bool:
     """Whether the engine `choice` ("auto", "fused" or "mjx") is fused for a compiled model
-    (`env.world_model`); this starts no device of JAX's."""
+    (`world.model.world_model`); this starts no device of JAX's."""
     if choice != "auto":
         return choice == "fused"
     return unsupported_feature(mj_model, "fused", addresses) is None

@@ -32,6 +32,12 @@ class PaddleConfig(settings.StrictModel):
     mass: Annotated[settings.Positive, Field(le=20.0)] = 0.1
     """Mass of the blade, kg; the handle has none."""
 
+    @pydantic.model_validator(mode="after")
+    def _check_quaternion(self):
+        if not any(self.quaternion):
+            raise ValueError("the quaternion is 0, which is no orientation; give w, x, y, z")
+        return self
+
 
 class BallConfig(settings.StrictModel):
     """The ball."""

@@ -104,6 +104,12 @@ class TrainConfig(StrictModel):
         return sources
 
     @property
+    def training_episode_steps(self) -> int:
+        """Control steps after which the training truncates an episode."""
+        limit = self.ppo.training_episode_seconds or self.env.episode_seconds
+        return min(self.env.episode_steps, max(1, round(limit / self.env.control_dt)))
+
+    @property
     def starts_with_learning_rate(self) -> bool:
         """Whether `ppo.learning_rate` is only the start, as `target_kl` adapts it after each
         minibatch; an algorithm of the user's may have a schedule of its own."""
@@ -141,15 +147,6 @@ class TrainConfig(StrictModel):
             _check_task(env, info.data["task"])
             return env
         return find_task(info.data["task"]).Config.model_validate(env)
-
-    @pydantic.field_validator("ppo", mode="before")
-    @classmethod
-    def _read_ppo(cls, ppo: Any, info: pydantic.ValidationInfo) -> Any:
-        """Plain values of an algorithm of the user's, as in a run's config, lose its own settings:
-        its code does not run here, and whatever acts with a policy needs none of them."""
-        if isinstance(ppo, dict) and is_file(info.data.get("algorithm", PPO_NAME)):
-            return {key: ppo[key] for key in ppo if key in PPOConfig.model_fields}
-        return ppo
 
 
 def _check_task(env: WorldConfig, name: str) -> None:
@@ -206,9 +203,14 @@ def load_run_config(
     # Here, as the name may stand for code that the user has named otherwise.
     env = validate(its_task.Config, values.get("env", {}), str(path), "env")
     values = values | {"env": env}
+    ppo = values.get("ppo", {})
     if algorithm is not None:
         settings = find_algorithm(algorithm).Config
-        values |= {"ppo": validate(settings, values.get("ppo", {}), str(path), "ppo")}
+        values["ppo"] = validate(settings, ppo, str(path), "ppo")
+    elif isinstance(ppo, dict) and is_file(str(values.get("algorithm", PPO_NAME))):
+        # The code of the user's algorithm does not run here, and whatever acts with its policy
+        # needs none of its own settings.
+        values["ppo"] = {key: ppo[key] for key in ppo if key in PPOConfig.model_fields}
     config = validate(TrainConfig, values, str(path))
     config.set_sources(sources)
     if config.env.mjcf is not None and not is_packaged(config.env.mjcf):

@@ -31,7 +31,7 @@ from pydantic.fields import FieldInfo
 
 from bounce_mjx.config.command_line import Flag
 from bounce_mjx.config.files import differing_keys, flat
-from bounce_mjx.config.settings import Layer, StrictModel, merged, nested
+from bounce_mjx.config.settings import Layer, StrictModel, default_of, has_default, merged, nested
 from bounce_mjx.config.user_code import is_file, is_same_code
 from bounce_mjx.config.validation import describe, groups_of, path_of, validate
 from bounce_mjx.errors import UserError, shorten
@@ -271,9 +271,10 @@ def _changed_defaults(algorithm: type[PPOConfig]) -> list[Layer]:
     preset that was made for PPO. They are a layer, so that they lie above the machine's preset."""
     changed = {}
     for key, field in PPOConfig.model_fields.items():
-        default = algorithm.model_fields[key].default
-        if default != field.default:
-            changed[key] = default
+        own_field = algorithm.model_fields[key]
+        # A narrower type without a default says nothing of the value.
+        if has_default(own_field) and default_of(own_field) != field.default:
+            changed[key] = default_of(own_field)
     return [Layer(f"defaults of {algorithm.__qualname__}", {"ppo": changed})] if changed else []
 
 
@@ -512,7 +513,10 @@ def _merge(layers: Sequence[Layer]) -> tuple[dict[str, Any], dict[str, str]]:
         if layer.is_world:
             randomization = without_idle_curriculum(values["env"]["randomization"])
             values["env"] = values["env"] | {"randomization": randomization}
-        sources |= dict.fromkeys(flat(layer.values), layer.source)
+        for key in flat(layer.values):
+            # The last source of its keys is that of a mapping (`TrainConfig.sources`).
+            sources.pop(key, None)
+            sources[key] = layer.source
     # A later layer may end a value, or replace a mapping by None.
     remaining = flat(values)
     return values, {key: source for key, source in sources.items() if key in remaining}

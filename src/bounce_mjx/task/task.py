@@ -114,6 +114,8 @@ class Recording(NamedTuple):
     """Commands after the step [T, K]."""
     running: jax.Array
     """Whether the episode had not ended before the step [T, K], bool."""
+    terminated: jax.Array
+    """Whether the episode ended on the step, and not by its time limit [T, K], bool."""
     command_velocity: jax.Array | None = None
     """Velocities of the joints' commands at the end of the step [T, n, K], rad/s; None if the
     commands do not move within limits."""
@@ -215,13 +217,11 @@ class Task:
         """Sizes and places of ball and paddle in the model. An environment sets those of its own
         model (`env.task.geometry = ...`); a task without one compiles the config's model here."""
         # Imported here, as a process that reads the settings alone needs no JAX.
-        from bounce_mjx.robot.model import find_addresses, load_model, read_geometry
+        from bounce_mjx.robot.model import find_addresses, read_geometry
+        from bounce_mjx.world.model import world_model
 
-        config = self.config
-        model = load_model(
-            config.mjcf, config.physics_dt, False, config.robot, num_balls=config.num_balls
-        )
-        return read_geometry(model, find_addresses(model), config.default_joint_angles)
+        model = world_model(self.config, visual=False)
+        return read_geometry(model, find_addresses(model), self.config.default_joint_angles)
 
     def throw(self, draws: jax.Array, command: Values) -> tuple[jax.Array, jax.Array] | None:
         """Position [3] (m) and velocity [3] (m/s) of the ball at a reset, before the noise and the

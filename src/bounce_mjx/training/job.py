@@ -618,9 +618,13 @@ class Job:
         """
         iterations = block_faults.shape[1]
         first = self.steps // self.config.ppo.batch_steps - iterations + 1
-        for seed in faults.mark_diverged(self.seeds, block_faults, self.trainer.checked, first):
+        diverged = faults.mark_diverged(self.seeds, block_faults, self.trainer.checked, first)
+        for seed in diverged:
             if len(self.seeds) > 1:
                 self.say(f"seed {seed.config.seed} diverged: {seed.progress.fault}")
+        if diverged:
+            # The results of the other seeds may now end the training: those that are saved.
+            self.saver.end()
         if not self.healthy():
             raise UserError(
                 f"training diverged: {self.seeds[-1].progress.fault}; the last good checkpoint is "

@@ -54,7 +54,7 @@ class PPOTrainer:
         self._observation_size = env.observation_size
         self.mesh = make_mesh(config.num_devices, config.ppo, config.num_seeds)
         """The devices on which it trains."""
-        algorithm = find_algorithm(config.algorithm)(config.ppo, env, episode_steps(config))
+        algorithm = find_algorithm(config.algorithm)(config.ppo, env, config.training_episode_steps)
         init = algorithm.init
         run = algorithm.run
         make_key = jax.random.PRNGKey
@@ -154,12 +154,6 @@ class PPOTrainer:
         policies = [ppo.policy_of(seed, self._observation_size) for seed in seeds]
         networks = [{"params": seed.params, "statistics": seed.statistics} for seed in seeds]
         return Snapshot(policies, state, networks)
-
-
-def episode_steps(config: TrainConfig) -> int:
-    """Control steps after which the training truncates an episode."""
-    limit = config.ppo.training_episode_seconds or config.env.episode_seconds
-    return min(config.env.episode_steps, max(1, round(limit / config.env.control_dt)))
 
 
 def make_mesh(num_devices: int | None, config: PPOConfig, num_seeds: int = 1) -> Mesh:

@@ -109,8 +109,8 @@ def join_loops(*configs: WorldConfig) -> None:
     Raises:
       UserError: an MJCF file does not fit the task.
     """
-    from bounce_mjx.env.env import world_model
     from bounce_mjx.physics.engine import is_fused
+    from bounce_mjx.world.model import world_model
 
     flags = os.environ.get("XLA_FLAGS")
     # Without a dash, it is empty on purpose or the name of a file with flags.

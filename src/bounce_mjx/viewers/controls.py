@@ -122,10 +122,11 @@ class Controls:
     def _add_command(self, gui: viser.GuiApi, name: str, command: Command) -> _Setting:
         given = self._simulation.command.get(name)
         start = 0.5 * (command.low + command.high) if given is None else given
-        start, *ends = (
-            round(float(end), _DECIMALS)
-            for end in (start, command.low, command.high, *(command.span or ()))
-        )
+        start = round(float(start), _DECIMALS)
+        # A span widens the slider, and so does a value that is given beyond it.
+        reached = [start, command.low, command.high, *(command.span or ())]
+        lowest = round(float(min(reached)), _DECIMALS)
+        highest = round(float(max(reached)), _DECIMALS)
         label = words(name)
         # The folder has the whole name, as the panel is narrow.
         short = label.split()[-1] + (f", {command.unit}" if command.unit else "")
@@ -136,8 +137,8 @@ class Controls:
             else:
                 handle = gui.add_slider(
                     short,
-                    min(start, *ends),
-                    max(start, *ends),
+                    lowest,
+                    highest,
                     command.step / _STEPS_PER_KEY,
                     start,
                     disabled=self._is_film,

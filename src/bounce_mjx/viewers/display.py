@@ -84,7 +84,8 @@ def _with_markers(config: WorldConfig, markers: Sequence[Marker]) -> mujoco.MjMo
     add_balls(spec, config.num_balls)
     names = {marker.name for marker in markers}
     for site in spec.sites:
-        # All sites of the project's own file are markers of one task.
+        # All sites of the project's own file are markers, each of some task; only those of this
+        # task are drawn, as bodies.
         if site.name in names or config.mjcf is None:
             site.group = _SHOWN_GROUPS
     for name, position, size, rgba, shape in markers:
@@ -227,7 +228,8 @@ def camera_pose(
     look_at = _LOOK_AT + 0.5 * np.array([*aside, rise])
     extent = size + 1.05 * np.linalg.norm(np.ptp(offsets, axis=0))
     view = extent * max(1.0, _FULL_ASPECT / aspect) * _VIEW
-    # What is above the focus stays above it; what is beside it leaves the picture.
+    # Seen from so much nearer, a height over the focus that shrinks by the zoom stays where it was
+    # in the picture. What is beside the focus shrinks faster, and so comes to its middle.
     look_at = focus + (look_at - focus) / (zoom**2, zoom**2, zoom)
     if aspect < _PHONE_ASPECT:
         view = _PHONE_DISTANCE * view

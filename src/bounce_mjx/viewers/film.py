@@ -1,4 +1,4 @@
-"""An episode of an evaluation in the viewers, as it was: bit for bit on a CPU."""
+"""An episode of an evaluation in the viewers, as it was (bit for bit on a CPU: `make_filmer`)."""
 
 from collections.abc import Callable, Sequence
 
@@ -31,8 +31,6 @@ class FilmPlayer(Simulation):
         self._world = {name: np.asarray(value)[0] for name, value in film.statistics.world.items()}
         self.frames = episode_frames(film.env, film.recording)
         """Every frame of the episode [T, 1, ...]."""
-        # The recording does not tell whether an episode failed in the last step that it may have.
-        self.frames.lost[-1] = ~np.asarray(film.statistics.running, bool)
         self._next = 0
         self.reset()
 
@@ -119,7 +117,6 @@ def episode_frames(
     qpos = np.moveaxis(recorded.qpos, -1, 1)
     over = np.zeros((steps, 1), bool)
     over[-1] = steps == length
-    lost = over & (length < len(recording.running))
     return EnvFrame(
         time=env.dt * np.arange(1, steps + 1)[:, None],
         qpos=qpos,
@@ -128,7 +125,7 @@ def episode_frames(
         command=recorded.command,
         metrics=recorded.metrics,
         over=over,
-        lost=lost,
+        lost=recorded.terminated,
     )
 
 

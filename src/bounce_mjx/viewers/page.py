@@ -32,12 +32,13 @@ def replay_first_and_worst(env: Env, recording: Recording) -> str:
 
 
 def worst_episode(recording: Recording) -> int:
-    """Index of the recorded episode that ended first; of those that ended together, of the one with
-    the lowest return."""
+    """Index of the recorded episode that survived the fewest steps; of several, of the one with the
+    lowest return."""
     running = np.asarray(recording.running)
+    survived = running & ~np.asarray(recording.terminated)
     terms = [np.asarray(x) for name, x in recording.metrics.items() if name.startswith("reward/")]
     returns = np.where(running, sum(terms, np.zeros(running.shape)), 0.0).sum(axis=0)
-    return int(np.lexsort((returns, running.sum(axis=0)))[0])
+    return int(np.lexsort((returns, survived.sum(axis=0)))[0])
 
 
 def _beside(frames: EnvFrame, others: EnvFrame) -> EnvFrame:

@@ -115,8 +115,8 @@ class Simulation:
         self.command: dict[str, float] = {}
         """Commands of all environments that are set; the others are sampled."""
         self.world: dict[str, Sequence[float]] | None = None
-        """Entries of terms of the world, in all environments; those that are not named are nominal.
-        None for a world sampled at each reset."""
+        """Entries of terms of the world that are set in all environments; those that are not named
+        are nominal. None for a world sampled at each reset. `world_value` tells what holds."""
         self.others: Sequence[Simulation] = ()
         """Simulations of the same robot that are shown with this one, after its environments, and
         have its commands and its world."""
@@ -288,7 +288,8 @@ def resample(recording: EnvFrame, dt: float, fps: float) -> EnvFrame:
     last = len(recording.time) - 1
     num_frames = 1 + math.ceil(last * dt * fps - 1e-6)
     steps = np.minimum(np.arange(num_frames) / (fps * dt), last)
-    before = steps.astype(int)
+    # Rounding may leave a picture at the time of a frame just before it.
+    before = (steps + 1e-6).astype(int)
     after = np.minimum(before + 1, last)
     fraction = (steps - before)[:, None] * ~recording.over[before]
     frames = jax.tree.map(lambda values: values[before], recording)

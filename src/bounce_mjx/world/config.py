@@ -221,7 +221,7 @@ class WorldConfig(RobotSettings):
         for key, needed in unused.items():
             group_name, name = key.split(".")
             group = getattr(self, group_name)
-            if getattr(group, name) != type(group).model_fields[name].default:
+            if getattr(group, name) != settings.default_of(type(group).model_fields[name]):
                 raise ValueError(
                     f"{key} has no effect without {needed}; set that too, or leave {key} out"
                 )
@@ -246,8 +246,8 @@ class WorldConfig(RobotSettings):
         Args:
           paddle: centre of the level paddle at `default_joint_angles`, m.
         """
-        world_start = WorldConfig.model_fields["ball_init_pos"].default
-        task_start = cls.model_fields["ball_init_pos"].default
+        world_start = settings.default_of(WorldConfig.model_fields["ball_init_pos"])
+        task_start = settings.default_of(cls.model_fields["ball_init_pos"])
         over_paddle = (0.0, 0.0, 0.4)
         position = []
         for i in range(3):
