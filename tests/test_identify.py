@@ -27,7 +27,12 @@ from bounce_mjx.identify.flight import acceleration, fit_flight
 from bounce_mjx.identify.following import command_delay, find_settled, follow, set_points
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.reading import read_csv
-from bounce_mjx.identify.simulation import compensated, make_targets
+from bounce_mjx.identify.simulation import (
+    _paddle_speeds,
+    compensated,
+    make_simulator,
+    make_targets,
+)
 from bounce_mjx.identify.stages import (
     Identified,
     _check_frame,
@@ -281,6 +286,76 @@ def test_a_ball_beside_the_paddle_is_refused(shift) -> None:
     np.testing.assert_allclose(list(map(float, found.split(", "))), shift, atol=0.015)
 
 
+@pytest.mark.slow
+def test_a_real_ball_leaves_the_paddle_at_once() -> None:
+    """Along the parabola that begins where and when it touches the paddle, with its restitution;
+    the model's ball is on the paddle for 10 ms more."""
+    config, layout = read_preset(Path("default")).env, Layout(6, True, 0.001)
+    log, gravity, restitution = at_home((0.0, 0.0, 0.0)), 9.81, 0.9
+    windows = windows_of(log)
+    model = world_model(config, visual=False)
+    addresses, data = find_addresses(model), mujoco.MjData(model)
+    data.qpos[list(addresses.arm_qpos)] = config.default_joint_angles
+    mujoco.mj_kinematics(model, data)
+    paddle, ball = addresses.paddle_geom, addresses.balls[0].geom
+    top = data.geom_xpos[paddle][2] + model.geom_size[paddle, 2] + model.geom_size[ball, 0]
+    s = int(np.flatnonzero(windows.has_ball)[1])
+    # The mean is over where in a physics step the ball touches the paddle.
+    falls, speed = windows.bounces[s] + 1e-3 * np.arange(8) / 8, 2.5
+    starts = np.repeat(windows.starts[None], len(falls), axis=0)
+    starts[:, s, 12:] = 0.0
+    starts[:, s, 12:14] = data.geom_xpos[paddle][:2]
+    starts[:, s, 14] = top + speed * falls - gravity * falls**2 / 2
+    starts[:, s, 17] = gravity * falls - speed
+    world = {"restitution": restitution, "air_drag": 0.0, "ball_latency": 0.0}
+    vector = layout.vector(world | {"action_latency": 0.0, "servo_lag": 0.0})
+    vectors = np.repeat(vector[None], len(falls), axis=0)
+    used = np.tile(np.arange(len(windows.first)) == s, (len(falls), 1))
+    since = windows.picture_times[s] - falls[:, None]
+    counts = (since[-1] > 0.02) & (windows.picture_weights[s] > 0.0)
+    expected = top + restitution * speed * since - gravity * since**2 / 2
+    off = []
+    for at_once in (True, False):
+        simulate = make_simulator(config, layout, log, windows, 1.0, leaves_at_once=at_once)
+        heights = windows.split(simulate(vectors, starts, used))[1][:, s, :, 2]
+        off.append(np.max(np.abs(np.mean(heights - expected, axis=0))[counts]))
+    assert off[0] < 3e-3 and off[1] > 15e-3
+
+
+def test_the_speed_of_the_paddle_is_that_of_its_joints() -> None:
+    """Against MuJoCo's Jacobian."""
+    config = read_preset(Path("default")).env
+    log, rates = at_home((0.0, 0.0, 0.0)), np.array([0.1, 0.2, -0.3, 0.1, 0.4, 0.2])
+    windows = windows_of(log._replace(joint_angles=log.joint_angles + np.outer(log.times, rates)))
+    model = world_model(config, visual=False)
+    addresses, data = find_addresses(model), mujoco.MjData(model)
+    s = int(np.flatnonzero(windows.has_ball)[0])
+    moved = (windows.zero[s] + windows.bounces[s]) * rates
+    data.qpos[list(addresses.arm_qpos)] = np.array(config.default_joint_angles) + moved
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    jacobian = np.zeros((3, model.nv))
+    mujoco.mj_jacGeom(model, data, jacobian, None, addresses.paddle_geom)
+    expected = jacobian[2, list(addresses.arm_qvel)] @ rates
+    assert abs(expected) > 0.05
+    assert _paddle_speeds(config, windows)[s] == pytest.approx(expected, abs=1e-4)
+
+
+@pytest.mark.parametrize("dt", [0.001, 0.0005])
+def test_the_delay_and_variance_of_a_lag_are_those_of_its_steps(dt: float) -> None:
+    """Of the answer to a step of the command, in steps of a training and of half the length."""
+    layout, log = Layout(6, False, dt), flight_log()
+    lag, edges = 0.008, dt * np.arange(round(0.5 / dt) + 1)
+    targets = np.repeat((log.target_times >= 0.1)[:, None], 6, axis=1).astype(float)
+    answer = make_targets(log._replace(servo_targets=targets), edges)(0.0, lag)[:, 0]
+    weights, times = np.diff(answer, prepend=0.0), edges[:-1] - 0.1
+    mean = weights @ times
+    vector, places = layout.vector({"action_latency": 0.0, "servo_lag": lag}), layout.slices
+    assert vector[places["delay"]][0] == pytest.approx(mean, abs=1e-6)
+    variance = weights @ (times - mean) ** 2
+    assert vector[places["delay_variance"]][0] == pytest.approx(variance, rel=1e-3)
+
+
 def unseen() -> Identified:
     """A log that shows nothing: all deviations are those of the prior."""
     layout = Layout(6, False, 0.001)
@@ -518,6 +593,9 @@ def test_a_hidden_robot_is_identified(tmp_path: Path) -> None:
     # A lag near 0 differs from a latency only in the second order.
     assert abs(world["servo_lag"] - truth["servo_lag"]) < 5e-3
     assert abs(world["restitution"] - truth["restitution"]) < 0.03
+    # Its contact is the model's, and its last simulation has steps of half the length.
+    assert not found.leaves_at_once
+    assert found.layout.physics_dt == 0.5 * config.physics_dt
     damping, true = (w["servo_damping"] / w["servo_gain"] for w in (world, truth))
     np.testing.assert_allclose(damping, true, rtol=0.3)
     # The fit explains the log down to the noise, which the model's own world does not.

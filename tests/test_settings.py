@@ -23,7 +23,7 @@ from bounce_mjx.runs.folders import create_run, pretrained_checkpoint
 from bounce_mjx.runs.settings import Choice, read_preset, stack
 from bounce_mjx.training import job
 from bounce_mjx.training.command import read_command
-from bounce_mjx.training.run import notes_on_starts
+from bounce_mjx.training.run import notes_on_starts, notes_on_worlds
 from test_keys import KEYS, NEEDED, WITH, other, settings
 
 OWN = """
@@ -251,6 +251,20 @@ def test_a_learning_rate_that_adapts_is_said_to_be_the_first_one() -> None:
     )
     for said in ({"learning_rate": 1e-3, "target_kl": 0.0}, {"target_kl": 0.01}):
         assert not notes_on_starts(stack(Choice()).config(said))
+
+
+def test_a_world_that_most_episodes_do_not_have_is_said(folder: Path) -> None:
+    """A preset's share decides how often a number of a named world is sampled at all."""
+    world = Path("ur5e_rtde")
+    sampled = stack(Choice(config=(Path("transfer"),), world=world))
+    (note,) = notes_on_worlds(sampled.config())
+    assert note.startswith("configs/transfer.yaml samples each number of the world configs/worlds/")
+    assert "in 20% of the episodes" in note
+    path = folder / "whole.yaml"
+    path.write_text("env: {randomization: {share: 1.0, shares: null}}")
+    for files in ((Path("transfer"), path), (Path("robust_cpu"),)):
+        whole = stack(Choice(config=files, world=world))
+        assert not notes_on_worlds(whole.config())
 
 
 def test_a_mistake_names_the_layer_that_has_it(folder: Path, refused) -> None:

@@ -21,7 +21,7 @@ from bounce_mjx.deploy.environments import (
 )
 from bounce_mjx.deploy.interface import check_interface, interface_of
 from bounce_mjx.env.env import Env
-from bounce_mjx.errors import reason_of
+from bounce_mjx.errors import reason_of, shorten
 from bounce_mjx.evaluation.config import EvaluationOptions
 from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
 from bounce_mjx.evaluation.results import Report
@@ -217,7 +217,7 @@ def run_training(
     """Trains with a config, which has its settings from layers, and returns the run."""
     if layers.resume is None:
         say(console, f"config: {layers.title}")
-    for note in (*layers.notes, *notes_on_starts(config)):
+    for note in (*layers.notes, *notes_on_starts(config), *notes_on_worlds(config)):
         say(console, f"note: {note}")
     seeds = job.train(config, console, resume=layers.resume, callbacks=callbacks)
     best = print_results(seeds, console)
@@ -236,6 +236,26 @@ def notes_on_starts(config: TrainConfig) -> list[str]:
         f"ppo.learning_rate {config.ppo.learning_rate} is only the first one, since ppo.target_kl "
         f"{config.ppo.target_kl} adapts it after each minibatch; to compare learning rates, set "
         "target_kl to 0, or change target_kl itself"
+    ]
+
+
+def notes_on_worlds(config: TrainConfig) -> list[str]:
+    """A sentence where most episodes do not have the numbers of a named world, as a preset's share
+    decides how often each term is sampled at all."""
+    share = config.env.randomization.share
+    prefix = "env.randomization."
+    of_world = [
+        key
+        for key, source in config.sources.items()
+        if key.startswith(prefix) and source.startswith("the world ")
+    ]
+    source = config.sources[f"{prefix}share"]
+    if share == 1.0 or not of_world or source in (FLAGS, PYTHON):
+        return []
+    return [
+        f"{shorten(source)} samples each number of {config.sources[of_world[0]]} in {share:.0%} of "
+        "the episodes (or as often as shares says), and the rest has the model's own; a --config "
+        "file with env: {randomization: {share: 1.0, shares: null}} trains in that world alone"
     ]
 
 
