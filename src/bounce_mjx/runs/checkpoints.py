@@ -70,6 +70,7 @@ class NotSavedError(UserError):
 
 def read_policy(checkpoint: Checkpoint, config: TrainConfig) -> Policy:
     """Restores the policy of a checkpoint."""
+    # Refuses a damaged one.
     read_record(checkpoint)
     policy = _read_arrays(checkpoint, POLICY, policy_shapes(config))
     for path, array in jax.tree_util.tree_leaves_with_path(policy):
@@ -125,6 +126,7 @@ def read_networks(
 ) -> tuple[Params, RunningStatistics, tuple[str, ...]]:
     """Restores both networks of a checkpoint, the statistics of their inputs, and the names of the
     critic metrics among these."""
+    # Refuses a damaged one.
     read_record(checkpoint)
     if (checkpoint.folder / NETWORKS).is_dir():
         item = NETWORKS
