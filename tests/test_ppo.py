@@ -297,10 +297,10 @@ def test_any_environment_and_any_loss_train(tmp_path) -> None:
 
 
 class Descent(ppo.PPO):
-    """Plain gradient descent with a schedule of its own, beside the KL rule."""
+    """Plain gradient descent with a weight decay and a schedule of its own, beside the KL rule."""
 
     def make_optimizer(self):
-        return optax.identity()
+        return optax.add_decayed_weights(0.1)
 
     def learning_rate(self, adapted, iteration):
         return 0.01 * 0.5**iteration
@@ -311,12 +311,13 @@ def test_a_schedule_decides_each_minibatch_step(trainer, params):
     config = trainer.config.model_copy(update={"target_kl": 0.01})
     descent, samples = Descent(config, trainer.env, 100), some_samples(trainer, params)
     flat, unravel = ravel_pytree(params)
-    before = ppo.LearnerState(flat, optax.EmptyState(), jnp.float32(0.1))
+    before = ppo.LearnerState(flat, descent.optimizer.init(flat), jnp.float32(0.1))
     step = jax.jit(lambda iteration: descent.minibatch_step(before, samples, unravel, iteration)[0])
     gradient, _ = ravel_pytree(jax.grad(lambda p: trainer.loss(p, samples)[0])(params))
     for iteration, rate in ((0, 0.01), (3, 0.00125)):
         moved = step(jnp.int32(iteration)).params - flat
-        np.testing.assert_allclose(moved, -rate * gradient, rtol=1e-4, atol=1e-7)
+        downhill = -rate * (gradient + 0.1 * flat)
+        np.testing.assert_allclose(moved, downhill, rtol=1e-4, atol=1e-7)
 
 
 def test_episodes_do_not_all_time_out_together():
