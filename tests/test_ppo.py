@@ -22,8 +22,9 @@ from bounce_mjx.learning.metrics import matching_metrics
 from bounce_mjx.learning.ppo import generalized_advantages
 from bounce_mjx.learning.registry import find_algorithm
 from bounce_mjx.learning.statistics import Normalizer, init_normalizer, normalize
+from bounce_mjx.runs.checkpoints import policy_shapes, read_policy, write_run
 from bounce_mjx.runs.config import load_run_config
-from bounce_mjx.runs.folders import create_run
+from bounce_mjx.runs.folders import latest_checkpoint
 from bounce_mjx.task import Task
 from bounce_mjx.training.command import read_command
 
@@ -567,9 +568,15 @@ def test_settings_of_an_own_algorithm_are_keys(tmp_path):
     flags = ["--config", "cpu", "--algorithm", name, "--own-cost", "2"]
     config = read_command(flags, "cpu").config
     assert find_algorithm(config.algorithm)(config.ppo, BounceBall(), 100).config.own_cost == 2.0
-    run = create_run(config.model_copy(update={"log_dir": tmp_path / "runs"}))
+    config = config.model_copy(update={"log_dir": tmp_path / "runs"})
+    policy = jax.tree.map(lambda x: np.ones(x.shape, x.dtype), policy_shapes(config))
+    run = write_run(config, 64, policy)
     assert load_run_config(run, algorithm=name).ppo.own_cost == 2.0
-    assert not hasattr(load_run_config(run).ppo, "own_cost")
+    without = load_run_config(run)
+    assert not hasattr(without.ppo, "own_cost")
+    jax.tree.map(
+        np.testing.assert_array_equal, read_policy(latest_checkpoint(run), without), policy
+    )
     with pytest.raises(UserError, match=r"which is code; name it to run it: --algorithm /.+:Own"):
         read_command(["--resume", str(run)])
     with pytest.raises(UserError, match="has no subclass 'Other' of PPO"):

@@ -34,7 +34,13 @@ from bounce_mjx.learning.ppo import PPO, Params, names_of_critic_metrics
 from bounce_mjx.learning.registry import find_algorithm
 from bounce_mjx.learning.statistics import RunningStatistics, init_statistics
 from bounce_mjx.runs import earlier, folders
-from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config, runs_folder
+from bounce_mjx.runs.config import (
+    CONFIG_FILE,
+    TrainConfig,
+    load_run_config,
+    runs_folder,
+    without_own_settings,
+)
 from bounce_mjx.runs.files import plain_path, seal, to_plain
 from bounce_mjx.runs.records import RECORD, Checkpoint, DamagedCheckpoint, Record, verify
 
@@ -212,7 +218,8 @@ def read_record(checkpoint: Checkpoint) -> Record:
     run_config = load_run_config(checkpoint.run)
     record = verify(checkpoint)
     try:
-        config = type(run_config).model_validate(earlier.present_settings(record.config))
+        stored = without_own_settings(earlier.present_settings(record.config))
+        config = type(run_config).model_validate(stored)
     # Pydantic's own is one.
     except ValueError as error:
         raise DamagedCheckpoint(checkpoint, error) from error
