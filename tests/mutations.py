@@ -128,7 +128,7 @@ FAULTS = [
     ("a curve keeps what was logged first", "reports/curves.py",
      "for event in log.Scalars(tag)}", "for event in log.Scalars(tag)[::-1]}", "test_plot.py -k logged_last"),
     ("runs of other settings are one group", "reports/curves.py",
-     "groups.setdefault(json.dumps(of_run), [])", 'groups.setdefault("", [])', "test_plot.py -k differ_in_the_seed"),
+     "members_of.setdefault(json.dumps(of_run), [])", 'members_of.setdefault("", [])', "test_plot.py -k differ_in_the_seed"),
     ("values that are no numbers are drawn", "reports/curves.py", "if math.isfinite(value)}", "if True}", "test_plot.py -k numbers_count"),
     ("a panel cuts what is below zero", "reports/figures.py", "if lowest >= 0.0:", "if True:", "test_plot.py -k whole_curve"),
     ("save_every saves at evaluations alone", "training/job.py",

@@ -22,8 +22,9 @@ from bounce_mjx.learning.metrics import matching_metrics
 from bounce_mjx.learning.ppo import generalized_advantages
 from bounce_mjx.learning.registry import find_algorithm
 from bounce_mjx.learning.statistics import Normalizer, init_normalizer, normalize
+from bounce_mjx.runs.checkpoints import policy_shapes, read_policy, write_run
 from bounce_mjx.runs.config import load_run_config
-from bounce_mjx.runs.folders import create_run
+from bounce_mjx.runs.folders import latest_checkpoint
 from bounce_mjx.task import Task
 from bounce_mjx.training.command import read_command
 
@@ -297,10 +298,10 @@ def test_any_environment_and_any_loss_train(tmp_path) -> None:
 
 
 class Descent(ppo.PPO):
-    """Plain gradient descent with a schedule of its own, beside the KL rule."""
+    """Plain gradient descent with a weight decay and a schedule of its own, beside the KL rule."""
 
     def make_optimizer(self):
-        return optax.identity()
+        return optax.add_decayed_weights(0.1)
 
     def learning_rate(self, adapted, iteration):
         return 0.01 * 0.5**iteration
@@ -311,12 +312,13 @@ def test_a_schedule_decides_each_minibatch_step(trainer, params):
     config = trainer.config.model_copy(update={"target_kl": 0.01})
     descent, samples = Descent(config, trainer.env, 100), some_samples(trainer, params)
     flat, unravel = ravel_pytree(params)
-    before = ppo.LearnerState(flat, optax.EmptyState(), jnp.float32(0.1))
+    before = ppo.LearnerState(flat, descent.optimizer.init(flat), jnp.float32(0.1))
     step = jax.jit(lambda iteration: descent.minibatch_step(before, samples, unravel, iteration)[0])
     gradient, _ = ravel_pytree(jax.grad(lambda p: trainer.loss(p, samples)[0])(params))
     for iteration, rate in ((0, 0.01), (3, 0.00125)):
         moved = step(jnp.int32(iteration)).params - flat
-        np.testing.assert_allclose(moved, -rate * gradient, rtol=1e-4, atol=1e-7)
+        downhill = -rate * (gradient + 0.1 * flat)
+        np.testing.assert_allclose(moved, downhill, rtol=1e-4, atol=1e-7)
 
 
 def test_episodes_do_not_all_time_out_together():
@@ -566,9 +568,15 @@ def test_settings_of_an_own_algorithm_are_keys(tmp_path):
     flags = ["--config", "cpu", "--algorithm", name, "--own-cost", "2"]
     config = read_command(flags, "cpu").config
     assert find_algorithm(config.algorithm)(config.ppo, BounceBall(), 100).config.own_cost == 2.0
-    run = create_run(config.model_copy(update={"log_dir": tmp_path / "runs"}))
+    config = config.model_copy(update={"log_dir": tmp_path / "runs"})
+    policy = jax.tree.map(lambda x: np.ones(x.shape, x.dtype), policy_shapes(config))
+    run = write_run(config, 64, policy)
     assert load_run_config(run, algorithm=name).ppo.own_cost == 2.0
-    assert not hasattr(load_run_config(run).ppo, "own_cost")
+    without = load_run_config(run)
+    assert not hasattr(without.ppo, "own_cost")
+    jax.tree.map(
+        np.testing.assert_array_equal, read_policy(latest_checkpoint(run), without), policy
+    )
     with pytest.raises(UserError, match=r"which is code; name it to run it: --algorithm /.+:Own"):
         read_command(["--resume", str(run)])
     with pytest.raises(UserError, match="has no subclass 'Other' of PPO"):

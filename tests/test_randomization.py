@@ -227,6 +227,9 @@ def test_a_share_of_the_terms_is_drawn() -> None:
         ({"paddle_tilt": [[0.0] * 3, [0.1] * 3]}, "two lists with one for each of 2 axes"),
         ({"paddle_tilt": [[0.0, 0.2], [0.1, 0.1]]}, "paddle_tilt (0.2, 0.1) is not a range"),
         ({"servo_gain": [[0.9] * 6, [1.1] * 5]}, "two numbers, or two lists with one for each"),
+        # A range of each joint, where the lower and the upper ends are due.
+        ({"servo_gain": [[0.9, 1.1]] * 6}, "two numbers, or two lists with one for each joint"),
+        ({"restitution": [0.7, 0.8, 0.9]}, "[0.7, 0.8, 0.9] is not a range; give two numbers"),
         (
             {"servo_gain": [[0.9] * 5, [1.1] * 5]},
             "servo_gain has 5 numbers, but default_joint_angles",

@@ -25,7 +25,7 @@ from bounce_mjx.commands import adopt as adopt_command
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.contacts import ContactChecker
 from bounce_mjx.resources import resource_path
-from bounce_mjx.robot.actuators import servo_settings
+from bounce_mjx.robot.actuators import ServoSettings, servo_settings
 from bounce_mjx.robot.adopt import adopt, check_as_alone
 from bounce_mjx.robot.arm import build_arm, compile_spec, locate, naming, read_spec
 from bounce_mjx.robot.config import PaddleConfig, RobotConfig
@@ -553,6 +553,28 @@ def test_adopt_prints_each_servo_and_each_change_of_the_world(tmp_path, capsys) 
         assert re.search(rf"  {name}: .* rad, inertia .*, {re.escape(numbers)}\n", said)
     assert "gravity [0.0, 0.0, -1.6], wind [1.0, 0.0, 0.0], density 1.2" in said
     assert "the disabled damper, the disabled actuator groups" in said
+
+
+def test_no_printed_number_is_minus_0() -> None:
+    pose = SimpleNamespace(
+        paddle=np.array([0.5, -4e-4, 0.2]),
+        angles=np.array([-4e-4, 1.0]),
+        acceleration=9.0,
+        reach=1.0,
+        manipulability=0.1,
+        inertia=(1.0, 1.0),
+    )
+    adoption = SimpleNamespace(
+        pose=pose,
+        clearance=0.1,
+        config=RobotConfig(),
+        action_scale=0.05,
+        servos=[ServoSettings(100.0, 1.0, None)] * 2,
+        arm=SimpleNamespace(joint_names=("a", "b"), changes=()),
+    )
+    lines = adopt_command.describe(adoption)
+    assert lines[0].startswith("paddle: level at x 0.500, y 0.000, z 0.200 m")
+    assert lines[5].startswith("  a: +0.000 rad") and lines[6].startswith("  b: +1.000 rad")
 
 
 def test_contacts_are_turned_off_where_the_arm_has_some(tmp_path) -> None:

@@ -278,6 +278,14 @@ def test_a_term_that_may_be_none_is_refused() -> None:
         task.weighted_terms(group(), 0.0)
 
 
+@pytest.mark.parametrize("kind", [task.Near, task.Gaussian, task.Proportional])
+def test_a_ready_made_term_that_gets_the_inputs_of_others_is_refused(kind: type) -> None:
+    group = pydantic.create_model("Terms", __base__=task.StrictModel, still=(kind, kind()))
+    assert float(task.weighted_terms(group(), ("others",), still=0.0)["still"]) in (0.0, 1.0)
+    with pytest.raises(UserError, match=f"the term still is a {kind.__name__}, which takes a num"):
+        task.weighted_terms(group(), ("others",))
+
+
 def test_a_task_has_its_own_config() -> None:
     with pytest.raises(UserError, match="the task Other has no Config of its own"):
         type("Other", (Mistyped,), {})

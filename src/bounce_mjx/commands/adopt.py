@@ -95,15 +95,15 @@ def _as_yaml(command: AdoptCommand, settings: dict[str, Any]) -> str:
     return f"# {head}\n{text}"
 
 
-def _rounded(position: "np.ndarray", digits: int) -> list[float]:
-    """The coordinates of a position [3], m, without a minus before a 0."""
-    return [round(coordinate, digits) + 0.0 for coordinate in position.tolist()]
+def _rounded(numbers: "np.ndarray", digits: int) -> list[float]:
+    """Numbers [N], such as the coordinates of a position, without a minus before a 0."""
+    return [round(number, digits) + 0.0 for number in numbers.tolist()]
 
 
 def describe(adoption: "Adoption") -> list[str]:
     """Lines about an adopted arm: its pose, its servos, and the changes to the user's model."""
     pose = adoption.pose
-    x, y, z = _rounded(pose.paddle, 6)
+    x, y, z = _rounded(pose.paddle, 3)
     strength = f"{pose.acceleration:.0f} m/s^2 upward in addition to holding the arm"
     if math.isinf(pose.acceleration):
         strength = "no force limit"
@@ -118,8 +118,9 @@ def describe(adoption: "Adoption") -> list[str]:
         f"clearance: {clearance}",
         f"servos: {kind}; action scale {adoption.action_scale:g} rad",
     ]
+    angles = _rounded(pose.angles, 3)
     for name, angle, inertia, servo in zip(
-        adoption.arm.joint_names, pose.angles, pose.inertia, adoption.servos, strict=True
+        adoption.arm.joint_names, angles, pose.inertia, adoption.servos, strict=True
     ):
         limit = "no force limit"
         if servo.force_limit is not None:

@@ -66,8 +66,8 @@ def parse(
     Args:
       description: what the command does; by default, the type's docstring.
       default: values for the flags that are not given; by default, the type's own default values.
-      is_first: whether other flags may follow, which a later call reads; these decide which there
-        are.
+      is_first: whether unknown flags are left for a later call, as the flags of this one decide
+        which there are.
 
     Raises:
       UserError: a flag is unknown or has a bad value.

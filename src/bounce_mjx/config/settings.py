@@ -115,8 +115,8 @@ class Layer(NamedTuple):
     values: dict[str, Any]
     """Nested, with the keys of `TrainConfig`."""
     is_world: bool = False
-    """Whether it brings the whole randomisation: what a preset's curriculum says of other terms
-    then ends, see `without_idle_curriculum`."""
+    """Whether it replaces all terms of the randomisation. What a preset's curriculum says of the
+    terms that there were then ends, see `without_idle_curriculum`."""
     whole: tuple[str, ...] = ()
     """Dotted keys of what it brings whole: also of a mapping, such as `shares`, nothing remains of
     the layers below."""
@@ -171,7 +171,8 @@ def nested(key: str, value: Any) -> dict[str, Any]:
 
 
 def merged(values: dict[str, Any], others: dict[str, Any]) -> dict[str, Any]:
-    """Nested mappings in which the others' keys win."""
+    """Nested mappings in which the others' keys win. Settings that are mappings themselves, such as
+    `shares`, are joined too."""
     result = dict(values)
     for key, value in others.items():
         if isinstance(value, dict) and isinstance(result.get(key), dict):

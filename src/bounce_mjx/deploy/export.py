@@ -138,6 +138,12 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
     servos = list(addresses.actuators)
     gear = m.actuator_gear[servos, 0]
     torques = largest_torques(m, addresses.arm_joints, addresses.actuators)
+    joint_ranges = []
+    for low, high in m.jnt_range[list(addresses.arm_joints)].tolist():
+        joint_ranges.append((low, high) if low < high else None)
+    commands = {}
+    for name, command in env.commands.items():
+        commands[name] = CommandRange((command.low, command.high), command.unit)
     return Metadata(
         format=FORMAT,
         task=config.task,
@@ -156,19 +162,13 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         largest_step=tuple(largest_steps),
         max_joint_velocity=env.max_joint_velocity,
         limits=limits,
-        joint_ranges=tuple(
-            (low, high) if low < high else None
-            for low, high in m.jnt_range[list(addresses.arm_joints)].tolist()
-        ),
+        joint_ranges=tuple(joint_ranges),
         servo_stiffness=tuple((m.actuator_gainprm[servos, 0] * gear**2).tolist()),
         servo_damping=tuple((-m.actuator_biasprm[servos, 2] * gear**2).tolist()),
         torque_limits=tuple(np.where(np.isfinite(torques), torques, None).tolist()),
         default_joint_angles=env.default_joint_angles,
         start_noise=env.reset.joint_angles + float(np.max(np.abs(displacement))),
-        commands={
-            name: CommandRange((command.low, command.high), command.unit)
-            for name, command in env.commands.items()
-        },
+        commands=commands,
         randomization=_ranges(env.randomization),
         chain=chain,
         paddle=paddle,
@@ -234,10 +234,11 @@ def largest_step(config: WorldConfig, act: Callable[[jax.Array], jax.Array]) -> 
 
 
 def _inputs(env: WorldConfig) -> tuple[Input, ...]:
-    return tuple(
-        Input(_INPUT_NAMES.get(part.name, part.name), part.count, part.size, part.unit)
-        for part in env.layout.parts
-    )
+    inputs = []
+    for part in env.layout.parts:
+        name = _INPUT_NAMES.get(part.name, part.name)
+        inputs.append(Input(name, part.count, part.size, part.unit))
+    return tuple(inputs)
 
 
 def _hinges(

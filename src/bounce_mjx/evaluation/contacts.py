@@ -38,12 +38,16 @@ def arm_contacts(config: WorldConfig, recording: Recording) -> list[ArmContact]:
     allowed = checker.touching(np.array(config.default_joint_angles))
     joint_angles = np.asarray(recording.joint_angles)
     running = np.asarray(recording.running)
-    found: dict[tuple[str, ...], list[int]] = {}
+    # The episode of each step in which the pair touches.
+    episodes_of: dict[tuple[str, ...], list[int]] = {}
     for step, episode in np.argwhere(running):
         for pair in checker.touching(joint_angles[step, :, episode]) - allowed:
             names = tuple(sorted(map(checker.name, pair)))
-            found.setdefault(names, []).append(int(episode))
-    return [ArmContact(pair, len(set(of)), len(of)) for pair, of in sorted(found.items())]
+            episodes_of.setdefault(names, []).append(int(episode))
+    contacts = []
+    for names, episodes in sorted(episodes_of.items()):
+        contacts.append(ArmContact(names, len(set(episodes)), len(episodes)))
+    return contacts
 
 
 def describe_contacts(contacts: Iterable[ArmContact], episodes: int) -> str:

@@ -90,16 +90,17 @@ def failures_of(setup: EpisodeSetup, statistics: Statistics) -> list[Failure]:
         if not lasted:
             failed.insert(0, _cause(s.ended_by, i))
         if failed:
-            found.append(
-                Failure(
-                    episode=i,
-                    seconds=float(s.steps[i]) * env.dt,
-                    lasted=lasted,
-                    failed=tuple(failed),
-                    command={name: float(x[i]) for name, x in s.command.items()},
-                    world={name: x[i].astype(float).tolist() for name, x in s.world.items()},
-                )
+            command = {name: float(values[i]) for name, values in s.command.items()}
+            world = {name: values[i].astype(float).tolist() for name, values in s.world.items()}
+            failure = Failure(
+                episode=i,
+                seconds=float(s.steps[i]) * env.dt,
+                lasted=lasted,
+                failed=tuple(failed),
+                command=command,
+                world=world,
             )
+            found.append(failure)
     return found
 
 
@@ -115,16 +116,16 @@ def associations(statistics: Statistics, failures: list[Failure]) -> list[Associ
     s = jax.tree.map(np.asarray, statistics)
     has_failed = np.zeros(len(s.running), bool)
     has_failed[[failure.episode for failure in failures]] = True
-    columns = {name: values for name, values in s.command.items()}
+    columns = dict(s.command)
     for name, values in s.world.items():
         entries = values.reshape(len(values), -1)
         for i, entry in enumerate(entries.T):
             columns[f"{name}[{i}]" if entries.shape[1] > 1 else name] = entry
-    found = [
-        Association(name, _thirds(values.astype(float), has_failed))
-        for name, values in columns.items()
-        if np.ptp(values) > 0.0
-    ]
+    found = []
+    for name, values in columns.items():
+        # One that does not vary goes with nothing.
+        if np.ptp(values) > 0.0:
+            found.append(Association(name, _thirds(values.astype(float), has_failed)))
     return sorted(found, key=lambda one: (-one.is_clear, -one.difference))
 
 

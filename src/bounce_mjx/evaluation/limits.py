@@ -35,8 +35,11 @@ def limit_shares(config: WorldConfig, recording: Recording, rate: float = 1000) 
     """
     limits = config.robot.limits
     # In the order of their differences; an arm with one of them has those before it.
-    given = {name: getattr(limits, name) for name in ("velocity", "acceleration", "jerk")}
-    bounds = {name: np.array(bound)[:, None] for name, bound in given.items() if bound is not None}
+    bounds = {}
+    for name in ("velocity", "acceleration", "jerk"):
+        bound = getattr(limits, name)
+        if bound is not None:
+            bounds[name] = np.array(bound)[:, None]
     smoothing = joint_limits(limits).smoothing
     smoothing = None if smoothing is None else smoothing[:, None]
     velocities = np.asarray(recording.command_velocity, np.float64)

@@ -102,11 +102,10 @@ class RobustnessReport(pydantic.BaseModel):
     def worst_share(self, outcome: ConditionOutcome) -> float:
         """Lowest of a condition's results that are shares, from 0 to 1; the share of the episodes
         that last if none is known to be one."""
-        shares = [
-            value
-            for name, value in outcome.values.items()
-            if value is not None and is_share(self.measured.get(name, ""))
-        ]
+        shares = []
+        for name, value in outcome.values.items():
+            if value is not None and is_share(self.measured.get(name, "")):
+                shares.append(value)
         return min(shares, default=100.0 * outcome.lasted) / 100.0
 
 
@@ -209,11 +208,10 @@ def _program(members: Sequence[Condition], physics: Physics) -> _Program:
     is_dry = any("joint_frictionloss" in condition.ranges for condition in members)
     on_c = physics == "mujoco" or (env.engine.name == "mjx" and is_dry)
     # Of the commands, those for which a condition has another range than the config.
-    changed = [
-        name
-        for name, ends in command_ranges(env.config).items()
-        if any(condition.commands[name] != ends for condition in members)
-    ]
+    changed = []
+    for name, ends in command_ranges(env.config).items():
+        if any(condition.commands[name] != ends for condition in members):
+            changed.append(name)
     return _Program(env, [*env.config.randomization.terms, *changed], on_c)
 
 

@@ -169,10 +169,9 @@ def paddle_points(env: Env, recording: Recording, steps: np.ndarray) -> np.ndarr
     """
     model, addresses = env.mj_model, env.addresses
     data = mujoco.MjData(model)
-    joint_angles, offsets = (
-        np.moveaxis(np.asarray(values), 1, 2)[steps]
-        for values in (recording.joint_angles, recording.ball - recording.paddle)
-    )
+    joint_angles = np.moveaxis(np.asarray(recording.joint_angles), 1, 2)[steps]
+    from_paddle = np.asarray(recording.ball - recording.paddle)
+    offsets = np.moveaxis(from_paddle, 1, 2)[steps]
     points = np.zeros((len(offsets), 2))
     for i, (angles, offset) in enumerate(zip(joint_angles, offsets, strict=True)):
         data.qpos[list(addresses.arm_qpos)] = angles

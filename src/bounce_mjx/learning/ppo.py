@@ -207,8 +207,8 @@ class PPO:
     def make_optimizer(self) -> optax.GradientTransformation:
         """Gradient of all parameters in one array [P] -> what the learning rate scales and a step
         subtracts [P]: Adam on clipped gradients. So it has the gradient's sign and no learning
-        rate, as `optax.scale_by_adam`, and not as `optax.adam`. It gets no parameters, which a
-        weight decay would need."""
+        rate, as `optax.scale_by_adam`, and not as `optax.adam`. It is given the parameters [P] too,
+        for a weight decay (`optax.add_decayed_weights`)."""
         clip = optax.clip_by_global_norm(self.config.max_grad_norm)
         return optax.chain(clip, optax.scale_by_adam(eps=1e-5))
 
@@ -218,7 +218,7 @@ class PPO:
         state = self.optimizer.init(gradient)
         # Several, as a schedule may begin with 0.
         for _ in range(3):
-            direction, state = self.optimizer.update(gradient, state)
+            direction, state = self.optimizer.update(gradient, state, jnp.zeros(1))
         if direction[0] < 0.0:
             raise UserError(
                 f"make_optimizer of {type(self).__name__} turns a gradient around, as optax.adam "
@@ -505,7 +505,7 @@ class PPO:
 
         gradient, metrics = jax.grad(loss_of, has_aux=True)(learner.params)
         metrics["loss/gradient_norm"] = optax.tree.norm(gradient)
-        direction, optimizer = self.optimizer.update(gradient, learner.optimizer)
+        direction, optimizer = self.optimizer.update(gradient, learner.optimizer, learner.params)
         learning_rate = self.learning_rate(learner.adapted_rate, iteration)
         return LearnerState(
             params=learner.params - learning_rate * direction,

@@ -110,26 +110,31 @@ def group_runs(runs: Sequence[Path]) -> list[Group]:
     configs = [load_run_config(run) for run in runs]
     settings = [_settings(run, config) for run, config in zip(runs, configs, strict=True)]
     shown = _telling_first(settings)
-    groups: dict[str, list[int]] = {}
+    members_of: dict[str, list[int]] = {}
     for i, of_run in enumerate(settings):
-        groups.setdefault(json.dumps(of_run), []).append(i)
-    return [
-        Group(
-            label=_label(configs[members[0]], _chosen(settings[members[0]], shown), len(members)),
+        members_of.setdefault(json.dumps(of_run), []).append(i)
+    groups = []
+    for members in members_of.values():
+        # All members have its settings.
+        first = members[0]
+        config = configs[first]
+        group = Group(
+            label=_label(config, _chosen(settings[first], shown), len(members)),
             runs=[read_curves(runs[i]) for i in members],
-            task_curves=configs[members[0]].env.task.curves,
+            task_curves=config.env.task.curves,
         )
-        for members in groups.values()
-    ]
+        groups.append(group)
+    return groups
 
 
 def _settings(run: Path, config: TrainConfig) -> dict[str, Any]:
     """The settings of a run that affect its training, by dotted name; files by their content, as
     the paths of the run's own copies would put every run in a separate group."""
     settings = flat(config.model_dump(mode="json", exclude=set(_FREE_KEYS)))
-    contents = {
-        key: read_source(settings[key]) for key in ("task", "algorithm") if is_file(settings[key])
-    }
+    contents = {}
+    for key in ("task", "algorithm"):
+        if is_file(settings[key]):
+            contents[key] = read_source(settings[key])
     if settings["env.mjcf"] is not None:
         contents["env.mjcf"] = (run / ROBOT / MANIFEST_FILE).read_bytes()
     for key, content in contents.items():
@@ -155,10 +160,15 @@ def _telling_first(settings: Sequence[dict[str, Any]]) -> list[str]:
     apart."""
 
     def num_told_apart(names: Sequence[str]) -> int:
-        return len({json.dumps([values.get(name) for name in names]) for values in settings})
+        different = set()
+        for values in settings:
+            different.add(json.dumps([values.get(name) for name in names]))
+        return len(different)
 
     # In the order of the settings; an algorithm of one's own may have more.
-    names = dict.fromkeys(name for values in settings for name in values)
+    names: dict[str, None] = {}
+    for values in settings:
+        names |= dict.fromkeys(values)
     rest = [name for name in names if num_told_apart([name]) > 1]
 
     needed = []

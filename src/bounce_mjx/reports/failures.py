@@ -29,7 +29,8 @@ def failures_table(
         f"{len(failures)} of {episodes:,} episodes failed: {len(failures) - missed} ended early, "
         f"{missed} lasted and missed a result"
     )
-    columns = [Column(header, justify="right") for header in ("episode", "at, s", *names)]
+    headers = "episode", "at, s", *names
+    columns = [Column(header, justify="right") for header in headers]
     table = plain_table(title, *columns, "what failed")
     ordered = sorted(failures, key=lambda failure: (failure.seconds, failure.episode))
     for failure in ordered[:_SHOWN_EPISODES]:
@@ -48,11 +49,12 @@ def association_lines(associations: Sequence[Association]) -> list[str]:
         return ["no term of the world goes clearly with failure (95% intervals of its thirds meet)"]
     lines = ["terms that go with failure: share of failures by third of the range (95% interval)"]
     for one in clear[:_PANELS]:
-        parts = [
-            f"{third.low:.3g} to {third.high:.3g}: {_percent(third.failed, third.episodes)} "
-            f"({100 * third.interval[0]:.1f} to {100 * third.interval[1]:.1f})"
-            for third in one.thirds
-        ]
+        parts = []
+        for third in one.thirds:
+            share = _percent(third.failed, third.episodes)
+            low, high = third.interval
+            interval = f"{100 * low:.1f} to {100 * high:.1f}"
+            parts.append(f"{third.low:.3g} to {third.high:.3g}: {share} ({interval})")
         lines.append(f"  {one.name}: {'; '.join(parts)}")
     return lines
 

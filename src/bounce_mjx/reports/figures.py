@@ -135,9 +135,17 @@ def reward_panels(groups: Sequence[Group]) -> dict[str, Figure]:
 
 def _reward_curves(groups: Sequence[Group]) -> list[Curve]:
     """The reward terms that any of the runs has logged."""
-    logged = dict.fromkeys(name for group in groups for run in group.runs for name in run.curves)
-    terms = [name for name in logged if name.startswith(_REWARD)]
-    return [Curve(x, "", title=x.removeprefix(_REWARD).replace("_", " ")) for x in terms]
+    # Without repetitions, in their order.
+    logged: dict[str, None] = {}
+    for group in groups:
+        for run in group.runs:
+            logged |= dict.fromkeys(run.curves)
+    curves = []
+    for name in logged:
+        if name.startswith(_REWARD):
+            title = name.removeprefix(_REWARD).replace("_", " ")
+            curves.append(Curve(tag=name, metric="", title=title))
+    return curves
 
 
 @style()
@@ -263,11 +271,10 @@ def _draw_heights(axes: Axes, env: Env, recording: Recording) -> None:
     """The first recorded episode, up to its end."""
     steps = int(recording.running[:, 0].sum())
     time = env.dt * (1 + np.arange(steps))
-    commands = {name: values[:, 0].tolist() for name, values in recording.command.items()}
-    levels = [
-        env.task.levels({name: values[step] for name, values in commands.items()})
-        for step in range(steps)
-    ]
+    levels = []
+    for step in range(steps):
+        command = {name: float(values[step, 0]) for name, values in recording.command.items()}
+        levels.append(env.task.levels(command))
     for i, name in enumerate(levels[0]):
         heights = [level[name] for level in levels]
         constant = f" {heights[0]:.2f} m" if len(set(heights)) == 1 else ""

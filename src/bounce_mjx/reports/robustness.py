@@ -57,11 +57,11 @@ def robustness_table(report: RobustnessReport) -> Table:
     columns = [Column("condition", overflow="fold"), Column("strength", justify="right")]
     columns += [Column(f"{letter} ", justify="right") for letter in letters.values()]
     table = plain_table(summary(report), *columns, Column(justify="right"))
-    described = [
-        f"{letter}  {result}: {report.measured.get(result, '')}"
-        for result, letter in letters.items()
-    ]
-    table.caption = escape("\n".join([*described, "*  misses its bound"]))
+    legend = []
+    for result, letter in letters.items():
+        legend.append(f"{letter}  {result}: {report.measured.get(result, '')}")
+    legend.append("*  misses its bound")
+    table.caption = escape("\n".join(legend))
     for _, outcomes in _rows(report.outcomes):
         for i, outcome in enumerate(outcomes):
             name = escape(outcome.perturbation) if i == 0 else ""

@@ -56,8 +56,10 @@ def seeds_table(reports: dict[int, Report | None]) -> Table:
       reports: reports by seed; None for a seed that diverged before its first evaluation.
     """
     known = [report for report in reports.values() if report is not None]
-    headers = "seed", *(result.name for result in known[0].results), "all met"
-    columns = [Column(escape(header.replace(" ", "\n")), justify="right") for header in headers]
+    columns = []
+    for header in ("seed", *(result.name for result in known[0].results), "all met"):
+        text = escape(header.replace(" ", "\n"))
+        columns.append(Column(text, justify="right"))
     table = plain_table("best checkpoint of each seed", *columns)
     for seed, report in reports.items():
         if report is None:
@@ -65,12 +67,17 @@ def seeds_table(reports: dict[int, Report | None]) -> Table:
             continue
         met = "[green]pass" if report.passed else "[red]FAIL"
         table.add_row(str(seed), *(figure_text(result.value) for result in report.results), met)
-    columns = zip(*([result.value for result in report.results] for report in known), strict=True)
-    # If a seed lacks a figure, the mean of the other seeds would be too favourable.
-    complete = [None if None in column else column for column in columns]
-    passed = f"{sum(report.passed for report in known)}/{len(reports)}"
-    for name, statistic, met in (("mean", np.mean, passed), ("std", np.std, "")):
-        table.add_row(name, *(figure_text(x and statistic(x)) for x in complete), met)
+    means = []
+    deviations = []
+    for i in range(len(known[0].results)):
+        values = [report.results[i].value for report in known]
+        # If a seed lacks a figure, the mean of the other seeds would be too favourable.
+        is_complete = None not in values
+        means.append(figure_text(np.mean(values) if is_complete else None))
+        deviations.append(figure_text(np.std(values) if is_complete else None))
+    passed = sum(report.passed for report in known)
+    table.add_row("mean", *means, f"{passed}/{len(reports)}")
+    table.add_row("std", *deviations, "")
     return table
 
 
@@ -82,9 +89,10 @@ def result_cells(result: Result) -> list[str]:
 
 def unsolved_line(report: Report) -> str:
     """What a policy misses, and what may help; empty if it meets all results."""
-    missed = [
-        f"{r.name} {figure_text(r.value)} ({r.bound})" for r in report.results if r.passed is False
-    ]
+    missed = []
+    for result in report.results:
+        if result.passed is False:
+            missed.append(f"{result.name} {figure_text(result.value)} ({result.bound})")
     if not missed:
         return ""
     return (
@@ -97,8 +105,9 @@ def details_line(report: Report) -> str:
     """The other figures of an evaluation, in one line."""
     parts = []
     for name, value in report.details.items():
-        title, unit = (part.replace("_", " ") for part in _NAME.fullmatch(name).groups(""))
-        unit = unit.replace(" ", "/")
+        title, unit = _NAME.fullmatch(name).groups("")
+        title = title.replace("_", " ")
+        unit = unit.replace("_", "/")
         if name != "episodes":
             rounded = None if value is None else float(f"{value:.4g}")
             parts.append(f"{title} {figure_text(rounded, 'g')} {unit}".rstrip())

@@ -85,7 +85,8 @@ def adopt(mjcf: Path, config: RobotConfig, control_dt: float, is_mount_given: bo
         if scale is None:
             servos, scale = _made_servos(model, addresses, arm, pose, control_dt)
             config = _with_servos(config, servos)
-            # `model_copy` checks nothing. The error begins with the doubt, in place of a file.
+            # `model_copy` checks nothing. The doubt is in place of a file: "the MJCF file X has
+            # servos of another size than robots have, perhaps by wrong units: ... is ...".
             doubt = "servos of another size than robots have, perhaps by wrong units"
             config = validate(RobotConfig, config.model_dump(), doubt)
         return Adoption(

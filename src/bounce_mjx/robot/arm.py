@@ -227,8 +227,8 @@ class _Builder:
     """The steps of one adoption.
 
     `_spec` is the user's file, and `_model` as MuJoCo compiles it. The model's ids are places in
-    the lists of the spec until the first element is deleted, in `_strip`: what compiling fuses, it
-    also takes out of the spec.
+    the lists of the spec until the first element is deleted, in `_strip`, as compiling also takes
+    the bodies that it fuses out of the spec.
     """
 
     def __init__(self, spec: mujoco.MjSpec, model: mujoco.MjModel, config: RobotConfig):

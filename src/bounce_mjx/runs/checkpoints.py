@@ -34,7 +34,13 @@ from bounce_mjx.learning.ppo import PPO, Params, names_of_critic_metrics
 from bounce_mjx.learning.registry import find_algorithm
 from bounce_mjx.learning.statistics import RunningStatistics, init_statistics
 from bounce_mjx.runs import earlier, folders
-from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config, runs_folder
+from bounce_mjx.runs.config import (
+    CONFIG_FILE,
+    TrainConfig,
+    load_run_config,
+    runs_folder,
+    without_own_settings,
+)
 from bounce_mjx.runs.files import plain_path, seal, to_plain
 from bounce_mjx.runs.records import RECORD, Checkpoint, DamagedCheckpoint, Record, verify
 
@@ -70,6 +76,7 @@ class NotSavedError(UserError):
 
 def read_policy(checkpoint: Checkpoint, config: TrainConfig) -> Policy:
     """Restores the policy of a checkpoint."""
+    # Refuses a damaged one.
     read_record(checkpoint)
     policy = _read_arrays(checkpoint, POLICY, policy_shapes(config))
     for path, array in jax.tree_util.tree_leaves_with_path(policy):
@@ -125,6 +132,7 @@ def read_networks(
 ) -> tuple[Params, RunningStatistics, tuple[str, ...]]:
     """Restores both networks of a checkpoint, the statistics of their inputs, and the names of the
     critic metrics among these."""
+    # Refuses a damaged one.
     read_record(checkpoint)
     if (checkpoint.folder / NETWORKS).is_dir():
         item = NETWORKS
@@ -210,7 +218,8 @@ def read_record(checkpoint: Checkpoint) -> Record:
     run_config = load_run_config(checkpoint.run)
     record = verify(checkpoint)
     try:
-        config = type(run_config).model_validate(earlier.present_settings(record.config))
+        stored = without_own_settings(earlier.present_settings(record.config))
+        config = type(run_config).model_validate(stored)
     # Pydantic's own is one.
     except ValueError as error:
         raise DamagedCheckpoint(checkpoint, error) from error

@@ -203,14 +203,11 @@ def load_run_config(
     # Here, as the name may stand for code that the user has named otherwise.
     env = validate(its_task.Config, values.get("env", {}), str(path), "env")
     values = values | {"env": env}
-    ppo = values.get("ppo", {})
-    if algorithm is not None:
+    if algorithm is None:
+        values = without_own_settings(values)
+    else:
         settings = find_algorithm(algorithm).Config
-        values["ppo"] = validate(settings, ppo, str(path), "ppo")
-    elif isinstance(ppo, dict) and is_file(str(values.get("algorithm", PPO_NAME))):
-        # The code of the user's algorithm does not run here, and whatever acts with its policy
-        # needs none of its own settings.
-        values["ppo"] = {key: ppo[key] for key in ppo if key in PPOConfig.model_fields}
+        values |= {"ppo": validate(settings, values.get("ppo", {}), str(path), "ppo")}
     config = validate(TrainConfig, values, str(path))
     config.set_sources(sources)
     if config.env.mjcf is not None and not is_packaged(config.env.mjcf):
@@ -222,6 +219,16 @@ def load_run_config(
                 f"{run / ROBOT} is not the robot of the training ({reason}); restore that folder"
             ) from error
     return config
+
+
+def without_own_settings(stored: dict[str, Any]) -> dict[str, Any]:
+    """A run's plain config without the settings of the user's own algorithm, if it has one: its
+    code does not run, and whatever acts with its policy needs none of them."""
+    ppo = stored.get("ppo")
+    if not isinstance(ppo, dict) or not is_file(str(stored.get("algorithm", PPO_NAME))):
+        return stored
+    known = {key: value for key, value in ppo.items() if key in PPOConfig.model_fields}
+    return stored | {"ppo": known}
 
 
 def dump_sources(config: TrainConfig) -> str:

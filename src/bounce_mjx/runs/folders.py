@@ -6,7 +6,8 @@
         task/, algorithm/               copies of the files of own ones
         events.out.tfevents.*           TensorBoard scalars
         results.json                    all evaluations, and the time of each activity
-        checkpoints/<number>/           of the newest state, and of the one with the best evaluation
+        checkpoints/<number>/           one for the newest state and one for the best evaluation, or
+                                        one for both
             policy/                     the policy's arrays
             training/                   the training state's arrays; optional
             networks/                   both networks, for another training; optional

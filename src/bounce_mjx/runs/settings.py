@@ -6,9 +6,10 @@ They are layers, and a later one wins:
     2. the preset for this machine
     3. what the user's own algorithm changes of PPO's defaults
     4. a preset that the user names, in place of the machine's
-    5. --warm-start: the environment and the networks of a policy
+    5. --warm-start: the environment and the networks of a policy; also that of a file of the
+       user's, which itself lies above it
     6. the user's files and further presets, each on those before it
-    7. --robot
+    7. --robot, or the robot of --world
     8. --world
     9. what the user says: flags of the command, or arguments of `train`
 
@@ -103,14 +104,15 @@ def stack(choice: Choice, machine: Path | None = None, whole: TrainConfig | None
     """
     if choice.resume is not None:
         return _stack_of_run(choice, whole)
-    # The task decides which file a preset's name stands for, so only paths can name it.
+    # The task decides which file a preset's name stands for, so that only a path can name a task or
+    # a warm start. These files are read again below, in their places.
     paths = [file for file in choice.config if os.path.isfile(file)]
-    naming = _layers_of_files(paths) if whole is None else [_layer_of(whole)]
-    policy = _policy(choice, naming, whole)
-    task_name, task = _task(choice, naming, policy, whole)
+    from_paths = _layers_of_files(paths) if whole is None else [_layer_of(whole)]
+    policy = _policy(choice, from_paths, whole)
+    task_name, task = _task(choice, from_paths, policy, whole)
     machines: list[Layer] = []
     named: list[Layer] = []
-    files = naming
+    files = from_paths
     if whole is None:
         found = preset_files(choice.config, task_name, machine)
         machines = _layers_of_files([found.machine])
@@ -119,7 +121,7 @@ def stack(choice: Choice, machine: Path | None = None, whole: TrainConfig | None
     algorithm_name, algorithm = _algorithm(choice, [*machines, *named, *files], whole)
     changed = _changed_defaults(algorithm)
     start = [] if policy is None else [policy.layer(is_in_world=choice.world is not None)]
-    chosen = () if policy is None else policy.notes
+    policy_notes = () if policy is None else policy.notes
     trained = None if policy is None else policy.config.env
     robot, world = robot_and_world(choice.robot, choice.world, task, trained)
     decided = {"task": task_name, "algorithm": algorithm_name}
@@ -130,7 +132,7 @@ def stack(choice: Choice, machine: Path | None = None, whole: TrainConfig | None
         algorithm=algorithm,
         layers=(*machines, *changed, *named, *start, *files, *robot, *world),
         decided=decided,
-        notes=(*chosen, *_notes(changed, named, "ppo."), *_notes(named, start, "env.")),
+        notes=(*policy_notes, *_notes(changed, named, "ppo."), *_notes(named, start, "env.")),
     )
 
 
@@ -227,7 +229,7 @@ def _task(
     name = _last(files, "task")
     if name is not None:
         if is_file(name):
-            raise unnamed_code(_sources_of(files), "task", name)
+            raise unnamed_code(_title_of(files), "task", name)
         return name, find_task(name)
     if policy is not None:
         return policy.config.task, policy.config.env.task
@@ -253,7 +255,7 @@ def _algorithm(
         return whole.algorithm, type(whole.ppo)
     name = choice.algorithm or _last(layers, "algorithm") or PPO_NAME
     if choice.algorithm is None and is_file(name):
-        raise unnamed_code(_sources_of(layers), "algorithm", name)
+        raise unnamed_code(_title_of(layers), "algorithm", name)
     return name, _settings_of(name)
 
 
@@ -262,7 +264,8 @@ def _settings_of(algorithm: str) -> type[PPOConfig]:
     return PPOConfig if algorithm == PPO_NAME else find_algorithm(algorithm).Config
 
 
-def _sources_of(layers: Sequence[Layer]) -> str:
+def _title_of(layers: Sequence[Layer]) -> str:
+    """The sources of the layers in words, the last first."""
     return " on ".join(layer.source for layer in reversed(layers))
 
 
@@ -342,8 +345,9 @@ def _policy(choice: Choice, files: Sequence[Layer], whole: TrainConfig | None) -
 
     task = choice.task or _last(files, "task")
     if choice.task is None and task is not None and is_file(task) and whole is None:
-        raise unnamed_code(_sources_of(files), "task", task)
+        raise unnamed_code(_title_of(files), "task", task)
     log_dir = choice.log_dir or _last_path(files, "log_dir")
+    # A new folder has no run yet that latest could stand for.
     if log_dir is None or not runs_in(log_dir):
         log_dir = runs_folder(whole.env.task if whole else find_task(task or DEFAULT))
     checkpoint, note = find_choice(path, log_dir)
@@ -380,8 +384,8 @@ class Stack:
 
     @property
     def title(self) -> str:
-        """The sources of the layers, the last first."""
-        return _sources_of(self.layers)
+        """The sources of the layers in words, the last first."""
+        return _title_of(self.layers)
 
     def config(
         self,
@@ -411,7 +415,7 @@ class Stack:
         try:
             config = self._validated(values)
         except _Mistake as mistake:
-            source = _source_of(mistake.path, layers)
+            source = _setter_of(mistake.path, layers)
             if flags is not None and source == FLAGS:
                 text = describe(mistake.error, self.fields, flags, mistake.group)
                 raise UserError(f"{text} (see {prog} --help)") from mistake.error
@@ -522,7 +526,7 @@ def _merge(layers: Sequence[Layer]) -> tuple[dict[str, Any], dict[str, str]]:
     return values, {key: source for key, source in sources.items() if key in remaining}
 
 
-def _source_of(path: Sequence[str], layers: Sequence[Layer]) -> str:
+def _setter_of(path: Sequence[str], layers: Sequence[Layer]) -> str:
     """The last layer that set a key; a guess for a rule that joins several settings of a group: the
     last layer with any of them. Without such a layer, it is the default that is wrong."""
     # An unknown key may be an empty group.

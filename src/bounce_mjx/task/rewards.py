@@ -104,7 +104,8 @@ def weighted_terms(
       term_inputs: by a term's name, what its formula takes instead.
 
     Raises:
-      UserError: a name of `term_inputs` is no term, or a term has no inputs.
+      UserError: a name of `term_inputs` is no term, a term has no inputs, or a ready-made one gets
+        something else than numbers.
     """
     names = term_names(type(reward))
     provided = set(term_inputs)
@@ -115,8 +116,22 @@ def weighted_terms(
     weighted = {}
     for name in names:
         term = getattr(reward, name)
-        weighted[name] = term.weight * term.value(term_inputs.get(name, inputs))
+        given = term_inputs.get(name, inputs)
+        _check_numbers(name, term, given)
+        weighted[name] = term.weight * term.value(given)
     return weighted
+
+
+def _check_numbers(name: str, term: RewardTerm, given: Any) -> None:
+    """Refuses anything but numbers for a ready-made term, such as the inputs of other terms."""
+    is_ready_made = type(term).value in (Near.value, Gaussian.value, Proportional.value)
+    is_number = isinstance(given, int | float) or hasattr(given, "shape")
+    if is_ready_made and not is_number:
+        raise UserError(
+            f"the term {name} is a {type(term).__name__}, which takes a number, and gets "
+            f"{shorten(type(given).__name__)}; give it by the term's name: weighted_terms(..., "
+            f"{name}=NUMBER)"
+        )
 
 
 def check_names(code: str, kind: str, names: Collection[str], expected: Collection[str]) -> None:

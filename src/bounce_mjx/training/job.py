@@ -285,9 +285,9 @@ class Job:
         self.clock.lap("setup")
 
     def compile(self, make_evaluators: MakeEvaluators) -> None:
-        """Compiles the programs that training needs to start. Evaluations are compiled, and the
-        libraries that save and draw are imported, in the background, also while the training
-        already runs."""
+        """Compiles the programs that training needs, opens the log, and starts the trainer from the
+        resumed state or the networks of a warm start. Evaluations are compiled, and the libraries
+        that save and draw are imported, in the background, also while the training already runs."""
 
         def trace() -> tuple[Evaluators, concurrent.futures.Future]:
             # The longest program is traced first: Python traces one program at a time while XLA
@@ -324,8 +324,8 @@ class Job:
 
     def evaluation_is_due(self) -> bool:
         """Whether the current policies are to be evaluated."""
-        # The best checkpoint of a resumed run may be damaged; a training that goes on finds another
-        # best policy.
+        # A finished run that is resumed with a damaged best checkpoint is evaluated again; one that
+        # goes on finds another best policy.
         if self.is_finished() and any(seed.best is None for seed in self.healthy()):
             return True
         # The policy of a warm start is the one to beat.
@@ -341,7 +341,7 @@ class Job:
         if reports is None:
             return
         seconds = sum(self.clock.seconds.values())
-        # First, as a save that has failed sets back the best policy.
+        # Before the reports are added, as a save that has failed sets back the best policy.
         self.saver.end()
         self.clock.lap("save")
         told = []
@@ -378,7 +378,7 @@ class Job:
         return hosts.any_of(self.stop.requested)
 
     def is_finished(self) -> bool:
-        """Whether the training ends here."""
+        """Whether the training ends here: at its last step, by a callback, or by its results."""
         return self.is_done() or self.is_solved()
 
     def train_block(self) -> tuple[BlockMetrics, float]:

@@ -131,13 +131,13 @@ class Saver:
     def _checkpoints(self, snapshot: Snapshot) -> list[Save]:
         """The checkpoints to write. With one seed, the state and its policy; with several, each
         policy that is the best of its seed, and then the state, whose record refers to them."""
-        # On a CPU the snapshot is a view of the training's buffers. JAX overwrites none that has a
-        # view, and would need more memory while they are written.
+        # On a CPU the snapshot is a view of the training's buffers, which keeps JAX from reusing
+        # them while they are written; a copy takes less memory.
         snapshot = jax.tree.map(np.array, snapshot)
         training = {checkpoints.TRAINING: snapshot.state}
         progress = [seed.progress.model_dump() for seed in self._seeds]
         if len(self._seeds) == 1:
-            # The best checkpoint stays beside the newest one.
+            # The best checkpoint stays beside the newest one, unless this one is the best.
             (seed,) = self._seeds
             is_best_kept = seed.saved is not None and not seed.has_unsaved_best
             kept = seed.saved.number if is_best_kept else None

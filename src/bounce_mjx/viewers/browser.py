@@ -7,6 +7,7 @@ import json
 import socket
 import time
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import jax
 import numpy as np
@@ -117,18 +118,16 @@ class _Plots:
             maxlen=round(_PLOT_SECONDS / env.dt)
         )
         """The last frames."""
-        levels = [
-            {"label": name, "stroke": colour, "width": 2, "dash": [6, 4]}
-            for name, colour in zip(self._levels(frame), itertools.cycle(_LEVEL_COLOURS))
-        ]
+        # The order of `_height_row`, after the times.
+        lines: list[dict[str, Any]] = [{"label": "s"}]
         count = frame.balls.shape[1]
-        balls = ["ball"] if count == 1 else [f"ball {i + 1}" for i in range(count)]
-        lines = [
-            {"label": "s"},
-            *({"label": name, "stroke": "#e8590c", "width": 2} for name in balls),
-            *levels,
-            {"label": "paddle", "stroke": "#1c7ed6", "width": 2},
-        ]
+        for i in range(count):
+            name = "ball" if count == 1 else f"ball {i + 1}"
+            lines.append({"label": name, "stroke": "#e8590c", "width": 2})
+        colours = itertools.cycle(_LEVEL_COLOURS)
+        for name in self._levels(frame):
+            lines.append({"label": name, "stroke": next(colours), "width": 2, "dash": [6, 4]})
+        lines.append({"label": "paddle", "stroke": "#1c7ed6", "width": 2})
         gui.add_markdown("height, m, over the last seconds")
         self._heights = gui.add_uplot(
             (np.zeros(1),) * len(lines),
@@ -146,11 +145,16 @@ class _Plots:
         """The task's heights."""
         return self._env.task.levels(at_index(frame.command, 0))
 
+    def _height_row(self, frame: EnvFrame) -> list[float]:
+        """The heights of the balls, of the task's levels and of the paddle."""
+        levels = self._levels(frame).values()
+        return [*frame.balls[0, :, 2], *levels, frame.paddle[0, 2]]
+
     def update(self) -> None:
         """Sends the history to the page."""
         dt = self._env.dt
         frames = list(self.history)
-        heights = [(*f.balls[0, :, 2], *self._levels(f).values(), f.paddle[0, 2]) for f in frames]
+        heights = [self._height_row(frame) for frame in frames]
         times = np.arange(1 - len(heights), 1) * dt
         self._heights.data = (times, *np.array(heights).T)
         recent = frames[-round(1.0 / _PLOT_RATE / dt) :]
@@ -160,27 +164,27 @@ class _Plots:
 
 def _reward_terms(frame: EnvFrame) -> dict[str, float]:
     """The weighted reward terms of the first environment."""
-    return {
-        name.removeprefix(_REWARD): value[0]
-        for name, value in frame.metrics.items()
-        if name.startswith(_REWARD)
-    }
+    terms = {}
+    for name, value in frame.metrics.items():
+        if name.startswith(_REWARD):
+            terms[name.removeprefix(_REWARD)] = value[0]
+    return terms
 
 
 def _legend(env: Env, frame: EnvFrame) -> str:
     """HTML that explains the task's markers, the line and the keys."""
     markers = env.task.markers(*environment_pose(frame, 0)[1:])
     # Markers whose names differ by a number are parts of one.
-    rows = {
-        words(marker.name.rstrip("_ 0123456789")): 255.0 * np.array(marker.rgba[:3])
-        for marker in markers
-    }
+    rows = {}
+    for marker in markers:
+        name = words(marker.name.rstrip("_ 0123456789"))
+        rows[name] = 255.0 * np.array(marker.rgba[:3])
     rows[f"path of the ball, {TRAIL_SECONDS} s"] = TRAIL_RGB
-    lines = [
-        f'<b style="color:rgb({",".join(f"{c:.0f}" for c in rgb)})">&#9632;</b> '
-        f"{html.escape(meaning)}<br>"
-        for meaning, rgb in rows.items()
-    ]
+    lines = []
+    for meaning, rgb in rows.items():
+        colour = ",".join(f"{part:.0f}" for part in rgb)
+        square = f'<b style="color:rgb({colour})">&#9632;</b>'
+        lines.append(f"{square} {html.escape(meaning)}<br>")
     return f"""<div style="font:11px sans-serif;line-height:1.6;padding:0 12px 8px 12px">
 {"".join(lines)}
 <b>space</b> pause, <b>R</b> reset, <b>Ctrl-K</b> all keys

@@ -70,18 +70,17 @@ class Scene:
         scene.add_light_hemisphere("/sky", ground_color=(170, 165, 160), intensity=1.3)
         _add_floor(scene)
         model = self._display.model
-        self._bodies = {
-            body: scene.add_batched_glb(
+        self._bodies = {}
+        for body, shapes in body_scenes(model):
+            is_marker = model.body_mocapid[body] >= 0
+            self._bodies[body] = scene.add_batched_glb(
                 f"/robot/{model.body(body).name}",
                 shapes.export(file_type="glb"),
                 batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (num_envs, 1)),
                 batched_positions=self._offsets,
                 lod="off",
-                # A marker casts none.
-                cast_shadow=bool(model.body_mocapid[body] < 0),
+                cast_shadow=not is_marker,
             )
-            for body, shapes in body_scenes(model)
-        }
         self._trail = Trail(self._dt)
         num_lines = num_envs * self._env.config.num_balls
         segments = self._trail.length - 1
@@ -96,17 +95,22 @@ class Scene:
         )
         self._focus = focus = np.array(self._env.task.focus())
         self._label_places = self._offsets + focus * (1.0, 1.0, 0.0)
-        self._labels = [
-            scene.add_label(
+        font_scale = 0.8
+        if num_envs <= 4:
+            font_scale = 1.0
+        if num_envs == 1:
+            font_scale = 1.4
+        self._labels = []
+        for i, place in enumerate(self._label_places):
+            label = scene.add_label(
                 f"/labels/{i}",
                 "",
                 position=place + (0.0, 0.0, _LABEL_HEIGHT),
                 anchor="bottom-center",
                 visible=False,
-                font_screen_scale=1.4 if num_envs == 1 else 1.0 if num_envs <= 4 else 0.8,
+                font_screen_scale=font_scale,
             )
-            for i, place in enumerate(self._label_places)
-        ]
+            self._labels.append(label)
         self._lost = np.zeros(num_envs, bool)
         for client in self._server.get_clients().values():
             self._frame(client)

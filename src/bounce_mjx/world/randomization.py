@@ -275,6 +275,15 @@ class RandomizationConfig(StrictModel):
             return
         raise ValueError(f"shares has a probability for {shorten(name)}, {reason}; remove it")
 
+    @pydantic.field_validator("*", mode="before")
+    @classmethod
+    def _check_ends(cls, ends: Any, info: pydantic.ValidationInfo) -> Any:
+        """A range of each joint is two lists, and not a list of as many ranges."""
+        is_list = isinstance(ends, list | tuple)
+        if info.field_name in TERMS and is_list and len(ends) != 2:
+            raise ValueError(_is_no_range(info.field_name, ends))
+        return ends
+
     @pydantic.model_validator(mode="after")
     def _check_ranges(self):
         """Each range has the shape and the bounds of its term."""
@@ -290,16 +299,8 @@ class RandomizationConfig(StrictModel):
         size = TERMS[name].size
         shapes = {(len(end),) if isinstance(end, tuple) else NUMBER for end in ends}
         fits_term = size is EACH_JOINT or shapes <= {NUMBER, size}
-        if len(shapes) == 1 and fits_term and (0,) not in shapes:
-            return
-        if size == NUMBER:
-            lists = ""
-        elif size is EACH_JOINT:
-            lists = ", or two lists with one for each joint"
-        else:
-            (num_axes,) = size
-            lists = f", or two lists with one for each of {num_axes} axes"
-        raise ValueError(f"{name} {shorten(str(ends))} is not a range; give two numbers{lists}")
+        if len(shapes) != 1 or not fits_term or (0,) in shapes:
+            raise ValueError(f"{name} {_is_no_range(name, ends)}")
 
     def _check_bounds(self, name: str) -> None:
         """Refuses a range that is empty or not within the term's bounds."""
@@ -339,6 +340,19 @@ class RandomizationConfig(StrictModel):
                 ends = tuple(start + (end - start) * progress for end in ends)
             ranges[name] = tuple(jnp.asarray(end, jnp.float32) for end in ends)
         return ranges
+
+
+def _is_no_range(name: str, ends: Any) -> str:
+    """What is wrong with the ends of a term's range, and what to give, in words."""
+    size = TERMS[name].size
+    if size == NUMBER:
+        lists = ""
+    elif size is EACH_JOINT:
+        lists = ", or two lists with one for each joint"
+    else:
+        (num_axes,) = size
+        lists = f", or two lists with one for each of {num_axes} axes"
+    return f"{shorten(str(ends))} is not a range; give two numbers{lists}"
 
 
 def entries(ends: Range) -> list[tuple[float, float]]:
