@@ -53,17 +53,19 @@ def mlp(num_inputs: int, num_outputs: int) -> nn.Sequential:
     )
 
 
+spaces = {
+    "observation_space": env.observation_space,
+    "state_space": env.state_space,
+    "action_space": env.action_space,
+    "device": env.device,
+}
+
+
 class Policy(GaussianMixin, Model):
     """From observations to the mean and the noise of the actions."""
 
-    def __init__(self, observation_space, state_space, action_space, device):
-        Model.__init__(
-            self,
-            observation_space=observation_space,
-            state_space=state_space,
-            action_space=action_space,
-            device=device,
-        )
+    def __init__(self):
+        Model.__init__(self, **spaces)
         GaussianMixin.__init__(self)
         self.net = mlp(self.num_observations, self.num_actions)
         self.log_std_parameter = nn.Parameter(torch.full((self.num_actions,), -1.0))
@@ -75,14 +77,8 @@ class Policy(GaussianMixin, Model):
 class Value(DeterministicMixin, Model):
     """From states, the observations with the critic metrics, to values."""
 
-    def __init__(self, observation_space, state_space, action_space, device):
-        Model.__init__(
-            self,
-            observation_space=observation_space,
-            state_space=state_space,
-            action_space=action_space,
-            device=device,
-        )
+    def __init__(self):
+        Model.__init__(self, **spaces)
         DeterministicMixin.__init__(self)
         self.net = mlp(self.num_states, 1)
 
@@ -90,8 +86,8 @@ class Value(DeterministicMixin, Model):
         return self.net(inputs["states"]), {}
 
 
-policy_model = Policy(env.observation_space, env.state_space, env.action_space, env.device)
-value_model = Value(env.observation_space, env.state_space, env.action_space, env.device)
+policy_model = Policy()
+value_model = Value()
 cfg = PPO_CFG(
     rollouts=ROLLOUTS,
     learning_epochs=4,

@@ -62,11 +62,11 @@ _STIFF_GAINS = (30.0, 100.0)
 _STIFF_DELAYS = (5e-4, 1e-3, 3e-3)
 # Candidates with the model's own servos, and with others, from each of which a search over a few
 # windows begins: a servo that is slow and a lag that is long delay alike, and only a search tells
-# them apart. Decrease of the cost from which the
-# controller counts as carrying the arm's weight.
+# them apart.
 _KEPT = 2
+# Decreases of the cost from which the controller counts as carrying the arm's weight, and from
+# which the ball counts as one that leaves the paddle at once.
 _CARRIED = 10.0
-# The same, from which the ball counts as one that leaves the paddle at once.
 _SHORT_CONTACT = 10.0
 # Successive angles that count as one below which what is left is the noise of the sensors: then an
 # error of the simulation's step shows.
