@@ -322,6 +322,8 @@ class _Sheet:
 
     def close(self) -> None:
         """Frees the renderer."""
+        # Otherwise this would free objects of the renderer that drew last.
+        self._renderer._gl_context.make_current()
         self._renderer.close()
 
 
