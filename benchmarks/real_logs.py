@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import mujoco
+import mujoco.sysid
 import numpy as np
 from numpy.polynomial.polynomial import polyfit
 from scipy.optimize import brentq, least_squares
@@ -442,6 +443,9 @@ def main() -> None:
     parser.add_argument("--flights", type=int, default=1000, help="most flights")
     parser.add_argument("--out", type=Path, default=None, help="JSON file")
     given = parser.parse_args()
+    # Without its extra, the module is there and empty.
+    if given.toolbox and not hasattr(mujoco.sysid, "optimize"):
+        parser.error("--toolbox needs MuJoCo's identification; pip install 'mujoco[sysid]'")
     set_up_jax(read_preset(Path("default")).env)
     rows: list[dict[str, Any]] = []
     for folder in given.folders:

@@ -89,32 +89,35 @@ def bounce(policy, rtde_c, rtde_r, camera, task_commands: dict, seconds: float) 
     reasons = []
     # A period begins before reading and computing, so that a control step lasts whole periods.
     t_start = rtde_c.initPeriod()
-    for _ in range(round(seconds / control_dt)):
-        ball = camera.measure(control_dt)
-        measurements = {
-            "joint_angles": rtde_r.getActualQ(),
-            "joint_velocities": rtde_r.getActualQd(),
-            "time": rtde_r.getTimestamp(),
-            **ball,
-            **task_commands,
-        }
-        commands = arm.commands(measurements)
-        for joint_angles in commands:
-            servo(rtde_c, joint_angles)
-            rtde_c.waitPeriod(t_start)
-            t_start = rtde_c.initPeriod()
-        if len(commands) == 0:
-            # The first sample is not believed yet, and nothing is sent.
-            rtde_c.waitPeriod(t_start)
-            t_start = rtde_c.initPeriod()
-        if arm.state == "ready" and ball["ball_age"] < MAX_FIRST_BALL_AGE:
-            arm.start()
-        elif arm.state == "stopped":
-            reasons.append(arm.reason)
-            if arm.fault != "ball_lost":
-                break
-            arm.restart()
-    rtde_c.servoStop()
+    try:
+        for _ in range(round(seconds / control_dt)):
+            ball = camera.measure(control_dt)
+            measurements = {
+                "joint_angles": rtde_r.getActualQ(),
+                "joint_velocities": rtde_r.getActualQd(),
+                "time": rtde_r.getTimestamp(),
+                **ball,
+                **task_commands,
+            }
+            commands = arm.commands(measurements)
+            for joint_angles in commands:
+                servo(rtde_c, joint_angles)
+                rtde_c.waitPeriod(t_start)
+                t_start = rtde_c.initPeriod()
+            if len(commands) == 0:
+                # The first sample is not believed yet, and nothing is sent.
+                rtde_c.waitPeriod(t_start)
+                t_start = rtde_c.initPeriod()
+            if arm.state == "ready" and ball["ball_age"] < MAX_FIRST_BALL_AGE:
+                arm.start()
+            elif arm.state == "stopped":
+                reasons.append(arm.reason)
+                if arm.fault != "ball_lost":
+                    break
+                arm.restart()
+    finally:
+        # Whatever ends the loop, the arm does not go on toward its last command.
+        rtde_c.servoStop()
     return reasons
 
 

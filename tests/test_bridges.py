@@ -144,6 +144,16 @@ def test_ur_rtde_bridge() -> None:
     reasons = bridge["bounce"](policy, control, receive, camera, wished, SECONDS)
     assert len(reasons) == 1 and "joint_velocities holds nan" in reasons[0]
     assert world.ticks < 2 * SECONDS * RATE
+    # A lost connection ends the program, and stops the arm first.
+    control.stopped = False
+
+    def lose_connection() -> list[float]:
+        raise RuntimeError("connection lost")
+
+    receive.getActualQ = lose_connection
+    with pytest.raises(RuntimeError, match="connection lost"):
+        bridge["bounce"](policy, control, receive, camera, wished, SECONDS)
+    assert control.stopped
 
 
 def message(**fields: Any) -> types.SimpleNamespace:
