@@ -60,8 +60,8 @@ _MARGIN = 1.25
 
 _ACTION = (
     "servo target of joint i in rad = clip(base[i] + action_scale * action[i], joint_ranges[i]), "
-    "where base is the joint angles of the same observation; with max_lead, it is the last servo "
-    "target within max_lead of them"
+    "at most largest_step[i] from the last one, where base is the joint angles of the same "
+    "observation; with max_lead, it is the last servo target within max_lead of them"
 )
 _LIMITED = "; the command moves toward it within limits"
 
@@ -108,8 +108,8 @@ def export_onnx(checkpoint: Checkpoint) -> bytes:
 
 
 def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
-    """Metadata of a run's policy. The largest step of its commands is that of actions that add to
-    the last target; `largest_step` measures the one of actions that add to the measured angles.
+    """Metadata of a run's policy. Its `largest_step` is that of actions that add to the last
+    target; where they add to the measured angles, `export_onnx` puts the measured one in its place.
 
     Args:
       steps: environment steps of the training.
@@ -174,6 +174,7 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         paddle=paddle,
         paddle_normal=normal,
         environment=_environment(env),
+        joint_damping=tuple(m.dof_damping[list(addresses.arm_qvel)].tolist()),
     )
 
 
