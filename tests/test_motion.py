@@ -650,11 +650,13 @@ def is_astray(changes: dict[str, Any], offset: float, time_constant: float) -> b
 
 
 def test_an_arm_of_the_training_is_followed_and_another_one_stops() -> None:
-    """Servos without damping, joints with damping of their own, and servos with constant errors."""
+    """Servos without damping, joints with damping of their own, and servos that are soft or have
+    constant errors."""
     quick = {"randomization": {}, "servo_damping": (0.0,) * 6}
     stiffness = load_policy("robust").metadata.servo_stiffness
     damped = quick | {"joint_damping": tuple(0.12 * k for k in stiffness)}
     offset = quick | {"randomization": {"servo_offset[3]": (-0.06, 0.02)}}
+    soft = quick | {"randomization": {"servo_gain": (0.5, 1.0)}, "sag": (0.0, 0.03, 0.0) * 2}
     late = {"randomization": {"action_latency": (0.0, 0.05)}, "servo_damping": (0.0,) * 6}
     assert np.isfinite(arm_responses(load_policy("robust").metadata._replace(**late))).all()
     for changes, beside, time_constant, expected in (
@@ -663,6 +665,7 @@ def test_an_arm_of_the_training_is_followed_and_another_one_stops() -> None:
         (damped, 0.0, 0.12, False),
         (quick, 0.0, 0.3, True),
         (offset, -0.06, 0.0, False),
+        (soft, -0.06, 0.0, False),
         (quick, -0.06, 0.0, True),
     ):
         assert is_astray(changes, beside, time_constant) == expected, (changes, beside)

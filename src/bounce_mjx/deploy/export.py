@@ -175,7 +175,25 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         paddle_normal=normal,
         environment=_environment(env),
         joint_damping=tuple(m.dof_damping[list(addresses.arm_qvel)].tolist()),
+        sag=_sag(m, env.default_joint_angles),
     )
+
+
+def _sag(m: mujoco.MjModel, joint_angles: Sequence[float]) -> tuple[float, ...]:
+    """How far the arm's weight takes each joint off its command at rest at these angles, rad."""
+    addresses = find_addresses(m)
+    data = mujoco.MjData(m)
+    data.qpos[list(addresses.arm_qpos)] = joint_angles
+    mujoco.mj_forward(m, data)
+    dofs = list(addresses.arm_qvel)
+    torques = (data.qfrc_bias - data.qfrc_passive)[dofs]
+    # What the servos carry beside their stiffness.
+    is_carried = m.jnt_actgravcomp[list(addresses.arm_joints)] != 0
+    torques = torques - np.where(is_carried, data.qfrc_gravcomp[dofs], 0.0)
+    servos = list(addresses.actuators)
+    stiffness = m.actuator_gainprm[servos, 0] * m.actuator_gear[servos, 0] ** 2
+    # Rounded, as it differs in its last digits from one machine to another.
+    return tuple(round(angle, 6) for angle in np.abs(torques / stiffness).tolist())
 
 
 def _environment(env: WorldConfig) -> dict[str, Any]:

@@ -26,9 +26,9 @@ _OF_NOISE = 3.0
 # holds, rad, and counts of the encoder.
 _HELD = 1e-3
 _COUNTS = 2.0
-# Distance from all these arms that is too far, beside the servos' constant errors, rad.
+# Distance from all these arms that is too far, rad.
 _TOO_FAR = 0.05
-# What a joint's load takes it off its command while it rests, rad.
+# What a load takes a joint off its command while it rests, beside the arm's own weight, rad.
 _SAG = 0.01
 # A ball so far below the paddle, or beside it without coming nearer, is lost; one so far above it
 # flies, m.
@@ -99,9 +99,11 @@ class Watch:
         """
         self._metadata = metadata
         self._max_age = max_picture_age
+        sag = max(metadata.sag, default=0.0) / least_term(metadata, "servo_gain", 1.0)
+        # Where the weight and the servos' constant errors take a joint from its command, rad.
+        self._beside_command = sag + largest_term(metadata, "servo_offset")
         # A robot's servo may have another zero than its encoder, unlike the training's.
-        self._servo_offset = largest_term(metadata, "servo_offset")
-        self.offset = _SAG + largest_term(metadata, "encoder_bias") + self._servo_offset
+        self.offset = _SAG + largest_term(metadata, "encoder_bias") + self._beside_command
         """Distance of a resting joint from its command, rad."""
         noise = largest_term(metadata, "joint_angle_noise")
         self._least = _OF_SCALE[metadata.action_base] * metadata.action_scale + _OF_NOISE * noise
@@ -147,7 +149,7 @@ class Watch:
         high = np.max(self._beside, axis=0)
         low = np.min(self._beside, axis=0)
         by_motion = (high - low) / self._allowed_motion()
-        by_place = np.maximum(high, -low) / (_TOO_FAR + self._servo_offset)
+        by_place = np.maximum(high, -low) / (_TOO_FAR + self._beside_command)
         unlike = np.min(np.maximum(by_motion, by_place), axis=0)
         joint = int(np.argmax(unlike))
         if not unlike[joint] <= 1.0:
@@ -171,8 +173,8 @@ class Watch:
         allowed = self._least + np.minimum(self._smallest_change, RESOLUTION)
         allowed += _OF_COMMANDS * np.ptp(self._commands, axis=0)
         if self._steps < self._settling:
-            # The servos' constant errors come with the first commands.
-            allowed += self._servo_offset
+            # They go there with the first commands.
+            allowed += self._beside_command
         # A moving joint's reading changes by a count, and one with noise in every step.
         of_repeating = np.minimum(allowed, _HELD + _COUNTS * self._smallest_change)
         return np.where(self._repeats >= self._compared, of_repeating, allowed)

@@ -53,6 +53,7 @@ _PER_JOINT = (
     "torque_limits",
     "default_joint_angles",
     "joint_damping",
+    "sag",
 )
 TERMS_PER_JOINT = frozenset(
     "servo_gain servo_damping servo_offset torque_limit joint_damping joint_frictionloss armature "
@@ -187,6 +188,9 @@ class Metadata(NamedTuple):
     joint_damping: tuple[float, ...] = ()
     """Torque of each joint's own damping per velocity, N m s/rad, which adds to the servo's; empty
     in a file of an earlier version."""
+    sag: tuple[float, ...] = ()
+    """How far the arm's weight takes each joint off its command in the start pose, rad; empty in a
+    file of an earlier version."""
 
 
 def measurement_sizes(metadata: Metadata) -> dict[str, int]:

@@ -85,6 +85,9 @@ class Supervisor:
         """Why the arm has stopped or brakes, or what it waits for before it goes home."""
         self._is_moving_home = False
         self._waited = 0
+        """Control steps in which the arm was not where its commands rest."""
+        self._resting_angles = np.array(metadata.default_joint_angles)
+        """Measured [J] in the last step at home, rad."""
 
     def start(self) -> None:
         """Starts an episode.
