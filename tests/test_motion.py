@@ -638,8 +638,9 @@ def is_astray(changes: dict[str, Any], offset: float, time_constant: float) -> b
     share = 1.0 - math.exp(-0.01 / max(time_constant, 1e-9))
     angles = home - 0.2
     for step in range(220):
-        given = measured_by_robust(angles) | {"time": 0.01 * step, "target_height": 0.6}
-        given["ball_position"] = place + [0.05, 0.03, 0.4 + 0.1 * math.sin(0.2 * step)]
+        ball = place + [0.05, 0.03, 0.4 + 0.1 * math.sin(0.2 * step)]
+        given = measured(angles, ball_position=ball, target_height=0.6)
+        given = {name: given[name] for name in policy.needs} | {"time": 0.01 * step}
         commands = arm.commands(given)
         if len(commands):
             angles = angles + share * (commands[-1] + offset - angles)
