@@ -596,6 +596,8 @@ def test_whatever_fails_the_arm_brakes_from_its_last_command(
     if kind == "order":
         with pytest.raises(UserError, match="call supervise again"):
             arm.supervisor.restart()
+        rows = policy.supervise(1000).commands(measured(HOME[::-1]))
+        np.testing.assert_allclose(rows, np.tile(HOME[::-1], (10, 1)), atol=1e-12)
 
 
 def test_a_reset_before_a_start_moves_nothing() -> None:
