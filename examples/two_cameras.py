@@ -504,6 +504,10 @@ _PRIOR_BALL = 0.005
 # Noise of a circle's centre, pixels, and how many times the typical residual a pose may be off.
 _PIXEL_NOISE = 0.3
 _BAD_RATIO = 4.0
+# Distance at which a pose agrees with cameras whose lens and ball are known roughly, pixels.
+_ROUGH_REPROJECTION = 15.0
+# Largest error of a calibration along an axis, m (root mean square).
+_MAX_ERROR = 0.01
 # Parts into which the poses are divided to measure the error with poses that were not used.
 _FOLDS = 4
 # How far over its target an apex may be, m.
@@ -674,8 +678,9 @@ def calibrate(
       pixels: the ball's centre in each camera's pictures [2, N, 2]; NaN where it was not seen.
     """
     ball = _nominal_ball(metadata)
-    used = np.all(np.isfinite(pixels), axis=(0, 2))
-    bad: list[int] = []
+    is_seen = np.all(np.isfinite(pixels), axis=(0, 2))
+    used = _agreeing_poses(ball_positions(metadata, joint_angles, ball), rough, pixels, is_seen)
+    bad = np.flatnonzero(is_seen & ~used).tolist()
     while True:
         if np.count_nonzero(used) < 8:
             raise SystemExit(
@@ -700,7 +705,51 @@ def calibrate(
         for pose in left_out:
             place = triangulate(fold_cameras, pixels[:, pose])
             errors[pose] = place - truth[pose]
-    return Calibration(cameras, adjusted, errors, tuple(sorted(bad)))
+    calibration = Calibration(cameras, adjusted, errors, tuple(sorted(bad)))
+    typical_errors = np.sqrt(np.nanmean(errors**2, axis=0))
+    if np.any(typical_errors > _MAX_ERROR):
+        raise SystemExit(
+            f"the poses do not agree ({calibration.report()}), but {1e3 * _MAX_ERROR:g} mm is the "
+            "most that a policy bears; check that the ball is fixed, that nothing else in the "
+            "pictures looks like it, and that the arm reached each pose"
+        )
+    return calibration
+
+
+def _agreeing_poses(
+    places: np.ndarray, rough: Sequence[Camera], pixels: np.ndarray, is_seen: np.ndarray
+) -> np.ndarray:
+    """Which poses [N] agree roughly with most others in the pictures of every camera.
+
+    Another thing that was taken for the ball is tens of pixels away from it. The bundle adjustment
+    would bend a lens to meet it, and then leave out other poses.
+
+    Args:
+      places: nominal places of the ball [N, 3], m.
+      rough: the cameras, of which the intrinsics count.
+      pixels: [2, N, 2].
+      is_seen: whether both cameras saw the ball [N].
+    """
+    numbers = np.flatnonzero(is_seen)
+    agrees = is_seen.copy()
+    for camera, seen in zip(rough, pixels, strict=True):
+        is_inlier = np.zeros(len(numbers), bool)
+        # OpenCV's least number of points.
+        if len(numbers) >= 4:
+            is_solved, _, _, inliers = cv2.solvePnPRansac(
+                places[numbers],
+                seen[numbers],
+                camera.matrix,
+                None,
+                iterationsCount=1000,
+                reprojectionError=_ROUGH_REPROJECTION,
+                confidence=0.9999,
+                flags=cv2.SOLVEPNP_SQPNP,
+            )
+            if is_solved:
+                is_inlier[inliers.ravel()] = True
+        agrees[numbers[~is_inlier]] = False
+    return agrees
 
 
 def _adjust(
