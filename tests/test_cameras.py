@@ -380,6 +380,31 @@ def test_a_picture_shows_the_instant_of_its_qpos_in_the_light_of_the_room(opengl
     rendered.close()
 
 
+def test_a_ball_before_a_thing_of_its_colour_is_told_from_it(opengl) -> None:
+    """An orange ball before the paddle's wooden handle in the shade: one edge encloses both,
+    and a ball that is still just after its bounce was expected to fall."""
+    metadata = load_policy("robust").metadata
+    mjcf = str(resource_path("mjcf/bounce_ball.xml"))
+    model = rendered_cameras.make_model(mjcf, "orange", True)
+    pair = rendered_cameras.true_cameras()
+    rendered = rendered_cameras.RenderedCameras(model, pair)
+    data = mujoco.MjData(model)
+    home = np.array(metadata.default_joint_angles)
+    backgrounds = rendered.still(rendered_cameras._posed(model, data, metadata, home, None))
+    # Away from its home, the arm is in no background.
+    lower = home + np.array([0.0, 0.05, -0.05, 0.0, 0.0, 0.0])
+    for beside in [(0.0, 0.01), (-0.01, 0.0), (-0.02, 0.0)]:
+        rendered_cameras._posed(model, data, metadata, lower, np.array(beside))
+        place = data.joint("ball_link").qpos[:3]
+        pictures = rendered.still(data)
+        for camera, picture, background in zip(pair, pictures, backgrounds, strict=True):
+            pixel = camera.project(place[None])[0]
+            expected = cameras.Expected(pixel, camera.radius_at(place), np.array([0.0, 4.0]))
+            circles = cameras.find_circles(picture, cameras.COLOURS["orange"], background, expected)
+            assert np.linalg.norm(circles[0].centre - pixel) < 1.5
+    rendered.close()
+
+
 class DrawnCameras:
     """Stands in for `RenderedCameras`: a grey wall, and the ball as a disc. It needs no OpenGL."""
 
