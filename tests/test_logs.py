@@ -591,6 +591,14 @@ def test_a_fault_of_a_log_is_named_with_its_place(name: str) -> None:
     assert {place for _, place in found} <= places or name == "swapped, all"
 
 
+def test_pictures_without_an_arm_beside_them_are_counted() -> None:
+    """Such as those of a camera whose clock is another one."""
+    log = sound_log()
+    (finding,) = examine([log._replace(picture_times=log.picture_times + 15.0)], ARM)[0].findings
+    assert finding.kind == "pictures alone" and not finding.is_fault
+    assert finding.text.startswith("1801 of 3600 pictures") and "after 29.990 s" in finding.text
+
+
 def test_the_same_log_twice_is_named() -> None:
     log = sound_log()
     once, again = examine([log, log._replace(source="copy")], ARM)

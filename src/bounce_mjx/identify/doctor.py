@@ -13,8 +13,8 @@ from numpy.polynomial.polynomial import polyfit
 from scipy.ndimage import uniform_filter1d
 from scipy.optimize import linear_sum_assignment
 
-from bounce_mjx.identify.following import commanded, find_settled
-from bounce_mjx.identify.log import JOINT_GAP, Log
+from bounce_mjx.identify.following import SETTLING, commanded, find_settled
+from bounce_mjx.identify.log import Log, find_gaps
 
 # Delays that are searched, s: a trajectory server gets its targets seconds ahead.
 _SHORTEST = -0.5
@@ -59,6 +59,8 @@ _GRAVITY = 9.81
 # Time of a piece of flight that shows the ball's acceleration, s.
 _PIECE = 0.12
 _FEWEST_PIECES = 10
+# Share of the pictures without angles and targets beside them that is worth a note.
+_ALONE = 0.05
 _PIECES = 300
 
 
@@ -506,15 +508,23 @@ def _runs(mask: np.ndarray) -> list[tuple[int, int]]:
 def _find_stamps(log: Log) -> list[Finding]:
     found = []
     for name, times in (("joint angles", log.times), ("servo targets", log.target_times)):
-        steps = np.diff(times)
-        typical = float(np.median(steps))
-        gaps = np.flatnonzero(steps > max(JOINT_GAP, 5.0 * typical))
-        if len(gaps):
+        if gaps := find_gaps(times):
+            longest = max(first - last for last, first in gaps)
             text = (
-                f"the {name} have {len(gaps)} gaps of up to {np.max(steps):.2f} s, the first at "
-                f"{times[gaps[0]]:.3f} s; what follows a gap counts from 0.3 s on"
+                f"the {name} have {len(gaps)} gaps of up to {longest:.2f} s, the first at "
+                f"{gaps[0][0]:.3f} s; what follows a gap counts from {SETTLING:g} s on"
             )
             found.append(Finding("gaps", "the stamps", text, is_fault=False))
+    first = max(log.times[0], log.target_times[0])
+    last = min(log.times[-1], log.target_times[-1])
+    is_alone = (log.picture_times < first) | (log.picture_times > last)
+    if np.sum(is_alone) > max(_ALONE * len(is_alone), 1.0):
+        text = (
+            f"{np.sum(is_alone)} of {len(is_alone)} pictures of the ball have stamps before "
+            f"{first:.3f} s or after {last:.3f} s, without joint angles and servo targets; their "
+            "bounces do not count"
+        )
+        found.append(Finding("pictures alone", "the stamps", text, is_fault=False))
     return found
 
 

@@ -40,8 +40,9 @@ _LARGEST_AGE = 1.0
 _FASTEST_DRIFT = 2e-4
 _NO_CLOCK = 0.1
 
-JOINT_GAP = 0.1
-"""Time between two rows of joint angles beyond which a log has a gap, s."""
+# Time between two rows, s and in typical steps, beyond which a log has a gap.
+_GAP = 0.1
+_GAP_STEPS = 5.0
 
 
 class Log(NamedTuple):
@@ -293,6 +294,13 @@ def align_clocks(log: Log) -> Log:
         )
     stamps = log.picture_times + drifts * slope * since + offset
     return log._replace(picture_times=stamps, notes=tuple(notes))
+
+
+def find_gaps(times: np.ndarray) -> list[tuple[float, float]]:
+    """The last time before each gap of a measurement's times [T], and the first one after it, s."""
+    steps = np.diff(times)
+    longest = max(_GAP, _GAP_STEPS * float(np.median(steps)))
+    return [(float(times[i]), float(times[i + 1])) for i in np.flatnonzero(steps > longest)]
 
 
 def least_age(log: Log) -> float:

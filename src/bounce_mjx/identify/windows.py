@@ -12,8 +12,8 @@ from scipy.ndimage import minimum_filter1d
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.identify.flight import fit_flight
-from bounce_mjx.identify.following import SETTLING, find_settled
-from bounce_mjx.identify.log import JOINT_GAP, Log
+from bounce_mjx.identify.following import find_settled, find_unknown, is_known
+from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.unknowns import BALL
 
 MAX_DELAY = 0.08
@@ -116,7 +116,13 @@ def cut(log: Log, physics_dt: float) -> Windows:
     Raises:
       UserError: there are fewer than five.
     """
-    spans = [(b - before, b + after, b) for b, before, after in _find_bounces(log)]
+    origin = float(min(log.times[0], log.target_times[0]))
+    # A simulation from the window's start cannot show what a picture saw before it.
+    earliest = origin + MAX_DELAY
+    spans = [(max(b - before, earliest), b + after, b) for b, before, after in _find_bounces(log)]
+    # Elsewhere, nothing says how the paddle moved.
+    is_shown = is_known(log, np.array([bounce for _, _, bounce in spans]))
+    spans = [span for span, shown in zip(spans, is_shown, strict=True) if shown]
     spans += [(start, end, np.nan) for start, end in _find_rests(log, spans)]
     if len(spans) < _FEWEST:
         raise UserError(
@@ -129,8 +135,7 @@ def cut(log: Log, physics_dt: float) -> Windows:
         with_ball = _thin(with_ball, max(_MOST_BALLS, _MOST - len(others)))
         spans = with_ball + _thin(sorted(others), _MOST - len(with_ball))
     spans.sort()
-    origin = float(min(log.times[0], log.target_times[0]))
-    begins = [max(start - MAX_DELAY, origin) for start, _, _ in spans]
+    begins = [start - MAX_DELAY for start, _, _ in spans]
     first = np.array([int((begin - origin) / physics_dt) for begin in begins], int)
     zero = origin + first * physics_dt
     angle_rows = []
@@ -216,14 +221,11 @@ def _slopes(times: np.ndarray, values: np.ndarray, reach: int) -> np.ndarray:
 
 
 def _find_rests(log: Log, spans: list[tuple[float, float, float]]) -> list[tuple[float, float]]:
-    """Times between the windows with a ball, in pieces; none of them spans a gap of the log."""
-    taken = sorted((start, end) for start, end, _ in spans)
-    gaps = np.flatnonzero(np.diff(log.times) > JOINT_GAP)
-    taken += [(log.times[i], log.times[i + 1] + SETTLING) for i in gaps]
-    first = max(log.times[0], log.target_times[0]) + SETTLING
+    """Times between the windows with a ball, in pieces; in none of them is the arm unknown."""
+    taken = [(start, end) for start, end, _ in spans] + find_unknown(log)
     pieces = []
-    begin = first
-    for start, end in [*sorted(taken), (log.times[-1], np.inf)]:
+    begin = log.times[0]
+    for start, end in sorted(taken):
         length = start - begin
         if length > _SHORTEST:
             count = int(np.ceil(length / (_BEFORE + _AFTER)))
