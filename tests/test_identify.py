@@ -11,6 +11,8 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import minimize
 
+from bounce_mjx.commands.main import main
+from bounce_mjx.deploy.recorder import Recorder
 from bounce_mjx.errors import UserError
 from bounce_mjx.identify.doctor import examine
 from bounce_mjx.identify.fit import (
@@ -32,6 +34,7 @@ from bounce_mjx.identify.simulation import (
     compensated,
     make_simulator,
     make_targets,
+    window_targets,
 )
 from bounce_mjx.identify.stages import (
     Identified,
@@ -188,6 +191,23 @@ def test_targets_are_late_and_lagged(latency: float, lag: float) -> None:
         state = mean if lag == 0.0 else mean + (state - mean) * np.exp(-0.001 / lag)
         expected.append(state)
     np.testing.assert_allclose(found[: len(expected)], expected, atol=2e-3)
+
+
+def test_a_log_of_hours_has_the_targets_of_its_windows_alone() -> None:
+    """The same as if all of its steps were computed."""
+    random = np.random.default_rng(1)
+    log = flight_log(60.0)
+    log = log._replace(servo_targets=random.normal(size=log.servo_targets.shape))
+    first = np.array([31_000, 300, 900, 55_000])
+    w = windows_of(log)._replace(first=first, steps=860, origin=0.0)
+    send, rows = window_targets(log, w)
+    for latency, lag in ((0.02, 0.0), (0.02, 0.2)):
+        some = send(latency, lag)
+        assert len(some) == 1760 + 2 * 2860
+        every = make_targets(log, 0.001 * np.arange(56_001))(latency, lag)
+        for begin, row in zip(first, rows, strict=True):
+            of_window = slice(row, row + 860)
+            np.testing.assert_allclose(some[of_window], every[begin : begin + 860], atol=2e-4)
 
 
 def measured_rows(w: Windows, angles: np.ndarray) -> np.ndarray:
@@ -566,6 +586,36 @@ def test_what_no_search_varied_has_the_deviation_of_its_prior() -> None:
     np.testing.assert_allclose(deviations[1][chosen], deviations[0][chosen])
 
 
+def test_a_log_that_no_world_explains_is_not_called_the_same_robot(
+    tmp_path: Path, monkeypatch, capsys
+) -> None:
+    """Nor is a page named that --check does not write."""
+    path, world = tmp_path / "log.csv", tmp_path / "world.yaml"
+    home = np.array(read_preset(Path("default")).env.default_joint_angles)
+    rates = np.arange(1.0, 7.0)
+    with Recorder(path, NAMES) as recorder:
+        for time in 0.01 * np.arange(1500):
+            late, sent = (home + 0.1 * np.sin(rates * t) for t in (time - 0.025, time))
+            recorder.step({"time": time, "joint_angles": late}, sent)
+    found = unseen()
+    world.write_text(to_yaml(found, flight_log(), NAMES, None), encoding="utf-8")
+    monkeypatch.setattr("bounce_mjx.identify.stages.identify", lambda *_: found)
+    arguments = ["identify", str(path), "--check", str(world), "--out", str(tmp_path / "new.yaml")]
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == 0 and "still matches" in capsys.readouterr().out
+    found = found._replace(joint_errors=np.full(6, 0.1))
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    printed = capsys.readouterr()
+    assert ended.value.code == 2 and "still matches" not in printed.out
+    assert "cannot be compared with" in printed.err and "does not explain" in printed.err
+    with pytest.raises(SystemExit) as ended:
+        main([*arguments, "--inspect"])
+    assert ended.value.code == 0 and "new.html" not in capsys.readouterr().out
+    assert not list(tmp_path.glob("new.*"))
+
+
 def test_errors_that_are_alike_count_as_one() -> None:
     """Against the correlation time of y' = a y + noise, (1 + a) / (1 - a)."""
     shares = np.array([0.0, 0.5, 0.9])
@@ -682,6 +732,8 @@ def test_an_arm_is_explained_no_worse_than_by_a_delay_and_offsets(late: float) -
         assert shown == {"action_latency", "servo_offset"}
         (said,) = (x for x in sentences(found, NAMES) if "stiff servos" in x)
         assert "the controller's own set points" in said
+        printed = total_delay(found, world_model(config, visual=False))
+        assert printed.startswith(f"total delay: {1e3 * late:.1f} ")
 
 
 def test_following_finds_delay_and_offsets() -> None:

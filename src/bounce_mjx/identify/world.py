@@ -230,7 +230,8 @@ def total_delay(found: Identified, model: mujoco.MjModel) -> str:
     """The delay from a command to the angle, which a log shows however it is shared.
 
     It is the action's latency, the lag, and the delay of the servos themselves: damping divided by
-    stiffness, which is the mean of a servo's answer to a step.
+    stiffness, which is the mean of a servo's answer to a step; less half a physics step, by which a
+    simulated servo answers earlier than that (see `_stiff_follower`).
     """
     layout = found.layout
     servos = list(find_addresses(model).actuators)
@@ -255,6 +256,7 @@ def total_delay(found: Identified, model: mujoco.MjModel) -> str:
     width = _HALF_WIDTH * misfit(found) * wider * float(np.sqrt(slope @ covariance @ slope))
     world = layout.world(vector)
     late = delay_and_servos(vector) - vector[delay] + world["action_latency"] + world["servo_lag"]
+    late = max(late - 0.5 * layout.physics_dt, 0.0)
     return f"total delay: {1e3 * late:.1f} +- {1e3 * width:.1f} ms, of latency, lag and servos"
 
 
