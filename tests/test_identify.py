@@ -14,7 +14,6 @@ from scipy.optimize import minimize
 from bounce_mjx.commands.main import main
 from bounce_mjx.deploy.recorder import Recorder
 from bounce_mjx.errors import UserError
-from bounce_mjx.identify.doctor import examine
 from bounce_mjx.identify.fit import (
     Fit,
     Noise,
@@ -27,6 +26,7 @@ from bounce_mjx.identify.fit import (
 )
 from bounce_mjx.identify.flight import acceleration, fit_flight
 from bounce_mjx.identify.following import command_delay, find_settled, follow, set_points
+from bounce_mjx.identify.inspection import examine
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.reading import read_csv
 from bounce_mjx.identify.simulation import (

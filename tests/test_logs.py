@@ -11,8 +11,8 @@ from bounce_mjx.deploy.recorder import Recorder
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.contacts import ContactChecker
 from bounce_mjx.identify import Topics
-from bounce_mjx.identify.doctor import describe, examine
 from bounce_mjx.identify.excitation import excite
+from bounce_mjx.identify.inspection import describe, examine
 from bounce_mjx.identify.log import Log, align_clocks, check
 from bounce_mjx.identify.reading import read_bag, read_csv, read_log
 from bounce_mjx.identify.world import measure_camera
@@ -670,6 +670,14 @@ def test_pictures_without_an_arm_beside_them_are_counted() -> None:
     (finding,) = examine([log._replace(picture_times=log.picture_times + 15.0)], ARM)[0].findings
     assert finding.kind == "pictures alone" and not finding.is_fault
     assert finding.text.startswith("1801 of 3600 pictures") and "after 29.990 s" in finding.text
+
+
+def test_a_ball_that_a_hand_carries_for_most_of_the_time_has_its_unit() -> None:
+    log = sound_log()
+    balls = log.ball_positions.copy()
+    times = log.picture_times[900:]
+    balls[900:, 2] = 0.4 + 0.2 * np.sin(2.0 * times)
+    assert examine([log._replace(ball_positions=balls)], ARM)[0].findings == ()
 
 
 def test_no_delay_is_told_of_joints_that_follow_nothing() -> None:

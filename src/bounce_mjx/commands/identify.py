@@ -45,7 +45,7 @@ def main(args: Sequence[str]) -> None:
     command = parse(IdentifyCommand, args, prog="bounce-mjx identify")
     if not command.logs:
         raise UserError("no log is given; name the CSV files or bags to identify from")
-    from bounce_mjx.identify.doctor import describe, examine
+    from bounce_mjx.identify.inspection import describe, examine
     from bounce_mjx.identify.reading import read_log
     from bounce_mjx.identify.stages import identify, join
     from bounce_mjx.identify.world import (

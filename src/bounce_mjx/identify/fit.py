@@ -99,6 +99,8 @@ class Problem(NamedTuple):
     see `correlation_times`."""
     progress: Callable[[str], None] = lambda line: None
     """Called with a line about each step of a search."""
+    gravity_compensation: float = 0.0
+    """Share of the arm's weight that its controller carries, if more than the model's own."""
     has_lift: bool = False
     """Whether spin lifts the ball; the spin after a bounce then is as free as that before it."""
     leaves_at_once: bool = False
@@ -318,7 +320,8 @@ def certainty(
     covariance [P, P], with it. What was not estimated has the prior's deviation.
 
     In units of the prior's deviations, window s has the derivatives J_s [M, P] and the gradient
-    g_s = J_s' r_s, after its start is eliminated (`_eliminate`).
+    g_s = J_s' r_s, after its start is eliminated (`_eliminate`). The residuals r_s are those at the
+    minimum, and the derivatives are taken where latency and lag differ (`Layout.interior`).
 
     *Information.* A bounce depends on where in a physics step it begins, which makes derivatives
     noisy, and J_s' J_s would count their noise as information. J1 and J2, by central differences

@@ -120,7 +120,7 @@ def set_points(log: Log, following: Following, dt: float) -> Log:
 
 
 def _hold(log: Log) -> float:
-    """Mean time for which a command has been held, s."""
+    """Mean time for which a command has been held when it acts, s: half of a control step."""
     return 0.5 * float(np.median(np.diff(log.target_times)))
 
 

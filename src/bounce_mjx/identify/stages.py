@@ -251,7 +251,9 @@ def identify(
         noise=sensors,
         progress=progress,
     )
-    carried = own._replace(simulate=make_simulator(config, layout, log, windows, carried=1.0))
+    carried = own._replace(
+        simulate=make_simulator(config, layout, log, windows, carried=1.0), gravity_compensation=1.0
+    )
     progress(f"arm: {1e3 * following.delay:.1f} ms behind its commands")
     if does_move(log):
         searches = [_search_arm(problem, config, delay, following) for problem in (own, carried)]
@@ -264,9 +266,10 @@ def identify(
         problem = own
         is_follower = False
         fit = _with_offsets(own, Fit(layout.mean, windows.starts))
-    share = float(problem.simulate is carried.simulate)
+    share = problem.gravity_compensation
+    # What the last searches vary.
     stages = ["arm"]
-    states = windows.arm_state
+    free_states = windows.arm_state
     if is_follower:
         progress(
             "the targets are set points, which the arm follows"
@@ -281,7 +284,7 @@ def identify(
         make = partial(make_simulator, config, layout, log, windows, share)
         problem, fit, pictures = _fit_ball(problem, fit, make)
         stages = [*stages, "flight", "bounce"]
-        states = None
+        free_states = None
     if does_move(log) and not is_follower and np.max(problem.correlation) < _FEW_ALIKE:
         lift = AIR_LIFT * problem.has_lift
         finer = _halve_steps(config)
@@ -294,9 +297,12 @@ def identify(
         problem = problem._replace(simulate=simulate, layout=layout)
     progress("all")
     angles = angle_weights(problem, problem.predict(fit.vector, fit.starts))
-    fit = minimise(problem, fit, stages, problem.weights(pictures, seen, angles), 3, states)
-    unseen = minimise(problem, fit, [], problem.weights(pictures, 1.0 - seen, angles), 3, states)
-    fit = minimise(problem, unseen, stages, problem.weights(pictures, 1.0, angles), 3, states)
+    of_seen = problem.weights(pictures, seen, angles)
+    of_unseen = problem.weights(pictures, 1.0 - seen, angles)
+    of_all = problem.weights(pictures, 1.0, angles)
+    fit = minimise(problem, fit, stages, of_seen, 3, free_states)
+    unseen = minimise(problem, fit, [], of_unseen, 3, free_states)
+    fit = minimise(problem, unseen, stages, of_all, 3, free_states)
     if not fit.cost < np.inf:
         raise UserError(
             f"the simulation of {log.source} diverges with {config.physics_dt:g} s steps; take a "

@@ -26,6 +26,7 @@ _BEFORE = 0.55
 _AFTER = 0.2
 _AFTER_SHARE = 0.3
 _SECONDS = MAX_DELAY + _BEFORE + _AFTER + 0.03
+# Shortest window of the arm alone, and twice the shortest flight on a side of a bounce, s.
 _SHORTEST = 0.16
 _FEWEST = 5
 _MOST = 240
@@ -135,23 +136,25 @@ def cut(log: Log, physics_dt: float) -> Windows:
         with_ball = _thin(with_ball, max(_MOST_BALLS, _MOST - len(others)))
         spans = with_ball + _thin(sorted(others), _MOST - len(with_ball))
     spans.sort()
+    # A span is that of the pictures; its simulation begins earlier, at the time `zero`.
     begins = [start - MAX_DELAY for start, _, _ in spans]
     first = np.array([int((begin - origin) / physics_dt) for begin in begins], int)
     zero = origin + first * physics_dt
     angle_rows = []
     picture_rows = []
-    starts = []
-    used = -np.inf
+    states = []
+    last_end = -np.inf
     settled = find_settled(log)
     bounces = np.array(spans)[:, 2] - zero
     for (start, end, _), begin, bounce in zip(spans, zero, bounces, strict=True):
-        inside = (log.times >= max(begin, used)) & (log.times < end) & settled
+        # Each angle counts in one window.
+        inside = (log.times >= max(begin, last_end)) & (log.times < end) & settled
         seen = (log.picture_times >= start) & (log.picture_times <= end) & np.isfinite(bounce)
         angle_rows.append(np.flatnonzero(inside))
         picture_rows.append(np.flatnonzero(seen))
         ball = _ball_start(log, picture_rows[-1], bounce, begin)
-        starts.append(np.concatenate([_joint_start(log, begin), ball]))
-        used = end
+        states.append(np.concatenate([_joint_start(log, begin), ball]))
+        last_end = end
     angle_times, angles, angle_weights = _pad(angle_rows, log.times, zero, log.joint_angles)
     picture_times, balls, picture_weights = _pad(
         picture_rows, log.picture_times, zero, log.ball_positions
@@ -168,7 +171,7 @@ def cut(log: Log, physics_dt: float) -> Windows:
         balls=balls,
         picture_weights=np.where(near, 0.0, picture_weights),
         bounces=bounces,
-        starts=np.stack(starts),
+        starts=np.stack(states),
         dt=physics_dt,
     )
 

@@ -59,6 +59,8 @@ _GRAVITY = 9.81
 # Time of a piece of flight that shows the ball's acceleration, s.
 _PIECE = 0.12
 _FEWEST_PIECES = 10
+# Distance of a piece's acceleration from gravity, in its size, up to which the ball falls.
+_NEAR_GRAVITY = 0.3
 # Share of the pictures without angles and targets beside them that is worth a note.
 _ALONE = 0.05
 _PIECES = 300
@@ -551,13 +553,17 @@ def _find_stamps(log: Log) -> list[Finding]:
 
 
 def _find_ball(log: Log) -> list[Finding]:
-    """A ball that does not fall."""
+    """A ball that never falls."""
     if len(log.picture_times) < 30:
         return []
-    found = []
     pulls = _accelerations(log.picture_times, log.ball_positions)
     if len(pulls) < _FEWEST_PIECES:
-        return found
+        return []
+    found = []
+    falls = np.linalg.norm(pulls + [0.0, 0.0, _GRAVITY], axis=1) < _NEAR_GRAVITY * _GRAVITY
+    if np.sum(falls) >= _FEWEST_PIECES:
+        # A hand may carry it in between, for most of the log.
+        return []
     pull = np.median(pulls, axis=0)
     size = float(np.linalg.norm(pull))
     axis = int(np.argmax(np.abs(pull)))
