@@ -247,7 +247,7 @@ def test_intervals_know_that_residuals_of_a_window_are_correlated() -> None:
     clean, moved = (w.split(problem.predict(x, w.starts))[0] for x in (truth, late))
     along = moved - clean
     estimates, deviations, independent = [], [], []
-    for _ in range(40):
+    for _ in range(20):
         common = random.normal(size=(len(w.first), 1, 1))
         noisy = clean + 1e-3 * random.normal(size=clean.shape) + common * along
         one = problem._replace(windows=w._replace(angles=noisy))
