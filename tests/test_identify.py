@@ -705,7 +705,9 @@ def test_a_flight_with_drag_and_spin_is_fitted_directly() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("late", [0.012, 0.003])
-def test_an_arm_is_explained_no_worse_than_by_a_delay_and_offsets(late: float) -> None:
+def test_an_arm_is_explained_no_worse_than_by_a_delay_and_offsets(
+    late: float, tmp_path: Path
+) -> None:
     """One that follows its commands more exactly than any servo, or so early that they are a
     controller's own set points; and what the servos of the model are, no log of it shows."""
     config, random = read_preset(Path("default")).env, np.random.default_rng(3)
@@ -732,8 +734,25 @@ def test_an_arm_is_explained_no_worse_than_by_a_delay_and_offsets(late: float) -
         assert shown == {"action_latency", "servo_offset"}
         (said,) = (x for x in sentences(found, NAMES) if "stiff servos" in x)
         assert "the controller's own set points" in said
-        printed = total_delay(found, world_model(config, visual=False))
+        model = world_model(config, visual=False)
+        printed = total_delay(found, model)
         assert float(printed.split(" ")[2]) == pytest.approx(1e3 * late, abs=0.15)
+        path = tmp_path / "world.yaml"
+        path.write_text(to_yaml(found, log, NAMES, None), encoding="utf-8")
+        assert read_world(path).sources["randomization.servo_gain"].startswith("Chosen, as a delay")
+        # Of servos and a lag, it is the time by which the simulated joints follow.
+        layout, windows = found.layout, found.windows
+        other_world = {"action_latency": 0.01, "servo_lag": 0.02, "joint_frictionloss": np.zeros(6)}
+        vector = layout.vector(other_world)
+        simulate = make_simulator(config, layout, log, windows, carried=1.0)
+        every = np.ones((1, len(windows.first)), bool)
+        simulated = windows.split(simulate(vector[None], windows.starts[None], every)[0])[0]
+        settled = (windows.angle_weights > 0.0) & (windows.angle_times > 0.4)
+        at = (windows.zero[:, None] + windows.angle_times)[settled]
+        other = log._replace(times=at, joint_angles=simulated[settled])
+        measured = command_delay(other, follow(other, np.ones(len(at), bool)))
+        printed = total_delay(found._replace(fit=found.fit._replace(vector=vector)), model)
+        assert float(printed.split(" ")[2]) == pytest.approx(1e3 * measured, abs=0.15)
 
 
 def test_following_finds_delay_and_offsets() -> None:

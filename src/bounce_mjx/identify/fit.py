@@ -305,6 +305,8 @@ def _bounded_step(hessian: np.ndarray, slope: np.ndarray, room: np.ndarray) -> n
     Args:
       room: smallest and largest change [2, F].
     """
+    if not len(slope):
+        return slope
     root = np.linalg.cholesky(hessian).T
     target = -np.linalg.solve(root.T, slope)
     low = np.minimum(room[0], 0.0)

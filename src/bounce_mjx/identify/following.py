@@ -47,10 +47,10 @@ def find_unknown(log: Log) -> list[tuple[float, float]]:
 
 def is_known(log: Log, times: np.ndarray) -> np.ndarray:
     """Which times [T] are in no stretch of `find_unknown`."""
-    known = np.ones(len(times), bool)
-    for begin, end in find_unknown(log):
-        known &= (times <= begin) | (times >= end)
-    return known
+    begins, ends = np.sort(np.array(find_unknown(log)).T)
+    begun = np.searchsorted(begins, times, side="left")
+    ended = np.searchsorted(ends, times, side="right")
+    return begun == ended
 
 
 def find_settled(log: Log) -> np.ndarray:

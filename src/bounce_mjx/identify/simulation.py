@@ -115,6 +115,7 @@ def make_simulator(
             rows = pool.map(lambda b: simulate_block(vectors, starts, c[b], s[b]), blocks)
             measured = np.concatenate(list(rows))
         result = np.zeros((*used.shape, measured.shape[1]))
+        # Where a candidate does not count, it has the numbers of the first.
         result[:, s[c == 0]] = measured[c == 0]
         result[c, s] = measured
         return result

@@ -38,6 +38,8 @@ _MOST_FLY = 0.5
 _SURPRISING = 3.0
 # Distance from a limit of the search within which an estimate is at it, in the same deviations.
 _AT_LIMIT = 1e-6
+# Terms of a follower's servos, which were chosen and not estimated.
+_OF_FOLLOWER = ("servo_lag", "servo_gain", "servo_damping", "joint_frictionloss")
 _MISTAKES = (
     "Look at the frame of the ball's position (the robot's base, in metres, z up), the unit and "
     "clock of ball_time and of the servo targets, swapped columns, a joint's zero, --robot, and "
@@ -229,9 +231,10 @@ def describe_doubts(found: Identified, joint_names: Sequence[str]) -> list[str]:
 def total_delay(found: Identified, model: mujoco.MjModel) -> str:
     """The delay from a command to the angle, which a log shows however it is shared.
 
-    It is the action's latency, the lag, and the delay of the servos themselves: damping divided by
-    stiffness, which is the mean of a servo's answer to a step; less half a physics step, by which a
-    simulated servo answers earlier than that (see `_stiff_follower`).
+    It is the action's latency, the mean delay of the lag's steps (shorter than the lag by half a
+    step at most), and the delay of the servos themselves: damping divided by stiffness, which is
+    the mean of a servo's answer to a step, less the half step by which a simulated servo answers
+    earlier.
     """
     layout = found.layout
     servos = list(find_addresses(model).actuators)
@@ -239,24 +242,20 @@ def total_delay(found: Identified, model: mujoco.MjModel) -> str:
 
     delay = layout.slices["delay"].start
 
-    def delay_and_servos(vector: np.ndarray) -> float:
-        """With the mean delay of a lag in place of the lag, which is longer by half a step at most:
-        their sum does not depend on how uncertain the lag is."""
+    def total(vector: np.ndarray) -> float:
         world = layout.world(vector)
         of_servos = np.mean(own * world["servo_damping"] / world["servo_gain"])
-        return float(vector[delay] + of_servos)
+        return float(vector[delay] + of_servos) - 0.5 * layout.physics_dt
 
     vector = found.fit.vector
     steps = 1e-3 * layout.deviation
-    moved = [delay_and_servos(vector + step) for step in np.diag(steps)]
-    slope = (np.array(moved) - delay_and_servos(vector)) / steps
+    moved = [total(vector + step) for step in np.diag(steps)]
+    slope = (np.array(moved) - total(vector)) / steps
     covariance = np.linalg.inv(found.information + np.diag(layout.deviation**-2.0))
     # As much wider than for independent residuals as the interval of the delay.
     wider = found.deviation[delay] / np.sqrt(covariance[delay, delay])
     width = _HALF_WIDTH * misfit(found) * wider * float(np.sqrt(slope @ covariance @ slope))
-    world = layout.world(vector)
-    late = delay_and_servos(vector) - vector[delay] + world["action_latency"] + world["servo_lag"]
-    late = max(late - 0.5 * layout.physics_dt, 0.0)
+    late = max(total(vector), 0.0)
     return f"total delay: {1e3 * late:.1f} +- {1e3 * width:.1f} ms, of latency, lag and servos"
 
 
@@ -281,8 +280,7 @@ def _describe_mistakes(found: Identified, joint_names: Sequence[str]) -> list[st
     typical[late] += found.stamp_age
     is_judged = np.ones(len(vector), bool)
     if found.is_follower:
-        # Its servos were chosen, not estimated.
-        for name in ("servo_gain", "servo_damping", "joint_frictionloss"):
+        for name in _OF_FOLLOWER:
             is_judged[layout.terms[name]] = False
     said = [
         f"warning: {entry.label} is {entry.value:.4g} {entry.unit}".rstrip()
@@ -354,6 +352,8 @@ def to_yaml(
             assumed.append(name)
         shown = any(entry.seen for entry in entries)
         how = "Identified" if shown else "Not shown, so the prior stands,"
+        if found.is_follower and name in _OF_FOLLOWER:
+            how = "Chosen, as a delay and offsets alone explain the joints,"
         values = ", ".join(map(_format, entries))
         sources[name] = f"{how} from {log.source}: {values} (95%)."
     for name in [name for name in BALL if name not in ranges]:
