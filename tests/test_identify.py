@@ -20,9 +20,11 @@ from bounce_mjx.identify.fit import (
     Problem,
     _bounded_step,
     _eliminate,
+    angle_weights,
     certainty,
     correlation_times,
     minimise,
+    picture_weights,
 )
 from bounce_mjx.identify.flight import acceleration, fit_flight
 from bounce_mjx.identify.following import command_delay, find_settled, follow, set_points
@@ -511,6 +513,9 @@ def test_a_fit_whose_simulation_diverges_has_an_infinite_cost() -> None:
 
     broken = problem._replace(simulate=diverge)
     assert minimise(broken, start, ["arm"], problem.weights(0.0), 2).cost == np.inf
+    predicted = broken.predict(start.vector, start.starts)
+    assert not np.any(angle_weights(broken, predicted))
+    assert not np.any(picture_weights(broken, predicted))
 
     def diverge_elsewhere(vectors: np.ndarray, starts: np.ndarray, used: np.ndarray) -> np.ndarray:
         moved = np.any(vectors != start.vector, axis=1)[:, None, None]

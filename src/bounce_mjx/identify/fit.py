@@ -582,7 +582,12 @@ def _multiply(columns: np.ndarray) -> np.ndarray:
 def angle_weights(problem: Problem, predicted: np.ndarray) -> np.ndarray:
     """Weights [S, A, n] of the joint angles: less for outliers."""
     residuals = problem.windows.split(predicted)[0] - problem.windows.angles
-    size = np.abs(residuals) / problem.noise.angles
+    return _huber_weights(np.abs(residuals) / problem.noise.angles)
+
+
+def _huber_weights(size: np.ndarray) -> np.ndarray:
+    """Weights of residuals of a size in units of their noise; 0 where a simulation diverges."""
+    size = np.where(np.isfinite(size), size, np.inf)
     return np.minimum(1.0, _HUBER / np.maximum(size, 1e-9))
 
 
@@ -617,7 +622,7 @@ def picture_weights(problem: Problem, predicted: np.ndarray) -> np.ndarray:
     white = problem.windows.split(problem.whiten(predicted, problem.weights()))[1]
     size = np.max(np.abs(white), axis=2)
     flies = flight_errors(problem, predicted, problem.windows.picture_weights) < NO_FLIGHT
-    return np.minimum(1.0, _HUBER / np.maximum(size, 1e-9)) * flies[:, None]
+    return _huber_weights(size) * flies[:, None]
 
 
 def flight_errors(problem: Problem, predicted: np.ndarray, pictures: np.ndarray) -> np.ndarray:
