@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from bounce_mjx.identify.doctor import Checkup, Joint
+from bounce_mjx.identify.inspection import Checkup, Joint
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.stages import Identified
 from bounce_mjx.identify.world import estimates, misfit, sentences
