@@ -385,7 +385,7 @@ def faults(joints: int) -> dict[str, Fault]:
             _later(_put("time", lambda m: m.measured["time"] + 0.5)), ("late_step",)
         ),
         "time 50 s ahead": Fault(
-            _later(_put("time", lambda m: m.measured["time"] + 50.0)), ("measurement",)
+            _later(_put("time", lambda m: m.measured["time"] + 50.0)), ("late_step",)
         ),
         "time in ms from the start": Fault(
             _put("time", lambda m: 1e3 * m.measured["time"]),

@@ -91,7 +91,7 @@ def simulate(
       model: of the arm and the ball; None for the one of `MJCF`.
 
     Returns:
-      Bounces and length (s) of each episode.
+      Bounces and length (s) of each episode; why the arm stopped is printed.
     """
     if model is None:
         model = mujoco.MjModel.from_xml_path(str(MJCF))
@@ -99,14 +99,16 @@ def simulate(
     joints = [data.joint(name) for name in policy.metadata.joint_names]
     for joint, angle in zip(joints, policy.metadata.default_joint_angles, strict=True):
         joint.qpos = angle
+    data.ctrl[:] = policy.metadata.default_joint_angles
     ball = data.joint("ball_link")
     ball_start = ball.qpos.copy()
 
     policy.reset()
-    arm = policy.supervise(rate=1.0 / model.opt.timestep, box=BOX)
+    rate = 1.0 / model.opt.timestep
+    arm = policy.supervise(rate, box=BOX)
     camera.look(data)
     counter = BounceCounter()
-    episode_start = 0.0
+    episode_start = None
     episodes = []
     while data.time < seconds - TIME_TOLERANCE:
         target = int(data.time / SECONDS_OF_A_TARGET_HEIGHT) % len(target_heights)
@@ -118,15 +120,19 @@ def simulate(
             **camera.measure(data.time),
         }
         commands = arm.commands(measurements)
-        if recorder is not None:
-            recorder.step(measurements, commands[-1])
+        if len(commands) == 0:
+            # The first sample is not believed yet: nothing is sent, and the servos keep theirs.
+            commands = np.tile(data.ctrl, (policy.commands_per_step(rate), 1))
 
         if arm.state == "ready" and "ball_position" in measurements:
             arm.start()
             counter = BounceCounter()
             episode_start = data.time
         elif arm.state == "stopped":
-            episodes.append((counter.bounces, data.time - episode_start))
+            print(f"stopped at {data.time:.2f} s ({arm.fault}): {arm.reason}", flush=True)
+            if episode_start is not None:
+                episodes.append((counter.bounces, data.time - episode_start))
+            episode_start = None
             arm.restart()
 
         for command in commands:
@@ -138,7 +144,10 @@ def simulate(
                 ball.qvel[:] = 0.0
             counter.watch(ball.qvel[2])
             camera.look(data)
-    if arm.state == "running":
+        if recorder is not None:
+            # After the commands, which a full disk must not keep back.
+            recorder.step(measurements, commands[-1])
+    if episode_start is not None:
         episodes.append((counter.bounces, data.time - episode_start))
     return episodes
 

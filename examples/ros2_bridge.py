@@ -4,7 +4,8 @@
 (PointStamped, in the frame of the base), and publishes /forward_position_controller/commands at
 500 Hz. The joints are the driver's names in the order of the controller, if they differ from the
 policy's.
-Publish a message on /start for each episode, also after a fault. Read "Safety steps" in
+Publish a message on /start for each episode, also after a fault; if the arm was moved with its
+servos off, start the program again. Read "Safety steps" in
 docs/real-robot.md first.
 """
 

@@ -19,7 +19,14 @@ import pytest
 from bounce_mjx import BounceBall, EnvConfig, load_policy
 from bounce_mjx.deploy.export import export_onnx, policy_metadata
 from bounce_mjx.deploy.graph import onnx_graph
-from bounce_mjx.deploy.metadata import CommandLimits, CommandRange, from_entries, to_entries
+from bounce_mjx.deploy.metadata import (
+    TERMS_PER_JOINT,
+    CommandLimits,
+    CommandRange,
+    from_entries,
+    in_driver_order,
+    to_entries,
+)
 from bounce_mjx.deploy.motion import paddle_position
 from bounce_mjx.deploy.policy import DeployedPolicy
 from bounce_mjx.env.env import Env
@@ -32,6 +39,7 @@ from bounce_mjx.runs import checkpoints
 from bounce_mjx.runs.checkpoints import save_checkpoint
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import find_checkpoint, save_config
+from bounce_mjx.world.randomization import EACH_JOINT, TERMS
 from bounce_mjx.world.sensing import Sensing
 
 CHECKOUT = Path(__file__).resolve().parent.parent
@@ -277,6 +285,22 @@ def test_metadata_describes_the_training_and_survives_the_file() -> None:
     np.testing.assert_allclose(metadata.largest_step, 0.02)
 
 
+def test_a_drivers_order_is_that_of_the_terms_too() -> None:
+    """Of those of each joint; of a paddle's axes not."""
+    of_joints = {name for name, term in TERMS.items() if term.size is EACH_JOINT}
+    assert TERMS_PER_JOINT == of_joints
+    gains = tuple(zip((0.8, 0.81, 0.82, 0.83, 0.84, 0.85), (1.2,) * 6, strict=True))
+    tilts = ((-0.2, 0.0), (0.0, 0.1))
+    terms = {"servo_gain": tuple(zip(*gains, strict=True)), "paddle_tilt": tilts}
+    metadata = policy_metadata(TrainConfig(env={"randomization": terms}), 64)
+    order = [3, 4, 5, 0, 2, 1]
+    names = [metadata.joint_names[i] for i in order]
+    ranges = in_driver_order(metadata, names, order).randomization
+    assert ranges.keys() == metadata.randomization.keys()
+    assert [ranges[f"servo_gain[{i}]"] for i in range(6)] == [gains[i] for i in order]
+    assert (ranges["paddle_tilt[0]"], ranges["paddle_tilt[1]"]) == ((-0.2, 0.0), (0.0, 0.1))
+
+
 def test_servo_targets_lead_the_measured_angles_as_in_the_environment() -> None:
     """The policy's actions add to its last targets; a step that is repeated changes nothing."""
     env = BounceBall(EnvConfig(action={"base": "target", "max_lead": 0.03}))
@@ -442,6 +466,78 @@ def test_histories_stay_in_control_steps(policies) -> None:
     np.testing.assert_array_equal(seen_after(steps, jitter), punctual)
     late = seen_after(np.delete(steps, [4, 5, 8]), np.zeros(9))
     np.testing.assert_allclose(late[ball], punctual[ball], atol=1e-12)
+
+
+def velocities_seen(policy: DeployedPolicy, calls: list[tuple[float, int, float]]) -> list[float]:
+    """Vertical velocities that a policy of differences makes of a ball that falls at 1.5 m/s.
+
+    Args:
+      calls: the time of each, the number of the picture that it has, and this picture's time, s.
+    """
+    place = 0
+    for part in policy.metadata.observation:
+        if part.name == "ball_velocity":
+            break
+        place += part.history * part.size
+    policy.reset()
+    seen = []
+    for time, _, taken in calls:
+        policy.step(falling(taken) | {"time": time, "ball_age": time - taken})
+        seen.append(float(policy.observation[place + 2]))
+    return seen
+
+
+def test_a_velocity_from_differences_is_of_the_real_time_between_pictures(policies) -> None:
+    """Whenever the calls come, also late ones; an older picture is not a newer one."""
+    policy = policies["sensors"]
+    rng = np.random.default_rng(0)
+    calls = []
+    for step in range(40):
+        time = 0.01 * step + rng.uniform(-0.004, 0.004)
+        picture = math.floor((time - 0.005) / 0.0083)
+        calls.append((time, picture, 0.0083 * picture))
+    late = [call for step, call in enumerate(calls) if step not in (10, 11, 20)]
+    for given in (calls, late):
+        seen = velocities_seen(policy, given)
+        first = next(i for i, call in enumerate(given) if call[1] != given[0][1])
+        assert seen[:first] == [0.0] * first
+        np.testing.assert_allclose(seen[first:], -1.5, rtol=1e-6)
+    # The third call comes earlier after the second than a control step; the fourth has an older
+    # picture, which came late.
+    shown = ((0.0, 0.0), (0.010, 0.008), (0.023, 0.008), (0.030, 0.008), (0.040, 0.0), (0.05, 0.04))
+    seen = velocities_seen(policy, [(time, 0, taken) for time, taken in shown])
+    np.testing.assert_allclose(seen, [0.0, -1.5, -1.5, -1.5, -1.5, -1.5], rtol=1e-6)
+
+
+FORGETFUL = """
+from bounce_mjx.task.track import Track
+
+class Config(Track.Config):
+    pass
+
+class Forgetful(Track):
+    Config = Config
+
+    def first_quantities(self, measured):
+        return (), {"aim": measured["ball_position"][:2]}
+
+    def next_quantities(self, memory, histories, measured):
+        return (), {"aim": measured["ball_position"][None, :2]}
+"""
+
+
+def test_a_task_need_not_look_at_its_last_quantities(tmp_path: Path) -> None:
+    (tmp_path / "forgetful.py").write_text(FORGETFUL, encoding="utf-8")
+    name = f"{tmp_path / 'forgetful.py'}:Forgetful"
+    run = make_run(tmp_path / "run", {"observation": {"ball_position": 2}, **LEVEL}, name)
+    policy = load_policy(run, task=name)
+    place = [part.name for part in policy.metadata.observation].index("aim")
+    start = sum(part.history * part.size for part in policy.metadata.observation[:place])
+    for step in range(3):
+        given = falling(0.01 * step) | dict.fromkeys(policy.metadata.commands, 0.5)
+        policy.step({key: given[key] for key in policy.needs})
+        aim = policy.observation[start : start + 2]
+        np.testing.assert_allclose(aim, given["ball_position"][:2], atol=1e-6)
 
 
 WRONG = {

@@ -64,6 +64,11 @@ def test_recorder_keeps_an_earlier_log(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"the log .+log\.csv exists; choose another name"):
         Recorder(path, JOINTS)
     assert path.read_bytes() == before
+    with (
+        Recorder(tmp_path / "another.csv", JOINTS) as recorder,
+        pytest.raises(UserError, match="has no time; give the measurements a time"),
+    ):
+        recorder.step({"joint_angles": [0.1, 0.2]}, [0.3, 0.4])
 
 
 def changed(line: str, row: int, column: int, cell: str) -> str:

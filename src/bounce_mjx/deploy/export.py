@@ -60,8 +60,8 @@ _MARGIN = 1.25
 
 _ACTION = (
     "servo target of joint i in rad = clip(base[i] + action_scale * action[i], joint_ranges[i]), "
-    "where base is the joint angles of the same observation; with max_lead, it is the last servo "
-    "target within max_lead of them"
+    "at most largest_step[i] from the last one, where base is the joint angles of the same "
+    "observation; with max_lead, it is the last servo target within max_lead of them"
 )
 _LIMITED = "; the command moves toward it within limits"
 
@@ -108,8 +108,8 @@ def export_onnx(checkpoint: Checkpoint) -> bytes:
 
 
 def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
-    """Metadata of a run's policy. The largest step of its commands is that of actions that add to
-    the last target; `largest_step` measures the one of actions that add to the measured angles.
+    """Metadata of a run's policy. Its `largest_step` is that of actions that add to the last
+    target; where they add to the measured angles, `export_onnx` puts the measured one in its place.
 
     Args:
       steps: environment steps of the training.
@@ -174,7 +174,26 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         paddle=paddle,
         paddle_normal=normal,
         environment=_environment(env),
+        joint_damping=tuple(m.dof_damping[list(addresses.arm_qvel)].tolist()),
+        sag=_sag(m, env.default_joint_angles),
     )
+
+
+def _sag(m: mujoco.MjModel, joint_angles: Sequence[float]) -> tuple[float, ...]:
+    """How far the arm's weight takes each joint off its command at rest at these angles, rad."""
+    addresses = find_addresses(m)
+    data = mujoco.MjData(m)
+    data.qpos[list(addresses.arm_qpos)] = joint_angles
+    mujoco.mj_forward(m, data)
+    dofs = list(addresses.arm_qvel)
+    torques = (data.qfrc_bias - data.qfrc_passive)[dofs]
+    # What the servos carry beside their stiffness.
+    is_carried = m.jnt_actgravcomp[list(addresses.arm_joints)] != 0
+    torques = torques - np.where(is_carried, data.qfrc_gravcomp[dofs], 0.0)
+    servos = list(addresses.actuators)
+    stiffness = m.actuator_gainprm[servos, 0] * m.actuator_gear[servos, 0] ** 2
+    # Rounded, as it differs in its last digits from one machine to another.
+    return tuple(round(angle, 6) for angle in np.abs(torques / stiffness).tolist())
 
 
 def _environment(env: WorldConfig) -> dict[str, Any]:

@@ -27,8 +27,8 @@ _OF_NOISE = 3.0
 _HELD = 1e-3
 _COUNTS = 2.0
 # Distance from all these arms that is too far, rad.
-_OFFSET = 0.05
-# What a resting joint may be off its command beside the encoder's bias: its load, rad.
+_TOO_FAR = 0.05
+# What a load takes a joint off its command while it rests, beside the arm's own weight, rad.
 _SAG = 0.01
 # A ball so far below the paddle, or beside it without coming nearer, is lost; one so far above it
 # flies, m.
@@ -37,8 +37,6 @@ _BESIDE = 0.9
 _FLYING = 0.05
 # Pictures in which the noise is smaller than the motion of a ball that comes nearer.
 _EARLIER = 5
-# Difference of two clocks, s.
-_SYNCHRONOUS = 1e-3
 
 Fault = tuple[str, str]
 """Code and reason."""
@@ -56,13 +54,22 @@ def arm_responses(metadata: Metadata) -> np.ndarray:
     the newest first, in the next measured angle, for arms of all latencies and lags.
 
     An arm is a servo, a first-order lag of the time constant damping / stiffness, behind the lag
-    and the latency of the randomisation; or an ideal servo, without any lag.
+    and the latency of the randomisation; or an ideal servo, without any lag. The damping is that of
+    the servo and of its joint.
     """
     dt = metadata.control_dt
     latency = largest_term(metadata, "action_latency")
-    lag = float(np.max(np.divide(metadata.servo_damping, metadata.servo_stiffness)))
-    slower = largest_term(metadata, "servo_damping", 1.0) / least_term(metadata, "servo_gain", 1.0)
-    slowest = lag * slower + largest_term(metadata, "servo_lag")
+    stiffness = np.array(metadata.servo_stiffness)
+    servo_damping = np.array(metadata.servo_damping)
+    joint_damping = np.array(metadata.joint_damping or np.zeros(len(stiffness)))
+    lag = max(float(np.max((servo_damping + joint_damping) / stiffness)), _NO_LAG)
+    most_damping = (
+        largest_term(metadata, "servo_damping", 1.0) * servo_damping
+        + joint_damping
+        + largest_term(metadata, "joint_damping")
+    )
+    least_stiffness = least_term(metadata, "servo_gain", 1.0) * stiffness
+    slowest = float(np.max(most_damping / least_stiffness)) + largest_term(metadata, "servo_lag")
     latencies = np.arange(0.0, latency + _LATER + 1e-9, _APART) / dt
     num_lags = 3 if slowest > 1.5 * lag else 1
     lags = np.concatenate([[_NO_LAG], np.linspace(lag, slowest, num_lags)])
@@ -79,7 +86,10 @@ def arm_responses(metadata: Metadata) -> np.ndarray:
 
 class Watch:
     """Compares the control steps of an arm and its balls with what the training's worlds can hold.
-    The functions that yield faults take the steps one after another."""
+
+    Each control step is given to one of the functions that yield faults, whose first fault counts:
+    it is read to that, or to its end.
+    """
 
     def __init__(self, metadata: Metadata, max_picture_age: float):
         """Bounds of a policy's worlds.
@@ -89,12 +99,17 @@ class Watch:
         """
         self._metadata = metadata
         self._max_age = max_picture_age
-        self.offset = _SAG + largest_term(metadata, "encoder_bias")
+        sag = max(metadata.sag, default=0.0) / least_term(metadata, "servo_gain", 1.0)
+        # Where the weight and the servos' constant errors take a joint from its command, rad.
+        self._beside_command = sag + largest_term(metadata, "servo_offset")
+        # A robot's servo may have another zero than its encoder, unlike the training's.
+        self.offset = _SAG + largest_term(metadata, "encoder_bias") + self._beside_command
         """Distance of a resting joint from its command, rad."""
         noise = largest_term(metadata, "joint_angle_noise")
         self._least = _OF_SCALE[metadata.action_base] * metadata.action_scale + _OF_NOISE * noise
         self._arms = arm_responses(metadata)
         self._compared = math.ceil(_COMPARED / metadata.control_dt)
+        self._settling = self._arms.shape[1] + self._compared
 
     def rest(self, angles: np.ndarray, command: np.ndarray) -> None:
         """The arm has rested at these angles [J], commanded to be there [J]."""
@@ -102,10 +117,12 @@ class Watch:
         self._commands = np.tile(command, (length + self._compared, 1))
         self._beside = np.tile(angles - command, (self._compared, arms, 1))
         self._angles = angles
+        self._steps = 0
         # Steps in which each reading has repeated, and its smallest change, which is a count of the
-        # encoder or more.
+        # encoder or more; unknown until the reading changes, so that one that has never changed has
+        # no narrower bound than others.
         self._repeats = np.zeros(len(angles), int)
-        self._count = np.full(len(angles), np.inf)
+        self._smallest_change = np.full(len(angles), np.inf)
 
     def begin(self) -> None:
         """An episode begins."""
@@ -123,6 +140,7 @@ class Watch:
           is_bridged: whether the angles are those of the step before, which say nothing of this.
         """
         self._commands = np.concatenate([command[None], self._commands[:-1]])
+        self._steps += 1
         if is_bridged:
             return
         beside = angles - self._arms @ self._commands[: self._arms.shape[1]]
@@ -131,10 +149,10 @@ class Watch:
         high = np.max(self._beside, axis=0)
         low = np.min(self._beside, axis=0)
         by_motion = (high - low) / self._allowed_motion()
-        by_place = np.maximum(high, -low) / _OFFSET
+        by_place = np.maximum(high, -low) / (_TOO_FAR + self._beside_command)
         unlike = np.min(np.maximum(by_motion, by_place), axis=0)
         joint = int(np.argmax(unlike))
-        if unlike[joint] > 1.0:
+        if not unlike[joint] <= 1.0:
             name = self._metadata.joint_names[joint]
             distance = np.min(np.abs(beside[:, joint]))
             yield (
@@ -146,15 +164,19 @@ class Watch:
         change = np.abs(angles - self._angles)
         has_changed = change > 0.0
         self._repeats = np.where(has_changed, 0, self._repeats + 1)
-        self._count = np.where(has_changed, np.minimum(self._count, change), self._count)
+        smallest = np.minimum(self._smallest_change, change)
+        self._smallest_change = np.where(has_changed, smallest, self._smallest_change)
         self._angles = angles
 
     def _allowed_motion(self) -> np.ndarray:
         """Motion of each joint beside the training's arms [J] that is no fault, rad."""
-        allowed = self._least + np.minimum(self._count, RESOLUTION)
+        allowed = self._least + np.minimum(self._smallest_change, RESOLUTION)
         allowed += _OF_COMMANDS * np.ptp(self._commands, axis=0)
+        if self._steps < self._settling:
+            # They go there with the first commands.
+            allowed += self._beside_command
         # A moving joint's reading changes by a count, and one with noise in every step.
-        of_repeating = np.minimum(allowed, _HELD + _COUNTS * self._count)
+        of_repeating = np.minimum(allowed, _HELD + _COUNTS * self._smallest_change)
         return np.where(self._repeats >= self._compared, of_repeating, allowed)
 
     def faults(
@@ -187,9 +209,13 @@ class Watch:
             self._pictures = self._pictures[-_EARLIER:] + [(balls, taken)]
         seen = self._pictures
         # A ball in flight that does not move is an old picture, whatever its age is said to be.
-        if age is None or np.max(balls[:, 2]) > paddle[2] + _FLYING:
-            age = max(self._time - seen[-1][1], age or 0.0)
-        if not -_SYNCHRONOUS <= age <= self._max_age:
+        is_flying = np.max(balls[:, 2]) > paddle[2] + _FLYING
+        if age is None:
+            age = self._time - seen[-1][1]
+        elif is_flying:
+            age = max(self._time - seen[-1][1], age)
+        # `Samples` refuses a picture of the future.
+        if not age <= self._max_age:
             yield "old_picture", f"the picture of the ball is {1e3 * age:.0f} ms old"
         earliest_balls, _ = seen[0]
         beside = np.linalg.norm((balls - paddle)[:, :2], axis=1)

@@ -30,7 +30,6 @@ _INDICES = {
     "dynamic_update_slice": range(2, 9),
     "gather": range(1, 2),
     "scatter": range(1, 2),
-    "scatter-add": range(1, 2),
 }
 _TYPES = {"f": np.dtype(np.float32), "i": np.dtype(np.int32), "b": np.dtype(bool)}
 # Operations, the types of operands for which they have a counterpart, and this counterpart: a node,

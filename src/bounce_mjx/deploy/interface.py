@@ -23,7 +23,8 @@ _UNITS = {"control step": " s", "action scale": " rad", "largest lead": " rad"}
 
 
 class Interface(NamedTuple):
-    """The meaning of a policy's observations and actions."""
+    """The meaning of a policy's observations and actions. What bounds the commands, such as the
+    arm's limits, is not in it, as the same numbers mean the same with and without."""
 
     task: str
     """Name of the task; of one in a file, its class."""

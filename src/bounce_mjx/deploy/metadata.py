@@ -44,7 +44,7 @@ NEXT = "next/"
 """What precedes the name of an output for the input of the same name in the next step."""
 
 
-# Fields with a number for each joint.
+# Fields with a number for each joint, and randomisation terms of which `name[i]` is that of one.
 _PER_JOINT = (
     "largest_step",
     "joint_ranges",
@@ -52,7 +52,14 @@ _PER_JOINT = (
     "servo_damping",
     "torque_limits",
     "default_joint_angles",
+    "joint_damping",
+    "sag",
 )
+TERMS_PER_JOINT = frozenset(
+    "servo_gain servo_damping servo_offset torque_limit joint_damping joint_frictionloss armature "
+    "link_mass encoder_bias joint_velocity_bias joint_start".split()
+)
+"""Randomisation terms with a number for each joint (`RandomizationConfig`)."""
 
 
 class Input(NamedTuple):
@@ -167,8 +174,8 @@ class Metadata(NamedTuple):
     """The commands of the policy, by name."""
     randomization: dict[str, tuple[float, float]]
     """Ranges of the training's domain randomisation by the keys of `env.randomization`, which
-    documents their units; `paddle_tilt[0]` is the range of one axis or joint alone. Missing terms
-    were not randomised."""
+    documents their units; `paddle_tilt[0]` is the range of one axis alone, and `servo_gain[2]` that
+    of the joint `joint_names[2]`. Missing terms were not randomised."""
     chain: tuple[Hinge, ...]
     """The hinges from the world to the paddle."""
     paddle: Vector
@@ -178,6 +185,12 @@ class Metadata(NamedTuple):
     environment: dict[str, Any] | None = None
     """Settings of the environment of the training, the `env` of its config; None in a file of an
     earlier version."""
+    joint_damping: tuple[float, ...] = ()
+    """Torque of each joint's own damping per velocity, N m s/rad, which adds to the servo's; empty
+    in a file of an earlier version."""
+    sag: tuple[float, ...] = ()
+    """How far the arm's weight takes each joint off its command in the start pose, rad; empty in a
+    file of an earlier version."""
 
 
 def measurement_sizes(metadata: Metadata) -> dict[str, int]:
@@ -252,14 +265,34 @@ def in_driver_order(metadata: Metadata, names: Sequence[str], order: Sequence[in
     """
 
     def ordered(values: Sequence[Any]) -> tuple[Any, ...]:
-        return tuple(values[i] for i in order)
+        return tuple(values[i] for i in order) if values else ()
 
     limits = metadata.limits
     if limits is not None:
         limits = CommandLimits._make(None if x is None else ordered(x) for x in limits)
     per_joint = {name: ordered(getattr(metadata, name)) for name in _PER_JOINT}
     chain = tuple(link._replace(joint=list(order).index(link.joint)) for link in metadata.chain)
-    return metadata._replace(joint_names=tuple(names), limits=limits, chain=chain, **per_joint)
+    return metadata._replace(
+        joint_names=tuple(names),
+        limits=limits,
+        chain=chain,
+        randomization=_terms_in_order(metadata.randomization, order),
+        **per_joint,
+    )
+
+
+def _terms_in_order(
+    ranges: dict[str, tuple[float, float]], order: Sequence[int]
+) -> dict[str, tuple[float, float]]:
+    """The ranges of the randomisation, of which `name[i]` is that of the joint `order[i]`."""
+    ordered = {}
+    for name, ends in ranges.items():
+        term, bracket, rest = name.partition("[")
+        if bracket and term in TERMS_PER_JOINT:
+            place = list(order).index(int(rest.removesuffix("]")))
+            name = f"{term}[{place}]"
+        ordered[name] = ends
+    return ordered
 
 
 def _plain(value: Any) -> Any:

@@ -7,11 +7,11 @@ from bounce_mjx.robot.setpoints import Setpoint, command, joint_limits, next_set
 
 
 class Motion:
-    """Commands of the joints, one control step after the other: within the arm's limits if the
-    policy has them, else a target for the whole control step.
+    """Commands of the joints, one control step after the other: within the arm's limits
+    (`Metadata.limits`), or without them a target for the whole control step.
 
-    Every command but the first is made by `aim`, which no target moves farther than
-    `Metadata.largest_step` from the last one.
+    `rest` says where the arm rests; every other command is made by `aim`, which no target moves
+    farther than `Metadata.largest_step` from the last one.
     """
 
     def __init__(self, metadata: Metadata):
@@ -22,12 +22,14 @@ class Motion:
         self._limits = joint_limits(metadata.limits, *self.ranges)
         self._still = np.zeros(len(metadata.joint_names))
         self.start: Setpoint | None = None
-        """The command at the start of the control step, before the mean that limits the jerk."""
+        """The command at the start of the control step, before the mean that limits the jerk
+        (`at` gives the one that is sent)."""
         self.end: Setpoint | None = None
         """That at its end; None before there is a command."""
 
     def rest(self, angles: np.ndarray | None) -> None:
-        """The arm rests, with its servos at these angles [J]; None: at those of the next step."""
+        """The arm rests, with its servos at these angles [J]; None: `begin` takes the measured
+        ones of the next step."""
         self.start = None
         self.end = None if angles is None else self._resting(np.array(angles, float))
 
@@ -40,10 +42,6 @@ class Motion:
         if self.end is None:
             self.rest(np.clip(angles, *self.ranges))
         self.start = self.end
-
-    def withdraw(self) -> None:
-        """Takes back the commands of the control step."""
-        self.end = self.start
 
     def hold(self) -> None:
         """A control step in which the commands brake, within the limits, or rest."""

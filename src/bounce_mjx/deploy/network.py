@@ -3,7 +3,7 @@ of the measurements. The world's quantities are the NumPy twin of `world/sensing
 compares the two."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,8 +17,29 @@ _TYPES = {"tensor(float)": np.float32, "tensor(int32)": np.int32, "tensor(bool)"
 _PER_JOINT = {"joint_angles", "joint_velocities", "servo_lead", "past_actions"}
 # Smallest difference between the times of two pictures, s.
 _SAME_PICTURE = 1e-4
+# Pictures of the same position are two if they are farther apart than this share of a control step:
+# the newest ones of two steps are half of it apart or more, whatever the camera's rate.
+_APART = 0.4
 # Shortest time between two pictures in a difference quotient, s.
 _SHORTEST = 1e-3
+
+
+class NoAction(UserError):
+    """A network that gives no finite action."""
+
+    fault = "network"
+    """Code, of the table in docs/real-robot.md."""
+
+
+class Picture(NamedTuple):
+    """The balls' last picture, of which velocities are made."""
+
+    position: np.ndarray
+    """m, as measured."""
+    taken: float
+    """Time since the first step, s."""
+    velocity: np.ndarray
+    """Between it and the picture before, m/s."""
 
 
 class OnnxNetwork:
@@ -45,6 +66,8 @@ class OnnxNetwork:
             if output.name != "action":
                 self._outputs.append(output.name)
                 self._remembered[output.name.removeprefix(NEXT)] = _zeros(output)
+        # A task that does not look at the value before has an output without an input.
+        self._read_again = [name for name in self._remembered if name in self._inputs]
         self._sizes = {}
         for part in self.metadata.observation:
             if part.name not in self._remembered:
@@ -76,7 +99,9 @@ class OnnxNetwork:
             if name not in self._memory:
                 self._rows[name] = _zeros(entry)
         balls = np.zeros(3 * self.metadata.num_balls)
-        self._picture: tuple[np.ndarray, np.ndarray, float] | None = None
+        self._now = 0.0
+        self._time: float | None = None
+        self._picture: Picture | None = None
         self._unknown = {
             "joint_angles": np.zeros(len(self.metadata.joint_names)),
             "ball_position": balls,
@@ -90,12 +115,14 @@ class OnnxNetwork:
           measured: arrays by name, as many as the policy needs: `joint_angles` [J],
             `joint_velocities` [J], `ball_position` [3], `ball_velocity` [3], `ball_age` [1],
             commands [1], and so on; of several balls one after another, [6] or [9]; units m, rad
-            and s.
+            and s. With `time` [1], a velocity from differences has the real time between two
+            pictures; without it, a control step is as long as `control_dt`.
           action: that of the step before [J].
 
         Raises:
-          UserError: the network gives no finite action.
+          NoAction: the network gives no finite action.
         """
+        self._take_time(measured)
         newest = self._newest(measured, action)
         for name, history in self._histories.items():
             if self._is_first:
@@ -108,13 +135,22 @@ class OnnxNetwork:
             self._rows[MEASURED + name][0] = newest[name]
         if IS_FIRST in self._rows:
             self._rows[IS_FIRST][0] = self._is_first
-        result, *values = self._session.run(self._outputs, self._rows | self._memory)
+        read_again = {name: self._memory[name] for name in self._read_again}
+        result, *values = self._session.run(self._outputs, self._rows | read_again)
         self._is_first = False
         if not np.isfinite(result).all():
-            raise UserError("the network returned an action that is not finite; stop the robot")
+            raise NoAction("the network returned an action that is not finite; stop the robot")
         self._memory = dict(zip(self._memory, values, strict=True))
         action = result[0].astype(float)
         return action if self._order is None else action[self._order]
+
+    def _take_time(self, measured: Measurements) -> None:
+        """Passes the time since the first step, s."""
+        last = self._time
+        self._time = float(measured["time"][0]) if "time" in measured else None
+        if not self._is_first:
+            is_known = last is not None and self._time is not None
+            self._now += self._time - last if is_known else self.metadata.control_dt
 
     def _newest(self, measured: Measurements, action: np.ndarray) -> Measurements:
         """The newest value of each quantity, with the joints in the network's order."""
@@ -124,6 +160,8 @@ class OnnxNetwork:
                 ordered = np.empty_like(newest[name])
                 ordered[self._order] = newest[name]
                 newest[name] = ordered
+        # Their names in the graph: the action as a measurement, and the picture's position, which
+        # the training tells from the true one.
         newest["action"] = newest["past_actions"]
         newest["ball_picture"] = newest["ball_position"]
         if "paddle_position" in self.reads:
@@ -143,27 +181,26 @@ class OnnxNetwork:
         return np.concatenate([values[part.name].ravel() for part in self.metadata.observation])
 
     def _difference(self, measured: Measurements) -> np.ndarray:
-        """Velocity of the ball by the difference of its last two pictures; updates the last one.
-        Without a measured age, a picture is new as soon as the position differs."""
+        """Velocity of the ball by the difference of its last two pictures, of which the newest is
+        remembered. A picture is new if it was taken later than the last one; without a measured
+        age, as soon as the position differs, and then it was taken now."""
         position = measured["ball_position"]
-        age = measured["ball_age"][0] if "ball_age" in measured else None
-        if self._picture is None:
-            velocity = self._unknown["ball_velocity"]
-            self._picture = position, velocity, age or 0.0
-            return velocity
-        last_position, velocity, last_age = self._picture
-        # The age of the last picture now.
-        held_age = last_age + self.metadata.control_dt
-        if age is None:
-            is_new = np.any(position != last_position)
-            age = 0.0 if is_new else held_age
+        age = float(measured["ball_age"][0]) if "ball_age" in measured else 0.0
+        taken = self._now - age
+        last = self._picture
+        if last is None:
+            self._picture = Picture(position, taken, self._unknown["ball_velocity"])
+            return self._picture.velocity
+        interval = taken - last.taken
+        if np.any(position != last.position):
+            is_new = interval > _SAME_PICTURE
         else:
-            is_new = held_age - age > _SAME_PICTURE
+            # The age of the same picture may have errors, by which it seems to be later.
+            is_new = "ball_age" in measured and interval > _APART * self.metadata.control_dt
         if is_new:
-            velocity = (position - last_position) / max(held_age - age, _SHORTEST)
-            last_position = position
-        self._picture = last_position, velocity, age
-        return velocity
+            velocity = (position - last.position) / max(interval, _SHORTEST)
+            self._picture = Picture(position, taken, velocity)
+        return self._picture.velocity
 
 
 def _zeros(entry: Any) -> np.ndarray:

@@ -14,16 +14,16 @@ from bounce_mjx.deploy.metadata import (
 )
 from bounce_mjx.deploy.motion import Motion
 from bounce_mjx.deploy.network import OnnxNetwork
-from bounce_mjx.deploy.samples import Measurements, Samples
+from bounce_mjx.deploy.samples import PAUSE, ImpossibleMeasurement, Measurements, Samples
 from bounce_mjx.deploy.supervisor import Supervisor
 from bounce_mjx.errors import MissingPackage, UserError
 
-_MAX_PAUSE = 1.0
 # Measurements and times beyond them are not of a robot.
 _LARGEST = 1e6
 _LARGEST_TIME = 1e15
-# A command outside its range that no world can hold, at least.
-_OUTSIDE = 0.5
+# A command that is farther outside its range than the range is long, and than this (in its unit),
+# is in another unit.
+_ROOM = 0.5
 # Resolution of a time as a share of a control step.
 _FINE = 0.25
 
@@ -31,8 +31,9 @@ _FINE = 0.25
 class DeployedPolicy:
     """A policy with the histories of its inputs; `load_policy` creates it.
 
-    Call `reset` before each ball and `step` once each control step. Positions are in the robot's
-    frame: x forward, z upward, the floor at z = 0.
+    Call `reset` before each ball and `step` once each control step; under a supervisor, its `start`
+    and `commands` do both. Positions are in the robot's frame: x forward, z upward, the floor at
+    z = 0.
     """
 
     def __init__(self, model: bytes, source: str):
@@ -54,7 +55,7 @@ class DeployedPolicy:
             self.motion = Motion(self.metadata)
             """Commands of the joints; a `Supervisor` also moves them without the policy."""
             self.samples = Samples(self.metadata)
-            """The last sample, with which the next one is compared."""
+            """What a robot may have measured: each sample, compared with the last one."""
             self._sizes = measurement_sizes(self.metadata)
             balls = self.metadata.num_balls
             self._defaults = {
@@ -84,17 +85,18 @@ class DeployedPolicy:
         self.reset()
 
     def use_joints(self, names: Sequence[str] | Mapping[str, str]) -> None:
-        """Takes and gives the joints in a driver's order from now on, and resets the policy.
+        """Takes and gives the joints in a driver's order from now on, and resets the policy. Call
+        it before `supervise`.
 
         Args:
-          names: as `joint_names` of `load_policy`.
+          names: as `joint_names` of `load_policy`, which calls it.
 
         Raises:
           UserError: they are not those of the policy's robot.
         """
-        order = _joint_order(names, self.metadata)
+        order = _joint_order(names, self._network.metadata)
         self._network.use_order(order)
-        self.metadata = in_driver_order(self.metadata, tuple(names), order)
+        self.metadata = in_driver_order(self._network.metadata, tuple(names), order)
         self.motion = Motion(self.metadata)
         self.samples = Samples(self.metadata)
         self.reset()
@@ -121,8 +123,8 @@ class DeployedPolicy:
         """Forgets the past. The next step fills the whole history with its measurements.
 
         Args:
-          targets: servo targets [J] (rad) at which the arm rests; by default, the joint angles of
-            the next step.
+          targets: servo targets [J] (rad) at which the arm rests, and from which the next command
+            moves; by default, the joint angles of the next step.
 
         Raises:
           UserError: the targets are not J finite numbers; nothing is forgotten.
@@ -131,10 +133,7 @@ class DeployedPolicy:
         if targets is not None:
             targets = _array("the targets", targets, count, "rad", _LARGEST)
         self._network.reset()
-        if targets is None:
-            self.samples.forget()
-        else:
-            self.samples.rest(targets)
+        self.samples.forget(targets)
         self._measured: Measurements = {}
         self._first: float | None = None
         self.step_number = -1
@@ -156,9 +155,9 @@ class DeployedPolicy:
             ball [B, 3], or the rows one after another.
 
             With `time`, a call may come at any rate: the time since the first step is rounded to
-            control steps. A call whose step is not a new one changes nothing and returns the last
-            action. A call several control steps late fills the missed steps with interpolated
-            measurements and the last action.
+            control steps. A call whose step is not a new one returns the last action, and its
+            sample is only one to compare the next with. A call several control steps late fills the
+            missed steps with interpolated measurements and the last action.
 
             One sample that cannot be true is bridged (`Samples`): the last one holds.
 
@@ -171,8 +170,8 @@ class DeployedPolicy:
           UserError: a required measurement is missing; a measurement is unknown, has the wrong
             shape, is not finite, or is what no world of the training can hold, mostly in another
             unit or frame; the second sample in a row, or the first one, cannot be true; or the
-            time is 1 s or more from the last. The policy's state does not change. Or the network
-            gives no finite action; then call `reset`.
+            time is 1 s or more from the last. What the network has seen does not change, nor the
+            command. Or the network gives no finite action; then call `reset`.
         """
         return self.act(self.read(measurements))
 
@@ -199,6 +198,7 @@ class DeployedPolicy:
         if angles is not None and self.metadata.max_lead is not None:
             last = angles if self.motion.end is None else self.motion.end.position
             measured = measured | {"servo_lead": last - angles}
+        # In the missed steps the robot went on with the last action.
         for left in reversed(range(steps)):
             between = {}
             for name, value in measured.items():
@@ -216,11 +216,12 @@ class DeployedPolicy:
         return self._action.copy()
 
     def servo_targets(self, action: np.ndarray) -> np.ndarray:
-        """Servo targets [J] (rad) for the last step's action [J]: the joint angles measured in that
-        step plus the scaled action, clipped to the joint ranges. With `metadata.max_lead`, the
-        action adds to the last targets, within that distance of the measured angles; another
-        action than the policy's then counts as sent. With `metadata.limits`, they are the last of
-        the `commands`.
+        """Sends an action [J] in the last step: its servo targets [J] (rad). They are the joint
+        angles measured in that step plus the scaled action, clipped to `metadata.largest_step` from
+        the last targets and to the joint ranges. With `metadata.max_lead`, the action adds to the
+        last targets, within that distance of the measured angles. With `metadata.limits`, they are
+        the last of the `commands`. Of another action than the policy's, the next step knows the
+        targets, but has the policy's own as its past action.
 
         Raises:
           UserError: there was no step since the reset, or it had no measured joint angles; or the
@@ -309,6 +310,9 @@ class DeployedPolicy:
     ) -> Measurements:
         """Copies of the measurements as arrays, with defaults for optional ones.
 
+        Here what is no measurement at all is refused, at once; `Samples.take` bridges what is one,
+        but cannot be true.
+
         Args:
           needs: as for `read`.
 
@@ -378,17 +382,18 @@ class DeployedPolicy:
         """Control steps from the last step to the time of the measurements, at least 0.
 
         Raises:
-          UserError: the time is 1 s or more from the last step's.
+          ImpossibleMeasurement: the time is 1 s or more from the last step's.
         """
         if "time" not in measured or self._first is None:
             return 1
         time = float(measured["time"][0])
         dt = self.metadata.control_dt
         elapsed = time - self._first - self.step_number * dt
-        if abs(elapsed) > _MAX_PAUSE - 1e-6:
-            raise UserError(
+        if abs(elapsed) > PAUSE - 1e-6:
+            raise ImpossibleMeasurement(
+                "late_step" if elapsed > 0.0 else "time",
                 f"the time {time} s is {elapsed:.3g} s after the last step's; call reset after a "
-                f"pause of {_MAX_PAUSE:g} s, and give seconds"
+                f"pause of {PAUSE:g} s, and give seconds",
             )
         return max(0, round((time - self._first) / dt) - self.step_number)
 
@@ -425,7 +430,7 @@ def _index_of(joints: Sequence[str], name: str) -> int:
 def _check_command(name: str, value: float, ends: tuple[float, float], unit: str) -> None:
     """Raises UserError for a command that no world of the training can hold."""
     low, high = ends
-    room = max(high - low, _OUTSIDE)
+    room = max(high - low, _ROOM)
     if not low - room <= value <= high + room:
         raise UserError(
             f"{name} is {value:.3g}, but the training had {low:.3g} to {high:.3g} ({unit}); give "
@@ -434,13 +439,12 @@ def _check_command(name: str, value: float, ends: tuple[float, float], unit: str
 
 
 def _array(label: str, value: Any, size: int, unit: str, limit: float, rows: int = 1) -> np.ndarray:
-    """A user's numbers, which may come in rows, as an array [size]; UserError for another shape or
-    kind, or numbers beyond a limit. Hidden entries of a masked array are not finite."""
+    """A copy of a user's numbers, which may come in rows, as an array [size]; UserError for another
+    shape or kind, or numbers beyond a limit. Hidden entries of a masked array are not finite."""
     count = "one number" if size == 1 else f"{size} numbers"
-    if isinstance(value, np.ma.MaskedArray):
-        value = np.ma.filled(value.astype(float), np.nan)
+    is_masked = isinstance(value, np.ma.MaskedArray)
     try:
-        array = np.asarray(value)
+        array = value if is_masked else np.asarray(value)
         # Text, truth values, dates and complex numbers are no measurements.
         if array.dtype.kind not in "fiuO":
             raise TypeError
@@ -449,6 +453,8 @@ def _array(label: str, value: Any, size: int, unit: str, limit: float, rows: int
         raise UserError(f"{label} is {str(value)[:100]!r}; give {count} ({unit})") from error
     if array.shape not in ((size,), (rows, size // rows)) and not (size == 1 and not array.shape):
         raise UserError(f"{label} has the shape {list(array.shape)}; give {count} ({unit})")
+    if is_masked:
+        array = np.ma.filled(array, np.nan)
     array = array.reshape(size)
     sizes = np.abs(array)
     if not sizes.max() <= limit + 1e-6:

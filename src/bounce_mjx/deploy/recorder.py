@@ -61,18 +61,20 @@ class Recorder(contextlib.AbstractContextManager):
         self._last: tuple[float, Any] = -np.inf, None
 
     def step(self, measurements: Mapping[str, Any], servo_targets: Any) -> None:
-        """Writes the row of a control step.
+        """Writes the row of a control step. Call it after the commands are sent, as it may raise.
 
         Args:
-          measurements: as for `DeployedPolicy.step`, with `time`. A missing one, or one that is not
-            finite, leaves its cells empty. `ball_position` counts as a new picture if it was taken
-            (`time` - `ball_age`) at another time than the last one; without `ball_age`, if it
-            differs.
+          measurements: as for `DeployedPolicy.step`, with `time`. Any other that is missing, or
+            not finite, leaves its cells empty. `ball_position` counts as a new picture if it was
+            taken (`time` - `ball_age`) at another time than the last one; without `ball_age`, if
+            it differs.
           servo_targets: sent in this step [J], rad.
 
         Raises:
-          UserError: a measurement has another size.
+          UserError: the time is missing, or a measurement has another size.
         """
+        if "time" not in measurements:
+            raise UserError("a row of the log has no time; give the measurements a time (s)")
         picture = self._new_picture(measurements)
         self._write({**measurements, "servo_targets": servo_targets, **picture})
 

@@ -1,7 +1,10 @@
 """What cannot be true is no measurement: a robot's sample against the last one that can be true.
 
 One sample that cannot be true is bridged: the last values hold for a step. The second one in a row
-raises. Each reason here is a row of the table in docs/real-robot.md.
+raises. What no single sample explains raises at once: first angles, a range that the arm has left
+little by little, a clock that stands or has jumped by a second, a picture of the future. Each
+reason here is a row of the table in docs/real-robot.md. What is no number at all is refused before
+(`DeployedPolicy.check`).
 """
 
 import math
@@ -25,9 +28,14 @@ _SAME = 0.1
 _OVERSPEED = 1.2
 # Largest noise in standard deviations.
 _LARGEST_NOISE = 8.0
-# Calls at one time, and a pause, s.
 _MOST_STANDING = 50
-_PAUSE = 1.0
+"""Calls at one time."""
+
+PAUSE = 1.0
+"""Time between two samples that is no step of one clock, s."""
+
+SYNCHRONOUS = 1e-3
+"""How far in the future a picture may be, as two clocks differ, s."""
 
 RESOLUTION = 2e-3
 """Largest count of an encoder, rad; one of 4,096 counts a turn has 1.5e-3."""
@@ -91,8 +99,13 @@ class Samples:
         self._bridged: set[str] = set()
         self._unconfirmed: np.ndarray | None = None
         self._standing = 0
-        self._arm_time = self._now = self._taken = 0.0
-        # The newest picture, what speaks against it, and whether the one before holds in its place.
+        # Times since here, s: of the last call, of the arm's last sample that was believed, and at
+        # which the ball's last believed picture was taken.
+        self._now = 0.0
+        self._arm_time = 0.0
+        self._taken = -math.inf
+        # The newest picture, what speaks against it, and whether the one before holds in its place
+        # already: one picture is bridged in all of its steps.
         self._seen: np.ndarray | None = None
         self._doubt: tuple[str, str] | None = None
         self._is_held = False
@@ -147,7 +160,7 @@ class Samples:
                 f"the time went back by {-elapsed:.3g} s; give seconds of one clock, and call "
                 "reset if it starts again"
             )
-            if elapsed <= -_PAUSE:
+            if elapsed <= -PAUSE:
                 raise ImpossibleMeasurement("time", reason)
             self._bridge(measured, ("time",), "time", reason)
             return
@@ -180,8 +193,9 @@ class Samples:
             self._bridge(measured, _OF_ARM, "joint_jump", reason + remedy)
             return
         if is_outside:
+            # Not by a jump, so that the next sample will say the same.
             self._check_range(angles)
-        velocities = measured.get("joint_velocities", self._fastest)
+        velocities = measured.get("joint_velocities", np.zeros(len(angles)))
         too_fast = np.abs(velocities) - self._fastest
         if too_fast.max() > 0.0:
             joint = int(np.argmax(too_fast))
@@ -248,7 +262,14 @@ class Samples:
     def _take_picture(self, measured: Measurements) -> None:
         """Believes the picture of the balls, or bridges it until the next one."""
         balls = measured["ball_position"].reshape(-1, 3)
-        taken = self._now - (float(measured["ball_age"][0]) if "ball_age" in measured else 0.0)
+        age = float(measured["ball_age"][0]) if "ball_age" in measured else 0.0
+        if age < -SYNCHRONOUS:
+            raise ImpossibleMeasurement(
+                "old_picture",
+                f"the picture of the ball is {1e3 * age:.0f} ms old; give the time since it was "
+                "taken, by one clock",
+            )
+        taken = self._now - age
         is_new = self._seen is None or (balls != self._seen).any()
         if is_new:
             self._seen = balls
@@ -256,7 +277,7 @@ class Samples:
             self._doubt = self._doubt_of(balls, measured.get("ball_velocity"), taken)
         if self._doubt is None:
             self._believe(measured, _OF_BALL)
-            self._taken = taken if is_new else self._taken
+            self._taken = max(taken, self._taken) if is_new else self._taken
         elif self._is_held:
             self._hold(measured, _OF_BALL)
         else:
@@ -282,6 +303,11 @@ class Samples:
                     f"{bounds.speed:.3g} (m/s); give this unit"
                 )
         if last is not None:
+            if (earlier := self._taken - taken) > self._metadata.control_dt:
+                return "old_picture", (
+                    f"the picture of the ball was taken {1e3 * earlier:.0f} ms before the last "
+                    "one; give the newest, and ages by one clock"
+                )
             between = max(taken - self._taken, self._metadata.control_dt)
             flown = _longest(balls - last.reshape(-1, 3))
             if flown > bounds.speed * between + self._ball_noise:
@@ -305,9 +331,15 @@ class Samples:
         self._hold(measured, names)
 
     def _hold(self, measured: Measurements, names: tuple[str, ...]) -> None:
-        measured |= {name: self._last[name] for name in names if name in measured}
-        if "ball_age" in measured and names == _OF_BALL:
-            measured["ball_age"] = np.array([self._now - self._taken])
+        """Puts the last values in place; what came for the first time is left out."""
+        for name in names:
+            value = measured.pop(name, None)
+            if value is None:
+                continue
+            if name == "ball_age":
+                measured[name] = np.array([self._now - self._taken])
+            elif name in self._last:
+                measured[name] = self._last[name]
 
 
 def check_mapping(measurements: Any) -> None:

@@ -1,7 +1,9 @@
 """A supervisor between a policy and an arm."""
 
 import math
+import traceback
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -10,6 +12,7 @@ from bounce_mjx.deploy.faults import Fault, Watch, picture_age
 from bounce_mjx.deploy.motion import paddle_position
 from bounce_mjx.deploy.samples import UnconfirmedSample, check_mapping
 from bounce_mjx.errors import UserError
+from bounce_mjx.robot.setpoints import Setpoint
 
 if TYPE_CHECKING:
     from bounce_mjx.deploy.policy import DeployedPolicy
@@ -17,15 +20,20 @@ if TYPE_CHECKING:
 State = Literal["homing", "ready", "running", "braking", "stopped"]
 Box = tuple[Sequence[float], Sequence[float]]
 
+# Of the commands at home, rad.
 _HOME_TOLERANCE = 2e-3
 # On the way home, rad/s.
 _HOME_SPEED = 0.3
+_OTHER_ORDER = "the policy's joints have another order than the supervisor's; call supervise again"
+# In which an arm comes to rest where its commands do, s.
+_SETTLING = 1.0
 
 
 class Supervisor:
     """Gives an arm's commands, and stops the arm when a measurement cannot be true
-    (`deploy.samples`), when the arm does not follow, or the ball is lost (`deploy.faults`), or when
-    the paddle would leave the box; `DeployedPolicy.supervise` creates it.
+    (`deploy.samples`), when the arm does not follow, or the ball is lost (`deploy.faults`), when
+    the paddle would leave the box, or when anything else fails; `DeployedPolicy.supervise` creates
+    it.
 
     Call `commands` once each control step, in every state:
 
@@ -34,6 +42,8 @@ class Supervisor:
     - running: it follows the policy, until a fault or `stop`;
     - braking: the commands slow down within the arm's limits, then it is
     - stopped: the commands rest, and `fault` and `reason` say why, until `restart`.
+
+    Each commands begin where the last ones ended, whatever happens to the policy meanwhile.
     """
 
     def __init__(
@@ -45,8 +55,13 @@ class Supervisor:
         max_steps_late: float = 2.0,
     ):
         """See `DeployedPolicy.supervise`."""
+        # Refuses a wrong rate.
         policy.commands_per_step(rate)
         self._policy = policy
+        self._metadata = policy.metadata
+        self._motion = policy.motion
+        self._end: Setpoint | None = policy.motion.end
+        policy.samples.forget(policy.targets)
         self._rate = rate
         metadata = policy.metadata
         age = picture_age(metadata) if max_picture_age is None else max_picture_age
@@ -57,18 +72,22 @@ class Supervisor:
             if not 0.0 < value <= most:
                 raise UserError(f"{name} is {value}; give a number above 0 and at most {most:g}")
         self._box = np.array(box, float)
-        self._most_idle = max_steps_late
+        self._max_steps_late = max_steps_late
         if self._box.shape != (2, 3) or not np.all(self._box[0] < self._box[1]):
             raise UserError(f"the box is {box}; give its lowest and its highest x, y and z, m")
         self._has_box = bool(np.any(np.isfinite(self._box)))
         self._watch = Watch(metadata, age)
         self.state: State = "homing"
         self.fault: str | None = None
-        """Code of the rule that was broken, such as `ball_lost`; `measurement` for a measurement
-        that the policy refuses, `stopped` after `stop`."""
+        """Code of the rule that was broken, such as `ball_lost`, of the tables in
+        docs/real-robot.md; `stopped` after `stop`."""
         self.reason: str | None = None
         """Why the arm has stopped or brakes, or what it waits for before it goes home."""
         self._is_moving_home = False
+        self._waited = 0
+        """Control steps in which the arm was not where its commands rest."""
+        self._resting_angles = np.array(metadata.default_joint_angles)
+        """Measured [J] in the last step at home, rad."""
 
     def start(self) -> None:
         """Starts an episode.
@@ -81,7 +100,11 @@ class Supervisor:
                 f"the arm is {self.state}, and an episode starts when it is ready; call restart "
                 "after a stop, and commands until the arm is home"
             )
+        self._take_back()
         self._policy.reset(self._policy.targets)
+        # A load and the servo hold the arm a little beside its command.
+        self._policy.samples.rest(self._resting_angles)
+        self._end = self._motion.end
         self._watch.begin()
         self._idle = 0
         self.state = "running"
@@ -93,19 +116,32 @@ class Supervisor:
             self.fault = fault
             self.reason = reason
 
-    def restart(self) -> None:
-        """Goes home after a stop, from where the arm then is, for the next `start`.
+    def restart(self, moved: bool = False) -> None:
+        """Goes home after a stop, for the next `start`. The commands go on where they rest, and
+        wait until the arm is there.
+
+        Args:
+          moved: whether the arm was moved with its servos off. Its commands then begin anew where
+            it is measured, as the first ones did.
 
         Raises:
-          UserError: the arm has not stopped.
+          UserError: the arm has not stopped, or the joints have another order now.
         """
         if self.state != "stopped":
             raise UserError(f"the arm is {self.state}; restart it when it has stopped")
+        if self._policy.metadata is not self._metadata:
+            raise UserError(_OTHER_ORDER)
+        self._take_back()
         self.state = "homing"
         self.fault = None
         self.reason = None
         self._is_moving_home = False
-        self._policy.samples.forget(self._policy.targets)
+        self._waited = 0
+        if moved:
+            self._policy.reset()
+            self._end = None
+        else:
+            self._policy.samples.forget(self._policy.targets)
 
     def commands(self, measurements: Mapping[str, Any]) -> np.ndarray:
         """Commands [M, J] of a control step at the robot's rate, rad; none ([0, J]) until a first
@@ -118,27 +154,54 @@ class Supervisor:
             changed.
 
         Raises:
-          UserError: the first joint angles are wrong, so that no command is known.
+          Exception: anything fails before there is a command, mostly a `UserError`, as the first
+            joint angles are wrong. Afterwards nothing is raised, and the arm brakes.
         """
         policy = self._policy
         try:
-            if self.state == "running":
+            if self._take_back():
+                self._stop_as_moved()
+            elif self.state == "running":
                 self._follow(measurements)
             elif self.state in ("homing", "ready"):
                 self._go_home(measurements)
-            elif policy.targets is None:
-                self._find_arm(measurements)
-        except UserError as error:
+        except Exception as error:
             if policy.targets is None:
                 raise
-            self.stop(str(error), getattr(error, "fault", "measurement"))
+            self.stop(*_fault_of(error))
         if policy.targets is None:
+            if self.state == "braking":
+                self.state = "stopped"
             return np.zeros((0, len(policy.metadata.joint_names)))
         if self.state in ("braking", "stopped"):
-            policy.motion.hold()
-            if self.state == "braking" and policy.motion.is_still:
+            # What this step was to send is not sent.
+            if self._end is not None:
+                self._motion.end = self._end
+            self._motion.hold()
+            if self.state == "braking" and self._motion.is_still:
                 self.state = "stopped"
+        self._end = self._motion.end
         return policy.commands(self._rate)
+
+    def _take_back(self) -> bool:
+        """Lets the commands go on where the last ones ended, and says whether anything else has
+        moved them since."""
+        is_new = self._policy.motion is not self._motion
+        if not is_new and (self._end is None or self._motion.end is self._end):
+            return False
+        self._policy.motion = self._motion
+        self._motion.end = self._end
+        return True
+
+    def _stop_as_moved(self) -> None:
+        """Brakes as something else has moved the commands."""
+        if self._policy.metadata is not self._metadata:
+            reason = _OTHER_ORDER
+        else:
+            reason = (
+                "the policy was reset or stepped beside its supervisor; call the supervisor alone"
+            )
+        self.stop(reason, "error")
 
     def _angles(self, measurements: Mapping[str, Any]) -> np.ndarray:
         """The joint angles [J], whatever else is measured."""
@@ -149,18 +212,33 @@ class Supervisor:
         return self._policy.read(of_arm, ("joint_angles",))["joint_angles"]
 
     def _find_arm(self, measurements: Mapping[str, Any]) -> np.ndarray | None:
-        """The joint angles [J] from which the arm goes home, and at which its commands then rest;
-        None before they are believed."""
+        """The joint angles [J] of the arm at rest, from which it goes home; None while that is not
+        known. The first command is where the arm is; after a stop, the arm has to be where its
+        commands rest."""
         policy = self._policy
         try:
             angles = self._angles(measurements)
         except UnconfirmedSample as error:
             self.reason = str(error)
             return None
-        # A small distance is the arm's load, and needs no step of the command.
-        if policy.targets is None or not self._are_near(policy.targets, angles):
+        if policy.targets is None:
             policy.reset(angles)
-        return angles
+            policy.samples.rest(angles)
+            return angles
+        if self._are_near(policy.targets, angles):
+            return angles
+        self._waited += 1
+        beside = np.abs(angles - policy.targets)
+        joint = int(np.argmax(beside))
+        reason = (
+            f"{self._metadata.joint_names[joint]} is {beside[joint]:.2g} rad from where its "
+            "commands rest; if the arm was moved with its servos off, call restart(moved=True)"
+        )
+        if self._waited * self._metadata.control_dt > _SETTLING:
+            self.stop(reason, "joint_astray")
+        else:
+            self.reason = reason
+        return None
 
     def _stop_at(self, faults: Iterable[Fault]) -> bool:
         """Brakes at the first of the faults, and says whether there is one."""
@@ -179,7 +257,7 @@ class Supervisor:
             angles = self._find_arm(measurements)
             if angles is None:
                 if policy.targets is not None:
-                    policy.motion.hold()
+                    self._motion.hold()
                 return
             self._watch.rest(angles, policy.targets)
             self._is_moving_home = True
@@ -188,11 +266,15 @@ class Supervisor:
         if self._stop_at(self._watch.arm_faults(angles, policy.targets, is_bridged)):
             return
         if np.abs(policy.targets - home).max() > _HOME_TOLERANCE:
-            policy.motion.move(home, _HOME_SPEED)
+            self._motion.move(home, _HOME_SPEED)
+            # An arm that starts outside of the box may come in.
+            if self._outside(self._motion.start.position) <= 0.0:
+                self._keep_in_box()
             return
-        policy.motion.hold()
-        is_home = policy.motion.is_still and self._are_near(angles, home)
+        self._motion.hold()
+        is_home = self._motion.is_still and self._are_near(angles, home)
         self.state = "ready" if is_home else "homing"
+        self._resting_angles = angles
 
     def _are_near(self, one: np.ndarray, other: np.ndarray) -> bool:
         return bool(np.max(np.abs(one - other)) <= self._watch.offset)
@@ -202,7 +284,7 @@ class Supervisor:
         policy = self._policy
         measured = policy.read(measurements, (*policy.needs, "joint_angles"))
         late = policy.steps_since(measured) - 1
-        if late > self._most_idle:
+        if late > self._max_steps_late:
             self.stop(f"a control step came {late} steps late", "late_step")
             return
         is_bridged = policy.samples.is_arm_bridged
@@ -212,20 +294,31 @@ class Supervisor:
         policy.act(measured)
         self._idle = self._idle + 1 if policy.step_number == last else 0
         if self._idle:
-            policy.motion.hold()
-        outside = self._outside()
-        if self._idle > self._most_idle:
+            self._motion.hold()
+        if self._idle > self._max_steps_late:
             self.stop(f"{self._idle} calls in a row are no new step", "no_step")
-        elif outside > 0.0:
-            self.stop(f"the paddle would come to rest {outside:.3g} m outside the box", "box")
-        else:
             return
-        policy.motion.withdraw()
+        self._keep_in_box()
 
-    def _outside(self) -> float:
-        """How far the paddle would be outside of the box if the commands braked from the end of
-        this control step, m."""
+    def _keep_in_box(self) -> None:
+        """Brakes if the paddle would leave the box when the commands braked from the end of this
+        control step."""
+        outside = self._outside(self._motion.braking_path())
+        if outside > 0.0:
+            self.stop(f"the paddle would come to rest {outside:.3g} m outside the box", "box")
+
+    def _outside(self, joint_angles: np.ndarray) -> float:
+        """How far the paddle is outside of the box at one of the joint angles [..., J], m; negative
+        inside."""
         if not self._has_box:
             return -math.inf
-        path = paddle_position(self._policy.metadata, self._policy.motion.braking_path())
-        return float(np.max([self._box[0] - path, path - self._box[1]]))
+        paddle = paddle_position(self._metadata, joint_angles)
+        return float(np.max([self._box[0] - paddle, paddle - self._box[1]]))
+
+
+def _fault_of(error: Exception) -> tuple[str, str]:
+    """Reason and code of an exception in a control step."""
+    if isinstance(error, UserError):
+        return str(error), getattr(error, "fault", "measurement")
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    return f"the program failed: {error!r} ({Path(place.filename).name}:{place.lineno})", "error"
