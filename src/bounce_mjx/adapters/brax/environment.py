@@ -121,8 +121,9 @@ class BraxBounceBall(brax.envs.Env):
     def reset(self, rng: jax.Array) -> State:
         """Starts an episode; consumes the key `rng`."""
         task = self.task
+        # Only an environment that was asked for it has one.
         if "sys" in vars(self):
-            task = randomized_task(task, self._own_sys.mj_model, self._own_sys, self.sys)
+            task = randomized_task(task, self._own_sys, self.sys)
         return self._to_brax(task.reset(rng))
 
     def step(self, state: State, action: jax.Array) -> State:

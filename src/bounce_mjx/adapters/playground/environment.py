@@ -110,8 +110,7 @@ class PlaygroundBounceBall(MjxEnv):
         """Starts an episode; consumes the key `rng`."""
         task = self.task
         if "_mjx_model" in vars(self):
-            own = self._own_mjx_model
-            task = randomized_task(task, self.mj_model, own, self._mjx_model)
+            task = randomized_task(task, self._own_mjx_model, self._mjx_model)
         state = task.reset(rng)
         physics = state.pipeline_state.physics
         dtype = physics.qpos.dtype
