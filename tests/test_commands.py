@@ -237,6 +237,16 @@ def test_the_help_of_a_training_is_one_screen_and_the_whole_help_has_every_flag(
     assert pages[1].index("\nppo:\n") < pages[1].index("--learning-rate FLOAT")
 
 
+def test_a_default_with_a_percent_sign_is_shown(tmp_path: Path, capsys) -> None:
+    """In the path of a task, for example."""
+    folder = tmp_path / "50%"
+    folder.mkdir()
+    task = shutil.copy(Path(__file__).parents[1] / "examples/dribble_task.py", folder / "t.py")
+    with pytest.raises(SystemExit):
+        console_script(["train", "--task", f"{task}:Dribble", "--help-all"])
+    assert "50%/t.py:Dribble)" in re.sub(r"\s", "", capsys.readouterr().out)
+
+
 def test_presets_are_valid() -> None:
     found = resource_path("configs").glob("*.yaml")
     files = {p.stem: p for p in found if not p.stem.startswith("robustness")}

@@ -63,8 +63,11 @@ MIRROR_LAW = Checkpoint(Path("mirror law"), Path("mirror law"), 0)
 
 def is_users_run(run: Path) -> bool:
     """Whether this is the folder of a run of the user's, beside whose files others may be written;
-    no policy of the package, and not the mirror law."""
-    return run not in {MIRROR_LAW.run, *map(resource_path, POLICIES.values())}
+    no policy of the package, by whatever path, and not the mirror law."""
+    if run == MIRROR_LAW.run:
+        return False
+    policies = {os.path.realpath(resource_path(folder)) for folder in POLICIES.values()}
+    return os.path.realpath(run) not in policies
 
 
 def create_run(config: TrainConfig) -> Path:
