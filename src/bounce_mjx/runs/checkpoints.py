@@ -37,6 +37,7 @@ from bounce_mjx.learning.statistics import RunningStatistics, init_statistics
 from bounce_mjx.runs import earlier, folders
 from bounce_mjx.runs.config import (
     CONFIG_FILE,
+    RESUMABLE_KEYS,
     TrainConfig,
     load_run_config,
     runs_folder,
@@ -56,12 +57,6 @@ NETWORKS = "networks"
 NETWORK_KEYS = ("hidden_layers", "critic_layers", "shared_critic", "activation")
 """Keys of `ppo` that shape the networks."""
 
-# Keys that may differ between a checkpoint and the training that resumes from it. All others must
-# be the same.
-RESUMABLE_KEYS = frozenset(
-    "total_steps eval_every save_every eval_episodes screening_episodes eval_seed "
-    "stop_when_solved log_dir num_devices".split()
-)
 # Room for the metadata of a checkpoint.
 _MARGIN = 2**20
 # Folder of what is being written or removed; a killed process leaves it.
