@@ -67,6 +67,13 @@ MISTAKES = (
     ("train --warm-start robust_smal", "did you mean robust_small?"),
     ("train --resume latst", "there is no checkpoint folder latst; did you mean latest?"),
     ("eval pretrained --robot ur5e", "give mirror"),
+    ("eval pretrained --log-dir typo", "--log-dir is where the newest run is looked for, and pret"),
+    ("robustness mirror --log-dir typo", "and mirror is named; omit one of them"),
+    ("play robust pretrained --log-dir typo", "and robust is named"),
+    ("plot nowhere --log-dir typo", "and nowhere is named"),
+    ("report nowhere --log-dir typo", "and nowhere is named"),
+    ("export robust --log-dir typo", "and robust is named"),
+    ("play robust latest --log-dir typo", "there is no run with a checkpoint in typo"),
     ("eval --nominal --randomization.air-drag 0 1", "--nominal and --randomization", "omit one"),
     (
         "eval robust --randomization.first-command-range 0.5 --randomization.warmup-steps 5",

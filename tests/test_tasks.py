@@ -450,7 +450,9 @@ def test_a_mistake_in_a_tasks_file_names_its_line(tmp_path: Path) -> None:
         find_task(f"{path}:Task")
 
 
-def test_a_package_can_have_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_package_can_have_tasks(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Its entry point gives the task a name, which its runs keep."""
     package = tmp_path / "my_tasks"
     package.mkdir()
@@ -465,6 +467,15 @@ def test_a_package_can_have_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
     (info / "entry_points.txt").write_text(f"[{registry.GROUP}]\ngone = my_tasks:Gone\n")
     with pytest.raises(UserError, match="the task gone cannot be imported .*; install the package"):
         find_task("gone")
+    # A policy of another task is evaluated all the same, also where the code itself is wrong.
+    (tmp_path / "wrong.py").write_text("undefined")
+    (info / "entry_points.txt").write_text(f"[{registry.GROUP}]\nbad = wrong:Task\n")
+    command, _ = parse_with_commands(EvalCommand, ["robust"], prog="bounce-mjx eval")
+    assert command.checkpoint == Path("robust")
+    said = capsys.readouterr().err
+    assert "warning: the task bad cannot be imported (name 'undefined' is not defined)" in said
+    with pytest.raises(UserError, match="the task bad cannot be imported"):
+        parse_with_commands(EvalCommand, ["--task", "bad"], prog="bounce-mjx eval")
     for attribute in ("Config", "__name__", "task.Task"):
         (info / "entry_points.txt").write_text(f"[{registry.GROUP}]\nno = my_tasks:{attribute}\n")
         words = "cannot be imported" if "." in attribute else "is no subclass of Task; correct the"

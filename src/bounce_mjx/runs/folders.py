@@ -215,10 +215,16 @@ def find_run(path: Path) -> Path:
     )
 
 
+def is_newest(path: Path | None) -> bool:
+    """Whether what the user gives as a run stands for the newest one: nothing, or `LATEST` unless
+    there is a folder with that name."""
+    return path is None or (str(path) == LATEST and not os.path.isdir(path))
+
+
 def named_run(path: Path | None, log_dir: Path) -> Path:
-    """A run's folder or a path in it, as the user named it: None and `LATEST` (unless there is a
-    folder with that name) stand for the newest run with a checkpoint in `log_dir`."""
-    if path is not None and (str(path) != LATEST or os.path.isdir(path)):
+    """A run's folder or a path in it, as the user named it; in place of `is_newest`, the newest run
+    with a checkpoint in `log_dir`."""
+    if not is_newest(path):
         return path
     if not (found := runs_in(log_dir)):
         raise UserError(
