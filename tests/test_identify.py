@@ -64,7 +64,7 @@ from bounce_mjx.physics import (
     edited_model,
     make_engine,
 )
-from bounce_mjx.reports.identification import identification_page
+from bounce_mjx.reports.identification import identification_page, inspection_page
 from bounce_mjx.robot.model import find_addresses, link_bodies
 from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.world.actuation import Actuators
@@ -460,6 +460,9 @@ def test_the_page_begins_with_the_answer() -> None:
     parts = "<b>Found:", "<b>How sure:", "<b>What to do:", "<h2>Estimates", "<h2>What the log"
     assert sorted(parts, key=page.index) == [*parts]
     assert "do not train with this world: A doubt." in page
+    inspected = inspection_page([log._replace(source="a&b.csv")], checkups)
+    assert "<title>bounce_mjx: logs a&amp;b.csv</title>" in inspected
+    assert "<h1>a&amp;b.csv</h1>" in inspected
     better = identification_page(found, [log], checkups, NAMES, Path("world.yaml"), [])
     assert "bounce-mjx identify LOG --check world.yaml" in better
     assert all(entry.label in page for entry in estimates(found, NAMES))

@@ -545,6 +545,8 @@ def test_adopt_prints_each_servo_and_each_change_of_the_world(tmp_path, capsys) 
     line = f"--site tool --out {tmp_path}/arm.yaml {flat}"
     adopt_command.main([f"{tmp_path}/my\narm.xml", *line.split()])
     said = capsys.readouterr().out
+    head, _ = (tmp_path / "arm.yaml").read_text().split("\n", 1)
+    assert head.endswith(f"arm.xml' {line}") and "bounce-mjx adopt '" in head
     robot = read_preset(tmp_path / "arm.yaml").env.robot
     for name, stiffness, damping in zip(
         ARM_JOINTS.split(), robot.servo_stiffness, robot.servo_damping, strict=True

@@ -62,7 +62,7 @@ def main(args: Sequence[str]) -> None:
         print(line)
     print(f"physics: {env.engine.name} ({env.engine.reason})")
     out = command.out or Path(f"{command.mjcf.stem}.yaml")
-    write_output(out, _as_yaml(command, settings))
+    write_output(out, _as_yaml(args, settings))
     print(f"config: {out}")
     flags = ["--robot", str(out)]
     if command.task != DEFAULT:
@@ -86,9 +86,9 @@ def _settings(command: AdoptCommand, adoption: "Adoption", task: type[Task]) -> 
     return {"task": command.task, "env": env}
 
 
-def _as_yaml(command: AdoptCommand, settings: dict[str, Any]) -> str:
+def _as_yaml(args: Sequence[str], settings: dict[str, Any]) -> str:
     """The config file, which begins with the command that wrote it."""
-    head = f"An arm with a paddle: bounce-mjx adopt {command.mjcf} --site {command.site}"
+    head = f"An arm with a paddle: {shlex.join(['bounce-mjx', 'adopt', *args])}"
     # A path may have a line break, which would end the comment.
     head = " ".join(head.splitlines())
     text = yaml.safe_dump(settings, sort_keys=False, default_flow_style=None, width=100)

@@ -87,6 +87,7 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.viewers.show import Shown, show
     from bounce_mjx.viewers.simulation import make_policy_controller
 
+    command.check_log_dir(*command.checkpoints or (None,))
     chosen = [command.choose(path, command.robot) for path in command.checkpoints or (None,)]
     configs = [_config(checkpoint, command) for checkpoint in chosen]
     # All are of one task, which `show` checks, and so have the same commands.

@@ -20,6 +20,7 @@ def main(args: Sequence[str]) -> None:
     command = parse(ReportCommand, args, prog="bounce-mjx report")
     from bounce_mjx.runs.folders import find_checkpoint
 
+    command.check_log_dir(command.run)
     checkpoint = find_checkpoint(command.choose_run(command.run))
     config = command.config_of_run(checkpoint.run)
 

@@ -43,11 +43,18 @@ def load_robustness(folder: Path) -> RobustnessReport | None:
 
 def summary(report: RobustnessReport) -> str:
     """The score of a report in one sentence."""
-    version = f" of {report.version}" if report.version else ""
     return (
-        f"{report.met} of {len(report.outcomes)} conditions{version} meet all judged results, with "
-        f"{report.episodes} episodes each"
+        f"{report.met} of {len(report.outcomes)} conditions of {_suite_name(report)} meet all "
+        f"judged results, with {report.episodes} episodes each"
     )
+
+
+def _suite_name(report: RobustnessReport) -> str:
+    """The suite by its version, or else by its file's name or what it consists of."""
+    if report.version:
+        return report.version
+    path = Path(report.suite)
+    return path.stem if path.suffix in (".yaml", ".yml") else report.suite
 
 
 def robustness_table(report: RobustnessReport) -> Table:

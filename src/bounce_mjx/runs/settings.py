@@ -42,6 +42,7 @@ from bounce_mjx.resources import policy_folder
 from bounce_mjx.runs.config import (
     CONFIG_FILE,
     DEFAULT_SOURCE,
+    RESUMABLE_KEYS,
     TrainConfig,
     fields_of,
     load_run_config,
@@ -551,8 +552,6 @@ def _has(values: dict[str, Any], path: Sequence[str], may_be_empty: bool) -> boo
 
 
 def _check_resumable(resumed: TrainConfig, config: TrainConfig) -> None:
-    from bounce_mjx.runs.checkpoints import RESUMABLE_KEYS
-
     if changed := differing_keys(resumed, config) - RESUMABLE_KEYS:
         raise UserError(
             f"--resume cannot change {', '.join(sorted(changed))}; leave those flags out, or "
