@@ -481,6 +481,27 @@ def test_a_command_moves_at_most_one_step_from_the_last() -> None:
             last = command
 
 
+def test_the_first_command_is_where_the_arm_is() -> None:
+    """Also outside of its range, to which it comes back at most a step at a time."""
+    for policy in (load_policy("robust"), load_policy("ur5e")):
+        metadata = policy.metadata
+        home = np.array(metadata.default_joint_angles)
+        angles = home.copy()
+        low, high = metadata.joint_ranges[1]
+        angles[1] = high + 0.3
+        given = measured(angles, target_height=0.6)
+        given["ball_position"] = paddle_position(metadata, home) + [0.0, 0.0, 0.3]
+        given = {name: given[name] for name in policy.needs}
+        with pytest.raises(UserError, match="the next sample confirms them"):
+            policy.step(given)
+        commands = [angles]
+        for _ in range(20):
+            commands.append(policy.servo_targets(policy.step(given)))
+        steps = np.abs(np.diff(commands, axis=0))
+        assert np.all(steps <= np.array(metadata.largest_step) + 1e-12)
+        assert commands[-1][1] < commands[0][1] - 1e-3
+
+
 def test_a_wrapped_angle_is_unwrapped_where_the_range_has_one_reading() -> None:
     policy, turned = load_policy("robust"), HOME + [2.0 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0]
     expected = load_policy("robust").step(measured_by_robust(HOME))
@@ -575,6 +596,8 @@ def test_whatever_fails_the_arm_brakes_from_its_last_command(
     if kind == "order":
         with pytest.raises(UserError, match="call supervise again"):
             arm.supervisor.restart()
+        rows = policy.supervise(1000).commands(measured(HOME[::-1]))
+        np.testing.assert_allclose(rows, np.tile(HOME[::-1], (10, 1)), atol=1e-12)
 
 
 def test_a_reset_before_a_start_moves_nothing() -> None:

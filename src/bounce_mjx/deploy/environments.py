@@ -30,8 +30,9 @@ from bounce_mjx.world.randomization import RandomizationConfig
 
 ONNX = ".onnx"
 NOMINAL = "nominal"
+"""World of a policy: the model's own."""
 TRAINING = "training"
-"""Worlds of a policy: the model's own, and those that its training sampled."""
+"""World of a policy: each that its training sampled."""
 
 # Wrappers of Gymnasium and SB3 after which the numbers are no longer the environment's own.
 _CHANGING = {
@@ -183,6 +184,7 @@ def environment_of(env: Any) -> Env:
                 "takes the environment's own; give the environment within it"
             )
         attributes = vars(inner) if hasattr(inner, "__dict__") else {}
+        # The environment for brax holds it as its task.
         task = getattr(type(inner), "task", None) or attributes.get("task")
         if isinstance(task, property):
             task = inner.task

@@ -40,7 +40,7 @@ class Motion:
         """Begins a control step where the last one ended, the first one at the measured angles
         [J]."""
         if self.end is None:
-            self.rest(np.clip(angles, *self.ranges))
+            self.rest(angles)
         self.start = self.end
 
     def hold(self) -> None:

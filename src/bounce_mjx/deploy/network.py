@@ -94,10 +94,7 @@ class OnnxNetwork:
         self._is_first = True
         self._memory = self._remembered
         self._histories = {name: np.zeros(size) for name, size in self._sizes.items()}
-        self._rows = {}
-        for name, entry in self._inputs.items():
-            if name not in self._memory:
-                self._rows[name] = _zeros(entry)
+        self._rows = {name: _zeros(entry) for name, entry in self._inputs.items()}
         balls = np.zeros(3 * self.metadata.num_balls)
         self._now = 0.0
         self._time: float | None = None
@@ -135,12 +132,13 @@ class OnnxNetwork:
             self._rows[MEASURED + name][0] = newest[name]
         if IS_FIRST in self._rows:
             self._rows[IS_FIRST][0] = self._is_first
-        read_again = {name: self._memory[name] for name in self._read_again}
-        result, *values = self._session.run(self._outputs, self._rows | read_again)
+        result, *values = self._session.run(self._outputs, self._rows)
         self._is_first = False
         if not np.isfinite(result).all():
             raise NoAction("the network returned an action that is not finite; stop the robot")
         self._memory = dict(zip(self._memory, values, strict=True))
+        for name in self._read_again:
+            self._rows[name] = self._memory[name]
         action = result[0].astype(float)
         return action if self._order is None else action[self._order]
 

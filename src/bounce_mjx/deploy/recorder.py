@@ -97,7 +97,8 @@ class Recorder(contextlib.AbstractContextManager):
         self.close()
 
     def _new_picture(self, measurements: Mapping[str, Any]) -> dict[str, Any]:
-        """The measured picture; without a position if it is none or the last one."""
+        """The measured picture; without a position if it is none or the last one, or was taken at
+        no known time."""
         time = float(np.ravel(measurements["time"])[0])
         age = measurements.get("ball_age")
         position = np.array(measurements.get("ball_position"), float)
@@ -106,7 +107,7 @@ class Recorder(contextlib.AbstractContextManager):
         is_old = (
             np.array_equal(position, seen) if age is None else abs(taken - last) < _SAME_PICTURE
         )
-        if is_old or not np.all(np.isfinite(position)):
+        if is_old or not np.all(np.isfinite([*np.ravel(position), taken])):
             return {"ball_position": None}
         self._last = taken, position
         return {"ball_position": position, "ball_time": taken}

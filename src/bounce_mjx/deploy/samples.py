@@ -81,6 +81,7 @@ class Samples:
         self._ball_noise = 1e-3 + largest * largest_term(metadata, "ball_position_noise")
         self._low, self._high = joint_ends(metadata)
         self._start = np.array(metadata.default_joint_angles)
+        self._still = np.zeros(len(self._start))
         self.forget()
 
     def forget(self, near: np.ndarray | None = None) -> None:
@@ -195,7 +196,7 @@ class Samples:
         if is_outside:
             # Not by a jump, so that the next sample will say the same.
             self._check_range(angles)
-        velocities = measured.get("joint_velocities", np.zeros(len(angles)))
+        velocities = measured.get("joint_velocities", self._still)
         too_fast = np.abs(velocities) - self._fastest
         if too_fast.max() > 0.0:
             joint = int(np.argmax(too_fast))

@@ -25,6 +25,7 @@ _HOME_TOLERANCE = 2e-3
 # On the way home, rad/s.
 _HOME_SPEED = 0.3
 _OTHER_ORDER = "the policy's joints have another order than the supervisor's; call supervise again"
+_MOVED = "the policy was reset or stepped beside its supervisor; call the supervisor alone"
 # In which an arm comes to rest where its commands do, s.
 _SETTLING = 1.0
 
@@ -55,14 +56,13 @@ class Supervisor:
         max_steps_late: float = 2.0,
     ):
         """See `DeployedPolicy.supervise`."""
-        # Refuses a wrong rate.
-        policy.commands_per_step(rate)
+        # Since the start of a control step, s.
+        self._times = np.arange(1, policy.commands_per_step(rate) + 1) / rate
         self._policy = policy
         self._metadata = policy.metadata
         self._motion = policy.motion
         self._end: Setpoint | None = policy.motion.end
         policy.samples.forget(policy.targets)
-        self._rate = rate
         metadata = policy.metadata
         age = picture_age(metadata) if max_picture_age is None else max_picture_age
         for name, value, most in (
@@ -93,15 +93,17 @@ class Supervisor:
         """Starts an episode.
 
         Raises:
-          UserError: the arm is not ready.
+          UserError: the arm is not ready, or the joints have another order now.
         """
         if self.state != "ready":
             raise UserError(
                 f"the arm is {self.state}, and an episode starts when it is ready; call restart "
                 "after a stop, and commands until the arm is home"
             )
+        if self._has_other_order:
+            raise UserError(_OTHER_ORDER)
         self._take_back()
-        self._policy.reset(self._policy.targets)
+        self._policy.reset(self._targets)
         # A load and the servo hold the arm a little beside its command.
         self._policy.samples.rest(self._resting_angles)
         self._end = self._motion.end
@@ -129,7 +131,7 @@ class Supervisor:
         """
         if self.state != "stopped":
             raise UserError(f"the arm is {self.state}; restart it when it has stopped")
-        if self._policy.metadata is not self._metadata:
+        if self._has_other_order:
             raise UserError(_OTHER_ORDER)
         self._take_back()
         self.state = "homing"
@@ -141,7 +143,7 @@ class Supervisor:
             self._policy.reset()
             self._end = None
         else:
-            self._policy.samples.forget(self._policy.targets)
+            self._policy.samples.forget(self._targets)
 
     def commands(self, measurements: Mapping[str, Any]) -> np.ndarray:
         """Commands [M, J] of a control step at the robot's rate, rad; none ([0, J]) until a first
@@ -157,22 +159,23 @@ class Supervisor:
           Exception: anything fails before there is a command, mostly a `UserError`, as the first
             joint angles are wrong. Afterwards nothing is raised, and the arm brakes.
         """
-        policy = self._policy
         try:
-            if self._take_back():
-                self._stop_as_moved()
+            if self._has_other_order:
+                self.stop(_OTHER_ORDER, "error")
+            elif self._take_back():
+                self.stop(_MOVED, "error")
             elif self.state == "running":
                 self._follow(measurements)
             elif self.state in ("homing", "ready"):
                 self._go_home(measurements)
         except Exception as error:
-            if policy.targets is None:
+            if self._targets is None:
                 raise
             self.stop(*_fault_of(error))
-        if policy.targets is None:
+        if self._targets is None:
             if self.state == "braking":
                 self.state = "stopped"
-            return np.zeros((0, len(policy.metadata.joint_names)))
+            return np.zeros((0, len(self._metadata.joint_names)))
         if self.state in ("braking", "stopped"):
             # What this step was to send is not sent.
             if self._end is not None:
@@ -181,27 +184,27 @@ class Supervisor:
             if self.state == "braking" and self._motion.is_still:
                 self.state = "stopped"
         self._end = self._motion.end
-        return policy.commands(self._rate)
+        return self._motion.at(self._times)
+
+    @property
+    def _targets(self) -> np.ndarray | None:
+        """Commands [J] at the end of the last control step, rad; None before there is one."""
+        if self._motion.end is None:
+            return None
+        return self._motion.at(np.array([self._metadata.control_dt]))[0]
 
     def _take_back(self) -> bool:
         """Lets the commands go on where the last ones ended, and says whether anything else has
         moved them since."""
-        is_new = self._policy.motion is not self._motion
-        if not is_new and (self._end is None or self._motion.end is self._end):
+        if self._end is None or self._motion.end is self._end:
             return False
-        self._policy.motion = self._motion
         self._motion.end = self._end
         return True
 
-    def _stop_as_moved(self) -> None:
-        """Brakes as something else has moved the commands."""
-        if self._policy.metadata is not self._metadata:
-            reason = _OTHER_ORDER
-        else:
-            reason = (
-                "the policy was reset or stepped beside its supervisor; call the supervisor alone"
-            )
-        self.stop(reason, "error")
+    @property
+    def _has_other_order(self) -> bool:
+        """Whether the policy's joints have another order than when the supervisor began."""
+        return self._policy.motion is not self._motion
 
     def _angles(self, measurements: Mapping[str, Any]) -> np.ndarray:
         """The joint angles [J], whatever else is measured."""
@@ -221,14 +224,14 @@ class Supervisor:
         except UnconfirmedSample as error:
             self.reason = str(error)
             return None
-        if policy.targets is None:
+        if self._targets is None:
             policy.reset(angles)
             policy.samples.rest(angles)
             return angles
-        if self._are_near(policy.targets, angles):
+        if self._are_near(self._targets, angles):
             return angles
         self._waited += 1
-        beside = np.abs(angles - policy.targets)
+        beside = np.abs(angles - self._targets)
         joint = int(np.argmax(beside))
         reason = (
             f"{self._metadata.joint_names[joint]} is {beside[joint]:.2g} rad from where its "
@@ -256,16 +259,16 @@ class Supervisor:
         else:
             angles = self._find_arm(measurements)
             if angles is None:
-                if policy.targets is not None:
+                if self._targets is not None:
                     self._motion.hold()
                 return
-            self._watch.rest(angles, policy.targets)
+            self._watch.rest(angles, self._targets)
             self._is_moving_home = True
             self.reason = None
         is_bridged = policy.samples.is_arm_bridged
-        if self._stop_at(self._watch.arm_faults(angles, policy.targets, is_bridged)):
+        if self._stop_at(self._watch.arm_faults(angles, self._targets, is_bridged)):
             return
-        if np.abs(policy.targets - home).max() > _HOME_TOLERANCE:
+        if np.abs(self._targets - home).max() > _HOME_TOLERANCE:
             self._motion.move(home, _HOME_SPEED)
             # An arm that starts outside of the box may come in.
             if self._outside(self._motion.start.position) <= 0.0:
@@ -288,7 +291,7 @@ class Supervisor:
             self.stop(f"a control step came {late} steps late", "late_step")
             return
         is_bridged = policy.samples.is_arm_bridged
-        if self._stop_at(self._watch.faults(measured, policy.targets, is_bridged)):
+        if self._stop_at(self._watch.faults(measured, self._targets, is_bridged)):
             return
         last = policy.step_number
         policy.act(measured)
