@@ -294,8 +294,8 @@ def _intact_checkpoints(
     """The intact checkpoints in a folder of a run, at least one, with their records. A warning
     names the damaged ones.
 
-    A single checkpoint is not read, and has None for its record: if it is damaged, whoever reads it
-    refuses it.
+    A single checkpoint is not read, and has None for its record, as there is nothing to compare it
+    with: if it is damaged, whoever reads it refuses it.
     """
     stored = _checkpoints_in(run, place or run)
     if newest is not None:
