@@ -332,6 +332,12 @@ def test_a_policy_is_named_by_its_run_or_its_checkpoint(trained: Path, monkeypat
         assert found.folder.resolve() == trained / f"checkpoints/{steps}"
 
 
+def test_a_report_of_one_checkpoint_is_refused(trained: Path, refused) -> None:
+    """It would show the best one."""
+    words = f"a report is of a run's best checkpoint; give {trained}, not"
+    refused(f"report {trained}/checkpoints/{STEPS}", words)
+
+
 @pytest.mark.parametrize("command", ["plot", "report"])
 def test_a_mistyped_run_is_told_before_what_draws_is_imported(
     command: str, refused, monkeypatch

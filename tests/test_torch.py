@@ -95,6 +95,8 @@ def test_arrays_pass_in_one_block():
     for name, array in layout.unpack(block).items():
         assert array.dtype == arrays[name].dtype
         np.testing.assert_array_equal(array, arrays[name])
+    with pytest.raises(UserError, match="has an array of uint8, and TorchVectorEnv takes four-"):
+        Layout({"bytes": jnp.zeros(3, jnp.uint8)})
     shared = torch.from_dlpack(block)
     for name, view in layout.views(shared).items():
         assert view.untyped_storage().data_ptr() == shared.data_ptr()

@@ -54,14 +54,16 @@ def main(args: Sequence[str]) -> None:
     robot = RobotConfig(site=command.site, joints=command.joints, paddle=command.paddle)
     chosen = command.paddle.model_dump(exclude_defaults=True)
     is_mount_given = "position" in chosen or "quaternion" in chosen
-    adoption = adopt(command.mjcf, robot, WorldConfig().control_dt, is_mount_given)
+    # The servos must follow within the control steps of the task.
+    adoption = adopt(command.mjcf, robot, task.Config().control_dt, is_mount_given)
     settings = _settings(command, adoption, task)
     config = validate(TrainConfig, settings, str(command.mjcf))
     env = Env(config.env)
     for line in describe(adoption):
         print(line)
     print(f"physics: {env.engine.name} ({env.engine.reason})")
-    out = command.out or Path(f"{command.mjcf.stem}.yaml")
+    # Of menagerie:NAME, the name.
+    out = command.out or Path(f"{command.mjcf.stem.rpartition(':')[2]}.yaml")
     write_output(out, _as_yaml(args, settings))
     print(f"config: {out}")
     flags = ["--robot", str(out)]

@@ -102,6 +102,7 @@ def read_actor(
         except UserError:
             if checkpoint.folder.exists():
                 raise
+            # Another one of the same run, and so of the same config.
             checkpoint = folders.best_checkpoint(checkpoint.run)
 
 
@@ -202,6 +203,7 @@ def read_start(config: TrainConfig, env: Env) -> tuple[Params, RunningStatistics
         return np.stack(rows)
 
     count, mean, summed_variance, std = statistics
+    # An unknown input has a mean of 0 and a variance of 1.
     seen = RunningStatistics(
         count, moved(mean, 0.0), moved(summed_variance, float(count)), moved(std, 1.0)
     )
@@ -315,8 +317,8 @@ def save_checkpoint(
     report: Report | None = None,
     kept: int | None = None,
 ) -> int:
-    """Writes a checkpoint, and then removes the others of the run. A process that is killed at any
-    moment leaves a complete one.
+    """Writes a checkpoint, and then removes the others of the run but for `kept`. A process that is
+    killed at any moment leaves a complete one.
 
     Args:
       run: the run's folder.

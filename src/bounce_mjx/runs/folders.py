@@ -4,7 +4,7 @@
         config.yaml                     the resolved config
         robot/                          a copy of --mjcf and its files, with a manifest
         task/, algorithm/               copies of the files of own ones
-        report.html, robustness.*       see `reports`
+        report.html, robustness.*, failures.png   see `reports`
         events.out.tfevents.*           TensorBoard scalars
         results.json                    all evaluations, and the time of each activity
         checkpoints/<number>/           one for the newest state and one for the best evaluation, or
@@ -239,7 +239,8 @@ def runs_in(folder: Path) -> list[Path]:
     time stamps of their names; before them, names without a stamp."""
     runs = [path.parent for path in folder.glob(f"*/{CONFIG_FILE}") if path.is_file()]
     # The length orders the numbers of runs that began in the same second.
-    runs.sort(key=lambda run: (run.name[0].isdigit(), run.name[:19], len(run.name), run.name))
+    stamp = len("2026-01-31_23-59-59")
+    runs.sort(key=lambda run: (run.name[0].isdigit(), run.name[:stamp], len(run.name), run.name))
     return list(filter(stored_checkpoints, runs))
 
 
@@ -294,8 +295,8 @@ def _intact_checkpoints(
     """The intact checkpoints in a folder of a run, at least one, with their records. A warning
     names the damaged ones.
 
-    A single checkpoint is not read, and has None for its record: if it is damaged, whoever reads it
-    refuses it.
+    A single checkpoint is not read, and has None for its record, as there is nothing to compare it
+    with: if it is damaged, whoever reads it refuses it.
     """
     stored = _checkpoints_in(run, place or run)
     if newest is not None:

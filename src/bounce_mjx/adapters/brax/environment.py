@@ -175,13 +175,14 @@ class BraxBounceBall(brax.envs.Env):
 
 
 def _complete(state: EnvState) -> EnvState:
-    """The state with its parts that hold no arrays, which TorchRL drops."""
-    dropped = {
+    """The state with the defaults of its parts that hold no arrays, which TorchRL drops; another
+    state as it is."""
+    defaults = {
         name: default
         for name, default in EnvState._field_defaults.items()
         if getattr(state, name) is None
     }
-    return state._replace(**dropped)
+    return state._replace(**defaults)
 
 
 def _drawable(mj_model: mujoco.MjModel) -> mujoco.MjModel:
