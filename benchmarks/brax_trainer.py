@@ -84,7 +84,6 @@ def train(physics: Literal["auto", "mjx"], config: TrainConfig, on_block: OnBloc
             brax_ppo.train(
                 environment=CriticObservation(env, ppo.critic_metrics),
                 **settings,
-                vf_loss_coefficient=2.0 * ppo.value_cost,
                 normalize_observations_std_eps=MIN_VARIANCE,
                 network_factory=networks,
                 max_devices_per_host=1,

@@ -30,6 +30,7 @@ from bounce_mjx import load_policy
 from bounce_mjx.deploy.motion import paddle_position
 from bounce_mjx.deploy.policy import DeployedPolicy
 from bounce_mjx.env.env import Env
+from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.episodes import reset_episodes
 from bounce_mjx.evaluation.results import Report, judge
 from bounce_mjx.evaluation.statistics import empty_statistics
@@ -147,7 +148,11 @@ def play(name: str, settings: Settings, start: Start, seed: int) -> Played:
     env = nominal_env(name)
     mjcf = str(resource_path("mjcf/bounce_ball.xml"))
     render_model = make_model(mjcf, settings.ball, settings.side_light, settings.quick)
-    camera = seen_ball(render_model, policy.metadata, settings.ball, settings.rate, seed)
+    try:
+        camera = seen_ball(render_model, policy.metadata, settings.ball, settings.rate, seed)
+    except SystemExit as refusal:
+        # A process of a pool that exits tells nobody why.
+        raise UserError(f"with the cameras of seed {seed}, {refusal}") from refusal
     episode = SeenEpisode(policy, env, camera, render_model)
     arm_qpos = list(env.addresses.arm_qpos)
     arm_qvel = list(env.addresses.arm_qvel)
@@ -157,7 +162,15 @@ def play(name: str, settings: Settings, start: Start, seed: int) -> Played:
     episode.reset(qpos[arm_qpos], qpos[ball_qpos][None], qvel[ball_qvel][None])
     qpos_path = [qpos.copy()]
     qvel_path = [qvel.copy()]
-    for _ in range(env.config.episode_steps):
+    num_steps = env.config.episode_steps
+    is_seen = len(camera.errors) > 0
+    if not is_seen:
+        # A supervised arm does not begin. Here the hand opens, and the ball falls.
+        qpos[ball_qpos[2]] = LOST - 0.1
+        qpos_path.append(qpos.copy())
+        qvel_path.append(qvel.copy())
+        num_steps = 0
+    for _ in range(num_steps):
         episode.control_step(start.command)
         qpos[arm_qpos], qvel[arm_qvel] = episode.simulator.joint_state()
         qpos[ball_qpos], qvel[ball_qvel] = np.split(episode.balls[0, :6], 2)
@@ -169,7 +182,7 @@ def play(name: str, settings: Settings, start: Start, seed: int) -> Played:
     return Played(
         qpos=np.array(qpos_path),
         qvel=np.array(qvel_path),
-        alarm=episode.alarm,
+        alarm=episode.alarm if is_seen else "no ball was seen",
         calibration=camera.calibration.report(),
         num_pairs=camera.num_pairs,
         errors=np.array(camera.errors),

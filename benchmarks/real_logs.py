@@ -29,7 +29,6 @@ from numpy.polynomial.polynomial import polyfit
 from scipy.optimize import brentq, least_squares
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.identify.doctor import examine
 from bounce_mjx.identify.following import (
     SETTLING,
     Following,
@@ -38,6 +37,7 @@ from bounce_mjx.identify.following import (
     follow,
     set_points,
 )
+from bounce_mjx.identify.inspection import examine
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.reading import read_csv
 from bounce_mjx.identify.simulation import compensated, make_targets

@@ -52,6 +52,9 @@ _RADIUS_TOLERANCE = 0.3
 _EDGE_TOLERANCE = 1.2
 _LEAST_ARC = 0.35
 _DIRECTIONS = 24
+# Score of a ball that is seen clearly; without one, so many circles of each edge are tried.
+_CLEAR_SCORE = 0.5
+_CANDIDATES = 4
 # Least share of a circle's inside that has the ball's colour, and points [25, 2] spread over the
 # inside of a circle of the radius 1 (a sunflower's seeds).
 _LEAST_FILLED = 0.4
@@ -192,19 +195,24 @@ def find_circles(
         mask[is_background > 0] = 0
     mask = cv2.medianBlur(mask, 3)
     contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    circles = []
+    edges = []
     for contour in contours:
         edge = contour.reshape(-1, 2).astype(float)
         if len(edge) < 3.0 * radii[0]:
             continue
         # A picture's border is no edge of the ball.
         size = np.array(mask.shape[::-1]) - 1
-        edge = edge[np.all((edge > 0) & (edge < size), axis=1)]
-        circle = fit_circle(edge, mask, radii, blur, expected_radius)
-        if circle is not None:
-            circles.append(circle._replace(centre=circle.centre + corner))
+        edges.append(edge[np.all((edge > 0) & (edge < size), axis=1)])
+    fits = [fit_circle(edge, mask, radii, blur, expected_radius) for edge in edges]
+    circles = [circle for circle in fits if circle is not None]
+    if all(circle.score <= _CLEAR_SCORE for circle in circles):
+        # The ball may share its edge with a thing of its colour.
+        for edge in edges:
+            circle = fit_circle(edge, mask, radii, blur, expected_radius, _CANDIDATES)
+            if circle is not None and circle.score > _CLEAR_SCORE:
+                circles.append(circle)
     circles.sort(key=lambda circle: circle.score, reverse=True)
-    return circles[:count]
+    return [circle._replace(centre=circle.centre + corner) for circle in circles[:count]]
 
 
 def fit_circle(
@@ -213,11 +221,12 @@ def fit_circle(
     radii: tuple[float, float],
     blur: np.ndarray,
     expected_radius: float | None = None,
+    num_candidates: int = 1,
 ) -> Circle | None:
     """The filled circle that most of an edge lies on; None if there is none.
 
-    Circles through three points on arcs of the edge are tried; the one with the most points close
-    to it and the most of its inside filled is refined on these points. With a blur, the edge is
+    Circles through three points on arcs of the edge are tried; those with the most points close to
+    them and the most of their inside filled are refined on these points. With a blur, the edge is
     that of a circle that moved along a line.
 
     Args:
@@ -226,13 +235,29 @@ def fit_circle(
       radii: smallest and largest radius.
       blur: motion [2] during the exposure, pixels.
       expected_radius: from the ball's distance, if it is known.
+      num_candidates: circles that are refined; the most complete one counts.
     """
     if len(edge) < 8:
         return None
-    best = _most_supported_circle(edge, mask, radii, blur)
-    if best is None:
-        return None
-    centre, radius = best
+    best = None
+    for centre, radius in _supported_circles(edge, mask, radii, blur, num_candidates):
+        circle = _refine(edge, mask, centre, radius, radii, blur, expected_radius)
+        if circle is not None and (best is None or circle.score > best.score):
+            best = circle
+    return best
+
+
+def _refine(
+    edge: np.ndarray,
+    mask: np.ndarray,
+    centre: np.ndarray,
+    radius: float,
+    radii: tuple[float, float],
+    blur: np.ndarray,
+    expected_radius: float | None,
+) -> Circle | None:
+    """The circle near a centre [2] and radius that fits the edge points close to it; None if they
+    are too few, or if it is not filled. The other arguments are those of `fit_circle`."""
     # The first centre may be at an end of the motion. In the end, a sharp edge is told by a narrow
     # tolerance from the edge of what hides the rest.
     length = float(np.linalg.norm(blur))
@@ -288,25 +313,29 @@ def _nearest_on_path(points: np.ndarray, centre: np.ndarray, blur: np.ndarray) -
     return centre + along[:, None] * blur
 
 
-def _most_supported_circle(
-    edge: np.ndarray, mask: np.ndarray, radii: tuple[float, float], blur: np.ndarray
-) -> tuple[np.ndarray, float] | None:
-    """Centre and radius of the circle through three points of an arc that has the most edge points
-    close to it, and is filled."""
-    count = len(edge)
-    starts = np.arange(0, count, max(1, count // 40))
+def _supported_circles(
+    edge: np.ndarray,
+    mask: np.ndarray,
+    radii: tuple[float, float],
+    blur: np.ndarray,
+    count: int,
+) -> list[tuple[np.ndarray, float]]:
+    """Centres and radii of some circles through three points of an arc: those that have the most
+    edge points close to them, and are filled; each half a radius at least from the ones before."""
+    num_points = len(edge)
+    starts = np.arange(0, num_points, max(1, num_points // 40))
     triples = []
     for share in (0.12, 0.22, 0.32):
         for circumference in (2.0 * np.pi * radii[0], 2.0 * np.pi * radii[1]):
-            stride = int(max(2, min(share * circumference, count / 3)))
+            stride = int(max(2, min(share * circumference, num_points / 3)))
             triples.append(np.stack([starts, starts + stride, starts + 2 * stride], axis=1))
-    corners = edge[np.concatenate(triples) % count]
+    corners = edge[np.concatenate(triples) % num_points]
     centres, circle_radii = _circles_through(corners)
     is_possible = (circle_radii > 0.8 * radii[0]) & (circle_radii < 1.2 * radii[1])
     centres = centres[is_possible]
     circle_radii = circle_radii[is_possible]
     if not len(centres):
-        return None
+        return []
     tolerance = _EDGE_TOLERANCE + 0.5 * np.linalg.norm(blur)
     columns = edge[None, :, 0] - centres[:, None, 0]
     rows = edge[None, :, 1] - centres[:, None, 1]
@@ -315,8 +344,14 @@ def _most_supported_circle(
     # A large circle has more edge; its share counts.
     support = np.count_nonzero(is_near, axis=1) / circle_radii
     support *= _filled_share(mask, centres, circle_radii)
-    best = int(np.argmax(support))
-    return centres[best], float(np.clip(circle_radii[best], *radii))
+    chosen: list[int] = []
+    for candidate in np.argsort(-support):
+        offsets = centres[chosen] - centres[candidate]
+        if np.all(np.hypot(offsets[:, 0], offsets[:, 1]) > 0.5 * radii[0]):
+            chosen.append(int(candidate))
+        if len(chosen) == count:
+            break
+    return [(centres[k], float(np.clip(circle_radii[k], *radii))) for k in chosen]
 
 
 def _circles_through(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -504,6 +539,10 @@ _PRIOR_BALL = 0.005
 # Noise of a circle's centre, pixels, and how many times the typical residual a pose may be off.
 _PIXEL_NOISE = 0.3
 _BAD_RATIO = 4.0
+# Distance at which a pose agrees with cameras whose lens and ball are known roughly, pixels.
+_ROUGH_REPROJECTION = 15.0
+# Largest error of a calibration along an axis, m (root mean square).
+_MAX_ERROR = 0.01
 # Parts into which the poses are divided to measure the error with poses that were not used.
 _FOLDS = 4
 # How far over its target an apex may be, m.
@@ -674,8 +713,9 @@ def calibrate(
       pixels: the ball's centre in each camera's pictures [2, N, 2]; NaN where it was not seen.
     """
     ball = _nominal_ball(metadata)
-    used = np.all(np.isfinite(pixels), axis=(0, 2))
-    bad: list[int] = []
+    is_seen = np.all(np.isfinite(pixels), axis=(0, 2))
+    used = _agreeing_poses(ball_positions(metadata, joint_angles, ball), rough, pixels, is_seen)
+    bad = np.flatnonzero(is_seen & ~used).tolist()
     while True:
         if np.count_nonzero(used) < 8:
             raise SystemExit(
@@ -700,7 +740,51 @@ def calibrate(
         for pose in left_out:
             place = triangulate(fold_cameras, pixels[:, pose])
             errors[pose] = place - truth[pose]
-    return Calibration(cameras, adjusted, errors, tuple(sorted(bad)))
+    calibration = Calibration(cameras, adjusted, errors, tuple(sorted(bad)))
+    typical_errors = np.sqrt(np.nanmean(errors**2, axis=0))
+    if np.any(typical_errors > _MAX_ERROR):
+        raise SystemExit(
+            f"the poses do not agree ({calibration.report()}), but {1e3 * _MAX_ERROR:g} mm is the "
+            "most that a policy bears; check that the ball is fixed, that nothing else in the "
+            "pictures looks like it, and that the arm reached each pose"
+        )
+    return calibration
+
+
+def _agreeing_poses(
+    places: np.ndarray, rough: Sequence[Camera], pixels: np.ndarray, is_seen: np.ndarray
+) -> np.ndarray:
+    """Which poses [N] agree roughly with most others in the pictures of every camera.
+
+    Another thing that was taken for the ball is tens of pixels away from it. The bundle adjustment
+    would bend a lens to meet it, and then leave out other poses.
+
+    Args:
+      places: nominal places of the ball [N, 3], m.
+      rough: the cameras, of which the intrinsics count.
+      pixels: [2, N, 2].
+      is_seen: whether both cameras saw the ball [N].
+    """
+    numbers = np.flatnonzero(is_seen)
+    agrees = is_seen.copy()
+    for camera, seen in zip(rough, pixels, strict=True):
+        is_inlier = np.zeros(len(numbers), bool)
+        # OpenCV's least number of points.
+        if len(numbers) >= 4:
+            is_solved, _, _, inliers = cv2.solvePnPRansac(
+                places[numbers],
+                seen[numbers],
+                camera.matrix,
+                None,
+                iterationsCount=1000,
+                reprojectionError=_ROUGH_REPROJECTION,
+                confidence=0.9999,
+                flags=cv2.SOLVEPNP_SQPNP,
+            )
+            if is_solved:
+                is_inlier[inliers.ravel()] = True
+        agrees[numbers[~is_inlier]] = False
+    return agrees
 
 
 def _adjust(

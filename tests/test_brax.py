@@ -14,6 +14,7 @@ import pytest
 from brax.envs.wrappers import training
 from brax.io import json as brax_json
 from brax.training.agents.ppo import checkpoint as brax_checkpoint
+from brax.training.agents.ppo.networks import make_ppo_networks
 from brax.training.agents.sac import networks as sac_networks
 from brax.training.agents.sac import train as brax_sac
 
@@ -25,6 +26,8 @@ from bounce_mjx.adapters.brax import (
     ppo,
 )
 from bounce_mjx.errors import UserError
+from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.task import term_names
 from bounce_mjx.task.bounce_rewards import BounceReward
 
@@ -177,6 +180,28 @@ def test_brax_ppo_trains_and_evaluates(ppo_example):
     for metrics in history:
         assert_evaluated(metrics)
     assert "viewer.js" in (folder / "rollout.html").read_text()
+
+
+def test_brax_gets_the_settings_that_it_has():
+    """The networks of the config, and the weight of the value loss, which brax halves."""
+    trainer = PPOConfig(
+        hidden_layers=(16, 8), critic_layers=(32,), activation="tanh", value_cost=0.3
+    )
+    networks = make_ppo_networks(29, 6, **ppo.network_settings(TrainConfig(ppo=trainer)))
+    params = networks.policy_network.init(jax.random.key(0))
+    observation = np.linspace(-1.0, 1.0, 29, dtype=np.float32)
+    x = observation
+    for layer in params["params"]["MLP_0"].values():
+        x = np.tanh(x @ layer["kernel"] + layer["bias"])
+    expected = x @ params["params"]["Dense_0"]["kernel"] + params["params"]["Dense_0"]["bias"]
+    result = networks.policy_network.apply(None, params, observation)
+    np.testing.assert_allclose(result[0], expected, rtol=1e-4, atol=1e-5)
+    critic = networks.value_network.init(jax.random.key(0))["params"]
+    assert [layer["bias"].shape for layer in critic.values()] == [(32,), (1,)]
+    assert ppo.ppo_settings(TrainConfig(ppo=trainer))["vf_loss_coefficient"] == 0.6
+    shared = TrainConfig(ppo=PPOConfig(shared_critic=True))
+    with pytest.raises(UserError, match=r"share no layers; set ppo\.shared_critic to false"):
+        ppo.network_settings(shared)
 
 
 @pytest.mark.slow

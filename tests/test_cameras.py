@@ -197,6 +197,32 @@ def test_a_pose_that_does_not_fit_is_named() -> None:
     assert "18 poses" in found.report() and "pose 8" in found.report()
 
 
+def test_two_poses_with_another_thing_in_place_of_the_ball_are_left_out() -> None:
+    metadata = load_policy("robust").metadata
+    rng = np.random.default_rng(0)
+    # Poses of an episode in which a lens was bent to meet the ring of the wrist.
+    rough = rendered_cameras.taped_cameras()
+    poses = cameras.plan_poses(metadata, rough, SIZE, seed=1053)
+    places = cameras.ball_positions(metadata, poses, cameras._nominal_ball(metadata))
+    pair = rendered_cameras.true_cameras()
+    pixels = np.stack([camera.project(places) for camera in pair])
+    pixels += 0.3 * rng.standard_normal(pixels.shape)
+    pixels[0, 2] += (-74.0, -22.0)
+    pixels[0, 18] += (79.0, 17.0)
+    found = cameras.calibrate(metadata, rough, poses, pixels)
+    assert found.bad == (2, 18)
+    for camera, true_camera in zip(found.cameras, pair, strict=True):
+        assert np.linalg.norm(camera.centre - true_camera.centre) < 0.03
+
+
+def test_a_calibration_that_no_policy_bears_is_refused() -> None:
+    metadata, rough, poses, pixels = observed(4)
+    # An arm that stops short of each pose, by a degree or two.
+    reached = poses + np.random.default_rng(0).normal(0.0, 0.025, poses.shape)
+    with pytest.raises(SystemExit, match="the poses do not agree .* 10 mm is the most"):
+        cameras.calibrate(metadata, rough, reached, pixels)
+
+
 def test_what_lies_below_a_falling_ball_is_not_it() -> None:
     """Such as the paddle's corner: a bounce throws a ball up, and never down."""
     tracker = cameras.Tracker(true_cameras(), cameras.COLOURS["orange"])
@@ -351,6 +377,31 @@ def test_a_picture_shows_the_instant_of_its_qpos_in_the_light_of_the_room(opengl
     mujoco.mj_forward(model, fresh)
     for drawn, right in zip(picture.pictures, rendered.still(fresh), strict=True):
         assert np.array_equal(drawn, right)
+    rendered.close()
+
+
+def test_a_ball_before_a_thing_of_its_colour_is_told_from_it(opengl) -> None:
+    """An orange ball before the paddle's wooden handle in the shade: one edge encloses both,
+    and a ball that is still just after its bounce was expected to fall."""
+    metadata = load_policy("robust").metadata
+    mjcf = str(resource_path("mjcf/bounce_ball.xml"))
+    model = rendered_cameras.make_model(mjcf, "orange", True)
+    pair = rendered_cameras.true_cameras()
+    rendered = rendered_cameras.RenderedCameras(model, pair)
+    data = mujoco.MjData(model)
+    home = np.array(metadata.default_joint_angles)
+    backgrounds = rendered.still(rendered_cameras._posed(model, data, metadata, home, None))
+    # Away from its home, the arm is in no background.
+    lower = home + np.array([0.0, 0.05, -0.05, 0.0, 0.0, 0.0])
+    for beside in [(0.0, 0.01), (-0.01, 0.0), (-0.02, 0.0)]:
+        rendered_cameras._posed(model, data, metadata, lower, np.array(beside))
+        place = data.joint("ball_link").qpos[:3]
+        pictures = rendered.still(data)
+        for camera, picture, background in zip(pair, pictures, backgrounds, strict=True):
+            pixel = camera.project(place[None])[0]
+            expected = cameras.Expected(pixel, camera.radius_at(place), np.array([0.0, 4.0]))
+            circles = cameras.find_circles(picture, cameras.COLOURS["orange"], background, expected)
+            assert np.linalg.norm(circles[0].centre - pixel) < 1.5
     rendered.close()
 
 

@@ -164,6 +164,24 @@ def test_the_best_checkpoint_has_the_best_evaluation(two: Path) -> None:
         assert find_checkpoint(two / f"checkpoints/{number}").number == number
 
 
+def test_a_folder_of_a_run_without_a_checkpoint_is_told_from_a_run_without_one(
+    two: Path, tmp_path: Path
+) -> None:
+    (two / "robot").mkdir()
+    with pytest.raises(UserError, match=f"robot holds no checkpoint of its run; give {two}"):
+        find_checkpoint(two / "robot")
+    empty = create_run(CONFIG.model_copy(update={"log_dir": tmp_path}))
+    with pytest.raises(UserError, match="as its training ended before the first one"):
+        find_checkpoint(empty)
+    # A manifest of a later version may mean something else.
+    files.seal(step_of(two))
+    manifest = step_of(two) / files.MANIFEST_FILE
+    manifest.write_text(manifest.read_text().replace('"format": 1', '"format": 2'))
+    with pytest.raises(UserError, match="damaged or of another version .*format"):
+        verify(find_checkpoint(step_of(two)))
+    files.seal(step_of(two))
+
+
 @pytest.mark.parametrize("wrong", [64, 128])
 def test_the_intact_checkpoint_takes_the_place_of_a_damaged_one(
     wrong: int, two: Path, tmp_path: Path, capsys

@@ -67,6 +67,13 @@ MISTAKES = (
     ("train --warm-start robust_smal", "did you mean robust_small?"),
     ("train --resume latst", "there is no checkpoint folder latst; did you mean latest?"),
     ("eval pretrained --robot ur5e", "give mirror"),
+    ("eval pretrained --log-dir typo", "--log-dir is where the newest run is looked for, and pret"),
+    ("robustness mirror --log-dir typo", "and mirror is named; omit one of them"),
+    ("play robust pretrained --log-dir typo", "and robust is named"),
+    ("plot nowhere --log-dir typo", "and nowhere is named"),
+    ("report nowhere --log-dir typo", "and nowhere is named"),
+    ("export robust --log-dir typo", "and robust is named"),
+    ("play robust latest --log-dir typo", "there is no run with a checkpoint in typo"),
     ("eval --nominal --randomization.air-drag 0 1", "--nominal and --randomization", "omit one"),
     (
         "eval robust --randomization.first-command-range 0.5 --randomization.warmup-steps 5",
@@ -237,6 +244,16 @@ def test_the_help_of_a_training_is_one_screen_and_the_whole_help_has_every_flag(
     assert pages[1].index("\nppo:\n") < pages[1].index("--learning-rate FLOAT")
 
 
+def test_a_default_with_a_percent_sign_is_shown(tmp_path: Path, capsys) -> None:
+    """In the path of a task, for example."""
+    folder = tmp_path / "50%"
+    folder.mkdir()
+    task = shutil.copy(Path(__file__).parents[1] / "examples/dribble_task.py", folder / "t.py")
+    with pytest.raises(SystemExit):
+        console_script(["train", "--task", f"{task}:Dribble", "--help-all"])
+    assert "50%/t.py:Dribble)" in re.sub(r"\s", "", capsys.readouterr().out)
+
+
 def test_presets_are_valid() -> None:
     found = resource_path("configs").glob("*.yaml")
     files = {p.stem: p for p in found if not p.stem.startswith("robustness")}
@@ -313,6 +330,12 @@ def test_a_policy_is_named_by_its_run_or_its_checkpoint(trained: Path, monkeypat
     ):
         found = choose_checkpoint(given, log_dir)
         assert found.folder.resolve() == trained / f"checkpoints/{steps}"
+
+
+def test_a_report_of_one_checkpoint_is_refused(trained: Path, refused) -> None:
+    """It would show the best one."""
+    words = f"a report is of a run's best checkpoint; give {trained}, not"
+    refused(f"report {trained}/checkpoints/{STEPS}", words)
 
 
 @pytest.mark.parametrize("command", ["plot", "report"])

@@ -113,6 +113,7 @@ def test_doctor_says_what_an_issue_needs(monkeypatch, capsys) -> None:
             'jax[gpu]<2; (python_version > "3") and extra == "sim"',
             "bounce_mjx[sim]; extra == 'all'",
             "nonesuch; extra == 'all'",
+            "needed-without-an-extra; python_version > '3'",
         ],
         "jax": ["nonesuch-plugin>=1; extra == 'gpu'", "numpy; extra == 'cpu'"],
     }

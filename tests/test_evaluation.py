@@ -457,6 +457,10 @@ def test_another_task_is_counted_and_judged_by_itself(dribbling):
     rows = show(seeds_table({0: report, 1: None})).splitlines()
     assert rows[2].split()[:4] == ["seed", "height", "rate", "stable"]
     assert rows[3].split() == ["0", "75.00", "50.00", "66.67", "FAIL"]
+    # The mean says that a seed is not in it.
+    assert rows[5].split() == ["mean", "of", "1", "75.00", "50.00", "66.67", "0/2"]
+    whole = show(seeds_table({0: report, 1: report})).splitlines()
+    assert whole[5].split()[:2] == ["mean", "75.00"]
 
 
 @pytest.mark.parametrize("name", ["steps", "passed", "screening"])

@@ -8,8 +8,9 @@ from pathlib import Path
 import jax
 import pytest
 
+from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
-from bounce_mjx.runs.files import new_file, write_atomically, write_output
+from bounce_mjx.runs.files import check_output, new_file, write_atomically, write_output
 from bounce_mjx.runs.presets import default_preset
 from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.task.bounce import BounceConfig as EnvConfig
@@ -35,6 +36,28 @@ def test_nothing_is_written_through_a_link(tmp_path: Path, victim: Path, write) 
     assert victim.read_text() == "mine"
     assert not (folder / "results.json").is_symlink()
     assert (folder / "results.json").read_text() == "new"
+
+
+def test_what_could_not_be_written_is_refused_before_the_work(tmp_path: Path, monkeypatch) -> None:
+    """A file is replaced by a new one in its folder, so that both must be writable."""
+    file = tmp_path / "results.json"
+    file.write_text("{}")
+    denied: list[Path] = []
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) not in denied)
+    check_output(file, "--json")
+    for denied[:] in ([tmp_path], [file]):
+        with pytest.raises(UserError, match=f"--json: {denied[0]} may not be written; give"):
+            check_output(file, "--json")
+    with pytest.raises(UserError, match="is a folder; give a file"):
+        check_output(tmp_path, "--json")
+    # A device is written itself.
+    denied[:] = [Path("/dev")]
+    check_output(Path("/dev/null"), "--json")
+
+
+def test_a_page_may_name_a_path_that_is_not_utf_8(tmp_path: Path) -> None:
+    write_output(tmp_path / "page.html", os.fsdecode(b"run \xff"))
+    assert (tmp_path / "page.html").read_text() == "run ?"
 
 
 def test_an_unfinished_file_leaves_the_old_one(tmp_path: Path, victim: Path) -> None:

@@ -229,6 +229,8 @@ def test_spaces_and_attributes(single, vectorised):
         assert env.unwrapped.mj_model.nu == 6 and env.metadata["render_fps"] == 100
     assert single.get_wrapper_attr("dt") == vectorised.dt == 0.01
     assert vectorised.call("dt") == vectorised.get_attr("dt") == (0.01,) * NUM_ENVS
+    with pytest.raises(UserError, match="reset would do it to all environments; use reset itself"):
+        vectorised.call("reset", seed=3)
 
 
 def test_equal_environments_share_their_programs():

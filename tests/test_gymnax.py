@@ -86,6 +86,11 @@ def test_spaces_and_settings(env, gymnax):
         GymnaxBounceBall(target_hight_range=(0.3, 0.4))
     with pytest.raises(UserError, match="reward.heigth; did you mean reward.height"):
         GymnaxBounceBall(reward={"heigth": {"weight": 2.0}})
+    # NumPy's rules would give every joint the one number.
+    state = jax.eval_shape(env.reset, jax.random.key(0))[1]
+    for wrong in (jnp.zeros(()), jnp.zeros(1), jnp.zeros((2, 6))):
+        with pytest.raises(UserError, match=r"the action has the shape .*; give \(6,\) for one"):
+            jax.eval_shape(env.step, jax.random.key(0), state, wrong)
 
 
 def test_gymnax_own_wrapper_logs_episodes(gymnax):

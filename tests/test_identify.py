@@ -11,20 +11,24 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import minimize
 
+from bounce_mjx.commands.main import main
+from bounce_mjx.deploy.recorder import Recorder
 from bounce_mjx.errors import UserError
-from bounce_mjx.identify.doctor import examine
 from bounce_mjx.identify.fit import (
     Fit,
     Noise,
     Problem,
     _bounded_step,
     _eliminate,
+    angle_weights,
     certainty,
     correlation_times,
     minimise,
+    picture_weights,
 )
 from bounce_mjx.identify.flight import acceleration, fit_flight
 from bounce_mjx.identify.following import command_delay, find_settled, follow, set_points
+from bounce_mjx.identify.inspection import examine
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.reading import read_csv
 from bounce_mjx.identify.simulation import (
@@ -32,6 +36,7 @@ from bounce_mjx.identify.simulation import (
     compensated,
     make_simulator,
     make_targets,
+    window_targets,
 )
 from bounce_mjx.identify.stages import (
     Identified,
@@ -39,6 +44,7 @@ from bounce_mjx.identify.stages import (
     _late_servos,
     _own_servos,
     identify,
+    join,
 )
 from bounce_mjx.identify.unknowns import MOTIONS, Layout
 from bounce_mjx.identify.windows import Windows, cut
@@ -46,6 +52,8 @@ from bounce_mjx.identify.world import (
     compare,
     describe_doubts,
     estimates,
+    misfit,
+    sentences,
     to_yaml,
     total_delay,
 )
@@ -56,7 +64,7 @@ from bounce_mjx.physics import (
     edited_model,
     make_engine,
 )
-from bounce_mjx.reports.identification import identification_page
+from bounce_mjx.reports.identification import identification_page, inspection_page
 from bounce_mjx.robot.model import find_addresses, link_bodies
 from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.world.actuation import Actuators
@@ -111,6 +119,64 @@ def windows_of(log: Log) -> Windows:
     return cut(log, 0.001)
 
 
+def part_of(log: Log, arm: tuple[float, float], targets: tuple[float, float]) -> Log:
+    """The log with the joint angles and the servo targets of some times (s) alone."""
+    measured = (log.times >= arm[0]) & (log.times <= arm[1])
+    sent = (log.target_times >= targets[0]) & (log.target_times <= targets[1])
+    return log._replace(
+        times=log.times[measured],
+        joint_angles=log.joint_angles[measured],
+        target_times=log.target_times[sent],
+        servo_targets=log.servo_targets[sent],
+    )
+
+
+@pytest.mark.parametrize(
+    "arm, targets", [((2.0, 5.0), (2.0, 5.0)), ((0.0, 5.0), (2.0, 7.0)), ((2.0, 7.0), (0.0, 5.0))]
+)
+def test_windows_are_of_times_at_which_the_arms_motion_is_known(arm, targets) -> None:
+    """Not of a bounce before or after the arm's rows, nor where targets begin late or end early."""
+    log = part_of(flight_log(8.0, gap=(9.0, 9.0)), arm, targets)
+    w = windows_of(log)
+    bounces = (w.zero + w.bounces)[w.has_ball]
+    assert len(bounces) == 5 and np.all((bounces > 2.3) & (bounces < 5.0))
+    times = (w.zero[:, None] + w.angle_times)[w.angle_weights > 0.0]
+    assert np.min(times) > 2.295 and np.max(times) < 5.005
+    # No picture was taken before the simulation of its window begins.
+    assert np.min(w.picture_times[w.picture_weights > 0.0]) > 0.079
+
+
+def test_what_follows_a_gap_of_the_targets_counts_once_the_arm_has_settled() -> None:
+    log = flight_log(8.0, gap=(9.0, 9.0))
+    sent = (log.target_times < 3.0) | (log.target_times > 4.0)
+    log = log._replace(target_times=log.target_times[sent], servo_targets=log.servo_targets[sent])
+    unknown = (log.times > 2.995) & (log.times < 4.305)
+    np.testing.assert_array_equal(find_settled(log), ~unknown & (log.times > 0.295))
+    w = windows_of(log)
+    times = (w.zero[:, None] + w.angle_times)[w.angle_weights > 0.0]
+    assert not np.any((times > 2.995) & (times < 4.305))
+    bounces = (w.zero + w.bounces)[w.has_ball]
+    assert not np.any((bounces > 2.995) & (bounces < 4.305))
+
+
+def test_no_window_spans_two_logs() -> None:
+    """Of which the first has pictures beyond the arm's rows, and the second before them."""
+    whole = flight_log(8.0, gap=(9.0, 9.0))
+    logs = part_of(whole, (0.0, 4.0), (0.0, 4.0)), part_of(whole, (5.0, 8.0), (4.0, 8.0))
+    joined = join(logs)
+    assert np.all(np.diff(joined.picture_times) > 0.0)
+    w = windows_of(joined)
+    # The first log ends at 4 s, and the second begins 1 s later.
+    ends = w.zero + np.max(w.angle_times * w.angle_weights, axis=1)
+    begins = w.zero + np.min(np.where(w.angle_weights > 0.0, w.angle_times, np.inf), axis=1)
+    assert np.all((ends < 4.01) | (begins > 6.295))
+    shown = w.zero[:, None] + w.picture_times
+    shown = np.where(w.picture_weights > 0.0, shown, np.nan)[w.has_ball]
+    is_early = np.nanmin(shown, axis=1) < 4.5
+    assert 0 < np.sum(is_early) < len(shown)
+    assert np.all(np.nanmax(shown[is_early], axis=1) < 4.51)
+
+
 @pytest.mark.parametrize("latency, lag", [(0.0237, 0.0), (0.0082, 0.015)])
 def test_targets_are_late_and_lagged(latency: float, lag: float) -> None:
     """Against a simulation with steps a hundred times as short."""
@@ -127,6 +193,23 @@ def test_targets_are_late_and_lagged(latency: float, lag: float) -> None:
         state = mean if lag == 0.0 else mean + (state - mean) * np.exp(-0.001 / lag)
         expected.append(state)
     np.testing.assert_allclose(found[: len(expected)], expected, atol=2e-3)
+
+
+def test_a_log_of_hours_has_the_targets_of_its_windows_alone() -> None:
+    """The same as if all of its steps were computed."""
+    random = np.random.default_rng(1)
+    log = flight_log(60.0)
+    log = log._replace(servo_targets=random.normal(size=log.servo_targets.shape))
+    first = np.array([31_000, 300, 900, 55_000])
+    w = windows_of(log)._replace(first=first, steps=860, origin=0.0)
+    send, rows = window_targets(log, w)
+    for latency, lag in ((0.02, 0.0), (0.02, 0.2)):
+        some = send(latency, lag)
+        assert len(some) == 1760 + 2 * 2860
+        every = make_targets(log, 0.001 * np.arange(56_001))(latency, lag)
+        for begin, row in zip(first, rows, strict=True):
+            of_window = slice(row, row + 860)
+            np.testing.assert_allclose(some[of_window], every[begin : begin + 860], atol=2e-4)
 
 
 def measured_rows(w: Windows, angles: np.ndarray) -> np.ndarray:
@@ -166,12 +249,12 @@ def test_intervals_know_that_residuals_of_a_window_are_correlated() -> None:
     clean, moved = (w.split(problem.predict(x, w.starts))[0] for x in (truth, late))
     along = moved - clean
     estimates, deviations, independent = [], [], []
-    for _ in range(40):
+    for _ in range(20):
         common = random.normal(size=(len(w.first), 1, 1))
         noisy = clean + 1e-3 * random.normal(size=clean.shape) + common * along
         one = problem._replace(windows=w._replace(angles=noisy))
         fit = minimise(one, Fit(truth, w.starts), ["arm"], weights, 4)
-        information, covariance = certainty(one, fit)
+        information, covariance = certainty(one, fit, layout.free(["arm"]))
         estimates.append(fit.vector[place])
         deviations.append(np.sqrt(covariance[place, place]))
         by_noise = np.linalg.inv(information + np.diag(layout.deviation**-2.0))
@@ -362,6 +445,12 @@ def unseen() -> Identified:
     return identified(layout, flight_log(), layout.mean, np.diag(layout.deviation**2))
 
 
+def ball_shown() -> Identified:
+    """A log that shows all unknowns, at their prior means."""
+    layout = Layout(6, True, 0.001)
+    return identified(layout, flight_log(), layout.mean, np.diag((0.1 * layout.deviation) ** 2))
+
+
 @pytest.mark.slow
 def test_the_page_begins_with_the_answer() -> None:
     """What the log leaves open comes after it, and the log itself last."""
@@ -371,6 +460,9 @@ def test_the_page_begins_with_the_answer() -> None:
     parts = "<b>Found:", "<b>How sure:", "<b>What to do:", "<h2>Estimates", "<h2>What the log"
     assert sorted(parts, key=page.index) == [*parts]
     assert "do not train with this world: A doubt." in page
+    inspected = inspection_page([log._replace(source="a&b.csv")], checkups)
+    assert "<title>bounce_mjx: logs a&amp;b.csv</title>" in inspected
+    assert "<h1>a&amp;b.csv</h1>" in inspected
     better = identification_page(found, [log], checkups, NAMES, Path("world.yaml"), [])
     assert "bounce-mjx identify LOG --check world.yaml" in better
     assert all(entry.label in page for entry in estimates(found, NAMES))
@@ -402,6 +494,134 @@ def test_a_model_that_does_not_explain_a_log_is_named() -> None:
     bounces = int(np.sum(found.windows.has_ball))
     (doubt,) = describe_doubts(found._replace(dropped=bounces - 1), NAMES)
     assert doubt.startswith(f"In {bounces - 1} of {bounces} windows")
+
+
+@pytest.mark.parametrize("sensor", ["joint_angles", "ball_position"])
+def test_an_error_that_is_no_number_explains_nothing(sensor: str) -> None:
+    found = ball_shown()
+    assert describe_doubts(found, NAMES) == [] and misfit(found) == 1.0
+    errors = found.joint_errors * (1.0 if sensor == "ball_position" else np.nan)
+    diverged = found._replace(held_out=found.held_out | {sensor: np.nan}, joint_errors=errors)
+    assert not misfit(diverged) == 1.0
+    assert "does not explain the" in describe_doubts(diverged, NAMES)[0]
+
+
+def test_a_fit_whose_simulation_diverges_has_an_infinite_cost() -> None:
+    problem = linear_problem(flight_log(), np.random.default_rng(0))
+    start = Fit(problem.layout.mean, problem.windows.starts)
+    assert minimise(problem, start, ["arm"], problem.weights(0.0), 2).cost < np.inf
+
+    def diverge(vectors: np.ndarray, starts: np.ndarray, used: np.ndarray) -> np.ndarray:
+        return problem.simulate(vectors, starts, used) * np.nan
+
+    broken = problem._replace(simulate=diverge)
+    assert minimise(broken, start, ["arm"], problem.weights(0.0), 2).cost == np.inf
+    predicted = broken.predict(start.vector, start.starts)
+    assert not np.any(angle_weights(broken, predicted))
+    assert not np.any(picture_weights(broken, predicted))
+
+    def diverge_elsewhere(vectors: np.ndarray, starts: np.ndarray, used: np.ndarray) -> np.ndarray:
+        moved = np.any(vectors != start.vector, axis=1)[:, None, None]
+        return np.where(moved, np.nan, problem.simulate(vectors, starts, used))
+
+    broken = problem._replace(simulate=diverge_elsewhere)
+    fit = minimise(broken, start, ["arm"], problem.weights(0.0), 2)
+    assert fit.cost < np.inf and np.array_equal(fit.vector, start.vector)
+
+
+def test_a_ball_that_no_window_checks_is_said() -> None:
+    found = ball_shown()
+    assert not any("nothing checks" in line for line in sentences(found, NAMES))
+    unchecked = found._replace(held_out={"joint_angles": 1.0})
+    assert any("nothing checks" in line for line in sentences(unchecked, NAMES))
+
+
+def test_a_warning_states_one_quantity_in_one_unit() -> None:
+    """The vector has a delay and a variance in s^2, and no age of a picture's stamp."""
+    layout = Layout(6, True, 0.001)
+    vector = layout.vector({"action_latency": 0.19, "servo_lag": 0.05, "ball_latency": 0.069})
+    vector[layout.slices["restitution"]] = 0.98 - 1e-12
+    found = identified(layout, flight_log(), vector, np.diag((0.1 * layout.deviation) ** 2))
+    said = [x for x in sentences(found._replace(stamp_age=0.01), NAMES) if x.startswith("warning")]
+    numbers = [
+        re.search(r"warning: (.+) is (\S+)( s)?, (\S+) deviations of the prior from (\S+)\.$", line)
+        for line in said
+    ]
+    shown = {x[1]: (float(x[2]), float(x[5])) for x in numbers}
+    # The prior's variance is 2e-4 s^2, and that of a lag its square.
+    assert shown["servo_lag"] == pytest.approx((0.05, np.sqrt(2e-4)), rel=0.01)
+    # The mean of a lag is shorter than it by half a step.
+    assert shown["action_latency and servo_lag together"] == pytest.approx((0.2395, 0.035))
+    assert "ball_latency" not in shown
+    # At a limit of the search, but for a rounding.
+    assert shown["restitution"] == pytest.approx((0.98, 0.85))
+    late = found._replace(fit=found.fit._replace(vector=vector + 0.01), stamp_age=0.01)
+    (line,) = (x for x in sentences(late, NAMES) if x.startswith("warning: ball_latency"))
+    assert "is 0.089 s" in line and line.endswith("from 0.02.")
+
+
+def test_a_picture_cannot_arrive_before_it_was_taken(tmp_path: Path) -> None:
+    """The search allows a latency below 0, as stamps are off; a world has a range from 0 on."""
+    layout = Layout(6, True, 0.001)
+    path = tmp_path / "world.yaml"
+    for latency, is_said in ((-0.001, False), (-0.02, True)):
+        vector = layout.vector({"ball_latency": latency})
+        shown = 0.1 * layout.deviation
+        found = identified(layout, flight_log(), vector, np.diag(shown**2))
+        (entry,) = (x for x in estimates(found, NAMES) if x.label == "ball_latency")
+        assert 0.0 == entry.low == entry.value <= entry.high
+        path.write_text(to_yaml(found, flight_log(), NAMES, None), encoding="utf-8")
+        low, high = read_world(path).settings["randomization"]["ball_latency"]
+        assert 0.0 == low <= high
+        said = [x for x in sentences(found, NAMES) if "arrive" in x]
+        assert len(said) == is_said and all("20.0 ms before" in x for x in said)
+
+
+def test_what_no_search_varied_has_the_deviation_of_its_prior() -> None:
+    """Such as the servos of a follower, and gravity's tilt without a ball."""
+    problem = linear_problem(flight_log(20.0), np.random.default_rng(3))
+    layout, weights = problem.layout, problem.weights(pictures=0.0)
+    fit = minimise(problem, Fit(layout.mean, problem.windows.starts), ["arm"], weights, 2)
+    searched = layout.free(["arm"])
+    gains = layout.slices["servo_gain"]
+    chosen = searched.copy()
+    chosen[gains] = False
+    deviations = [
+        np.sqrt(np.diag(certainty(problem, fit, which)[1])) for which in (searched, chosen)
+    ]
+    assert np.all(deviations[0][gains] < 0.9 * layout.deviation[gains])
+    np.testing.assert_allclose(deviations[1][gains], layout.deviation[gains])
+    np.testing.assert_allclose(deviations[1][chosen], deviations[0][chosen])
+
+
+def test_a_log_that_no_world_explains_is_not_called_the_same_robot(
+    tmp_path: Path, monkeypatch, capsys
+) -> None:
+    """Nor is a page named that --check does not write."""
+    path, world = tmp_path / "log.csv", tmp_path / "world.yaml"
+    home = np.array(read_preset(Path("default")).env.default_joint_angles)
+    rates = np.arange(1.0, 7.0)
+    with Recorder(path, NAMES) as recorder:
+        for time in 0.01 * np.arange(1500):
+            late, sent = (home + 0.1 * np.sin(rates * t) for t in (time - 0.025, time))
+            recorder.step({"time": time, "joint_angles": late}, sent)
+    found = unseen()
+    world.write_text(to_yaml(found, flight_log(), NAMES, None), encoding="utf-8")
+    monkeypatch.setattr("bounce_mjx.identify.stages.identify", lambda *_: found)
+    arguments = ["identify", str(path), "--check", str(world), "--out", str(tmp_path / "new.yaml")]
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == 0 and "still matches" in capsys.readouterr().out
+    found = found._replace(joint_errors=np.full(6, 0.1))
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    printed = capsys.readouterr()
+    assert ended.value.code == 2 and "still matches" not in printed.out
+    assert "cannot be compared with" in printed.err and "does not explain" in printed.err
+    with pytest.raises(SystemExit) as ended:
+        main([*arguments, "--inspect"])
+    assert ended.value.code == 0 and "new.html" not in capsys.readouterr().out
+    assert not list(tmp_path.glob("new.*"))
 
 
 def test_errors_that_are_alike_count_as_one() -> None:
@@ -492,11 +712,15 @@ def test_a_flight_with_drag_and_spin_is_fitted_directly() -> None:
 
 
 @pytest.mark.slow
-def test_an_arm_is_explained_no_worse_than_by_a_delay_and_offsets() -> None:
-    """One that follows its commands more exactly than any servo."""
+@pytest.mark.parametrize("late", [0.012, 0.003])
+def test_an_arm_is_explained_no_worse_than_by_a_delay_and_offsets(
+    late: float, tmp_path: Path
+) -> None:
+    """One that follows its commands more exactly than any servo, or so early that they are a
+    controller's own set points; and what the servos of the model are, no log of it shows."""
     config, random = read_preset(Path("default")).env, np.random.default_rng(3)
-    times = np.arange(0.0, 9.0, 0.008)
-    rates, late = np.array([1.1, 1.7, 2.3, 2.9, 1.3, 0.7]), 0.012
+    times = np.arange(0.0, 4.5, 0.008)
+    rates = np.array([1.1, 1.7, 2.3, 2.9, 1.3, 0.7])
     home = np.array(config.default_joint_angles)
     offsets = np.array([0.002, -0.001, 0.0, 0.001, -0.002, 0.0005])
     angles = home + offsets + 0.3 * np.sin(np.outer(times - late, rates))
@@ -509,6 +733,34 @@ def test_an_arm_is_explained_no_worse_than_by_a_delay_and_offsets() -> None:
         np.sqrt(np.mean(errors**2)) for errors in (found.joint_errors, found.following_errors)
     )
     assert of_model < 1.1 * of_delay
+    # The delay is that of the targets as they are in the log.
+    assert of_delay < 1.2e-4
+    assert found.has_set_points == (late < 0.004)
+    if found.has_set_points:
+        assert found.is_follower
+        shown = {x.label.split(" ")[0] for x in estimates(found, NAMES) if x.seen}
+        assert shown == {"action_latency", "servo_offset"}
+        (said,) = (x for x in sentences(found, NAMES) if "stiff servos" in x)
+        assert "the controller's own set points" in said
+        model = world_model(config, visual=False)
+        printed = total_delay(found, model)
+        assert float(printed.split(" ")[2]) == pytest.approx(1e3 * late, abs=0.15)
+        path = tmp_path / "world.yaml"
+        path.write_text(to_yaml(found, log, NAMES, None), encoding="utf-8")
+        assert read_world(path).sources["randomization.servo_gain"].startswith("Chosen, as a delay")
+        # Of servos and a lag, it is the time by which the simulated joints follow.
+        layout, windows = found.layout, found.windows
+        other_world = {"action_latency": 0.01, "servo_lag": 0.02, "joint_frictionloss": np.zeros(6)}
+        vector = layout.vector(other_world)
+        simulate = make_simulator(config, layout, log, windows, carried=1.0)
+        every = np.ones((1, len(windows.first)), bool)
+        simulated = windows.split(simulate(vector[None], windows.starts[None], every)[0])[0]
+        settled = (windows.angle_weights > 0.0) & (windows.angle_times > 0.4)
+        at = (windows.zero[:, None] + windows.angle_times)[settled]
+        other = log._replace(times=at, joint_angles=simulated[settled])
+        measured = command_delay(other, follow(other, np.ones(len(at), bool)))
+        printed = total_delay(found._replace(fit=found.fit._replace(vector=vector)), model)
+        assert float(printed.split(" ")[2]) == pytest.approx(1e3 * measured, abs=0.15)
 
 
 def test_following_finds_delay_and_offsets() -> None:

@@ -11,8 +11,8 @@ from bounce_mjx.deploy.recorder import Recorder
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.contacts import ContactChecker
 from bounce_mjx.identify import Topics
-from bounce_mjx.identify.doctor import examine
 from bounce_mjx.identify.excitation import excite
+from bounce_mjx.identify.inspection import describe, examine
 from bounce_mjx.identify.log import Log, align_clocks, check
 from bounce_mjx.identify.reading import read_bag, read_csv, read_log
 from bounce_mjx.identify.world import measure_camera
@@ -120,7 +120,16 @@ def swapped(lines: list[str]) -> list[str]:
             scaled("joint_angles", 57.3),
             r"is -28\.\d+ rad .+ if these are degrees, write .+ \[deg\]",
         ),
-        (scaled("time", 1000.0), r"are 10 s apart, .+ if the times are milliseconds, write time"),
+        (
+            scaled("time", 1000.0),
+            r"are 10 s apart, .+ if the times are milliseconds, write time \[ms\]",
+        ),
+        # From here on, more than an hour from the log's middle.
+        (
+            scaled("time", 1e6),
+            r"are 1e\+04 s apart, .+ if the times are microseconds, write time \[us\]",
+        ),
+        (scaled("time", 1e9), r"are 1e\+07 s apart, .+ write time \[ns\]"),
         (scaled("time", -1.0), r"119 of the 120 joint angles .+ row 3 has a time out of order"),
         (scaled("ball_position", 1000.0), r"the ball .+ write ball_position\.x \[mm\]"),
         (lambda lines: [lines[0].replace("left", "a"), *lines[1:]], "angles.a, .+ --joint-names"),
@@ -142,7 +151,10 @@ def test_a_wrong_log_is_refused_by_one_sentence(change, sentence: str, tmp_path:
 @pytest.mark.parametrize(
     "change, sentence",
     [
-        (with_cell(7, 2, "nan"), "1 of the 120 joint angles in {}: row 8 lacks one of its 2"),
+        (
+            with_cell(7, 2, "nan"),
+            "1 of the 120 joint angles in {}: row 8 lacks its time or one of its 2",
+        ),
         (with_cell(9, 7, "99"), "1 of the 60 pictures of the ball in {}: row 10 is farther away"),
         (with_cell(9, 0, "0"), "joint angles in {}: row 10 has a time far from the others"),
         (swapped, "1 of the 120 joint angles in {}: row 41 has a time out of order"),
@@ -156,6 +168,21 @@ def test_a_wrong_log_is_refused_by_one_sentence(change, sentence: str, tmp_path:
                 lines[0],
                 *(
                     ",".join([*x.split(",")[:7], *lines[i - i % 2 + 1].split(",")[7:]])
+                    for i, x in enumerate(lines[1:])
+                ),
+            ],
+            "60 of the 120 pictures of the ball in {}: row 3 repeats the one before",
+        ),
+        (
+            # The same under a stamp of its own, later than that of the next picture.
+            lambda lines: [
+                lines[0],
+                *(
+                    x
+                    if i % 2 == 0
+                    else ",".join(
+                        [*x.split(",")[:7], *lines[i].split(",")[7:10], x.split(",")[0], "0.5"]
+                    )
                     for i, x in enumerate(lines[1:])
                 ),
             ],
@@ -178,6 +205,26 @@ def test_what_one_row_lacks_is_left_out_and_counted(change, sentence: str, tmp_p
     )
     assert set(log.picture_times) <= set(whole.picture_times)
     assert len(log.picture_times) >= ROWS // 2 - 1
+
+
+def test_a_log_of_hours_is_read_and_milliseconds_are_named(tmp_path: Path) -> None:
+    """However long: a row is far in time if none is near it, not if it is far from the middle."""
+    names = ("a", "b")
+    rows = np.arange(40_000)
+    wave = np.sin(0.1 * rows)
+    for step, is_read in ((0.19, True), (10.0, False)):
+        path = tmp_path / f"{step}.csv"
+        titles = [
+            f"{kind}.{name} [rad]" for kind in ("joint_angles", "servo_targets") for name in names
+        ]
+        table = np.column_stack([step * rows, wave, wave, wave, wave])
+        np.savetxt(path, table, "%.6g", ",", header=",".join(["time [s]", *titles]), comments="")
+        if is_read:
+            log = read_csv(path, names)
+            assert len(log.times) == len(rows) and not log.notes and log.times[-1] > 7500.0
+        else:
+            with pytest.raises(UserError, match=r"are 10 s apart, .+ milliseconds, write time"):
+                read_csv(path, names)
 
 
 def test_reader_reads_what_the_recorder_writes(tmp_path: Path) -> None:
@@ -335,6 +382,16 @@ def test_bags_are_read_as_logs(storage: str, tmp_path: Path) -> None:
         read_bag(folder, ("left", "elbow"), TOPICS)
 
 
+def test_pictures_of_a_bag_in_simulated_time_have_their_age(tmp_path: Path) -> None:
+    """Also those that arrive before the first angles and after the last."""
+    bag = Bag().fill(20, clock=50.0)
+    for arrival in (99.9, 100.5):
+        bag.add("/ball", arrival, bag.point(arrival - 50.018, (1.0, 2.0, 0.1 * arrival)))
+    log = read_bag(bag.write(tmp_path / "bag"), JOINTS, TOPICS)
+    assert len(log.picture_times) == 21
+    np.testing.assert_allclose(log.arrivals - log.picture_times, 0.018, atol=1e-6)
+
+
 def test_messages_without_a_measurement_are_left_out_and_counted(tmp_path: Path) -> None:
     bag = Bag()
     bag.add("/joint_states", 99.0, bag.joints(99.0, [0.02], ["finger"]))
@@ -394,6 +451,19 @@ def test_excitation_moves_every_joint_within_its_limits_and_without_contacts() -
         checker = ContactChecker(config, margin=0.005, table_height=table)
         targets = excite(config, 20.0, 1.0, table_height=table).targets
         assert not any(checker.touching(pose) for pose in targets[::10])
+
+
+def test_an_excitation_moves_each_joint_or_says_which_cannot() -> None:
+    config = read_preset(Path("default")).env
+    model = load_model(None, 0.001)
+    limits = model.jnt_range[list(find_addresses(model).arm_joints)]
+    home = np.array(config.default_joint_angles)
+    for start in (limits[0, 1] - 0.01, limits[0, 1]):
+        home[0] = start
+        with pytest.raises(UserError, match=r"Joint1 cannot move, as it starts at .+ its range is"):
+            excite(config.model_copy(update={"default_joint_angles": tuple(home)}), 20.0, 1.0)
+    with pytest.raises(UserError, match="0.001 s are too short to move 6 joints; give at least"):
+        excite(config, 0.001, 1.0)
 
 
 def test_excite_command_writes_a_motion(tmp_path: Path, capsys) -> None:
@@ -552,10 +622,8 @@ def in_feet(log: Log) -> Log:
     return log._replace(ball_positions=3.281 * log.ball_positions)
 
 
-def held_pictures(log: Log) -> Log:
-    balls = log.ball_positions.copy()
-    balls[1::2] = balls[: len(balls[1::2]) * 2 : 2]
-    return log._replace(ball_positions=balls)
+def targets_in_degrees(log: Log) -> Log:
+    return log._replace(servo_targets=np.degrees(log.servo_targets))
 
 
 FAULTS = {
@@ -568,6 +636,7 @@ FAULTS = {
     "frozen": (with_angles(still_encoder), "Joint5"),
     "frozen, all": (with_angles(lost_connection), "all joints"),
     "unit": (with_angles(degrees), "Joint3"),
+    "unit, of the targets": (targets_in_degrees, "Joint3"),
     "scale": (with_angles(geared), "Joint6"),
     "saturated": (with_angles(stopped), "Joint2"),
     "hand guided": (with_targets(lambda x: np.repeat(x[:1], len(x), 0)), "all joints"),
@@ -579,7 +648,6 @@ FAULTS = {
     "ball axes": (upside_down, "the ball"),
     "ball axes, turned": (other_axes, "the ball"),
     "ball unit": (in_feet, "the ball"),
-    "repeated pictures": (held_pictures, "the ball"),
 }  # fmt: skip
 
 
@@ -593,7 +661,36 @@ def test_a_fault_of_a_log_is_named_with_its_place(name: str) -> None:
     assert (name.split(" by ")[0].split(",")[0], where) in found
     # No other joint is blamed.
     places = {where, "Joint5"} if name == "swapped" else {where}
-    assert {place for _, place in found} <= places or name == "swapped, all"
+    is_of_all = name in ("swapped, all", "unit, of the targets")
+    assert {place for _, place in found} <= places or is_of_all
+    if name.startswith("unit"):
+        right = "joint_angles" if name == "unit" else "servo_targets"
+        assert f"write {right}.Joint3 [deg]" in checkup.faults[0].text or is_of_all
+        assert all("[deg]" in fault.text and right in fault.text for fault in checkup.faults)
+
+
+def test_pictures_without_an_arm_beside_them_are_counted() -> None:
+    """Such as those of a camera whose clock is another one."""
+    log = sound_log()
+    (finding,) = examine([log._replace(picture_times=log.picture_times + 15.0)], ARM)[0].findings
+    assert finding.kind == "pictures alone" and not finding.is_fault
+    assert finding.text.startswith("1801 of 3600 pictures") and "after 29.990 s" in finding.text
+
+
+def test_a_ball_that_a_hand_carries_for_most_of_the_time_has_its_unit() -> None:
+    log = sound_log()
+    balls = log.ball_positions.copy()
+    times = log.picture_times[900:]
+    balls[900:, 2] = 0.4 + 0.2 * np.sin(2.0 * times)
+    assert examine([log._replace(ball_positions=balls)], ARM)[0].findings == ()
+
+
+def test_no_delay_is_told_of_joints_that_follow_nothing() -> None:
+    log = with_targets(lambda targets: np.repeat(targets[:1], len(targets), 0))(sound_log())
+    checkups = examine([log], ARM)
+    assert describe([log], checkups)[0].endswith("none of its joints follows its command")
+    log = sound_log()
+    assert describe([log], examine([log], ARM))[0].endswith("follow their commands 25 ms later")
 
 
 def test_the_same_log_twice_is_named() -> None:

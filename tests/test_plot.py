@@ -104,6 +104,12 @@ def test_runs_that_differ_in_the_seed_are_one_group(runs: list[Path]) -> None:
         "num_envs 2048 (one run)",
     ]
     assert [group.label for group in group_runs(runs[:3])] == ["3 runs"]
+    # How often a training is evaluated and saved changes nothing in it.
+    path = runs[0] / "config.yaml"
+    text = path.read_text()
+    path.write_text(text.replace("eval_every: 2000000", "eval_every: 1000000"))
+    assert path.read_text() != text
+    assert [group.label for group in group_runs(runs[:3])] == ["3 runs"]
 
 
 def test_a_sweep_of_an_own_algorithms_setting_is_several_groups(tmp_path: Path) -> None:
@@ -245,7 +251,9 @@ def test_a_panel_has_a_point_for_each_evaluation_and_steps_in_millions() -> None
     group = Group("one run", [RunCurves(Path("run"), curves, 4_000_000)], task_curves)
     axes, empty = curves_figure([group]).axes
     assert empty.get_xlim() == axes.get_xlim()
-    (points,) = [line for line in axes.lines if line.get_label() == "evaluation, without noise"]
+    (points,) = [
+        line for line in axes.lines if line.get_label() == "evaluation, actions not sampled"
+    ]
     assert (points.get_marker(), points.get_linestyle()) == ("o", "None")
     assert points.get_xydata().tolist() == [[2e6, 7.0], [4e6, 9.0]]
     (met,) = [line for line in axes.lines if line.get_label() == "all results met"]
@@ -357,6 +365,17 @@ def as_shown(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
 
+NOMINAL_OUTCOME = {
+    "perturbation": "nominal", "group": "nominal", "unit": "", "strength": None, "trained": True,
+    "physics": "fused", "values": {"stable": 98.0}, "failed": [], "lasted": 1.0,
+    "mean_length_s": 20.0,
+}  # fmt: skip
+ROBUSTNESS = {
+    "checkpoint": "c", "steps": 12_000, "suite": "s.yaml", "episodes": 4, "seed": 0,
+    "outcomes": [NOMINAL_OUTCOME],
+}  # fmt: skip
+
+
 def test_training_leaves_a_report(trained: Path) -> None:
     """The run's episodes of 0.5 s end before the height is measured."""
     page = check_report(trained)
@@ -364,6 +383,7 @@ def test_training_leaves_a_report(trained: Path) -> None:
     assert (height.value, height.passed) == (None, False)
     assert ">-</td>" in re.search(r"<td[^>]*>height</td>.*", page)[0]
     assert "apex error - m, " in page
+    assert "They show another policy" not in page
     # The log has no point either, which a curve would show as a perfect value.
     log = EventAccumulator(str(trained)).Reload().Tags()["scalars"]
     assert "results/stable" in log and "results/mean_return" in log
@@ -383,10 +403,18 @@ def test_report_is_drawn_again(
     (run / "report.html").symlink_to(other)
     own_plots("Mine", "Mine", "The best checkpoint")
     monkeypatch.setattr(report_page.mujoco, "__version__", "9.9")
+    # The save of the results was interrupted, and the robustness is that of an earlier policy.
+    results = json.loads((run / "results.json").read_text())
+    results["best_steps"] += 1
+    (run / "results.json").write_text(json.dumps(results))
+    (run / "robustness.json").write_text(json.dumps(ROBUSTNESS))
     report_command.main([str(run)])
-    check_report(run, own_plots=3)
+    check_report(run, own_plots=4)
     assert other.read_text() == "mine"
     page = (run / "report.html").read_text("utf-8")
+    drawn_steps = results["best_steps"] - 1
+    assert f"They show another policy than the results, that after {drawn_steps:,} steps." in page
+    assert ">Perturbed worlds, of the policy after 12,000 steps</h2>" in page
     # A later MuJoCo writes the page, but did not train.
     versions = re.search("<p>Trained on .* with bounce_mjx (.*)\n.* MuJoCo 9.9, JAX", page)
     assert versions[1] == f"{bounce_mjx.__version__}." and "Peitian AIR4-560" in page

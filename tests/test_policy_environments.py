@@ -21,6 +21,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.resources import POLICIES
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import pretrained_checkpoint
+from bounce_mjx.task.bounce import BounceConfig
 from bounce_mjx.world.randomization import RandomizationConfig
 
 STEPS = 600
@@ -172,6 +173,50 @@ def test_a_policy_refuses_another_environment(slow_run: Path) -> None:
     policy = Run("pretrained").policy_in(BounceBall())
     with pytest.raises(UserError, match=r"has the shape \[2\], but the last axis must have 29"):
         policy(np.zeros(2))
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_a_setting_without_an_effect_is_refused(library: str, need) -> None:
+    """A warm-up, where nothing counts the steps of the training; a world or a task beside a config
+    that has its own; the time limit of brax, which its trainers decide."""
+    config = BounceConfig(randomization={"ball_mass": (0.5, 2.0), "warmup_steps": 1000})
+    warmup = {"randomization": config.randomization}
+    match library:
+        case "torch" | "rsl_rl" | "skrl":
+            env = BounceBall(config)
+            assert environment_of(_make(library, need, env=env)) is env
+            refused = [({"env": env, "world": "training"}, "env and world both say")]
+        case "playground":
+            make_config = _adapter(
+                "playground.environment", "default_config", need, "mujoco_playground"
+            )
+            policy = {"policy": "robust", "world": "training"}
+            assert _make(library, need, config=make_config(**policy), **policy)
+            refused = [
+                ({"config_overrides": {"task.randomization.warmup_steps": 1000}}, "term whose"),
+                ({"config": make_config(policy="robust"), **policy}, "training is another one"),
+            ]
+            with pytest.raises(UserError, match="its ranges do not grow here"):
+                make = make_config()
+                make.task.randomization = config.randomization.model_dump(mode="json")
+                _make(library, need, config=make)
+        case "brax":
+            refused = [
+                (warmup, "its ranges do not grow here; set warmup_steps to 0"),
+                ({"config": config}, "its ranges do not grow here"),
+                ({"config": BounceConfig(), "world": "training"}, "config and world both say"),
+                ({"config": BounceConfig(), "task": "bounce"}, "config and task both say"),
+                ({"episode_seconds": 30}, "episode_seconds has no effect here; give brax's"),
+            ]
+            # A group that is given in part keeps the other values.
+            drag = BounceConfig(randomization={"air_drag": (0.1, 0.2)})
+            both = _make(library, need, config=drag, randomization={"ball_mass": (0.5, 2.0)})
+            assert both.task.config.randomization.terms == ("ball_mass", "air_drag")
+        case _:
+            refused = [(warmup, "its ranges do not grow here; set warmup_steps to 0")]
+    for settings, words in refused:
+        with pytest.raises(UserError, match=words):
+            _make(library, need, **settings)
 
 
 def _deep(config, change: dict) -> dict:

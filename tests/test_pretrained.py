@@ -20,7 +20,13 @@ from bounce_mjx.learning.policy import make_networks, networks_of
 from bounce_mjx.resources import ARM_POLICIES, POLICIES, TASK_POLICIES, resource_path
 from bounce_mjx.runs.checkpoints import read_policy
 from bounce_mjx.runs.config import TrainConfig, load_run_config, runs_folder
-from bounce_mjx.runs.folders import best_checkpoint, choose_checkpoint, pretrained_checkpoint
+from bounce_mjx.runs.folders import (
+    MIRROR_LAW,
+    best_checkpoint,
+    choose_checkpoint,
+    is_users_run,
+    pretrained_checkpoint,
+)
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.runs.worlds import in_world
@@ -147,6 +153,16 @@ def test_its_training_command_gives_its_config(shipped: dict, monkeypatch) -> No
         shipped["seed"],
     )
     assert shipped["device"]
+
+
+def test_nothing_is_written_beside_a_policy_of_the_package(tmp_path: Path, monkeypatch) -> None:
+    """Also where it is named by its path, as a terminal completes it in a checkout."""
+    monkeypatch.chdir(resource_path("pretrained").parent)
+    (tmp_path / "link").symlink_to(resource_path("pretrained/robust"))
+    for path in ("robust", "pretrained", "pretrained/robust", "./pretrained/", tmp_path / "link"):
+        assert not is_users_run(choose_checkpoint(Path(path), Path("runs/none")).run), path
+    assert not is_users_run(MIRROR_LAW.run)
+    assert is_users_run(tmp_path)
 
 
 def test_it_is_used_if_there_is_no_run(tmp_path: Path, monkeypatch, capsys) -> None:

@@ -9,6 +9,7 @@ import jax
 import mujoco
 import numpy as np
 import pytest
+import yaml
 
 from against_c import (
     States,
@@ -545,6 +546,8 @@ def test_adopt_prints_each_servo_and_each_change_of_the_world(tmp_path, capsys) 
     line = f"--site tool --out {tmp_path}/arm.yaml {flat}"
     adopt_command.main([f"{tmp_path}/my\narm.xml", *line.split()])
     said = capsys.readouterr().out
+    head, _ = (tmp_path / "arm.yaml").read_text().split("\n", 1)
+    assert head.endswith(f"arm.xml' {line}") and "bounce-mjx adopt '" in head
     robot = read_preset(tmp_path / "arm.yaml").env.robot
     for name, stiffness, damping in zip(
         ARM_JOINTS.split(), robot.servo_stiffness, robot.servo_damping, strict=True
@@ -553,6 +556,26 @@ def test_adopt_prints_each_servo_and_each_change_of_the_world(tmp_path, capsys) 
         assert re.search(rf"  {name}: .* rad, inertia .*, {re.escape(numbers)}\n", said)
     assert "gravity [0.0, 0.0, -1.6], wind [1.0, 0.0, 0.0], density 1.2" in said
     assert "the disabled damper, the disabled actuator groups" in said
+
+
+def test_adopted_servos_follow_within_the_control_steps_of_the_task(tmp_path) -> None:
+    (tmp_path / "arm.xml").write_text(mjcf(arm(), motors(ARM_JOINTS)))
+    (tmp_path / "slow.py").write_text(
+        "from bounce_mjx.task.bounce import Bounce, BounceConfig\n"
+        "class Config(BounceConfig):\n    control_dt: float = 0.02\n"
+        "class Slow(Bounce):\n    Config = Config\n"
+    )
+    flat = "--paddle.position 0 0 0.03 --paddle.quaternion 1 0 0 0"
+    line = f"{tmp_path}/arm.xml --site tool --out {tmp_path}/arm.yaml {flat}"
+    adopt_command.main([*line.split(), "--task", f"{tmp_path}/slow.py:Slow"])
+    written = yaml.safe_load((tmp_path / "arm.yaml").read_text())["env"]["robot"]
+    robot = RobotConfig.model_validate(
+        {"site": "tool", "paddle": {"position": (0, 0, 0.03), "quaternion": (1, 0, 0, 0)}}
+    )
+    expected = adopt(tmp_path / "arm.xml", robot, 0.02, is_mount_given=True).config
+    np.testing.assert_allclose(written["servo_stiffness"], expected.servo_stiffness)
+    quick = adopt(tmp_path / "arm.xml", robot, 0.01, is_mount_given=True).config
+    assert np.all(np.array(expected.servo_stiffness) < 0.5 * np.array(quick.servo_stiffness))
 
 
 def test_no_printed_number_is_minus_0() -> None:

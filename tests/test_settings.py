@@ -328,6 +328,14 @@ def test_a_mapping_on_the_command_line_is_whole(folder: Path, refused) -> None:
     refused("train --randomization.shares gravity 0.5 gravity 1", "has a name twice")
 
 
+def test_the_command_line_takes_the_words_of_a_file_for_null_and_small_numbers() -> None:
+    for word in ("null", "None"):
+        config = read_command(["--eval-every", "3", "--save-every", word]).config
+        assert config.save_every is None and config.sources["save_every"] == "flags"
+    angles = "--default-joint-angles 0 -1e-3 -.5E+0 -2.e-5 0 -0.1".split()
+    assert read_command(angles).config.env.default_joint_angles == (0, -1e-3, -0.5, -2e-5, 0, -0.1)
+
+
 def test_the_source_is_what_set_the_value_that_counts(folder: Path) -> None:
     """A policy brings its task; a world ends a curriculum that it has no use for."""
     config = read_command("--config finetune --warm-start track".split()).config

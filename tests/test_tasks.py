@@ -1,5 +1,6 @@
 """A task is a file among others: of the package, of a user, of another package."""
 
+import json
 import re
 import shlex
 import shutil
@@ -25,8 +26,10 @@ from bounce_mjx.env.env import Env, EnvState
 from bounce_mjx.env.vector import VectorStep
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.metrics import rollout_metrics, step_metrics
-from bounce_mjx.runs.config import CONFIG_FILE, load_run_config
-from bounce_mjx.runs.folders import create_run
+from bounce_mjx.runs import checkpoints
+from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
+from bounce_mjx.runs.files import seal
+from bounce_mjx.runs.folders import create_run, find_checkpoint
 from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.task import registry
 from bounce_mjx.task.registry import find_task, task_name
@@ -355,6 +358,49 @@ def test_a_run_keeps_its_task_which_runs_only_if_the_user_names_it(
     assert said == "Config (0.065, 0.085)\n" and marker.exists()
 
 
+def write_policy(config: TrainConfig) -> Path:
+    """A run with an untrained policy."""
+    shapes = checkpoints.policy_shapes(config)
+    policy = jax.tree.map(lambda shape: jnp.ones(shape.shape, shape.dtype), shapes)
+    return checkpoints.write_run(config, 1, policy)
+
+
+def test_a_checkpoint_is_read_without_the_original_files(mine: Path, tmp_path: Path) -> None:
+    """Its record names the original of the task's file, which nobody has named anew; the run's own
+    copy was named."""
+    config = read_preset(None, task=f"{mine}:Dribble").model_copy(update={"log_dir": tmp_path})
+    run_folder = write_policy(config)
+    marker = tmp_path / "ran"
+    mine.write_text(f"open({str(marker)!r}, 'w')\n")
+
+    def read(run_folder: Path) -> None:
+        config = load_run_config(run_folder, f"{run_folder}/task/mine.py:Dribble")
+        checkpoints.read_policy(find_checkpoint(run_folder), config)
+
+    read(run_folder)
+    assert not marker.exists()
+    mine.unlink()
+    moved = run_folder.rename(tmp_path / "moved")
+    read(moved)
+
+
+def test_a_checkpoint_does_not_bring_code_into_a_run_without(mine: Path, tmp_path: Path) -> None:
+    """Neither a task nor an algorithm, also with a valid manifest."""
+    marker = tmp_path / "ran"
+    mine.write_text(f"open({str(marker)!r}, 'w')\n")
+    config = read_preset(None).model_copy(update={"log_dir": tmp_path})
+    run_folder = write_policy(config)
+    for key in ("task", "algorithm"):
+        (record,) = run_folder.glob("checkpoints/*/record/metadata")
+        stored = json.loads(record.read_text())
+        stored["config"] |= {"task": config.task, "algorithm": "ppo", key: f"{mine}:Dribble"}
+        record.write_text(json.dumps(stored))
+        seal(record.parent.parent)
+        with pytest.raises(UserError, match=f"different config.*differs in {key};"):
+            checkpoints.read_policy(find_checkpoint(run_folder), config)
+    assert not marker.exists()
+
+
 def test_another_file_than_the_runs_is_told(
     mine: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -404,7 +450,9 @@ def test_a_mistake_in_a_tasks_file_names_its_line(tmp_path: Path) -> None:
         find_task(f"{path}:Task")
 
 
-def test_a_package_can_have_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_package_can_have_tasks(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Its entry point gives the task a name, which its runs keep."""
     package = tmp_path / "my_tasks"
     package.mkdir()
@@ -419,6 +467,15 @@ def test_a_package_can_have_tasks(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
     (info / "entry_points.txt").write_text(f"[{registry.GROUP}]\ngone = my_tasks:Gone\n")
     with pytest.raises(UserError, match="the task gone cannot be imported .*; install the package"):
         find_task("gone")
+    # A policy of another task is evaluated all the same, also where the code itself is wrong.
+    (tmp_path / "wrong.py").write_text("undefined")
+    (info / "entry_points.txt").write_text(f"[{registry.GROUP}]\nbad = wrong:Task\n")
+    command, _ = parse_with_commands(EvalCommand, ["robust"], prog="bounce-mjx eval")
+    assert command.checkpoint == Path("robust")
+    said = capsys.readouterr().err
+    assert "warning: the task bad cannot be imported (name 'undefined' is not defined)" in said
+    with pytest.raises(UserError, match="the task bad cannot be imported"):
+        parse_with_commands(EvalCommand, ["--task", "bad"], prog="bounce-mjx eval")
     for attribute in ("Config", "__name__", "task.Task"):
         (info / "entry_points.txt").write_text(f"[{registry.GROUP}]\nno = my_tasks:{attribute}\n")
         words = "cannot be imported" if "." in attribute else "is no subclass of Task; correct the"

@@ -95,6 +95,8 @@ def test_arrays_pass_in_one_block():
     for name, array in layout.unpack(block).items():
         assert array.dtype == arrays[name].dtype
         np.testing.assert_array_equal(array, arrays[name])
+    with pytest.raises(UserError, match="has an array of uint8, and TorchVectorEnv takes four-"):
+        Layout({"bytes": jnp.zeros(3, jnp.uint8)})
     shared = torch.from_dlpack(block)
     for name, view in layout.views(shared).items():
         assert view.untyped_storage().data_ptr() == shared.data_ptr()
@@ -111,6 +113,30 @@ def test_clock_is_a_copy(env):
     given += 7
     env.step(torch.zeros(NUM_ENVS, 6))
     assert env.clock.tolist() == [1, 2, 3, 4]
+    for wrong in (torch.zeros(NUM_ENVS + 1), torch.zeros(NUM_ENVS, 1), torch.tensor(3)):
+        with pytest.raises(UserError, match=r"clock has the shape .*must have \(4,\)"):
+            env.clock = wrong
+    assert env.clock.tolist() == [1, 2, 3, 4]
+
+
+def test_a_warm_up_goes_on_through_the_resets_of_a_training():
+    """skrl resets a single environment after each episode; only a seed begins anew."""
+    growing = {"first_command_range": 0.01, "warmup_steps": NUM_ENVS * 5}
+    config = EnvConfig(physics="fused", target_height_range=(0.5, 0.9), randomization=growing)
+    env = TorchVectorEnv(BounceBall(config), NUM_ENVS)
+
+    def spread() -> float:
+        heights = env.reset()[0][:, 28]
+        return float(heights.max() - heights.min())
+
+    assert spread() < 0.01
+    assert spread() < 0.01
+    for _ in range(5):
+        env.step(torch.zeros(NUM_ENVS, 6))
+    assert spread() > 0.05
+    assert spread() > 0.05
+    env.reset(seed=0)
+    assert spread() < 0.01
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
@@ -190,6 +216,8 @@ def test_wrong_environment_is_refused(task):
         TorchVectorEnv(task, NUM_ENVS, critic_metrics=("bounces",))
     with pytest.raises(UserError, match="call reset first"):
         TorchVectorEnv(task, NUM_ENVS).step(torch.zeros(NUM_ENVS, 6))
+    with pytest.raises(UserError, match="call reset first"):
+        _ = TorchVectorEnv(task, NUM_ENVS).clock
 
 
 def test_rsl_rl_gets_time_outs_and_terminal_observations(env):

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from bounce_mjx.deploy.environments import environment_config
+from bounce_mjx.deploy.environments import environment_config, refuse_warmup
 from bounce_mjx.env.env import Env, State
 from bounce_mjx.errors import needed
 from bounce_mjx.task.task import Task
@@ -61,7 +61,10 @@ class GymnaxBounceBall:
         Raises:
           UserError: a setting is wrong, or the policy's environment has another value.
         """
-        self.task = Env(environment_config(self.name, task, policy, world, settings))
+        config = environment_config(self.name, task, policy, world, settings)
+        refuse_warmup(config, self.name)
+        self.task = Env(config)
+        """The environment; its own `task` is the task."""
         self.default_params = EnvParams(self.task.config.episode_steps)
         """The time limit of the settings."""
         self.num_actions = self.task.action_size
@@ -107,6 +110,7 @@ class GymnaxBounceBall:
         stepped = self.task.step(state.env, action)
         time = state.time + 1
         terminated = stepped.done > 0
+        # Never both, as in `env/vector.py`; gymnax's own environments may say both.
         truncated = (time >= limit) & ~terminated
         next_state = jax.tree.map(
             lambda new, old: jnp.where(terminated | truncated, new, old),

@@ -1,8 +1,8 @@
 """The domain randomisation of brax and MuJoCo Playground on this project's physics.
 
 Their `randomization_fn` returns a MuJoCo model with a batch axis in some fields. The entries that
-differ between environments become `PhysicsParameters.entries`, of which the fused engine refuses
-the name of one that it does not read.
+differ between environments become `PhysicsParameters.entries`; the fused engine refuses those that
+it does not read.
 """
 
 import dataclasses
@@ -22,6 +22,7 @@ from bounce_mjx.physics.edited import INSEPARABLE, edited
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS, PhysicsParameters
 from bounce_mjx.physics.scalars import scalars_of
 from bounce_mjx.robot.model import find_addresses
+from bounce_mjx.robot.numbers import field_of
 from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.world.randomization import TERMS, RandomizationConfig
 from bounce_mjx.world.sampling import nominal_values, physics_parameters, sample_world
@@ -49,7 +50,7 @@ def domain_randomize(
 
     Args:
       mj_model: the environment's model.
-      model: brax's system or MJX's model, made of it.
+      model: brax's system or MJX's model of it; brax's draws some shapes in another size.
       rng: keys [B].
       config: ranges and shares of the terms, of which only those that change the physics act; None
         for `default_terms`.
@@ -80,27 +81,34 @@ def domain_randomize(
         )
         parameters = scalars_of(physics_parameters(world, mj_model), dtype)
         world_model = edited(mj_model, addresses, parameters)
-        # The fields with entries of their own.
-        fields = [name for name in world_model.fields if world_model.rows(name)]
-        return {name: world_model.array(name) for name in fields}
+        fields = {}
+        for name in world_model.fields:
+            # A field that only follows from others has none.
+            rows = world_model.rows(name)
+            if rows:
+                values = jnp.asarray(field_of(model, name))
+                is_edited = np.isin(np.arange(len(values)), rows)
+                is_edited = is_edited.reshape(-1, *[1] * (values.ndim - 1))
+                fields[name] = jnp.where(is_edited, world_model.array(name), values)
+        return fields
 
     fields = jax.jit(jax.vmap(sample))(rng)
     axes = jax.tree.map(lambda _: None, model)
     return model.tree_replace(fields), axes.tree_replace(dict.fromkeys(fields, 0))
 
 
-def parameters_of(mj_model: mujoco.MjModel, base: Any, model: Any) -> PhysicsParameters:
+def parameters_of(base: Any, model: Any) -> PhysicsParameters:
     """The entries of one environment's randomised model that differ from the environment's own.
 
-    What MuJoCo's compiler derives from them, such as an inertia from a mass, follows by itself.
+    What MuJoCo's compiler derives from them, such as an inertia from a mass, follows by itself. The
+    physics refuses the name of an entry that is none of MuJoCo's.
 
     Args:
-      mj_model: the environment's model.
-      base: brax's system or MJX's model, made of it.
+      base: the environment's own brax system or MJX model.
       model: `base` with other values, as in `jax.vmap` over a batch of models.
 
     Raises:
-      UserError: a changed field is none of MuJoCo's, or the values are not known.
+      UserError: the values are not known.
     """
     before = dict(_fields_of(base))
     changed = {
@@ -110,6 +118,7 @@ def parameters_of(mj_model: mujoco.MjModel, base: Any, model: Any) -> PhysicsPar
     }
     entries = {}
     for name, batch in _batches(changed).items():
+        # Of an entry that varies, the value of this environment is in the model.
         varied = np.any(batch != np.asarray(before[name]), axis=0)
         if name in INSEPARABLE:
             varied |= varied.any(axis=1, keepdims=True)
@@ -118,12 +127,12 @@ def parameters_of(mj_model: mujoco.MjModel, base: Any, model: Any) -> PhysicsPar
     return PhysicsParameters(entries=entries or None)
 
 
-def randomized_task(task: Env, mj_model: mujoco.MjModel, base: Any, model: Any) -> Env:
+def randomized_task(task: Env, base: Any, model: Any) -> Env:
     """The environment in the physics of a randomised model; itself if the model changes nothing.
 
-    The arguments after the task, and the errors, are those of `parameters_of`.
+    The models and the errors are those of `parameters_of`.
     """
-    parameters = parameters_of(mj_model, base, model)
+    parameters = parameters_of(base, model)
     if parameters == MODEL_PARAMETERS:
         return task
     return Env(task.config, randomize=lambda key: parameters)
@@ -148,7 +157,7 @@ def _equal(a: Any, b: Any) -> bool:
 
 
 def _batches(fields: Fields) -> Fields:
-    """The values of the fields in all environments, the batch in front.
+    """The values [B, ...] of the fields in all environments, or [1, ...] where these share one.
 
     Inside `jax.vmap`, the value of one environment is a tracer. The vmap rule of a function gets
     the array behind it, with all environments.
@@ -173,6 +182,7 @@ def _batches(fields: Fields) -> Fields:
 
     traced = [name for name, value in fields.items() if isinstance(value, jax.core.Tracer)]
     if traced:
+        # For its vmap rule alone, which fills `batches`.
         probe([fields[name] for name in traced])
     if batches.keys() != set(traced):
         raise UserError(

@@ -23,8 +23,8 @@ class Sb3VecEnv(VecEnv):
     """B environments in one compiled step; an ended episode is reset within the step that ends it.
 
     The info of an ended episode has `terminal_observation`, `TimeLimit.truncated`, the metrics of
-    its last step, and its statistics as `episode`, as from SB3's `Monitor`. Other infos are empty,
-    because many dictionaries would take longer than the physics.
+    its last step, and its statistics as `episode`, as from SB3's `Monitor`. Other infos have
+    `TimeLimit.truncated` alone, because many entries would take longer than the physics.
     """
 
     def __init__(self, num_envs: int = 256, **settings: Any):

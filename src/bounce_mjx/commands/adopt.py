@@ -54,15 +54,17 @@ def main(args: Sequence[str]) -> None:
     robot = RobotConfig(site=command.site, joints=command.joints, paddle=command.paddle)
     chosen = command.paddle.model_dump(exclude_defaults=True)
     is_mount_given = "position" in chosen or "quaternion" in chosen
-    adoption = adopt(command.mjcf, robot, WorldConfig().control_dt, is_mount_given)
+    # The servos must follow within the control steps of the task.
+    adoption = adopt(command.mjcf, robot, task.Config().control_dt, is_mount_given)
     settings = _settings(command, adoption, task)
     config = validate(TrainConfig, settings, str(command.mjcf))
     env = Env(config.env)
     for line in describe(adoption):
         print(line)
     print(f"physics: {env.engine.name} ({env.engine.reason})")
-    out = command.out or Path(f"{command.mjcf.stem}.yaml")
-    write_output(out, _as_yaml(command, settings))
+    # Of menagerie:NAME, the name.
+    out = command.out or Path(f"{command.mjcf.stem.rpartition(':')[2]}.yaml")
+    write_output(out, _as_yaml(args, settings))
     print(f"config: {out}")
     flags = ["--robot", str(out)]
     if command.task != DEFAULT:
@@ -86,9 +88,9 @@ def _settings(command: AdoptCommand, adoption: "Adoption", task: type[Task]) -> 
     return {"task": command.task, "env": env}
 
 
-def _as_yaml(command: AdoptCommand, settings: dict[str, Any]) -> str:
+def _as_yaml(args: Sequence[str], settings: dict[str, Any]) -> str:
     """The config file, which begins with the command that wrote it."""
-    head = f"An arm with a paddle: bounce-mjx adopt {command.mjcf} --site {command.site}"
+    head = f"An arm with a paddle: {shlex.join(['bounce-mjx', 'adopt', *args])}"
     # A path may have a line break, which would end the comment.
     head = " ".join(head.splitlines())
     text = yaml.safe_dump(settings, sort_keys=False, default_flow_style=None, width=100)

@@ -38,8 +38,9 @@ class EvalCommand(WhichPolicy):
     seed: NonNegativeInt = evaluation.DEFAULT_SEED
     """Seed of the resets."""
     nominal: bool = False
-    """Evaluate without domain randomisation, with the task's default commands where the policy was
-    trained with them; else each episode samples its world and commands, as in training."""
+    """Evaluate without domain randomisation, and with the task's default commands where the policy
+    was trained with them. Without this flag, each episode samples its world and commands, as in
+    training."""
     contacts: bool = False
     """Also count contacts of the arm with itself and the floor, which the physics leaves out, in
     the first 32 episodes."""
@@ -75,6 +76,7 @@ def main(args: Sequence[str]) -> None:
     check_output(command.json_file, "--json")
     console = stdout()
     check_one_world(command.nominal, command.world, command.randomization)
+    command.check_log_dir(command.checkpoint)
     checkpoint = command.choose(command.checkpoint, command.robot)
     config = command.config_of(checkpoint, command.robot, command.world)
     config = in_what_if_world(config, command.randomization)

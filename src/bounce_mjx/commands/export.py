@@ -29,11 +29,12 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.training.setup import set_up_jax
 
     check_output(command.onnx, "--onnx")
+    command.check_log_dir(command.checkpoint)
     set_up_jax()
     checkpoint = choose_checkpoint(command.checkpoint, command.folder)
-    print(f"checkpoint: {checkpoint.folder} ({checkpoint.steps:,} steps)")
     # Refuses a run of a task in a file that --task does not name.
     command.config_of_run(checkpoint.run)
+    print(f"checkpoint: {checkpoint.folder} ({checkpoint.steps:,} steps)")
     content = export_onnx(checkpoint)
     write_output(command.onnx, content)
     print(f"written: {command.onnx} ({len(content) / 1000:.0f} kB)")

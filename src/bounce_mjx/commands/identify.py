@@ -27,7 +27,7 @@ class IdentifyCommand(StrictModel):
     """Look at the logs alone: name their faults and draw them on the page, without a fit."""
     force: bool = False
     """Fit logs with faults, and write a world that does not explain them, with that sentence in
-    it."""
+    it, or compare it (--check)."""
     check: Path | None = None
     """World that was identified earlier; compare the logs with it, and write nothing."""
     camera_rotation: NonNegative = 0.0
@@ -45,7 +45,7 @@ def main(args: Sequence[str]) -> None:
     command = parse(IdentifyCommand, args, prog="bounce-mjx identify")
     if not command.logs:
         raise UserError("no log is given; name the CSV files or bags to identify from")
-    from bounce_mjx.identify.doctor import describe, examine
+    from bounce_mjx.identify.inspection import describe, examine
     from bounce_mjx.identify.reading import read_log
     from bounce_mjx.identify.stages import identify, join
     from bounce_mjx.identify.world import (
@@ -85,7 +85,8 @@ def main(args: Sequence[str]) -> None:
     if known is None:
         write_output(page, inspection_page(logs, checkups))
     if command.inspect:
-        print(str(page))
+        if known is None:
+            print(str(page))
         sys.exit(2 if faults else 0)
     if faults and not command.force:
         raise UserError(
@@ -101,12 +102,17 @@ def main(args: Sequence[str]) -> None:
         print(f"{entry.label}: {entry.value:.5g}, {interval}{seen}")
     for line in sentences(found, names):
         print(line)
+    doubts = [*map(str, faults), *describe_doubts(found, names)]
     if known is not None:
+        if doubts and not command.force:
+            raise UserError(
+                f"the log cannot be compared with {command.check}, because no world explains it: "
+                f"{doubts[0]} Compare all the same with --force"
+            )
         changed = compare(known, found, names)
         for line in changed or [f"the robot still matches {command.check}"]:
             print(line)
         sys.exit(1 if changed else 0)
-    doubts = [*map(str, faults), *describe_doubts(found, names)]
     write_output(page, identification_page(found, logs, checkups, names, command.out, doubts))
     print(str(page))
     if doubts and not command.force:

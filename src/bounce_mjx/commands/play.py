@@ -66,6 +66,7 @@ def main(args: Sequence[str]) -> None:
     command, given_commands = parse_with_commands(PlayCommand, args, prog="bounce-mjx play")
     if len(command.checkpoints) > MAX_ENVS:
         raise UserError(f"{len(command.checkpoints)} policies are given; give at most {MAX_ENVS}")
+    command.check_log_dir(*command.checkpoints or (None,))
     check_one_world(command.nominal, command.world, command.randomization)
     if "suite" in command.model_fields_set and command.condition is None:
         raise UserError("--suite is that of a condition; add --condition, or omit --suite")

@@ -29,6 +29,7 @@ def main(args: Sequence[str]) -> None:
     command = parse(PlotCommand, args, prog="bounce-mjx plot")
     from bounce_mjx.runs.folders import find_checkpoint, runs_of_seeds
 
+    command.check_log_dir(*command.runs or (None,))
     runs = [command.choose_run(run) for run in command.runs or (None,)]
     seeds = [seed for run in runs for seed in runs_of_seeds(run)]
     checkpoints = [find_checkpoint(seed) for seed in seeds]

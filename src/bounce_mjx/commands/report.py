@@ -6,6 +6,7 @@ from typing import Annotated
 
 from bounce_mjx.commands.which_policy import WhichPolicy
 from bounce_mjx.config.command_line import Flag, parse
+from bounce_mjx.errors import UserError
 
 
 class ReportCommand(WhichPolicy):
@@ -20,7 +21,12 @@ def main(args: Sequence[str]) -> None:
     command = parse(ReportCommand, args, prog="bounce-mjx report")
     from bounce_mjx.runs.folders import find_checkpoint
 
-    checkpoint = find_checkpoint(command.choose_run(command.run))
+    command.check_log_dir(command.run)
+    run = command.choose_run(command.run)
+    checkpoint = find_checkpoint(run)
+    # With several seeds, that of the best one lies below the run.
+    if checkpoint.run.absolute() in run.absolute().parents:
+        raise UserError(f"a report is of a run's best checkpoint; give {checkpoint.run}, not {run}")
     config = command.config_of_run(checkpoint.run)
 
     # These take seconds, which a mistake in the words above should not.

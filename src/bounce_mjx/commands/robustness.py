@@ -65,6 +65,7 @@ def main(args: Sequence[str]) -> None:
     if command.assumed and "suite" in command.model_fields_set:
         raise UserError("--assumed leaves the suite out; omit --suite, or --assumed")
     console = stdout()
+    command.check_log_dir(command.checkpoint)
     checkpoint = command.choose(command.checkpoint, command.robot)
     config = command.config_of(checkpoint, command.robot)
     path, conditions, num_assumed = suite_conditions(command.suite, config, command.world)

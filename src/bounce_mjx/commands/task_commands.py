@@ -9,7 +9,7 @@ from bounce_mjx.commands.which_policy import WhichPolicy
 from bounce_mjx.config.command_line import Flag, flag_names, parse, read_flags, typed
 from bounce_mjx.config.files import flat
 from bounce_mjx.config.settings import fields_in
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import UserError, warn_once
 from bounce_mjx.task.registry import find_task, registered_tasks
 from bounce_mjx.world.config import Command, WorldConfig
 
@@ -71,7 +71,13 @@ def _fields_of(task: str | None) -> dict[str, FieldInfo]:
     commands: dict[str, Command] = {}
     # Without --task, the run may be of any task.
     for name in [task] if task else registered_tasks():
-        commands |= find_task(name).Config().commands
+        try:
+            commands |= find_task(name).Config().commands
+        except UserError as error:
+            if task:
+                raise
+            # The run is hardly of a task of another package that is broken.
+            warn_once(f"{error}; its commands are no flags")
     fields = {}
     for name, command in commands.items():
         flag = Flag(metavar="|".join(command.names) or command.unit.upper() or "FLOAT")

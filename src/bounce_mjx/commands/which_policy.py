@@ -149,8 +149,22 @@ class WhichPolicy(StrictModel):
 
     @property
     def folder(self) -> Path:
-        """Folder in which to look for the newest run."""
+        """`log_dir`, or the folder of the task's runs."""
         return self.log_dir or run_configs.runs_folder(find_task(self.task or DEFAULT))
+
+    def check_log_dir(self, *paths: Path | None) -> None:
+        """Refuses a folder in which to look for the newest run where the user names every policy.
+
+        Raises:
+          UserError: --log-dir is given, and no path stands for the newest run.
+        """
+        from bounce_mjx.runs.folders import is_newest
+
+        if self.log_dir is not None and not any(map(is_newest, paths)):
+            raise UserError(
+                f"--log-dir is where the newest run is looked for, and {paths[0]} is named; omit "
+                "one of them"
+            )
 
     def choose(self, path: Path | None, robot: Path | None = None) -> "Checkpoint":
         """`choose_checkpoint`, or `MIRROR_LAW` for the word mirror.

@@ -4,6 +4,7 @@ import argparse
 import re
 import types
 from collections.abc import Mapping, Sequence
+from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, NoReturn, TypeVar
 
@@ -18,6 +19,10 @@ from bounce_mjx.errors import UserError, suggest
 
 CommandT = TypeVar("CommandT", bound=pydantic.BaseModel)
 
+# Words for a setting without a value: that of YAML and of the help, and Python's.
+_NO_VALUE = ("null", "None")
+# A negative number with an exponent.
+_SMALL_NUMBER = re.compile(r"-(\d+\.?\d*|\.\d+)[eE][+-]?\d{1,3}")
 # Columns: more than any table or line has.
 _NO_WRAP = 100_000
 
@@ -161,11 +166,14 @@ def read_flags(
 
 def plain_words(args: Sequence[str]) -> list[str]:
     """The words of a command line with each flag in one spelling: --num-envs for --num_envs,
-    --report for --report=true, and --no-report for --report=false."""
+    --report for --report=true, and --no-report for --report=false. A negative number is without an
+    exponent, -0.001 for -1e-3, which argparse takes for a flag."""
     return [_plain_word(word) for word in args]
 
 
 def _plain_word(word: str) -> str:
+    if _SMALL_NUMBER.fullmatch(word):
+        return f"{Decimal(word):f}"
     if not word.startswith("--"):
         return word
     flag, equals, value = word.partition("=")
@@ -262,13 +270,14 @@ def _add_arguments(
 def _help_of(field: FieldInfo, default: Any, is_short: bool) -> str:
     """A flag's help: the docstring of its setting, of which a short help has the first sentence,
     and the default value."""
-    text = " ".join((field.description or "").split()).replace("%", "%%")
+    text = " ".join((field.description or "").split())
     if is_short:
         text = re.split(r"(?<=[\w)])[.;] ", text)[0].rstrip(".")
-    if default is False or default in (None, ()):
-        return text
-    words = " ".join(map(str, default)) if isinstance(default, tuple) else default
-    return f"{text} (default: {words})"
+    if default is not False and default not in (None, ()):
+        words = " ".join(map(str, default)) if isinstance(default, tuple) else default
+        text = f"{text} (default: {words})"
+    # To argparse, a single one begins a name.
+    return text.replace("%", "%%")
 
 
 def _options_of(field: FieldInfo, mark: Flag) -> dict[str, Any]:
@@ -290,8 +299,8 @@ def _is_list(kind: Any) -> bool:
 
 
 def _plain(kind: Any, given: bool | str | list[str]) -> Any:
-    """The words of a setting as pydantic reads them; those of a mapping as a list, or None. A list
-    may also have commas, except where a file's name may."""
+    """The words of a setting as pydantic reads them, or None; those of a mapping as a list, from
+    which `_pairs` makes it. A list may also have commas, except where a file's name may."""
     if isinstance(given, bool):
         return given
     kinds = set(types_in(kind))
@@ -300,7 +309,7 @@ def _plain(kind: Any, given: bool | str | list[str]) -> Any:
     for word in [given] if isinstance(given, str) else given:
         parts += word.split(",") if is_list and Path not in kinds else [word]
     if type(None) in kinds:
-        parts = [None if part == "None" else part for part in parts]
+        parts = [None if part in _NO_VALUE else part for part in parts]
     return parts if is_list and parts != [None] else parts[0]
 
 

@@ -74,7 +74,7 @@ Steps = Annotated[int, _WholeNumber, Field(ge=1, le=10**12)]
 
 
 class StrictModel(pydantic.BaseModel):
-    """An immutable, strict group of settings."""
+    """An immutable group of settings, which refuses unknown keys."""
 
     model_config = pydantic.ConfigDict(
         frozen=True, extra="forbid", use_attribute_docstrings=True, validate_default=True
@@ -115,8 +115,8 @@ class Layer(NamedTuple):
     values: dict[str, Any]
     """Nested, with the keys of `TrainConfig`."""
     is_world: bool = False
-    """Whether it replaces all terms of the randomisation. What a preset's curriculum says of the
-    terms that there were then ends, see `without_idle_curriculum`."""
+    """Whether it replaces all terms of the randomisation. A preset's curriculum of terms that this
+    world does not have is dropped (`without_idle_curriculum`)."""
     whole: tuple[str, ...] = ()
     """Dotted keys of what it brings whole: also of a mapping, such as `shares`, nothing remains of
     the layers below."""

@@ -70,12 +70,8 @@ def environment_config(
         if world is not None:
             raise UserError(f"{title}: world is that of a policy, and none is given; give policy")
         return validate(task_config(task or DEFAULT), settings, title)
-    on_top = {}
-    for key, value in settings.items():
-        is_group = isinstance(value, pydantic.BaseModel)
-        on_top[key] = value.model_dump() if is_group else value
-    trained = policy_environment(policy, task, world, on_top.get("mjcf"))
-    config = validate(type(trained), merged(trained.model_dump(), on_top), title)
+    trained = policy_environment(policy, task, world, settings.get("mjcf"))
+    config = with_settings(trained, settings, title)
     check_interface(
         interface_of(trained),
         interface_of(config),
@@ -83,6 +79,33 @@ def environment_config(
         "leave these settings out, or make the environment without the policy",
     )
     return config
+
+
+def with_settings(config: WorldConfig, settings: dict[str, Any], title: str) -> WorldConfig:
+    """A config with fields on top. A group that is given in part keeps the other values.
+
+    Raises:
+      UserError: a setting is wrong.
+    """
+    on_top = {}
+    for key, value in settings.items():
+        is_group = isinstance(value, pydantic.BaseModel)
+        on_top[key] = value.model_dump() if is_group else value
+    return validate(type(config), merged(config.model_dump(), on_top), title)
+
+
+def refuse_warmup(config: WorldConfig, title: str) -> None:
+    """Refuses the settings of a warm-up in an environment that has no count of a training's steps,
+    over which its ranges would grow.
+
+    Raises:
+      UserError: they have one.
+    """
+    if config.randomization.warmup_steps:
+        raise UserError(
+            f"{title}: the randomisation has warmup_steps, but its ranges do not grow here; set "
+            "warmup_steps to 0 and first_command_range to 1, or train with TorchVectorEnv"
+        )
 
 
 def settings_class(

@@ -18,6 +18,7 @@ from bounce_mjx.env.checks import (
     check_tags,
     check_task,
 )
+from bounce_mjx.errors import UserError
 from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState
 from bounce_mjx.physics.engine import Engine, make_engine
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
@@ -264,7 +265,15 @@ class Env:
         The action becomes the servos' targets, which latency and lag delay (`Actuators.next`); the
         physics takes its steps; the task judges the true state under the command that the policy
         has seen; then commands change, the clock moves on, and the sensors measure.
+
+        Raises:
+          UserError: the action has another shape, which NumPy's rules would spread over the joints.
         """
+        if jnp.shape(action) != (self.action_size,):
+            raise UserError(
+                f"the action has the shape {jnp.shape(action)}; give {(self.action_size,)} for one "
+                "environment, and batch environments with jax.vmap"
+            )
         robot_model.check_unedited(self.mj_model, self._fingerprint)
         before = state.pipeline_state
         control, actuation = self.control(before, action)

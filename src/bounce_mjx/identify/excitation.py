@@ -26,6 +26,8 @@ _FAST = (0.6, 10.0)
 _RAMP = 0.5
 # Distance from the ends of a joint's range, rad.
 _FROM_END = 0.02
+# Least distance from there that the lift leaves a joint, rad.
+_ROOM = 0.1
 # Share of a limit that targets use.
 _BELOW_LIMIT = 0.9
 _TOGETHER = (0.53, 0.71, 0.89, 1.13, 1.37, 1.61, 1.83, 2.11)
@@ -74,8 +76,18 @@ def excite(
     bounds = _BELOW_LIMIT * np.array([[np.inf] * n if x is None else x for x in given])
     bounds[0] = np.minimum(bounds[0], max_velocity)
     low, high = joint_ranges(model, find_addresses(model))
-    centre = _lift_paddle(model, home, low + _FROM_END, high - _FROM_END)
+    # Lifted, each joint has room to both sides, or as much as in the start pose.
+    reach = _FROM_END + _ROOM
+    lowest = np.minimum(low + reach, home)
+    highest = np.maximum(high - reach, home)
+    centre = _lift_paddle(model, home, lowest, highest)
     room = np.minimum(centre - low, high - centre) - _FROM_END
+    if np.min(room) < _SMALLEST_AMPLITUDE:
+        joint = int(np.argmin(room))
+        raise UserError(
+            f"{names[joint]} cannot move, as it starts at {home[joint]:.3g} rad and its range is "
+            f"{low[joint]:.3g} to {high[joint]:.3g} rad; change default_joint_angles"
+        )
     amplitudes = np.minimum(_LARGEST_AMPLITUDE, room)
     contacts = ContactChecker(config, MARGIN, table_height)
     # Parts of the arm that overlap or nearly touch in its start pose are modelled so.
@@ -88,7 +100,7 @@ def excite(
         )
     times = np.arange(round(seconds / dt)) * dt
     lifting = max(_LIFTING, _time_of_step(np.abs(centre - home), bounds))
-    if times[-1] < 2.0 * lifting + 1.0 * n:
+    if not len(times) or times[-1] < 2.0 * lifting + 1.0 * n:
         raise UserError(
             f"{seconds:g} s are too short to move {n} joints; give at least "
             f"{2.0 * lifting + 1.0 * n:.0f} s"

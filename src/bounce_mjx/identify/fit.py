@@ -99,6 +99,8 @@ class Problem(NamedTuple):
     see `correlation_times`."""
     progress: Callable[[str], None] = lambda line: None
     """Called with a line about each step of a search."""
+    gravity_compensation: float = 0.0
+    """Share of the arm's weight that its controller carries, if more than the model's own."""
     has_lift: bool = False
     """Whether spin lifts the ball; the spin after a bounce then is as free as that before it."""
     leaves_at_once: bool = False
@@ -188,7 +190,8 @@ def minimise(
     free_states: np.ndarray | None = None,
 ) -> Fit:
     """Steps of Levenberg and Marquardt from a fit, until one lowers the cost by less than 0.3, a
-    fraction of what a change of the unknowns by their deviation does.
+    fraction of what a change of the unknowns by their deviation does, or by less than 2e-5 of it.
+    The cost is infinite if the simulation diverges at the fit.
 
     Args:
       stages: those whose unknowns may change; of none, the starts alone.
@@ -216,6 +219,9 @@ def minimise(
         vector = fit.vector
         starts = fit.starts
         line = _linearise(problem, vector, starts, unknowns, entries, weights)
+        if not np.all(np.isfinite(line.white)):
+            # The simulation diverges.
+            return Fit(vector, starts, line.predicted, weights, np.inf)
         now = float(np.sum(data_costs(line.white[None], starts[None])) + prior_costs(vector))
         fit = Fit(vector, starts, line.predicted, weights, now)
         vectors, states = _list_trials(problem, fit, line, unknowns, entries, used)
@@ -230,7 +236,8 @@ def minimise(
             # Of the best damping, each window takes the share that suits it.
             best = damping * len(_SHARES) + np.argmin(costs[damping], axis=0)
             fit = Fit(
-                vector=vectors[best[0]],
+                # All shares of a damping have the same unknowns.
+                vector=vectors[damping * len(_SHARES)],
                 starts=states[best, windows],
                 predicted=outcome[best, windows],
                 weights=weights,
@@ -298,6 +305,8 @@ def _bounded_step(hessian: np.ndarray, slope: np.ndarray, room: np.ndarray) -> n
     Args:
       room: smallest and largest change [2, F].
     """
+    if not len(slope):
+        return slope
     root = np.linalg.cholesky(hessian).T
     target = -np.linalg.solve(root.T, slope)
     low = np.minimum(room[0], 0.0)
@@ -306,12 +315,15 @@ def _bounded_step(hessian: np.ndarray, slope: np.ndarray, room: np.ndarray) -> n
     return inside.x
 
 
-def certainty(problem: Problem, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+def certainty(
+    problem: Problem, fit: Fit, is_estimated: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Information [P, P] of a log about the unknowns at a minimum, without the prior, and their
-    covariance [P, P], with it.
+    covariance [P, P], with it. What was not estimated has the prior's deviation.
 
     In units of the prior's deviations, window s has the derivatives J_s [M, P] and the gradient
-    g_s = J_s' r_s, after its start is eliminated (`_eliminate`).
+    g_s = J_s' r_s, after its start is eliminated (`_eliminate`). The residuals r_s are those at the
+    minimum, and the derivatives are taken where latency and lag differ (`Layout.interior`).
 
     *Information.* A bounce depends on where in a physics step it begins, which makes derivatives
     noisy, and J_s' J_s would count their noise as information. J1 and J2, by central differences
@@ -328,6 +340,10 @@ def certainty(problem: Problem, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
     multi-stage samples"). With C = R R' and the leverage H_s = R' A_s R, this is R' g_s ->
     (I - H_s)^-1/2 R' g_s. The result is C with each deviation widened to that of the sandwich,
     where that one is larger.
+
+    Args:
+      is_estimated: which unknowns [P] are at the minimum; no search has moved the others from their
+        prior mean, or from the number that was chosen for them.
     """
     layout = problem.layout
     deviations, _, searched = problem.scale_starts()
@@ -359,7 +375,9 @@ def certainty(problem: Problem, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
     independent = root @ root.T
     scatter = _symmetrise(gradients[0].T @ gradients[1]) + np.diag(1.0 / (values + 1.0))
     sandwich = root @ scatter @ root.T
-    wider = np.sqrt(np.maximum(np.diag(sandwich) / np.diag(independent), 1.0)) * scale
+    variance = np.maximum(np.diag(sandwich), np.diag(independent))
+    variance = np.where(is_estimated, variance, np.maximum(variance, 1.0))
+    wider = np.sqrt(variance / np.diag(independent)) * scale
     information = (vectors * values) @ vectors.T
     return information / np.outer(scale, scale), independent * np.outer(wider, wider)
 
@@ -491,11 +509,13 @@ def _linearise(
         states[i][:, at] += difference.steps[~is_unknown]
     predicted = problem.simulate(vectors, states, np.array(used))
     white = problem.whiten(predicted, weights)
+    # A window whose simulation diverges there has no derivative.
+    changed = np.where(np.isfinite(white), white, white[0])
     jacobian = np.zeros((*white.shape[1:], num_free + len(entries)))
     for i, difference in enumerate(differences, 1):
         changes = zip(difference.columns, difference.steps, difference.rows, strict=True)
         for column, step, rows in changes:
-            jacobian[:, rows, column] = (white[i] - white[0])[:, rows] / step
+            jacobian[:, rows, column] = (changed[i] - white[0])[:, rows] / step
     return _Linearisation(
         predicted=predicted[0],
         white=white[0],
@@ -562,7 +582,12 @@ def _multiply(columns: np.ndarray) -> np.ndarray:
 def angle_weights(problem: Problem, predicted: np.ndarray) -> np.ndarray:
     """Weights [S, A, n] of the joint angles: less for outliers."""
     residuals = problem.windows.split(predicted)[0] - problem.windows.angles
-    size = np.abs(residuals) / problem.noise.angles
+    return _huber_weights(np.abs(residuals) / problem.noise.angles)
+
+
+def _huber_weights(size: np.ndarray) -> np.ndarray:
+    """Weights of residuals of a size in units of their noise; 0 where a simulation diverges."""
+    size = np.where(np.isfinite(size), size, np.inf)
     return np.minimum(1.0, _HUBER / np.maximum(size, 1e-9))
 
 
@@ -597,7 +622,7 @@ def picture_weights(problem: Problem, predicted: np.ndarray) -> np.ndarray:
     white = problem.windows.split(problem.whiten(predicted, problem.weights()))[1]
     size = np.max(np.abs(white), axis=2)
     flies = flight_errors(problem, predicted, problem.windows.picture_weights) < NO_FLIGHT
-    return np.minimum(1.0, _HUBER / np.maximum(size, 1e-9)) * flies[:, None]
+    return _huber_weights(size) * flies[:, None]
 
 
 def flight_errors(problem: Problem, predicted: np.ndarray, pictures: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from bounce_mjx.identify.log import JOINT_GAP, Log
+from bounce_mjx.identify.log import Log, find_gaps
 
 SETTLING = 0.3
 """Time after the start of a log, or a gap, until the arm has forgotten the unknown commands before
@@ -34,12 +34,28 @@ class Following(NamedTuple):
     """Root mean square [n] of what is left, without outliers, rad."""
 
 
+def find_unknown(log: Log) -> list[tuple[float, float]]:
+    """Begin and end (s) of each stretch in which the arm is not measured, or may still follow
+    targets that the log lacks: around the log, and from each gap of the joint angles or the servo
+    targets until the arm has settled after it."""
+    begin = max(log.times[0], log.target_times[0])
+    stretches = [(-np.inf, begin + SETTLING), (float(log.times[-1]), np.inf)]
+    for times in (log.times, np.append(log.target_times, max(log.times[-1], log.target_times[-1]))):
+        stretches += [(last, first + SETTLING) for last, first in find_gaps(times)]
+    return stretches
+
+
+def is_known(log: Log, times: np.ndarray) -> np.ndarray:
+    """Which times [T] are in no stretch of `find_unknown`."""
+    begins, ends = np.sort(np.array(find_unknown(log)).T)
+    begun = np.searchsorted(begins, times, side="left")
+    ended = np.searchsorted(ends, times, side="right")
+    return begun == ended
+
+
 def find_settled(log: Log) -> np.ndarray:
-    """Which joint angles [T] no longer depend on the targets before the log or in a gap."""
-    begins = log.times[np.flatnonzero(np.diff(log.times) > JOINT_GAP) + 1]
-    begins = np.concatenate([[max(log.times[0], log.target_times[0])], begins])
-    last = np.maximum(np.searchsorted(begins, log.times, side="right") - 1, 0)
-    return log.times - begins[last] >= SETTLING
+    """Which joint angles [T] depend on no targets that the log lacks."""
+    return is_known(log, log.times)
 
 
 def does_move(log: Log) -> bool:
@@ -104,7 +120,7 @@ def set_points(log: Log, following: Following, dt: float) -> Log:
 
 
 def _hold(log: Log) -> float:
-    """Mean time for which a command has been held, s."""
+    """Mean time for which a command has been held when it acts, s: half of a control step."""
     return 0.5 * float(np.median(np.diff(log.target_times)))
 
 

@@ -14,11 +14,14 @@ _BEYOND_RANGE = 0.5
 _LARGEST_ANGLE = 4.0 * np.pi
 _FARTHEST_BALL = 20.0
 _LONGEST_STEP = 0.2
+# A control step, s, by which the unit of longer ones is guessed.
+_USUAL_STEP = 0.005
 _MIN_ROWS = 100
-# Share of a measurement's rows from which their times, or balls far away, are no slips; and time
-# from the log's middle beyond which one is wrong, s.
+# Share of a measurement's rows from which their times, or balls far away, are no slips.
 _WRONG_ROWS = 0.05
+# Time without a row, s and in typical steps, on whose other side are times of another clock.
 _FAR_IN_TIME = 3600.0
+_FAR_STEPS = 100.0
 # Step of stamps from which a 32-bit number has made them useless, and how exactly they keep to it
 # in a file of decimals, s.
 _COARSE_STAMP = 2e-3
@@ -39,9 +42,12 @@ _LARGEST_AGE = 1.0
 # Two quartz clocks drift by less; a stamp that drifts by more, s over the log, has another unit.
 _FASTEST_DRIFT = 2e-4
 _NO_CLOCK = 0.1
+# Change of the youngest pictures' age over a log that is worth a note, s.
+_GROWING_AGE = 0.01
 
-JOINT_GAP = 0.1
-"""Time between two rows of joint angles beyond which a log has a gap, s."""
+# Time between two rows, s and in typical steps, beyond which a log has a gap.
+_GAP = 0.1
+_GAP_STEPS = 5.0
 
 
 class Log(NamedTuple):
@@ -99,7 +105,7 @@ class Rows(NamedTuple):
 
         Args:
           why: what is wrong with them.
-          refused: share of the rows from which the log is refused, if there are two.
+          refused: share of the rows from which the log is refused, if at least two are wrong.
           advice: what to do then.
 
         Raises:
@@ -125,8 +131,8 @@ def make_log(source: str, angles: Rows, targets: Rows, balls: Rows) -> Log:
     wrong times, which its notes count.
 
     Raises:
-      UserError: no joint angle or target is left, or a twentieth of the times or of the balls
-        cannot be.
+      UserError: no joint angle or target is left, their times are no seconds, or a twentieth of the
+        times or of the balls cannot be.
     """
     notes: list[str] = []
     angles = _in_order(angles, notes)
@@ -134,10 +140,11 @@ def make_log(source: str, angles: Rows, targets: Rows, balls: Rows) -> Log:
     angles = angles.without(
         _find_spikes(angles, targets), "is a spike: the joint is elsewhere before and after", notes
     )
-    balls = balls.chosen(np.argsort(balls.times, kind="stable"))
     # An arm may have been recorded alone, with a tracker that saw no ball. Trackers, and logs of
-    # control steps, hold the last picture until the next.
+    # control steps, hold the last picture until the next, at times under a new stamp, which may be
+    # later than that of the next.
     balls = _clean(balls, notes, lambda rows: rows.values)
+    balls = balls.chosen(np.argsort(balls.times, kind="stable"))
     balls = balls.without(
         np.any(np.abs(balls.values) > _FARTHEST_BALL, axis=1),
         f"is farther away than {_FARTHEST_BALL:g} m",
@@ -164,7 +171,7 @@ def _clean(
     rows: Rows, notes: list[str], told: Callable[[Rows], np.ndarray], refused: float = np.inf
 ) -> Rows:
     """The rows in which every number is finite, that do not tell the same as the one before, and
-    whose times are near the log's middle.
+    whose times are near those of most others.
 
     Args:
       told: what rows tell [R, k].
@@ -172,23 +179,63 @@ def _clean(
     """
     numbers = np.column_stack([rows.times, rows.arrivals, rows.values])
     wrong = ~np.isfinite(numbers).all(axis=1)
-    rows = rows.without(wrong, f"lacks one of its {rows.values.shape[1]} numbers", notes, refused)
+    lack = f"lacks its time or one of its {rows.values.shape[1]} numbers"
+    rows = rows.without(wrong, lack, notes, refused)
     same = np.all(np.diff(told(rows), axis=0, prepend=np.nan) == 0.0, axis=1)
     rows = rows.without(same, "repeats the one before", notes)
-    middle = np.median(rows.times) if len(rows.times) else 0.0
-    far = np.abs(rows.times - middle) > _FAR_IN_TIME
+    far = _find_far(rows.times)
     return rows.without(far, "has a time far from the others", notes, _WRONG_ROWS, _ONE_CLOCK)
+
+
+def _find_far(times: np.ndarray) -> np.ndarray:
+    """Which times [R] are on the other side of a long stretch without any from most others."""
+    if len(times) < 2:
+        return np.zeros(len(times), bool)
+    ordered = np.sort(times)
+    longest = max(_FAR_IN_TIME, _FAR_STEPS * float(np.median(np.abs(np.diff(times)))))
+    groups = np.split(ordered, np.flatnonzero(np.diff(ordered) > longest) + 1)
+    most = max(groups, key=len)
+    return (times < most[0]) | (times > most[-1])
 
 
 def _in_order(rows: Rows, notes: list[str]) -> Rows:
     """The rows of a measurement of every control step: whole, once each, with increasing times."""
+    _check_steps(rows)
     _check_digits(rows)
     rows = _clean(rows, notes, lambda rows: np.column_stack([rows.times, rows.values]), 1.0)
     early = np.diff(np.maximum.accumulate(rows.times), prepend=-np.inf) <= 0.0
-    late = np.append(rows.times[:-1] >= np.minimum.accumulate(rows.times[::-1])[-2::-1], False)
+    # The earliest time of each row and those after it.
+    earliest = np.minimum.accumulate(rows.times[::-1])[::-1]
+    late = np.zeros(len(rows.times), bool)
+    late[:-1] = rows.times[:-1] >= earliest[1:]
     # A time that is too late makes all that follow early, and one too early all before it late.
-    wrong = min(early, late[: len(early)], key=np.sum)
+    wrong = min(early, late, key=np.sum)
     return rows.without(wrong, "has a time out of order", notes, _WRONG_ROWS, _ONE_CLOCK)
+
+
+def _check_steps(rows: Rows) -> None:
+    """Refuses times of another unit.
+
+    Raises:
+      UserError: control steps would be too long.
+    """
+    times = rows.times[np.isfinite(rows.times)]
+    if len(times) < 2:
+        return
+    typical = float(np.median(np.abs(np.diff(times))))
+    if typical > _LONGEST_STEP:
+        raise UserError(
+            f"the {rows.name} are {typical:.3g} s apart, and at most {_LONGEST_STEP:g} s is "
+            f"expected; if the times are {_name_unit(typical / _USUAL_STEP)}"
+        )
+
+
+def _name_unit(factor: float, column: str = "time") -> str:
+    """A unit of which a second has about `factor`, and how to write it in a column's title."""
+    units = {"milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns"}
+    power = int(np.clip(round(np.log10(factor) / 3.0), 1, 3))
+    name = list(units)[power - 1]
+    return f"{name}, write {column} [{units[name]}]"
 
 
 def _check_digits(rows: Rows) -> None:
@@ -204,7 +251,7 @@ def _check_digits(rows: Rows) -> None:
     off = np.abs(times - grid * np.round(times / grid))
     typical = float(np.median(np.abs(np.diff(times))))
     # Simulated steps may be whole numbers of such a grid by themselves.
-    is_coarse = _COARSE_STAMP < grid < _FAR_IN_TIME and 0.1 * typical < grid
+    is_coarse = grid > _COARSE_STAMP and 0.1 * typical < grid
     if is_coarse and np.all(off < _ROUNDED):
         raise UserError(
             f"the times of the {rows.name} are multiples of {grid:.3g} s, as a 32-bit number "
@@ -260,7 +307,8 @@ def align_clocks(log: Log) -> Log:
     A camera with its own clock is off by a constant and drifts by some parts in 1e5. The drift is
     the slope of a line (Theil 1950 and Sen 1968, which no fourth of its points can bend) through
     the ages of the youngest picture in each stretch of the log. One of less than a millisecond, and
-    an offset of less than a second, count as none; so does a drift faster than any clock's.
+    an offset of less than a second, count as none. A drift faster than any clock's is not
+    corrected: pictures that wait longer and longer look like it, and a note says so.
 
     Raises:
       UserError: the stamps are no seconds.
@@ -283,7 +331,12 @@ def align_clocks(log: Log) -> Log:
     elif total > _NO_CLOCK:
         raise UserError(
             f"the time stamps of the pictures in {log.source} advance by {1.0 - slope:.4g} s each "
-            "second, and 1 s is expected; if they are milliseconds, write ball_time [ms]"
+            f"second, and 1 s is expected; if they are {_name_unit(abs(1.0 - slope), 'ball_time')}"
+        )
+    elif total > _GROWING_AGE:
+        notes.append(
+            f"the age of the youngest pictures in {log.source} changes by {1e3 * total:.0f} ms in "
+            "it, faster than clocks drift; look for pictures that wait, and at their stamps"
         )
     offset *= abs(offset) > _LARGEST_AGE
     if offset:
@@ -293,6 +346,13 @@ def align_clocks(log: Log) -> Log:
         )
     stamps = log.picture_times + drifts * slope * since + offset
     return log._replace(picture_times=stamps, notes=tuple(notes))
+
+
+def find_gaps(times: np.ndarray) -> list[tuple[float, float]]:
+    """The last time before each gap of a measurement's times [T], and the first one after it, s."""
+    steps = np.diff(times)
+    longest = max(_GAP, _GAP_STEPS * float(np.median(steps)))
+    return [(float(times[i]), float(times[i + 1])) for i in np.flatnonzero(steps > longest)]
 
 
 def least_age(log: Log) -> float:
@@ -310,8 +370,7 @@ def check(log: Log, joint_names: Sequence[str], joint_ranges: np.ndarray) -> Non
       joint_ranges: lower and upper limit [n, 2] of each joint, rad; both 0 for none.
 
     Raises:
-      UserError: it is too short, its times are not seconds or of two clocks, or a joint is far
-        outside its range.
+      UserError: it is too short, its times are of two clocks, or a joint is far outside its range.
     """
     limited = joint_ranges[:, :1] < joint_ranges[:, 1:]
     ends = np.array([-1.0, 1.0])
@@ -323,11 +382,6 @@ def check(log: Log, joint_names: Sequence[str], joint_ranges: np.ndarray) -> Non
         if len(times) < _MIN_ROWS:
             raise UserError(
                 f"{log.source} has {len(times)} {name}; record at least {_MIN_ROWS} control steps"
-            )
-        if (typical := float(np.median(np.diff(times)))) > _LONGEST_STEP:
-            raise UserError(
-                f"the {name} in {log.source} are {typical:.3g} s apart, and at most "
-                f"{_LONGEST_STEP:g} s is expected; if the times are milliseconds, write time [ms]"
             )
         if np.any(outside := (values < low) | (values > high)):
             row, joint = np.argwhere(outside)[0]

@@ -176,7 +176,7 @@ def read_bag(path: Path, joint_names: Sequence[str], topics: Topics) -> Log:
         joint, the ball is in two frames, or as `make_log`.
     """
     messages = _read_messages(path, topics)
-    rows = []
+    groups = []
     for name, topic in (("joint angles", topics.joints), ("servo targets", topics.targets)):
         named = {joint for _, message in messages[topic] for joint in getattr(message, "name", ())}
         missing = [joint for joint in joint_names if joint not in named]
@@ -188,8 +188,8 @@ def read_bag(path: Path, joint_names: Sequence[str], topics: Topics) -> Log:
             )
         read = partial(_read_angles, joint_names=joint_names)
         source = f"{topic} in {path}"
-        rows.append(_make_rows(f"{name} of {source}", messages[topic], len(joint_names), read))
-    angles, targets = rows
+        groups.append(_make_rows(f"{name} of {source}", messages[topic], len(joint_names), read))
+    angles, targets = groups
     name = f"pictures of the ball of {topics.ball} in {path}"
     balls = _make_rows(name, messages[topics.ball], 3, _read_position)
     seen = np.flatnonzero(np.isfinite(balls.values).all(axis=1))
@@ -202,9 +202,10 @@ def read_bag(path: Path, joint_names: Sequence[str], topics: Topics) -> Log:
     is_stamped = np.isfinite(angles.times)
     ages = (angles.arrivals - angles.times)[is_stamped]
     if np.any(is_stamped) and abs(np.median(ages)) > _TWO_CLOCKS:
-        # Such as simulated time: pictures arrived when the angles of the same moment did.
-        arrivals = np.interp(balls.arrivals, angles.arrivals[is_stamped], angles.times[is_stamped])
-        balls = balls._replace(arrivals=arrivals)
+        # Such as simulated time: a picture arrived when the angles of the same moment did, and
+        # beyond them at the age of the nearest.
+        age = np.interp(balls.arrivals, angles.arrivals[is_stamped], ages)
+        balls = balls._replace(arrivals=balls.arrivals - age)
     return make_log(str(path), angles, targets, balls)
 
 

@@ -26,6 +26,8 @@ _LANES = 128
 """Windows that one thread simulates at a time; more would not fit the processor's cache."""
 # Time about a bounce over which the paddle's speed is measured, s.
 _ABOUT_BOUNCE = 0.03
+# Time after which the longest lag of the search has forgotten a target, s.
+_FORGOTTEN = 2.0
 
 
 Simulate = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -58,15 +60,14 @@ def make_simulator(
         pass for one of 0.05 more restitution.
     """
     run = _compile(config, layout.num_joints)
-    early = _contact_time(config) if leaves_at_once else 0.0
+    contact_time = _contact_time(config) if leaves_at_once else 0.0
     # By how much the paddle has moved in the time for which the ball does not stay on it.
-    carried_up = early * _paddle_speeds(config, windows)
+    paddle_rise = contact_time * _paddle_speeds(config, windows)
     n = layout.num_joints
-    count = int(windows.first.max()) + windows.steps
-    send = make_targets(log, windows.origin + windows.dt * np.arange(count + 1))
+    send, first_rows = window_targets(log, windows)
     shown = windows.balls[windows.picture_weights > 0.0]
     middle = np.mean(shown, axis=0) if len(shown) else np.zeros(3)
-    steps = windows.first + np.arange(windows.steps)[:, None]
+    target_rows = first_rows + np.arange(windows.steps)[:, None]
     angle_times = windows.angle_times.T.astype(np.float32)
     picture_times = windows.picture_times.T.astype(np.float32)
     has_left = windows.picture_times > windows.bounces[:, None]
@@ -89,7 +90,7 @@ def make_simulator(
         for i in np.unique(c):
             lanes = c == i
             late = send(*(float(world[x][lanes][0]) for x in ("action_latency", "servo_lag")))
-            targets[:, :, lanes] = np.moveaxis(late[steps[:, s[lanes]]], 2, 1)
+            targets[:, :, lanes] = np.moveaxis(late[target_rows[:, s[lanes]]], 2, 1)
         given = {k: np.moveaxis(v, 0, -1).astype(np.float32) for k, v in world.items()}
         first = starts[c, s].T.astype(np.float32)
         out = run(
@@ -98,8 +99,8 @@ def make_simulator(
             targets,
             angle_times[:, s],
             picture_times[:, s],
-            (early * has_left[s]).T.astype(np.float32),
-            (carried_up[:, None] * has_left)[s].T.astype(np.float32),
+            (contact_time * has_left[s]).T.astype(np.float32),
+            (paddle_rise[:, None] * has_left)[s].T.astype(np.float32),
             middle.astype(np.float32),
             np.float32(carried),
             np.float32(lift),
@@ -114,6 +115,7 @@ def make_simulator(
             rows = pool.map(lambda b: simulate_block(vectors, starts, c[b], s[b]), blocks)
             measured = np.concatenate(list(rows))
         result = np.zeros((*used.shape, measured.shape[1]))
+        # Where a candidate does not count, it has the numbers of the first.
         result[:, s[c == 0]] = measured[c == 0]
         result[c, s] = measured
         return result
@@ -198,7 +200,16 @@ def _compile(config: WorldConfig, n: int) -> Callable[..., tuple[jax.Array, jax.
 
     @jax.jit
     def run(
-        world, starts, targets, angle_times, picture_times, early, carried_up, middle, carried, lift
+        world,
+        starts,
+        targets,
+        angle_times,
+        picture_times,
+        contact_time,
+        paddle_rise,
+        middle,
+        carried,
+        lift,
     ):
         shares = {f"body_gravcomp[{b}]": jnp.maximum(carried, own.body_gravcomp[b]) for b in links}
 
@@ -227,38 +238,69 @@ def _compile(config: WorldConfig, n: int) -> Callable[..., tuple[jax.Array, jax.
         shown_times = picture_times - world["ball_latency"]
         aside = at(path[:, n : n + 2], speed[:, n : n + 2], shown_times)
         # What happens across the paddle, which is nearly level, happens earlier.
-        height = at(path[:, n + 2 :], speed[:, n + 2 :], shown_times + early)
-        balls = jnp.concatenate([aside, height - carried_up[:, None]], axis=1)
+        height = at(path[:, n + 2 :], speed[:, n + 2 :], shown_times + contact_time)
+        balls = jnp.concatenate([aside, height - paddle_rise[:, None]], axis=1)
         turned = jnp.cross(world[CAMERA_ROTATION][None], balls - middle[:, None], axis=1)
         return angles, balls + turned + world["ball_position_bias"]
 
     return run
 
 
-def make_targets(log: Log, edges: np.ndarray) -> Callable[[float, float], np.ndarray]:
+def window_targets(
+    log: Log, windows: Windows
+) -> tuple[Callable[[float, float], np.ndarray], np.ndarray]:
+    """(latency, lag) -> the servo targets [T, n], rad, in the physics steps of all windows and in
+    those before them that a lag still shows; and the row [S] of each window's first step.
+
+    A log of hours has windows in a few percent of its time.
+    """
+    before = round(_FORGOTTEN / windows.dt)
+    stretches: list[list[int]] = []
+    for first in np.sort(windows.first).tolist():
+        begin = max(first - before, 0)
+        if not stretches or begin > stretches[-1][1]:
+            stretches.append([begin, begin])
+        stretches[-1][1] = first + windows.steps
+    begins, ends = np.array(stretches).T
+    edges = [
+        windows.origin + windows.dt * np.arange(a, b) for a, b in zip(begins, ends + 1, strict=True)
+    ]
+    rows = np.cumsum(ends - begins) - (ends - begins)
+    stretch = np.searchsorted(begins, windows.first, side="right") - 1
+    return make_targets(log, *edges), windows.first - begins[stretch] + rows[stretch]
+
+
+def make_targets(log: Log, *stretches: np.ndarray) -> Callable[[float, float], np.ndarray]:
     """(latency, lag) -> the servo targets [T, n], rad, in each physics step, in float32.
 
     Args:
-      edges: times [T + 1] at which the physics steps begin, and the last one ends, s.
+      stretches: of each stretch of steps, one after another in the result, the times at which they
+        begin, and the last one ends, s. Before a stretch, the target was constant.
     """
-    dt = float(edges[1] - edges[0])
+    dt = float(stretches[0][1] - stretches[0][0])
     # The integral of the targets, each held until the next: its difference over a step is the
     # step's mean target, whatever the latency's share of a step.
-    times = np.minimum(np.append(log.target_times, np.inf), edges[-1] + 1.0)
+    times = np.minimum(np.append(log.target_times, np.inf), stretches[-1][-1] + 1.0)
     held = np.cumsum(np.diff(times)[:, None] * log.servo_targets, axis=0)
     integrals = np.concatenate([np.zeros((1, held.shape[1])), held])
 
-    @lru_cache(64)
-    def delay(latency: float, lag: float) -> np.ndarray:
+    def delay_stretch(edges: np.ndarray, latency: float, lag: float) -> np.ndarray:
         at = edges - latency
+        too_early = np.minimum(at - times[0], 0.0)
+        row = max(int(np.searchsorted(log.target_times, at[0], side="right")) - 1, 0)
         columns = []
-        early = np.minimum(at - times[0], 0.0)
-        for integral, first in zip(integrals.T, log.servo_targets[0], strict=True):
-            mean = np.diff(np.interp(at, times, integral) + early * first) / dt
+        for integral, earliest, before in zip(
+            integrals.T, log.servo_targets[0], log.servo_targets[row], strict=True
+        ):
+            mean = np.diff(np.interp(at, times, integral) + too_early * earliest) / dt
             if lag > 1e-6:
                 share = -np.expm1(-dt / lag)
-                mean, _ = lfilter([share], [1.0, share - 1.0], mean, zi=[(1.0 - share) * first])
+                mean, _ = lfilter([share], [1.0, share - 1.0], mean, zi=[(1.0 - share) * before])
             columns.append(mean)
         return np.stack(columns, axis=1).astype(np.float32)
+
+    @lru_cache(64)
+    def delay(latency: float, lag: float) -> np.ndarray:
+        return np.concatenate([delay_stretch(edges, latency, lag) for edges in stretches])
 
     return delay

@@ -43,7 +43,8 @@ from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.model import model_nominals, world_model
 
-# Every fifth window is held out of the search until its last stage.
+# Every fifth window is held out of the search for the unknowns until its last stage. Its residuals
+# give its outliers less weight, as in all windows, and choose between servos and a follower.
 _HELD_OUT = 5
 # Latencies of the ball, s, and its frictions, of the first candidates.
 _BALL_LATENCIES = np.arange(-0.004, 0.05, 0.008)
@@ -74,6 +75,8 @@ _FEW_ALIKE = 3.0
 # Standard deviation of stamps about regular steps below which the steps count as regular, s.
 _JITTER = 5e-4
 _FEWEST_BOUNCES = 3
+# Time between two logs that are joined, s.
+_APART = 1.0
 # Distance of the bounces from the paddle's height beyond which the search would not find them, m.
 _BESIDE = 0.03
 
@@ -96,7 +99,8 @@ class Identified(NamedTuple):
     after: dict[str, float]
     """In the identified world."""
     held_out: dict[str, float]
-    """On the windows that the search had not seen."""
+    """On the windows that the search had not seen, with their outliers weighted; without a sensor
+    that none of them shows."""
     dropped: int
     """Windows whose ball was not in free flight."""
     counted: Noise | None = None
@@ -110,9 +114,11 @@ class Identified(NamedTuple):
     """Those of the identified world [n], rad."""
     gravity_compensation: float = 0.0
     """Share of the arm's weight that its controller carries, if more than the model's own."""
+    has_set_points: bool = False
+    """Whether the log's targets are a controller's own set points: the arm is then a follower."""
     is_follower: bool = False
-    """Whether the arm follows its commands late, with an offset and stiff servos, as a fit of the
-    servos explained windows that the search had not seen no better."""
+    """Whether the arm follows its commands late, with an offset and stiff servos: its targets are
+    set points, or a fit of the servos explained windows that the search had not seen no better."""
     has_lift: bool = False
     """Whether the flights show lift by spin."""
     leaves_at_once: bool = False
@@ -127,20 +133,25 @@ class Identified(NamedTuple):
 
 
 def join(logs: Sequence[Log]) -> Log:
-    """Several logs, one after another; no window spans two of them."""
+    """Several logs, one after another, without the pictures of times at which the arm was not
+    recorded; no window spans two of them."""
     shifted = []
     start = 0.0
     for log in logs:
-        shift = start - min(log.times[0], log.target_times[0])
+        first = min(log.times[0], log.target_times[0])
+        last = max(log.times[-1], log.target_times[-1])
+        is_within = (log.picture_times >= first) & (log.picture_times <= last + 0.5 * _APART)
+        shift = start - first
         shifted.append(
             log._replace(
                 times=log.times + shift,
                 target_times=log.target_times + shift,
-                picture_times=log.picture_times + shift,
-                arrivals=log.arrivals + shift,
+                picture_times=log.picture_times[is_within] + shift,
+                ball_positions=log.ball_positions[is_within],
+                arrivals=log.arrivals[is_within] + shift,
             )
         )
-        start = float(max(shifted[-1].times[-1], shifted[-1].target_times[-1])) + 1.0
+        start = float(last + shift) + _APART
 
     def joined(field: str) -> np.ndarray:
         return np.concatenate([getattr(log, field) for log in shifted])
@@ -211,7 +222,8 @@ def identify(
       progress: called with a line about each step.
 
     Raises:
-      UserError: the log has fewer than five windows, or the ball bounces beside the paddle.
+      UserError: the log has fewer than five windows, the ball bounces beside the paddle, or the
+        simulation diverges.
     """
     times = {name: _straighten(getattr(log, name)) for name in ("times", "target_times")}
     log = log._replace(**times)
@@ -227,6 +239,8 @@ def identify(
     held_out = _held_out_rows(log, windows)
     following = follow(log, settled & ~held_out)
     delay = command_delay(log, following)
+    # Of the targets as they are in the log, which `following` was fitted to.
+    following_errors = held_out_error(log, following, settled & held_out)
     has_set_points = shows_set_points(log, following)
     log = set_points(log, following, config.physics_dt)
     own = Problem(
@@ -237,7 +251,9 @@ def identify(
         noise=sensors,
         progress=progress,
     )
-    carried = own._replace(simulate=make_simulator(config, layout, log, windows, carried=1.0))
+    carried = own._replace(
+        simulate=make_simulator(config, layout, log, windows, carried=1.0), gravity_compensation=1.0
+    )
     progress(f"arm: {1e3 * following.delay:.1f} ms behind its commands")
     if does_move(log):
         searches = [_search_arm(problem, config, delay, following) for problem in (own, carried)]
@@ -250,11 +266,16 @@ def identify(
         problem = own
         is_follower = False
         fit = _with_offsets(own, Fit(layout.mean, windows.starts))
-    share = float(problem.simulate is carried.simulate)
+    share = problem.gravity_compensation
+    # What the last searches vary.
     stages = ["arm"]
-    states = windows.arm_state
+    free_states = windows.arm_state
     if is_follower:
-        progress("a delay and offsets explain the arm as well as its servos do")
+        progress(
+            "the targets are set points, which the arm follows"
+            if has_set_points
+            else "a delay and offsets explain the arm as well as its servos do"
+        )
         fit = follower
         stages = []
     pictures = np.ones_like(windows.picture_weights)
@@ -263,7 +284,7 @@ def identify(
         make = partial(make_simulator, config, layout, log, windows, share)
         problem, fit, pictures = _fit_ball(problem, fit, make)
         stages = [*stages, "flight", "bounce"]
-        states = None
+        free_states = None
     if does_move(log) and not is_follower and np.max(problem.correlation) < _FEW_ALIKE:
         lift = AIR_LIFT * problem.has_lift
         finer = _halve_steps(config)
@@ -276,14 +297,27 @@ def identify(
         problem = problem._replace(simulate=simulate, layout=layout)
     progress("all")
     angles = angle_weights(problem, problem.predict(fit.vector, fit.starts))
-    fit = minimise(problem, fit, stages, problem.weights(pictures, seen, angles), 3, states)
-    unseen = minimise(problem, fit, [], problem.weights(pictures, 1.0 - seen, angles), 3, states)
-    fit = minimise(problem, unseen, stages, problem.weights(pictures, 1.0, angles), 3, states)
+    of_seen = problem.weights(pictures, seen, angles)
+    of_unseen = problem.weights(pictures, 1.0 - seen, angles)
+    of_all = problem.weights(pictures, 1.0, angles)
+    fit = minimise(problem, fit, stages, of_seen, 3, free_states)
+    unseen = minimise(problem, fit, [], of_unseen, 3, free_states)
+    fit = minimise(problem, unseen, stages, of_all, 3, free_states)
+    if not fit.cost < np.inf:
+        raise UserError(
+            f"the simulation of {log.source} diverges with {config.physics_dt:g} s steps; take a "
+            "smaller physics_dt in the robot's config"
+        )
     nominals = model_nominals(config)
     known = {name: nominals[name] for name in layout.terms if name in nominals}
     nominal_vector = own.layout.vector(known)
     before = fit._replace(predicted=own.predict(nominal_vector, fit.starts))
-    information, covariance = certainty(problem, fit)
+    is_estimated = layout.free(stages)
+    if is_follower:
+        # By `follow`; its servos were chosen.
+        is_estimated[layout.slices["delay"]] = True
+        is_estimated[layout.slices["servo_offset"]] = True
+    information, covariance = certainty(problem, fit, is_estimated)
     counts = np.any(windows.split(fit.weights)[1] > 0.0, axis=(1, 2))
     by_sensor = problem._replace(noise=sensors, correlation=1.0)
     return Identified(
@@ -299,9 +333,10 @@ def identify(
         dropped=int(np.sum(windows.has_ball & ~counts)),
         counted=problem.noise,
         following=following,
-        following_errors=held_out_error(log, following, settled & held_out),
+        following_errors=following_errors,
         joint_errors=_joint_errors(windows, unseen),
         gravity_compensation=share,
+        has_set_points=has_set_points,
         is_follower=is_follower,
         has_lift=problem.has_lift,
         leaves_at_once=problem.leaves_at_once,
@@ -335,6 +370,13 @@ def _joint_errors(windows: Windows, fit: Fit) -> np.ndarray:
     weights = windows.split(fit.weights)[0]
     counts = np.any(weights > 0.0, axis=2)
     return error_size((angles - windows.angles)[counts])
+
+
+def _squared_errors(windows: Windows, fit: Fit) -> float:
+    """Of all joints together, rad^2; infinite if the simulation diverges."""
+    if not np.isfinite(fit.cost):
+        return np.inf
+    return float(np.sum(_joint_errors(windows, fit) ** 2))
 
 
 def _is_seen(count: int) -> np.ndarray:
@@ -468,7 +510,8 @@ def _guess_spins(problem: Problem, fit: Fit) -> Fit:
         )
 
     # At first, each flight may have any drag; their median is then that of the ball.
-    free = [fit_window(s, GUESSED_DRAG, 1.0).drag_deviation for s in with_ball]
+    seen = with_ball[_is_seen(len(windows.first))[with_ball]]
+    free = [fit_window(s, GUESSED_DRAG, 1.0).drag_deviation for s in seen]
     drag = GUESSED_DRAG * (1.0 + float(np.median(free)))
     vector[problem.layout.slices["air_drag"]] = drag
     for s in with_ball:
@@ -479,11 +522,11 @@ def _guess_spins(problem: Problem, fit: Fit) -> Fit:
 
 
 def _flight_noise(problem: Problem, fit: Fit, flying: np.ndarray) -> Noise:
-    """The sensors' noise, or what the flights [S, B] leave where it is larger: a camera's errors
-    that change slowly are not in the differences of neighbouring pictures."""
+    """The sensors' noise, or what the flights [S, B] of the search leave where it is larger: a
+    camera's errors that change slowly are not in the differences of neighbouring pictures."""
     windows = problem.windows
     residuals = windows.split(problem.predict(fit.vector, fit.starts))[1] - windows.balls
-    counts = flying & (windows.picture_weights > 0.0)
+    counts = flying & (windows.picture_weights > 0.0) & (_training(problem) > 0.0)
     errors = error_size(residuals[counts])
     return problem.noise._replace(balls=np.maximum(problem.sensors.balls, errors))
 
@@ -590,7 +633,9 @@ def _stiff_follower(
     joint, by servos that are too stiff to matter."""
     layout = problem.layout
     windows = problem.windows
-    total = max(delay, 0.0)
+    # A servo answers the mean command of a physics step, that of its middle, at the step's end: by
+    # half a step earlier than the sum of these delays.
+    total = max(delay + 0.5 * config.physics_dt, 0.0)
     own_delay = _servo_delays(config)
     vectors = []
     for gain, longest in itertools.product(_STIFF_GAINS, _STIFF_DELAYS):
@@ -609,7 +654,7 @@ def _stiff_follower(
         minimise(problem, Fit(vector, windows.starts), [], few, 2, windows.arm_state)
         for vector in vectors
     ]
-    best = min(followers, key=lambda fit: np.sum(_joint_errors(windows, fit) ** 2))
+    best = min(followers, key=lambda fit: _squared_errors(windows, fit))
     return _with_offsets(problem, best._replace(starts=windows.starts))
 
 
@@ -621,7 +666,7 @@ def _explains_better(problem: Problem, simple: Fit, fit: Fit) -> bool:
     def unseen_error(fit: Fit) -> float:
         """Of the arm's angles, with the best starts of these windows."""
         started = minimise(problem, fit, [], unseen, 3, windows.arm_state)
-        return float(np.sum(_joint_errors(windows, started) ** 2))
+        return _squared_errors(windows, started)
 
     return unseen_error(simple) <= unseen_error(fit)
 
@@ -705,17 +750,20 @@ def _sample(problem: Problem, counts: np.ndarray) -> np.ndarray:
 
 
 def _measure_errors(problem: Problem, fit: Fit) -> dict[str, float]:
-    """Root mean square of each sensor's residuals in units of its noise; the estimated starts count
-    as degrees of freedom."""
+    """Root mean square of each sensor's residuals in units of its noise; the entries of the starts
+    that were searched count as degrees of freedom. The unknowns, dozens beside thousands of
+    residuals, do not."""
+    windows = problem.windows
     white = problem.whiten(fit.predicted, fit.weights)
-    parts = zip(problem.windows.split(white), problem.windows.split(fit.weights), strict=True)
-    states = (2 * problem.layout.num_joints, 6)
+    parts = zip(windows.split(white), windows.split(fit.weights), strict=True)
+    searched = problem.scale_starts()[2]
+    num_searched = [np.sum(searched[which]) for which in (windows.arm_state, ~windows.arm_state)]
     errors = {}
-    for name, (residuals, weights), known in zip(
-        ("joint_angles", "ball_position"), parts, states, strict=True
+    for name, (residuals, weights), num_states in zip(
+        ("joint_angles", "ball_position"), parts, num_searched, strict=True
     ):
         used = np.sum(weights > 0.0, axis=(1, 2))
-        free = float(np.sum(np.maximum(used - known, 0)))
+        free = float(np.sum(np.maximum(used - num_states, 0)))
         if free > 0.0:
             errors[name] = float(np.sqrt(np.sum(residuals**2) / free))
     return errors

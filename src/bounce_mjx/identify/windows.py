@@ -12,8 +12,8 @@ from scipy.ndimage import minimum_filter1d
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.identify.flight import fit_flight
-from bounce_mjx.identify.following import SETTLING, find_settled
-from bounce_mjx.identify.log import JOINT_GAP, Log
+from bounce_mjx.identify.following import find_settled, find_unknown, is_known
+from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.unknowns import BALL
 
 MAX_DELAY = 0.08
@@ -26,6 +26,7 @@ _BEFORE = 0.55
 _AFTER = 0.2
 _AFTER_SHARE = 0.3
 _SECONDS = MAX_DELAY + _BEFORE + _AFTER + 0.03
+# Shortest window of the arm alone, and twice the shortest flight on a side of a bounce, s.
 _SHORTEST = 0.16
 _FEWEST = 5
 _MOST = 240
@@ -116,7 +117,13 @@ def cut(log: Log, physics_dt: float) -> Windows:
     Raises:
       UserError: there are fewer than five.
     """
-    spans = [(b - before, b + after, b) for b, before, after in _find_bounces(log)]
+    origin = float(min(log.times[0], log.target_times[0]))
+    # A simulation from the window's start cannot show what a picture saw before it.
+    earliest = origin + MAX_DELAY
+    spans = [(max(b - before, earliest), b + after, b) for b, before, after in _find_bounces(log)]
+    # Elsewhere, nothing says how the paddle moved.
+    is_shown = is_known(log, np.array([bounce for _, _, bounce in spans]))
+    spans = [span for span, shown in zip(spans, is_shown, strict=True) if shown]
     spans += [(start, end, np.nan) for start, end in _find_rests(log, spans)]
     if len(spans) < _FEWEST:
         raise UserError(
@@ -129,24 +136,25 @@ def cut(log: Log, physics_dt: float) -> Windows:
         with_ball = _thin(with_ball, max(_MOST_BALLS, _MOST - len(others)))
         spans = with_ball + _thin(sorted(others), _MOST - len(with_ball))
     spans.sort()
-    origin = float(min(log.times[0], log.target_times[0]))
-    begins = [max(start - MAX_DELAY, origin) for start, _, _ in spans]
+    # A span is that of the pictures; its simulation begins earlier, at the time `zero`.
+    begins = [start - MAX_DELAY for start, _, _ in spans]
     first = np.array([int((begin - origin) / physics_dt) for begin in begins], int)
     zero = origin + first * physics_dt
     angle_rows = []
     picture_rows = []
-    starts = []
-    used = -np.inf
+    states = []
+    last_end = -np.inf
     settled = find_settled(log)
     bounces = np.array(spans)[:, 2] - zero
     for (start, end, _), begin, bounce in zip(spans, zero, bounces, strict=True):
-        inside = (log.times >= max(begin, used)) & (log.times < end) & settled
+        # Each angle counts in one window.
+        inside = (log.times >= max(begin, last_end)) & (log.times < end) & settled
         seen = (log.picture_times >= start) & (log.picture_times <= end) & np.isfinite(bounce)
         angle_rows.append(np.flatnonzero(inside))
         picture_rows.append(np.flatnonzero(seen))
         ball = _ball_start(log, picture_rows[-1], bounce, begin)
-        starts.append(np.concatenate([_joint_start(log, begin), ball]))
-        used = end
+        states.append(np.concatenate([_joint_start(log, begin), ball]))
+        last_end = end
     angle_times, angles, angle_weights = _pad(angle_rows, log.times, zero, log.joint_angles)
     picture_times, balls, picture_weights = _pad(
         picture_rows, log.picture_times, zero, log.ball_positions
@@ -163,7 +171,7 @@ def cut(log: Log, physics_dt: float) -> Windows:
         balls=balls,
         picture_weights=np.where(near, 0.0, picture_weights),
         bounces=bounces,
-        starts=np.stack(starts),
+        starts=np.stack(states),
         dt=physics_dt,
     )
 
@@ -216,14 +224,11 @@ def _slopes(times: np.ndarray, values: np.ndarray, reach: int) -> np.ndarray:
 
 
 def _find_rests(log: Log, spans: list[tuple[float, float, float]]) -> list[tuple[float, float]]:
-    """Times between the windows with a ball, in pieces; none of them spans a gap of the log."""
-    taken = sorted((start, end) for start, end, _ in spans)
-    gaps = np.flatnonzero(np.diff(log.times) > JOINT_GAP)
-    taken += [(log.times[i], log.times[i + 1] + SETTLING) for i in gaps]
-    first = max(log.times[0], log.target_times[0]) + SETTLING
+    """Times between the windows with a ball, in pieces; in none of them is the arm unknown."""
+    taken = [(start, end) for start, end, _ in spans] + find_unknown(log)
     pieces = []
-    begin = first
-    for start, end in [*sorted(taken), (log.times[-1], np.inf)]:
+    begin = log.times[0]
+    for start, end in sorted(taken):
         length = start - begin
         if length > _SHORTEST:
             count = int(np.ceil(length / (_BEFORE + _AFTER)))

@@ -36,6 +36,10 @@ _MOST_FLY = 0.5
 
 # Deviations of the prior beyond which an estimate is a mistake, and what is likely to be wrong.
 _SURPRISING = 3.0
+# Distance from a limit of the search within which an estimate is at it, in the same deviations.
+_AT_LIMIT = 1e-6
+# Terms of a follower's servos, which were chosen and not estimated.
+_OF_FOLLOWER = ("servo_lag", "servo_gain", "servo_damping", "joint_frictionloss")
 _MISTAKES = (
     "Look at the frame of the ball's position (the robot's base, in metres, z up), the unit and "
     "clock of ball_time and of the servo targets, swapped columns, a joint's zero, --robot, and "
@@ -66,7 +70,8 @@ class Estimate(NamedTuple):
 
 def estimates(found: Identified, joint_names: Sequence[str]) -> list[Estimate]:
     """All unknowns with their intervals; a sensor whose residuals exceed its noise widens them.
-    `ball_latency` is the time from the exposure to the arrival."""
+    `ball_latency` is the time from the exposure to the arrival. Values and intervals are within
+    the bounds of the world's terms."""
     layout = found.layout
     vector = found.fit.vector
     world = layout.world(vector)
@@ -90,8 +95,8 @@ def estimates(found: Identified, joint_names: Sequence[str]) -> list[Estimate]:
         array[late] += found.stamp_age
     for name, place in layout.terms.items():
         if name in TERMS:
-            low[place] = np.clip(low[place], *TERMS[name].bounds)
-            high[place] = np.clip(high[place], *TERMS[name].bounds)
+            for array in (values, low, high):
+                array[place] = np.clip(array[place], *TERMS[name].bounds)
     seen = found.deviation < _UNSEEN * layout.deviation
     return [
         Estimate(
@@ -141,7 +146,7 @@ def misfit(found: Identified) -> float:
     """Factor by which the errors in windows that the search had not seen exceed those in all, at
     least 1."""
     ratios = [found.held_out[name] / found.after[name] for name in found.held_out]
-    return max(1.0, *ratios)
+    return float(np.max([1.0, *ratios]))
 
 
 def sentences(found: Identified, joint_names: Sequence[str]) -> list[str]:
@@ -149,7 +154,12 @@ def sentences(found: Identified, joint_names: Sequence[str]) -> list[str]:
     said = describe_doubts(found, joint_names)
     if found.gravity_compensation:
         said.append("The log shows that the controller carries the arm's weight.")
-    if found.is_follower:
+    if found.has_set_points:
+        said.append(
+            "The targets are the controller's own set points, which the joints follow at once: the "
+            "world has their delay, a constant offset of each joint, and stiff servos."
+        )
+    elif found.is_follower:
         said.append(
             "A delay and a constant offset of each joint explain the angles in windows that the "
             "search had not seen no worse than servos do: the world has these, and stiff servos."
@@ -163,6 +173,11 @@ def sentences(found: Identified, joint_names: Sequence[str]) -> list[str]:
         said.append(
             f"In {found.dropped} of {int(np.sum(found.windows.has_ball))} windows, the ball was "
             "not in free flight; their pictures do not count."
+        )
+    if "ball_position" in found.after and "ball_position" not in found.held_out:
+        said.append(
+            "No window with a bounce was left out of the search, so that nothing checks what was "
+            "found about the ball; record more bounces."
         )
     if not np.any(found.windows.has_ball):
         said.append(
@@ -189,7 +204,8 @@ def describe_doubts(found: Identified, joint_names: Sequence[str]) -> list[str]:
     for j, (name, error) in enumerate(zip(joint_names, found.joint_errors, strict=False)):
         noise = found.noise.angles[j]
         motion = float(np.std(angles[:, j]))
-        if error > max(_GOOD_FIT * noise, _GOOD_SHARE * motion, _GOOD_ANGLE):
+        # Also an error that is no number is none that the model explains.
+        if not error <= max(_GOOD_FIT * noise, _GOOD_SHARE * motion, _GOOD_ANGLE):
             doubts.append(
                 f"The model does not explain the angles of {name}: its error in windows that the "
                 f"search had not seen is {1e3 * error:.2g} mrad, and {1e3 * noise:.2g} mrad is the "
@@ -204,7 +220,7 @@ def describe_doubts(found: Identified, joint_names: Sequence[str]) -> list[str]:
         )
     ratio = found.held_out.get("ball_position", 0.0)
     error = ratio * float(np.mean(found.noise.balls)) if bounces else 0.0
-    if ratio > _GOOD_FIT and error > _GOOD_DISTANCE:
+    if not (ratio <= _GOOD_FIT or error <= _GOOD_DISTANCE):
         doubts.append(
             f"The model does not explain the ball: its error in windows that the search had not "
             f"seen is {1e3 * error:.2g} mm, {ratio:.2g} times the camera's noise."
@@ -215,8 +231,10 @@ def describe_doubts(found: Identified, joint_names: Sequence[str]) -> list[str]:
 def total_delay(found: Identified, model: mujoco.MjModel) -> str:
     """The delay from a command to the angle, which a log shows however it is shared.
 
-    It is the action's latency, the lag, and the delay of the servos themselves: damping divided by
-    stiffness, which is the mean of a servo's answer to a step.
+    It is the action's latency, the mean delay of the lag's steps (shorter than the lag by half a
+    step at most), and the delay of the servos themselves: damping divided by stiffness, which is
+    the mean of a servo's answer to a step, less the half step by which a simulated servo answers
+    earlier.
     """
     layout = found.layout
     servos = list(find_addresses(model).actuators)
@@ -224,44 +242,58 @@ def total_delay(found: Identified, model: mujoco.MjModel) -> str:
 
     delay = layout.slices["delay"].start
 
-    def delay_and_servos(vector: np.ndarray) -> float:
-        """With the mean delay of a lag in place of the lag, which is longer by half a step at most:
-        their sum does not depend on how uncertain the lag is."""
+    def total(vector: np.ndarray) -> float:
         world = layout.world(vector)
         of_servos = np.mean(own * world["servo_damping"] / world["servo_gain"])
-        return float(vector[delay] + of_servos)
+        return float(vector[delay] + of_servos) - 0.5 * layout.physics_dt
 
     vector = found.fit.vector
     steps = 1e-3 * layout.deviation
-    moved = [delay_and_servos(vector + step) for step in np.diag(steps)]
-    slope = (np.array(moved) - delay_and_servos(vector)) / steps
+    moved = [total(vector + step) for step in np.diag(steps)]
+    slope = (np.array(moved) - total(vector)) / steps
     covariance = np.linalg.inv(found.information + np.diag(layout.deviation**-2.0))
     # As much wider than for independent residuals as the interval of the delay.
     wider = found.deviation[delay] / np.sqrt(covariance[delay, delay])
     width = _HALF_WIDTH * misfit(found) * wider * float(np.sqrt(slope @ covariance @ slope))
-    world = layout.world(vector)
-    late = delay_and_servos(vector) - vector[delay] + world["action_latency"] + world["servo_lag"]
+    late = max(total(vector), 0.0)
     return f"total delay: {1e3 * late:.1f} +- {1e3 * width:.1f} ms, of latency, lag and servos"
 
 
 def _describe_mistakes(found: Identified, joint_names: Sequence[str]) -> list[str]:
-    """Warnings of estimates that are several deviations of the prior away."""
+    """Warnings of estimates that are several deviations of the prior away, or that cannot be."""
     layout = found.layout
     vector = found.fit.vector
-    means = layout.decode(layout.mean)
+    listed = estimates(found, joint_names)
+    expected = layout.world(layout.mean)
+    typical = np.concatenate([np.ravel(expected[name]) for name in layout.terms])
     off = np.abs(vector - layout.mean) / layout.deviation
-    at_limit = np.any((layout.limits == vector) & (layout.limits != 0.0), axis=0)
+    # Of a physical quantity that may be absent, such as drag, 0 is a value like any other.
+    is_near = np.abs(layout.limits - vector) < _AT_LIMIT * layout.deviation
+    at_limit = np.any(is_near & (layout.limits != 0.0), axis=0)
+    # The deviations are those of the delay, which latency and lag share.
+    delay = layout.slices["delay"].start
+    listed[delay] = listed[delay]._replace(
+        label="action_latency and servo_lag together", value=float(vector[delay])
+    )
+    typical[delay] = layout.mean[delay]
+    late = layout.slices.get("ball_latency", slice(0, 0))
+    typical[late] += found.stamp_age
     is_judged = np.ones(len(vector), bool)
     if found.is_follower:
-        # Its servos were chosen, not estimated.
-        for name in ("servo_gain", "servo_damping", "joint_frictionloss"):
+        for name in _OF_FOLLOWER:
             is_judged[layout.terms[name]] = False
     said = [
         f"warning: {entry.label} is {entry.value:.4g} {entry.unit}".rstrip()
-        + f", {off[i]:.1f} deviations of the prior from {means[i]:g}."
-        for i, entry in enumerate(estimates(found, joint_names))
+        + f", {off[i]:.1f} deviations of the prior from {typical[i]:.3g}."
+        for i, entry in enumerate(listed)
         if is_judged[i] and (off[i] > _SURPRISING or at_limit[i])
     ]
+    ages = vector[late] + found.stamp_age
+    if np.any(ages + _HALF_WIDTH * found.deviation[late] * misfit(found) < 0.0):
+        said.append(
+            f"warning: the pictures arrive {-1e3 * ages[0]:.1f} ms before what they show, which "
+            "cannot be; the world has a ball_latency of 0."
+        )
     advice = _MISTAKES if np.any(found.windows.has_ball) else _ARM_MISTAKES
     return [*said, advice] if said else []
 
@@ -320,6 +352,8 @@ def to_yaml(
             assumed.append(name)
         shown = any(entry.seen for entry in entries)
         how = "Identified" if shown else "Not shown, so the prior stands,"
+        if found.is_follower and name in _OF_FOLLOWER:
+            how = "Chosen, as a delay and offsets alone explain the joints,"
         values = ", ".join(map(_format, entries))
         sources[name] = f"{how} from {log.source}: {values} (95%)."
     for name in [name for name in BALL if name not in ranges]:

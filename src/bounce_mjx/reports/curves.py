@@ -13,14 +13,20 @@ import numpy as np
 from bounce_mjx.config.files import flat
 from bounce_mjx.config.user_code import is_file, read_source
 from bounce_mjx.errors import UserError, reason_of, shorten
-from bounce_mjx.runs.config import CONFIG_FILE, ROBOT, TrainConfig, load_run_config
+from bounce_mjx.runs.config import (
+    CONFIG_FILE,
+    RESUMABLE_KEYS,
+    ROBOT,
+    TrainConfig,
+    load_run_config,
+)
 from bounce_mjx.runs.files import MANIFEST_FILE
 from bounce_mjx.runs.presets import read_config_file
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.task.task import Curve
 
-# Settings that may differ within a group: the seed, the run's location, its length, its devices.
-_FREE_KEYS = frozenset(("seed", "log_dir", "total_steps", "stop_when_solved", "num_devices"))
+# Settings that may differ within a group: the seed, and what may differ within a run.
+_FREE_KEYS = RESUMABLE_KEYS | {"seed"}
 _LEARNING_RATE = "ppo.learning_rate"
 # Maximum number of settings in a label.
 _MAX_NAMED = 3

@@ -206,7 +206,7 @@ def _draw_curve(axes: Axes, groups: Sequence[Group], shown: Curve) -> None:
     """One line for a group of one run; for several runs, faint lines, their mean, and a band of one
     standard deviation on each side. A point for each evaluation, in which actions are not sampled,
     and a dotted line where a run first met all results."""
-    # Evaluations log the means of a task's metrics in metres.
+    # Where the task's details have the mean of the metric, as mean_error_m.
     evaluated = "mean_return" if shown.tag == RETURN else f"mean_{shown.metric}_m"
     for i, group in enumerate(groups):
         curves = [run.curves[shown.tag] for run in group.runs if shown.tag in run.curves]
@@ -217,7 +217,7 @@ def _draw_curve(axes: Axes, groups: Sequence[Group], shown: Curve) -> None:
             points = run.curves.get(f"results/{evaluated}")
             if points is not None:
                 values = shown.scale * points.values
-                label = "evaluation, without noise"
+                label = "evaluation, actions not sampled"
                 axes.plot(points.steps, values, "o", color=f"C{i}", ms=4.0, label=label)
             if run.solved_steps is not None:
                 axes.axvline(

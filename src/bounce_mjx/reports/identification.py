@@ -1,13 +1,14 @@
 """The page about an identified robot: what was found, how sure it is, and what to do."""
 
 import html
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from bounce_mjx.identify.doctor import Checkup, Joint
+from bounce_mjx.identify.inspection import Checkup, Joint
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.stages import Identified
 from bounce_mjx.identify.world import estimates, misfit, sentences
@@ -22,10 +23,10 @@ _DRAWN = 600
 
 def inspection_page(logs: Sequence[Log], checkups: Sequence[Checkup]) -> str:
     """The page about logs alone, self-contained: their faults, and how the joints follow."""
-    source = html.escape(", ".join(log.source for log in logs))
+    source = ", ".join(log.source for log in logs)
     faults = sum(len(checkup.faults) for checkup in checkups)
     advice = "mend them before a fit." if faults else "identify the robot from these logs."
-    body = f"""<h1>{source}</h1>
+    body = f"""<h1>{html.escape(source)}</h1>
 <p><b>Found:</b> {faults} faults.</p>
 <p><b>What to do:</b> {advice}</p>
 {_describe_logs(logs, checkups)}"""
@@ -182,7 +183,7 @@ def difference_figure(log: Log, checkup: Checkup) -> Figure:
 
 def _drawn_rows(log: Log) -> slice:
     """The rows of a log that a figure draws."""
-    return slice(None, None, max(len(log.times) // _DRAWN, 1))
+    return slice(None, None, max(math.ceil(len(log.times) / _DRAWN), 1))
 
 
 def _late_command(log: Log, j: int, joint: Joint, rows: slice) -> np.ndarray:

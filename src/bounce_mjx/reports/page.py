@@ -23,8 +23,9 @@ from bounce_mjx.reports.tables import details_line, result_cells
 from bounce_mjx.runs.checkpoints import read_actor
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.files import write_output
-from bounce_mjx.runs.folders import Checkpoint, best_checkpoint
+from bounce_mjx.runs.folders import best_checkpoint
 from bounce_mjx.runs.progress import load_results
+from bounce_mjx.runs.records import Checkpoint
 from bounce_mjx.task.task import Recording
 from bounce_mjx.viewers.page import replay_first_and_worst, worst_episode
 
@@ -58,14 +59,19 @@ def write_report(run: Path, recording: Recording | None = None) -> Path:
     config = load_run_config(run)
     groups = group_runs([run])
     env = Env(config.env)
-    recording = recording or record_checkpoint(best_checkpoint(run))
+    drawn_steps = results.best_steps
+    if recording is None:
+        checkpoint = best_checkpoint(run)
+        drawn_steps = checkpoint.steps
+        recording = record_checkpoint(checkpoint)
     robustness = load_robustness(run)
     drawn = [("The best checkpoint", figures.evaluation_figure(env, recording, _WIDTH))]
     for plot in figures.RUN_PLOTS.values():
         if plot.title is not None:
             drawn.append((plot.title, plot.draw(groups, columns=_COLUMNS)))
     if robustness is not None:
-        drawn.append(("Perturbed worlds", robustness_figure(robustness)))
+        title = f"Perturbed worlds, of the policy after {robustness.steps:,} steps"
+        drawn.append((title, robustness_figure(robustness)))
     robot = "Peitian AIR4-560" if config.env.mjcf is None else config.env.mjcf.stem
     replay = replay_first_and_worst(env, recording)
     report = results.best
@@ -73,6 +79,10 @@ def write_report(run: Path, recording: Recording | None = None) -> Path:
     worst = "the worst" if worst_episode(recording) == 0 else "and in the worst"
     seconds = results.seconds | {"total": sum(results.seconds.values())}
     phases = [[name, f"{value:.1f}"] for name, value in seconds.items()]
+    another = ""
+    if drawn_steps != results.best_steps:
+        # A save was interrupted, or the best checkpoint is damaged.
+        another = f" They show another policy than the results, that after {drawn_steps:,} steps."
     resets = "fresh resets" if results.fresh_resets else "the resets of the selection"
     body = f"""<h1>{html.escape(report.summary)}</h1>
 <p>Run <code>{html.escape(str(run))}</code>, seed {config.seed}, task {html.escape(config.task)} on
@@ -81,7 +91,7 @@ after {results.best_steps:,} of {results.trained_steps:,} environment steps, on 
 {html.escape(details_line(report))}.</p>
 <p>Trained on {html.escape(results.device)} with bounce_mjx {html.escape(results.version or "?")}.
 Replayed and drawn with {env.engine.name} physics, MuJoCo {mujoco.__version__}, JAX
-{jax.__version__}.</p>
+{jax.__version__}.{another}</p>
 {table(["result", "measured", "value", "bound", ""], map(result_cells, report.results))}
 <h2>The policy in its first recorded episode, {worst} of {num_recorded}</h2>
 <iframe title="Replay" src="{data_url("text/html", replay.encode())}"></iframe>
@@ -97,5 +107,5 @@ evaluation that met all results.</p>
 {table(["phase", "seconds"], phases)}
 <details><summary>Config</summary><pre>{html.escape(dump_config(config))}</pre></details>"""
     path = run / "report.html"
-    write_output(path, page(run.name, body))
+    write_output(path, page(run.absolute().name, body))
     return path

@@ -14,6 +14,7 @@ from matplotlib.patches import Rectangle
 from rich.markup import escape
 from rich.table import Column, Table
 
+from bounce_mjx.evaluation.results import is_share
 from bounce_mjx.evaluation.robustness import ConditionOutcome, RobustnessReport
 from bounce_mjx.evaluation.suite import NOMINAL, strength_text
 from bounce_mjx.reports.figures import PANEL_WIDTH, style
@@ -43,11 +44,18 @@ def load_robustness(folder: Path) -> RobustnessReport | None:
 
 def summary(report: RobustnessReport) -> str:
     """The score of a report in one sentence."""
-    version = f" of {report.version}" if report.version else ""
     return (
-        f"{report.met} of {len(report.outcomes)} conditions{version} meet all judged results, with "
-        f"{report.episodes} episodes each"
+        f"{report.met} of {len(report.outcomes)} conditions of {_suite_name(report)} meet all "
+        f"judged results, with {report.episodes} episodes each"
     )
+
+
+def _suite_name(report: RobustnessReport) -> str:
+    """The suite by its version, or else by its file's name or what it consists of."""
+    if report.version:
+        return report.version
+    path = Path(report.suite)
+    return path.stem if path.suffix in (".yaml", ".yml") else report.suite
 
 
 def robustness_table(report: RobustnessReport) -> Table:
@@ -87,9 +95,9 @@ def result_letters(report: RobustnessReport) -> dict[str, str]:
 
 @style()
 def robustness_figure(report: RobustnessReport) -> Figure:
-    """Chart of perturbations by strength. The colour of a cell shows the lowest of the results that
-    are shares. A cell has a tick or the letters of the missed results; a frame marks conditions
-    within the training ranges."""
+    """Chart of perturbations by strength. The colour of a cell shows `worst_share`. A cell has a
+    tick or the letters of the missed results; a frame marks conditions within the training
+    ranges."""
     letters = result_letters(report)
     rows = _rows(report.outcomes)
     figure = Figure(figsize=(2.0 * PANEL_WIDTH, _LINE * len(rows) + 1.8), layout="constrained")
@@ -106,7 +114,9 @@ def robustness_figure(report: RobustnessReport) -> Figure:
         for x, outcome in enumerate(outcomes):
             missed = "".join(letters[name] for name in outcome.failed)
             _draw_cell(axes, (x, y), outcome, report.worst_share(outcome), missed)
-    _draw_scale(figure, axes)
+    has_shares = any(map(is_share, report.measured.values()))
+    label = "lowest result of those in %" if has_shares else "episodes that last, %"
+    _draw_scale(figure, axes, label)
     missed = "   ".join(f"{letter} {name}" for name, letter in letters.items())
     below = f"{_TICK} all judged results met; missed: {missed}; framed: within the trained ranges"
     figure.supxlabel(below, fontsize=8, wrap=True)
@@ -133,7 +143,7 @@ def _draw_cell(
     axes.text(x + 0.5, y + 0.5, text, fontsize=7, ha="center", va="center", color=ink)
 
 
-def _draw_scale(figure: Figure, axes: Axes) -> None:
+def _draw_scale(figure: Figure, axes: Axes, label: str) -> None:
     """The colours of the shares, below the cells."""
     bar = figure.colorbar(
         ScalarMappable(_SCALE, _COLOURS),
@@ -143,7 +153,7 @@ def _draw_scale(figure: Figure, axes: Axes) -> None:
         shrink=0.5,
         aspect=50,
     )
-    bar.set_label("lowest result of those in %", fontsize=8)
+    bar.set_label(label, fontsize=8)
 
 
 def _rows(outcomes: Sequence[ConditionOutcome]) -> list[tuple[str, list[ConditionOutcome]]]:

@@ -50,7 +50,7 @@ def results_table(report: Report, title: str) -> Table:
 
 def seeds_table(reports: dict[int, Report | None]) -> Table:
     """The results of the best checkpoint of each seed, with their mean and standard deviation over
-    the seeds.
+    the seeds that have results.
 
     Args:
       reports: reports by seed; None for a seed that diverged before its first evaluation.
@@ -71,13 +71,15 @@ def seeds_table(reports: dict[int, Report | None]) -> Table:
     deviations = []
     for i in range(len(known[0].results)):
         values = [report.results[i].value for report in known]
-        # If a seed lacks a figure, the mean of the other seeds would be too favourable.
+        # The mean of those that have a figure would be too favourable.
         is_complete = None not in values
         means.append(figure_text(np.mean(values) if is_complete else None))
         deviations.append(figure_text(np.std(values) if is_complete else None))
     passed = sum(report.passed for report in known)
-    table.add_row("mean", *means, f"{passed}/{len(reports)}")
-    table.add_row("std", *deviations, "")
+    # A seed that diverged is in no mean.
+    of_known = "" if len(known) == len(reports) else f" of {len(known)}"
+    table.add_row(f"mean{of_known}", *means, f"{passed}/{len(reports)}")
+    table.add_row(f"std{of_known}", *deviations, "")
     return table
 
 

@@ -29,6 +29,7 @@ from bounce_mjx.config.user_code import is_file
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.evaluation.results import Report
+from bounce_mjx.learning.config import PPO_NAME
 from bounce_mjx.learning.policy import Actor, Policy, make_networks, networks_of, untrained_policy
 from bounce_mjx.learning.ppo import PPO, Params, names_of_critic_metrics
 from bounce_mjx.learning.registry import find_algorithm
@@ -36,6 +37,7 @@ from bounce_mjx.learning.statistics import RunningStatistics, init_statistics
 from bounce_mjx.runs import earlier, folders
 from bounce_mjx.runs.config import (
     CONFIG_FILE,
+    RESUMABLE_KEYS,
     TrainConfig,
     load_run_config,
     runs_folder,
@@ -43,6 +45,7 @@ from bounce_mjx.runs.config import (
 )
 from bounce_mjx.runs.files import plain_path, seal, to_plain
 from bounce_mjx.runs.records import RECORD, Checkpoint, DamagedCheckpoint, Record, verify
+from bounce_mjx.task.registry import DEFAULT
 
 POLICY = "policy"
 """Item of a checkpoint: what acts."""
@@ -54,12 +57,6 @@ NETWORKS = "networks"
 NETWORK_KEYS = ("hidden_layers", "critic_layers", "shared_critic", "activation")
 """Keys of `ppo` that shape the networks."""
 
-# Keys that may differ between a checkpoint and the training that resumes from it. All others must
-# be the same.
-RESUMABLE_KEYS = frozenset(
-    "total_steps eval_every save_every eval_episodes screening_episodes eval_seed "
-    "stop_when_solved log_dir num_devices".split()
-)
 # Room for the metadata of a checkpoint.
 _MARGIN = 2**20
 # Folder of what is being written or removed; a killed process leaves it.
@@ -105,6 +102,7 @@ def read_actor(
         except UserError:
             if checkpoint.folder.exists():
                 raise
+            # Another one of the same run, and so of the same config.
             checkpoint = folders.best_checkpoint(checkpoint.run)
 
 
@@ -205,6 +203,7 @@ def read_start(config: TrainConfig, env: Env) -> tuple[Params, RunningStatistics
         return np.stack(rows)
 
     count, mean, summed_variance, std = statistics
+    # An unknown input has a mean of 0 and a variance of 1.
     seen = RunningStatistics(
         count, moved(mean, 0.0), moved(summed_variance, float(count)), moved(std, 1.0)
     )
@@ -214,23 +213,50 @@ def read_start(config: TrainConfig, env: Env) -> tuple[Params, RunningStatistics
 
 
 def read_record(checkpoint: Checkpoint) -> Record:
-    """Verifies every file of a checkpoint and reads its plain data."""
+    """Verifies every file of a checkpoint and reads its plain data.
+
+    No code that the record names is looked at: the settings are read with the classes of the run's
+    own config, whose task the user has named.
+    """
     run_config = load_run_config(checkpoint.run)
     record = verify(checkpoint)
     try:
         stored = without_own_settings(earlier.present_settings(record.config))
-        config = type(run_config).model_validate(stored)
+        differing = _differing_keys(run_config, stored)
     # Pydantic's own is one.
     except ValueError as error:
         raise DamagedCheckpoint(checkpoint, error) from error
-    # The checkpoint has the paths of the original files, and the run's config those of its copies.
-    files = {key for key in ("task", "algorithm") if is_file(getattr(config, key))}
-    if differing := differing_keys(run_config, config) - RESUMABLE_KEYS - files - {"env.mjcf"}:
+    if differing:
         raise UserError(
             f"{checkpoint.folder} has a different config from {checkpoint.run / CONFIG_FILE}, "
             f"which differs in {', '.join(sorted(differing))}; restore that file"
         )
     return record
+
+
+def _differing_keys(run_config: TrainConfig, stored: dict[str, Any]) -> set[str]:
+    """The settings of a record, plain, that are not those of its run's config.
+
+    Raises:
+      ValueError: they are no settings of the run's task.
+    """
+    names = {"task": run_config.task, "algorithm": run_config.algorithm}
+    stored = {"task": DEFAULT, "algorithm": PPO_NAME} | stored
+    others = {key for key, name in names.items() if not _is_same_name(str(stored[key]), name)}
+    if others:
+        return others
+    env = type(run_config.env).model_validate(stored.get("env", {}))
+    config = TrainConfig.model_validate(stored | names | {"env": env})
+    # The record has the path of the original MJCF file, and the run's config that of its copy.
+    return differing_keys(run_config, config) - RESUMABLE_KEYS - {"env.mjcf"}
+
+
+def _is_same_name(stored: str, name: str) -> bool:
+    """Whether a record names the task or the algorithm of its run. It has the path of the original
+    file, which may be gone or be another one by now, and the run's config that of its copy."""
+    if is_file(stored) and is_file(name):
+        return stored.rpartition(":")[2] == name.rpartition(":")[2]
+    return stored == name
 
 
 def _read_arrays(checkpoint: Checkpoint, item: str, template: Any) -> Any:
@@ -291,8 +317,8 @@ def save_checkpoint(
     report: Report | None = None,
     kept: int | None = None,
 ) -> int:
-    """Writes a checkpoint, and then removes the others of the run. A process that is killed at any
-    moment leaves a complete one.
+    """Writes a checkpoint, and then removes the others of the run but for `kept`. A process that is
+    killed at any moment leaves a complete one.
 
     Args:
       run: the run's folder.

@@ -26,6 +26,12 @@ from bounce_mjx.world.config import WorldConfig
 CONFIG_FILE = "config.yaml"
 ROBOT = "robot"
 """Folder of a run with a copy of its robot."""
+RESUMABLE_KEYS = frozenset(
+    "total_steps eval_every save_every eval_episodes screening_episodes eval_seed "
+    "stop_when_solved log_dir num_devices".split()
+)
+"""Keys that do not affect what a training learns in a number of steps: they may differ between a
+checkpoint and the training that resumes from it. All others must be the same."""
 DEFAULT_SOURCE = "default"
 """Source of a setting that no layer set."""
 
@@ -96,7 +102,7 @@ class TrainConfig(StrictModel):
         setting that nothing set has its default."""
         sources = dict.fromkeys(fields_of(type(self.env), type(self.ppo)), DEFAULT_SOURCE)
         for key, source in self._sources.items():
-            # A setting may be a mapping, whose keys are named too.
+            # Of a mapping, such as `shares`, each entry has a source.
             while key and key not in sources:
                 key = key.rpartition(".")[0]
             if key:

@@ -15,14 +15,15 @@ BEST = "best"
 """Folder of the best checkpoint."""
 
 _NOTHING = object()
+_ANY = object()
 _ENDED = {
-    "env.estimator": ...,
+    # It ran only where `env.observation.position` asked for it.
+    "env.estimator": _ANY,
     "env.observation.position": "measured",
     "env.randomization.restitution_slope": None,
     "env.randomization.air_lift": None,
 }
-"""Settings that ended, with the value that changes nothing today; ... for any: the
-estimator ran only where `env.observation.position` asked for it."""
+"""Settings that ended, with the value that changes nothing today."""
 _MOVED = {
     "env.joint_angle_noise": "env.reset.joint_angles",
     "env.joint_velocity_noise": "env.reset.joint_velocities",
@@ -36,7 +37,7 @@ def present_settings(config: dict[str, Any]) -> dict[str, Any]:
     unknown, where it would change something."""
     for key, harmless in _ENDED.items():
         value = _value(config, key)
-        if value is not _NOTHING and harmless in (..., value):
+        if value is not _NOTHING and (harmless is _ANY or harmless == value):
             config = _without(config, key)
     for key, present in _MOVED.items():
         value = _value(config, key)

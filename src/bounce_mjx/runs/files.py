@@ -7,7 +7,7 @@ import os
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import pydantic
 from pydantic_core import to_jsonable_python
@@ -23,7 +23,8 @@ class Manifest(pydantic.BaseModel):
     """manifest.json: size and SHA-256 of every other file in a checkpoint, by name, but for
     those that begin with a dot, such as a file system's own."""
 
-    format: int = 1
+    format: Literal[1] = 1
+    """A later version's would mean something else."""
     files: dict[str, dict[str, int | str]]
 
 
@@ -103,7 +104,8 @@ def write_output(path: Path, content: str | bytes) -> None:
     Raises:
       UserError: it cannot be written.
     """
-    content = content.encode() if isinstance(content, str) else content
+    # A path in it may not be UTF-8.
+    content = content.encode(errors="replace") if isinstance(content, str) else content
     with writable(path, "give another file or folder"):
         is_special = path.exists() and not path.is_file()
         (Path.write_bytes if is_special else write_atomically)(path, content)
@@ -132,8 +134,8 @@ def check_output(path: Path | None, flag: str, suffixes: tuple[str, ...] = ()) -
       suffixes: the ends of the name that it may have; by default, any.
 
     Raises:
-      UserError: it has another suffix, may not be written, is a folder, or is in one that does not
-        exist.
+      UserError: it has another suffix, it or its folder may not be written, it is a folder, or is
+        in one that does not exist.
     """
     if path is None:
         return
@@ -142,8 +144,15 @@ def check_output(path: Path | None, flag: str, suffixes: tuple[str, ...] = ()) -
     folder = path.absolute().parent
     if not os.path.isdir(folder):
         raise UserError(f"the folder of {flag} {path} does not exist; make it")
-    if os.path.isdir(path) or not os.access(path if os.path.exists(path) else folder, os.W_OK):
-        raise UserError(f"{flag} {path} is a folder, or may not be written; give another file")
+    if os.path.isdir(path):
+        raise UserError(f"{flag} {path} is a folder; give a file")
+    written = [path] if os.path.exists(path) else []
+    # A new file beside it replaces a file; a device or a pipe is written itself.
+    if not written or os.path.isfile(path):
+        written.append(folder)
+    for place in written:
+        if not os.access(place, os.W_OK):
+            raise UserError(f"{flag}: {place} may not be written; give another file")
 
 
 def seal(folder: Path) -> None:

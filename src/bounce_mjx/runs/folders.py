@@ -4,6 +4,7 @@
         config.yaml                     the resolved config
         robot/                          a copy of --mjcf and its files, with a manifest
         task/, algorithm/               copies of the files of own ones
+        report.html, robustness.*, failures.png   see `reports`
         events.out.tfevents.*           TensorBoard scalars
         results.json                    all evaluations, and the time of each activity
         checkpoints/<number>/           one for the newest state and one for the best evaluation, or
@@ -13,6 +14,7 @@
             networks/                   both networks, for another training; optional
             record/                     the steps, the config, the evaluations so far and its own
             manifest.json               size and SHA-256 of every other file
+        checkpoints/<number>.damaged    a damaged one, which a resumed training has set aside
 
 A checkpoint's number is that of the steps trained; see `Checkpoint`.
 
@@ -63,8 +65,11 @@ MIRROR_LAW = Checkpoint(Path("mirror law"), Path("mirror law"), 0)
 
 def is_users_run(run: Path) -> bool:
     """Whether this is the folder of a run of the user's, beside whose files others may be written;
-    no policy of the package, and not the mirror law."""
-    return run not in {MIRROR_LAW.run, *map(resource_path, POLICIES.values())}
+    no policy of the package, by whatever path, and not the mirror law."""
+    if run == MIRROR_LAW.run:
+        return False
+    policies = {os.path.realpath(resource_path(folder)) for folder in POLICIES.values()}
+    return os.path.realpath(run) not in policies
 
 
 def create_run(config: TrainConfig) -> Path:
@@ -210,10 +215,16 @@ def find_run(path: Path) -> Path:
     )
 
 
+def is_newest(path: Path | None) -> bool:
+    """Whether what the user gives as a run stands for the newest one: nothing, or `LATEST` unless
+    there is a folder with that name."""
+    return path is None or (str(path) == LATEST and not os.path.isdir(path))
+
+
 def named_run(path: Path | None, log_dir: Path) -> Path:
-    """A run's folder or a path in it, as the user named it: None and `LATEST` (unless there is a
-    folder with that name) stand for the newest run with a checkpoint in `log_dir`."""
-    if path is not None and (str(path) != LATEST or os.path.isdir(path)):
+    """A run's folder or a path in it, as the user named it; in place of `is_newest`, the newest run
+    with a checkpoint in `log_dir`."""
+    if not is_newest(path):
         return path
     if not (found := runs_in(log_dir)):
         raise UserError(
@@ -225,10 +236,11 @@ def named_run(path: Path | None, log_dir: Path) -> Path:
 
 def runs_in(folder: Path) -> list[Path]:
     """Runs with a checkpoint in a folder, such as those of several seeds, the oldest first by the
-    time stamps of their names; before them, those without one."""
+    time stamps of their names; before them, names without a stamp."""
     runs = [path.parent for path in folder.glob(f"*/{CONFIG_FILE}") if path.is_file()]
     # The length orders the numbers of runs that began in the same second.
-    runs.sort(key=lambda run: (run.name[0].isdigit(), run.name[:19], len(run.name), run.name))
+    stamp = len("2026-01-31_23-59-59")
+    runs.sort(key=lambda run: (run.name[0].isdigit(), run.name[:stamp], len(run.name), run.name))
     return list(filter(stored_checkpoints, runs))
 
 
@@ -269,6 +281,7 @@ def best_checkpoint(
 
     def quality(checkpoint: Checkpoint) -> tuple[Any, ...]:
         record = records[checkpoint]
+        # One without an evaluation is below any.
         score = record.report.score if record and record.report else ()
         # Version 0.1.0 wrote no evaluation of a policy that it shipped.
         return score, checkpoint.folder.parent.name == earlier.BEST, checkpoint.number
@@ -282,8 +295,8 @@ def _intact_checkpoints(
     """The intact checkpoints in a folder of a run, at least one, with their records. A warning
     names the damaged ones.
 
-    A single checkpoint is not read, and has None for its record: if it is damaged, whoever reads it
-    refuses it.
+    A single checkpoint is not read, and has None for its record, as there is nothing to compare it
+    with: if it is damaged, whoever reads it refuses it.
     """
     stored = _checkpoints_in(run, place or run)
     if newest is not None:
@@ -402,10 +415,12 @@ def _checkpoints_in(run: Path, place: Path) -> list[Checkpoint]:
     place = Path(os.path.abspath(place))
     stored = stored_checkpoints(run)
     inside = [checkpoint for checkpoint in stored if checkpoint.folder.is_relative_to(place)]
-    if not inside:
+    if not stored:
         raise UserError(
-            f"{place} has no checkpoint, as its training ended before the first one; start again"
+            f"{run} has no checkpoint, as its training ended before the first one; start again"
         )
+    if not inside:
+        raise UserError(f"{place} holds no checkpoint of its run; give {run}, or one of its own")
     return inside
 
 

@@ -56,7 +56,7 @@ def preset_files(config: Sequence[Path], task: str, machine: Path | None = None)
       UserError: a file is missing or invalid, or names a base that is not used.
     """
     of_task = f"{PRESETS}/{task}"
-    # The task's own first.
+    # The task's own first; a word that is none of these is looked for in the presets of all tasks.
     files = [named_file(named_file(file, of_task), PRESETS, "preset") for file in config]
     bases = {}
     for file in files:
@@ -67,16 +67,19 @@ def preset_files(config: Sequence[Path], task: str, machine: Path | None = None)
         if bases.get(file) is not None:
             raise UserError(f"{file} lies on {files[0]}, so its {BASE} is not used; give it first")
     if not files or files[0] not in bases:
+        # The first file is silent: on the machine's.
         base = machine or default_preset(has_accelerator())
         return PresetFiles(_preset(str(base), of_task), None, tuple(files))
     base = bases[files[0]]
     if base is not None:
+        # It names one.
         named = _preset(str(base), of_task)
         if named is None:
             raise UserError(
                 f"{files[0]}: {BASE} is {shorten(repr(base))}; give the name of a preset, or null"
             )
         return PresetFiles(None, named, tuple(files))
+    # It stands alone: a preset of the package, or a file of the user's.
     if files[0].resolve().is_relative_to(resource_path(PRESETS).resolve()):
         return PresetFiles(None, files[0], tuple(files[1:]))
     return PresetFiles(None, None, tuple(files))

@@ -52,7 +52,11 @@ class Progress(pydantic.BaseModel):
         return bool(met) and self.evaluations[-1]["steps"] >= PATIENCE * met[0]
 
     def results(self, **run: Any) -> dict[str, Any]:
-        """Content of results.json, with the other fields of `Results`."""
+        """Content of results.json, after an evaluation.
+
+        Args:
+          run: the other fields of `Results`, such as device and seconds.
+        """
         return self.best.to_dict() | self.model_dump(exclude={"best", "fault"}) | run
 
     def has(self, steps: int) -> bool:

@@ -6,8 +6,8 @@ They are layers, and a later one wins:
     2. the preset for this machine
     3. what the user's own algorithm changes of PPO's defaults
     4. a preset that the user names, in place of the machine's
-    5. --warm-start: the environment and the networks of a policy; also that of a file of the
-       user's, which itself lies above it
+    5. --warm-start: the environment and the networks of a policy, whether a flag or a file of the
+       user's names it
     6. the user's files and further presets, each on those before it
     7. --robot, or the robot of --world
     8. --world
@@ -42,6 +42,7 @@ from bounce_mjx.resources import policy_folder
 from bounce_mjx.runs.config import (
     CONFIG_FILE,
     DEFAULT_SOURCE,
+    RESUMABLE_KEYS,
     TrainConfig,
     fields_of,
     load_run_config,
@@ -91,34 +92,36 @@ class Choice(StrictModel):
 # Reading: what lies on what ---------------------------------------------------------------------
 
 
-def stack(choice: Choice, machine: Path | None = None, whole: TrainConfig | None = None) -> "Stack":
+def stack(
+    choice: Choice, machine: Path | None = None, whole_config: TrainConfig | None = None
+) -> "Stack":
     """The layers of a choice, without what the user says.
 
     Args:
       machine: the machine's preset; None asks JAX, which starts its devices.
-      whole: a config that takes the place of files, and stands alone.
+      whole_config: a config that takes the place of files, and stands alone.
 
     Raises:
       UserError: a file or a run is missing or wrong, two parts of the choice exclude each other, or
         a task or an algorithm is a file that the user has not named.
     """
     if choice.resume is not None:
-        return _stack_of_run(choice, whole)
+        return _stack_of_run(choice, whole_config)
     # The task decides which file a preset's name stands for, so that only a path can name a task or
     # a warm start. These files are read again below, in their places.
     paths = [file for file in choice.config if os.path.isfile(file)]
-    from_paths = _layers_of_files(paths) if whole is None else [_layer_of(whole)]
-    policy = _policy(choice, from_paths, whole)
-    task_name, task = _task(choice, from_paths, policy, whole)
+    from_paths = _layers_of_files(paths) if whole_config is None else [_layer_of(whole_config)]
+    policy = _policy(choice, from_paths, whole_config)
+    task_name, task = _task(choice, from_paths, policy, whole_config)
     machines: list[Layer] = []
     named: list[Layer] = []
     files = from_paths
-    if whole is None:
+    if whole_config is None:
         found = preset_files(choice.config, task_name, machine)
         machines = _layers_of_files([found.machine])
         named = _layers_of_files([found.named])
         files = _layers_of_files(found.own)
-    algorithm_name, algorithm = _algorithm(choice, [*machines, *named, *files], whole)
+    algorithm_name, algorithm = _algorithm(choice, [*machines, *named, *files], whole_config)
     changed = _changed_defaults(algorithm)
     start = [] if policy is None else [policy.layer(is_in_world=choice.world is not None)]
     policy_notes = () if policy is None else policy.notes
@@ -136,12 +139,12 @@ def stack(choice: Choice, machine: Path | None = None, whole: TrainConfig | None
     )
 
 
-def _stack_of_run(choice: Choice, whole: TrainConfig | None) -> "Stack":
+def _stack_of_run(choice: Choice, whole_config: TrainConfig | None) -> "Stack":
     """The layer of a run that is resumed."""
     from bounce_mjx.runs.folders import find_run, named_run
 
     excluded = {
-        "config": choice.config or whole is not None,
+        "config": choice.config or whole_config is not None,
         "robot": choice.robot,
         "world": choice.world,
     }
@@ -211,19 +214,20 @@ def _task(
     choice: Choice,
     files: Sequence[Layer],
     policy: "_Policy | None",
-    whole: TrainConfig | None,
+    whole_config: TrainConfig | None,
 ) -> tuple[str, type[Task]]:
     """Name and class of the task: the user's, the files', or that of the policy.
 
     Raises:
       UserError: there is none, or it is a file that the user has not named.
     """
-    if whole is not None:
-        if choice.task is not None and not is_same_code(choice.task, whole.task):
+    if whole_config is not None:
+        if choice.task is not None and not is_same_code(choice.task, whole_config.task):
             raise UserError(
-                f"the config is of the task {whole.task}, and task is {choice.task}; leave it out"
+                f"the config is of the task {whole_config.task}, and task is {choice.task}; leave "
+                "it out"
             )
-        return whole.task, whole.env.task
+        return whole_config.task, whole_config.env.task
     if choice.task is not None:
         return choice.task, find_task(choice.task)
     name = _last(files, "task")
@@ -237,22 +241,23 @@ def _task(
 
 
 def _algorithm(
-    choice: Choice, layers: Sequence[Layer], whole: TrainConfig | None
+    choice: Choice, layers: Sequence[Layer], whole_config: TrainConfig | None
 ) -> tuple[str, type[PPOConfig]]:
     """Name and settings of the algorithm.
 
     Raises:
       UserError: there is none, or it is a file that the user has not named.
     """
-    if whole is not None and choice.algorithm is None:
-        settings = _settings_of(whole.algorithm)
+    if whole_config is not None and choice.algorithm is None:
+        settings = _settings_of(whole_config.algorithm)
         # Code that was imported otherwise has another class of the same name.
-        if settings.__qualname__ != type(whole.ppo).__qualname__:
+        if settings.__qualname__ != type(whole_config.ppo).__qualname__:
             raise UserError(
-                f"the config's ppo is {type(whole.ppo).__qualname__}, and its algorithm "
-                f"{whole.algorithm} has {settings.__qualname__}; name the algorithm that has them"
+                f"the config's ppo is {type(whole_config.ppo).__qualname__}, and its algorithm "
+                f"{whole_config.algorithm} has {settings.__qualname__}; name the algorithm that "
+                "has them"
             )
-        return whole.algorithm, type(whole.ppo)
+        return whole_config.algorithm, type(whole_config.ppo)
     name = choice.algorithm or _last(layers, "algorithm") or PPO_NAME
     if choice.algorithm is None and is_file(name):
         raise unnamed_code(_title_of(layers), "algorithm", name)
@@ -297,8 +302,8 @@ def _notes(below: list[Layer], above: list[Layer], prefix: str) -> list[str]:
 
 
 def _as_in_yaml(value: Any) -> Any:
-    """A value with a list in place of a tuple, which YAML does not have."""
-    return list(value) if isinstance(value, tuple) else value
+    """A value with lists in place of tuples, which YAML does not have."""
+    return list(map(_as_in_yaml, value)) if isinstance(value, list | tuple) else value
 
 
 class _Policy(NamedTuple):
@@ -324,7 +329,9 @@ class _Policy(NamedTuple):
         return Layer(f"the warm start {self.start}", values, whole=whole)
 
 
-def _policy(choice: Choice, files: Sequence[Layer], whole: TrainConfig | None) -> _Policy | None:
+def _policy(
+    choice: Choice, files: Sequence[Layer], whole_config: TrainConfig | None
+) -> _Policy | None:
     """The policy of the warm start that the user or a file asks for.
 
     Raises:
@@ -334,7 +341,7 @@ def _policy(choice: Choice, files: Sequence[Layer], whole: TrainConfig | None) -
         path = choice.warm_start
     else:
         # A whole config has its environment already.
-        path = _last_path(files, "warm_start") if whole is None else None
+        path = _last_path(files, "warm_start") if whole_config is None else None
     if path is None:
         return None
     if choice.robot:
@@ -344,12 +351,12 @@ def _policy(choice: Choice, files: Sequence[Layer], whole: TrainConfig | None) -
     from bounce_mjx.runs.folders import find_choice, runs_in
 
     task = choice.task or _last(files, "task")
-    if choice.task is None and task is not None and is_file(task) and whole is None:
+    if choice.task is None and task is not None and is_file(task) and whole_config is None:
         raise unnamed_code(_title_of(files), "task", task)
     log_dir = choice.log_dir or _last_path(files, "log_dir")
     # A new folder has no run yet that latest could stand for.
     if log_dir is None or not runs_in(log_dir):
-        log_dir = runs_folder(whole.env.task if whole else find_task(task or DEFAULT))
+        log_dir = runs_folder(whole_config.env.task if whole_config else find_task(task or DEFAULT))
     checkpoint, note = find_choice(path, log_dir)
     config = load_run_config(checkpoint.run, task)
     start = path if policy_folder(path) else checkpoint.folder
@@ -435,7 +442,7 @@ class Stack:
         Raises:
           UserError: a group is one value.
         """
-        # In this order, a group comes before those in it.
+        # In this order, a group comes before those in it, so that the outermost is named.
         for group in sorted(groups_of(self.fields)):
             part: Any = layer.values
             for name in group.split("."):
@@ -460,7 +467,8 @@ class Stack:
         return Layer(source, values, whole=tuple(whole))
 
     def _full_key(self, key: str) -> str:
-        """The dotted key of a setting or a group that stands alone; an unknown one stays."""
+        """The dotted key of a setting or a group that stands alone, the training's own first; an
+        unknown key stays."""
         for full in (key, f"env.{key}", f"ppo.{key}"):
             if any(field == full or field.startswith(f"{full}.") for field in self.fields):
                 return full
@@ -512,6 +520,7 @@ def _merge(layers: Sequence[Layer]) -> tuple[dict[str, Any], dict[str, str]]:
     sources: dict[str, str] = {}
     for layer in layers:
         for key in layer.whole:
+            # The layer has the key, so that the None does not remain.
             values = merged(values, nested(key, None))
         values = merged(values, layer.values)
         if layer.is_world:
@@ -529,7 +538,7 @@ def _merge(layers: Sequence[Layer]) -> tuple[dict[str, Any], dict[str, str]]:
 def _setter_of(path: Sequence[str], layers: Sequence[Layer]) -> str:
     """The last layer that set a key; a guess for a rule that joins several settings of a group: the
     last layer with any of them. Without such a layer, it is the default that is wrong."""
-    # An unknown key may be an empty group.
+    # A layer with a value first; an unknown key, as in `foo: {}`, may be an empty group.
     for may_be_empty in (False, True):
         for layer in reversed(layers):
             if _has(layer.values, path, may_be_empty):
@@ -551,8 +560,6 @@ def _has(values: dict[str, Any], path: Sequence[str], may_be_empty: bool) -> boo
 
 
 def _check_resumable(resumed: TrainConfig, config: TrainConfig) -> None:
-    from bounce_mjx.runs.checkpoints import RESUMABLE_KEYS
-
     if changed := differing_keys(resumed, config) - RESUMABLE_KEYS:
         raise UserError(
             f"--resume cannot change {', '.join(sorted(changed))}; leave those flags out, or "

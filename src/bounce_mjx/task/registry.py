@@ -39,7 +39,8 @@ def find_task(name: str) -> type[Task]:
     module, _, attribute = known[name].partition(":")
     try:
         task = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
+    # Code of another package raises any error.
+    except Exception as error:
         raise UserError(
             f"the task {name} cannot be imported ({reason_of(error)}); install the package that "
             "has it again"

@@ -200,7 +200,7 @@ def train(
     for key in ("task", "algorithm", "warm_start", "log_dir"):
         if key in said:
             choice[key] = said[key]
-    layers = stack(validate(Choice, choice, PYTHON), whole=whole)
+    layers = stack(validate(Choice, choice, PYTHON), whole_config=whole)
     config = layers.config(said)
     set_up_jax(config.env)
     console = stdout(quiet=quiet or not hosts.is_leader())

@@ -1,6 +1,6 @@
 """brax: importing this package registers the environment as "bounce_ball".
 
-Then `brax.envs.get_environment("bounce_ball", episode_seconds=30)` returns a
+Then `brax.envs.get_environment("bounce_ball", control_dt=0.02)` returns a
 `BraxBounceBall` with these settings. brax's wrappers and trainers accept it, and also every
 `Env`. Needs the extra `brax`.
 """

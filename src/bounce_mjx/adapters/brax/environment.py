@@ -17,8 +17,7 @@ from brax.io import image, mjcf
 from flax import struct
 
 from bounce_mjx.adapters.randomization import randomized_task
-from bounce_mjx.config.validation import validate
-from bounce_mjx.deploy.environments import environment_config
+from bounce_mjx.deploy.environments import environment_config, refuse_warmup, with_settings
 from bounce_mjx.env.env import Env, EnvState, State
 from bounce_mjx.errors import UserError
 from bounce_mjx.task.task import Task
@@ -86,18 +85,28 @@ class BraxBounceBall(brax.envs.Env):
             is (`deploy.environments`), if there is no config.
           world: of the policy: nominal (the default), training for the worlds that its training
             sampled, or a named world.
-          settings: fields of the task's config, such as episode_seconds=30, which replace fields of
-            `config`.
+          settings: fields of the task's config, such as control_dt=0.02, on top of `config`. A
+            group that is given in part keeps the other values. Not episode_seconds: brax's
+            wrappers and trainers end the episodes, after their own `episode_length`
+            (`task.config.episode_steps` is the config's).
 
         Raises:
-          UserError: a setting is wrong, or the policy's environment has another value.
+          UserError: a setting is wrong, has no effect here, or the policy's environment has another
+            value.
         """
+        if "episode_seconds" in settings:
+            raise UserError(
+                f"{ENV_NAME}: episode_seconds has no effect here; give brax's wrapper or trainer "
+                "an episode_length in steps"
+            )
         if config is None:
             config = environment_config(ENV_NAME, task, policy, world, settings)
-        elif policy is not None:
-            raise UserError("config and policy both say the environment; give one of them")
         else:
-            config = validate(type(config), config.model_dump() | settings, ENV_NAME)
+            for name, value in (("task", task), ("policy", policy), ("world", world)):
+                if value is not None:
+                    raise UserError(f"config and {name} both say the environment; give one of them")
+            config = with_settings(config, settings, ENV_NAME)
+        refuse_warmup(config, ENV_NAME)
         self.task = Env(config)
         self.dt = self.task.dt
         """Time of one control step, s."""
@@ -121,8 +130,9 @@ class BraxBounceBall(brax.envs.Env):
     def reset(self, rng: jax.Array) -> State:
         """Starts an episode; consumes the key `rng`."""
         task = self.task
+        # Only an environment that was asked for it has one.
         if "sys" in vars(self):
-            task = randomized_task(task, self._own_sys.mj_model, self._own_sys, self.sys)
+            task = randomized_task(task, self._own_sys, self.sys)
         return self._to_brax(task.reset(rng))
 
     def step(self, state: State, action: jax.Array) -> State:
@@ -165,13 +175,14 @@ class BraxBounceBall(brax.envs.Env):
 
 
 def _complete(state: EnvState) -> EnvState:
-    """The state with its parts that hold no arrays, which TorchRL drops."""
-    dropped = {
+    """The state with the defaults of its parts that hold no arrays, which TorchRL drops; another
+    state as it is."""
+    defaults = {
         name: default
         for name, default in EnvState._field_defaults.items()
         if getattr(state, name) is None
     }
-    return state._replace(**dropped)
+    return state._replace(**defaults)
 
 
 def _drawable(mj_model: mujoco.MjModel) -> mujoco.MjModel:

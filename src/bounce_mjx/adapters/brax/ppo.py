@@ -43,8 +43,10 @@ def load_brax_policy(path: str | Path, deterministic: bool = True) -> BraxPolicy
         raise UserError(
             f"{path} holds no checkpoint of brax's PPO; give the save_checkpoint_path of ppo.train"
         )
+    # load_config looks up the initialiser by its name, None where there is none.
     brax_networks.KERNEL_INITIALIZER.setdefault(None, None)
     config = checkpoint.load_config(folder)
+    # So brax stores the size of an observation that is one array.
     if "shape" in config.observation_size:
         with config.ignore_type():
             config.observation_size = config.observation_size["shape"][-1]
@@ -56,7 +58,9 @@ def load_brax_policy(path: str | Path, deterministic: bool = True) -> BraxPolicy
 def ppo_settings(config: TrainConfig | None = None) -> dict[str, Any]:
     """Keyword arguments of brax's `ppo.train`, from a config or `configs/default.yaml`.
 
-    brax's trainer lacks `critic_metrics` and the decay of the learning rate.
+    brax's trainer lacks `critic_metrics`, `min_noise_std`, `compute_dtype` and the decay of the
+    learning rate. The episodes have the environment's whole time limit, not
+    `training_episode_seconds`, as brax evaluates with the same `episode_length`.
     """
     config = config or read_preset(resource_path("configs/default.yaml"))
     ppo = config.ppo
@@ -79,17 +83,26 @@ def ppo_settings(config: TrainConfig | None = None) -> dict[str, Any]:
         gae_lambda=ppo.gae_lambda,
         clipping_epsilon=ppo.clip_epsilon,
         entropy_cost=ppo.entropy_cost,
+        # brax halves it.
+        vf_loss_coefficient=2.0 * ppo.value_cost,
         max_grad_norm=ppo.max_grad_norm,
         reward_scaling=ppo.reward_scale,
     )
 
 
 def network_settings(config: TrainConfig | None = None) -> dict[str, Any]:
-    """Keyword arguments of brax's `make_ppo_networks`, from a config or `configs/default.yaml`."""
+    """Keyword arguments of brax's `make_ppo_networks`, from a config or `configs/default.yaml`.
+
+    Raises:
+      UserError: the config has a shared critic, which brax's networks lack.
+    """
     ppo = (config or read_preset(resource_path("configs/default.yaml"))).ppo
+    if ppo.shared_critic:
+        raise UserError("brax's networks share no layers; set ppo.shared_critic to false")
     return dict(
         policy_hidden_layer_sizes=ppo.hidden_layers,
-        value_hidden_layer_sizes=ppo.hidden_layers,
+        value_hidden_layer_sizes=ppo.critic_layers or ppo.hidden_layers,
+        activation=brax_networks.ACTIVATION[ppo.activation],
         distribution_type="normal",
         noise_std_type="log",
         init_noise_std=ppo.init_noise_std,

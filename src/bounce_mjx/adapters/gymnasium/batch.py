@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from bounce_mjx.adapters.gymnasium.programs import Episodes, Programs, shared_programs
-from bounce_mjx.deploy.environments import environment_config, settings_class
+from bounce_mjx.deploy.environments import environment_config, refuse_warmup, settings_class
 from bounce_mjx.errors import UserError, suggest
 from bounce_mjx.task.task import Task
 
@@ -79,6 +79,7 @@ class Batch:
             advice = suggest(name, known) or f"give {', '.join(known)}"
             raise UnexpectedArgument(f"got an unexpected keyword argument {name!r}; {advice}")
         self.config = environment_config(title, task, policy, world, settings)
+        refuse_warmup(self.config, title)
         self.num_envs = whole_number("num_envs", num_envs)
         self.episode_steps = self.config.episode_steps
         """Time limit of an episode in steps."""

@@ -282,7 +282,8 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
             )
         actions = checked_actions(actions, self.action_space.shape)
         if self.autoreset_mode is AutoresetMode.SAME_STEP:
-            # The ended ones have already been reset, and any one may end now.
+            # The ended ones have already been reset, and any one may end now: a seed is drawn for
+            # each, and those of episodes that go on are kept (`EpisodeSeeds`).
             skipped = np.zeros(self.num_envs, bool)
             seeds = self._seeds.draw(~skipped)
             result = self._batch.step(actions, seeds, skipped, reset_after=True)
@@ -309,6 +310,8 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         for each environment [B]."""
         if name == "render":
             return self.render() or (None,) * self.num_envs
+        if name in ("reset", "step"):
+            raise UserError(f"call of {name} would do it to all environments; use {name} itself")
         value = getattr(self, name)
         return (value(*args, **kwargs) if callable(value) else value,) * self.num_envs
 

@@ -1,7 +1,7 @@
 """B episodes on JAX that start and end separately, and their compiled functions.
 
 Each episode has its own random key, so that a seed starts the same one in a batch of any size.
-Batches of equal configs and sizes share their programs.
+Batches of equal configs share their programs, of which JAX keeps one for each size.
 """
 
 import functools
@@ -29,7 +29,7 @@ class Episodes(NamedTuple):
 
 
 class Programs:
-    """The functions of `Episodes`, compiled for one config and number of environments."""
+    """The functions of `Episodes`, compiled for one config."""
 
     def __init__(self, config: WorldConfig):
         cache_compilations()

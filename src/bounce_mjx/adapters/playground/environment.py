@@ -12,10 +12,10 @@ import numpy as np
 from flax import struct
 
 from bounce_mjx.adapters.randomization import randomized_task
-from bounce_mjx.deploy.environments import environment_config
+from bounce_mjx.deploy.environments import environment_config, refuse_warmup
 from bounce_mjx.env import env as core
 from bounce_mjx.env.env import Env, EnvState
-from bounce_mjx.errors import needed
+from bounce_mjx.errors import UserError, needed
 from bounce_mjx.lazy import import_mjx
 from bounce_mjx.physics import PhysicsState
 from bounce_mjx.resources import resource_path
@@ -66,11 +66,12 @@ class TaskData:
     time: jax.Array
     """Time since the reset [], s."""
     ctrl: jax.Array
-    """Servo targets [nu] of the last action, without any latency."""
+    """Servo targets [nu] of the last step, as late as the world makes them; moving ones at its
+    start."""
     mocap_pos: jax.Array
     mocap_quat: jax.Array
     xfrc_applied: jax.Array
-    """Zero [nbody, 6]."""
+    """Zero [nbody, 6]; the physics reads neither these forces nor the mocap bodies."""
     task: EnvState
     """Everything else that the next step depends on."""
 
@@ -88,6 +89,9 @@ class PlaygroundBounceBall(MjxEnv):
     ):
         """Makes the environment; a config must be the one of the task or the policy.
 
+        Its `episode_length` and `action_repeat` end and repeat nothing: as for Playground's own
+        environments, those of the wrapper or the trainer do.
+
         Args:
           task: its class, its name, or FILE.py:CLASS; None for the policy's, or the default one.
           policy: a name, a run's folder, a checkpoint in it or an .onnx file, whose environment it
@@ -98,20 +102,28 @@ class PlaygroundBounceBall(MjxEnv):
         Raises:
           UserError: a setting is wrong, or the policy's environment has another value.
         """
-        super().__init__(config or default_config(task, policy, world), config_overrides)
+        if config is None:
+            config = default_config(task, policy, world)
+        elif world is not None and config.task != default_config(task, policy, world).task:
+            raise UserError(
+                f"config and world both say the world, and {world} is another one; give the world "
+                "to default_config alone"
+            )
+        super().__init__(config, config_overrides)
         settings = self._config.task.to_dict() | {
             "control_dt": self._config.ctrl_dt,
             "physics_dt": self._config.sim_dt,
             "episode_seconds": self._config.episode_length * self._config.ctrl_dt,
         }
-        self.task = Env(environment_config(ENV_NAME, task, policy, world, settings))
+        settings = environment_config(ENV_NAME, task, policy, world, settings)
+        refuse_warmup(settings, ENV_NAME)
+        self.task = Env(settings)
 
     def reset(self, rng: jax.Array) -> State:
         """Starts an episode; consumes the key `rng`."""
         task = self.task
         if "_mjx_model" in vars(self):
-            own = self._own_mjx_model
-            task = randomized_task(task, self.mj_model, own, self._mjx_model)
+            task = randomized_task(task, self._own_mjx_model, self._mjx_model)
         state = task.reset(rng)
         physics = state.pipeline_state.physics
         dtype = physics.qpos.dtype

@@ -1,4 +1,4 @@
-"""The environment for PyTorch, without a copy through DLPack; needs the extra `torch`."""
+"""The environment for PyTorch, through DLPack, without a copy; needs the extra `torch`."""
 
 from bounce_mjx.errors import needed
 

@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 import torch
 
+from bounce_mjx.errors import UserError
+
 
 class _Place(NamedTuple):
     """Position of one array in the block."""
@@ -40,7 +42,11 @@ class Layout:
     word, a bool takes a byte; every array starts at a new word."""
 
     def __init__(self, shapes: Any):
-        """Lays out a pytree of shapes and types, as `jax.eval_shape` gives it."""
+        """Lays out a pytree of shapes and types, as `jax.eval_shape` gives it.
+
+        Raises:
+          UserError: an array is neither of four-byte numbers nor of bools.
+        """
         leaves, self._tree = jax.tree.flatten(shapes)
         self._places: list[_Place] = []
         # Made in advance, because each step makes the tensors anew.
@@ -49,6 +55,12 @@ class Layout:
         for leaf in leaves:
             shape = tuple(leaf.shape)
             dtype = jnp.dtype(leaf.dtype)
+            if dtype.itemsize != 4 and dtype != jnp.bool_:
+                raise UserError(
+                    f"the environment's state has an array of {dtype.name}, and TorchVectorEnv "
+                    "takes four-byte numbers and bools; convert it in the task, or switch JAX's "
+                    "64-bit mode off"
+                )
             stop = start + math.ceil(leaf.size * dtype.itemsize / 4)
             self._places.append(_Place(shape, dtype, start, stop))
             stride = torch.empty(shape, device="meta").stride()

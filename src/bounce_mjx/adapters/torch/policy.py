@@ -66,6 +66,7 @@ def to_policy(
             "the network has an ELU with another alpha than 1, which a policy has not; train with 1"
         )
     layers = [{"kernel": _array(x.weight).T, "bias": _bias(x)} for x in linears]
+    # The names of `learning/policy.py`, which are brax's.
     params = {
         "MLP_0": {f"hidden_{i}": layer for i, layer in enumerate(layers[:-1])},
         "Dense_0": layers[-1],

@@ -40,7 +40,8 @@ class RslRlVecEnv(VecEnv):
         return self
 
     def seed(self, seed: int = -1) -> int:
-        """Sets the seed of the next `reset`; -1 continues with the present random numbers."""
+        """Sets the seed of the next `reset`; -1 continues with the present random numbers. rsl_rl's
+        runners call no `reset`: for them, give `TorchVectorEnv` the seed."""
         self._seed = None if seed < 0 else seed
         return seed
 

@@ -19,7 +19,8 @@ class SkrlEnv(Wrapper):
 
     Rewards, terminated and truncated are [B, 1]; `state()` is the value network's input, the
     observation and the critic metrics [B, N + K]. skrl's trainers bootstrap a time-out from the
-    first observation of the next episode; `result` has the last one of the old.
+    first observation of the next episode; `result` has the last one of the old. They also reset a
+    single environment again after each of its episodes.
     """
 
     # skrl's properties would ask the environment that is wrapped.

@@ -76,8 +76,9 @@ class TorchVectorEnv:
         Raises:
           UserError: torch cannot use JAX's device, a metric is unknown, or there is no such policy.
         """
-        if env is not None and policy is not None:
-            raise UserError("env and policy both say the environment; give one of them")
+        for name, value in (("policy", policy), ("world", world)):
+            if env is not None and value is not None:
+                raise UserError(f"env and {name} both say the environment; give one of them")
         self.env = env or Env(environment_config("TorchVectorEnv", None, policy, world, {}))
         self.num_envs = num_envs
         self.num_observations = self.env.observation_size
@@ -92,7 +93,8 @@ class TorchVectorEnv:
         self.critic_metrics = matching_metrics(critic_metrics, metrics)
         self.metric_names = tuple(metrics)
         action = jax.ShapeDtypeStruct((num_envs, self.num_actions), jnp.float32)
-        carried, *_ = jax.eval_shape(self._start, self._key)
+        steps = jnp.int32(0) if self.env.warmup_steps else None
+        carried, *_ = jax.eval_shape(self._start, self._key, steps)
         _, result = jax.eval_shape(self._step, carried, action)
         self._carried_layout = Layout(carried)
         self._result_layout = Layout(result)
@@ -105,13 +107,18 @@ class TorchVectorEnv:
         samples other episodes than the same seed of Gymnasium's environments, which have a stream
         of random numbers each.
 
+        The ranges of a randomisation with a warm-up go on growing; a `seed` begins them anew, too.
+
         Returns:
           The observations [B, N] and the critic metrics [B, K].
         """
+        steps = jnp.int32(0) if self.env.warmup_steps else None
         if seed is not None:
             self._key = _committed_key(seed)
+        elif self._block is not None:
+            steps = self._carried().steps
         self._key, key = jax.random.split(self._key)
-        self._block, observation, critic_metrics = self._jit_start(key)
+        self._block, observation, critic_metrics = self._jit_start(key, steps)
         return torch.from_dlpack(observation), torch.from_dlpack(critic_metrics)
 
     def step(self, action: torch.Tensor) -> StepResult:
@@ -142,12 +149,21 @@ class TorchVectorEnv:
     @property
     def clock(self) -> torch.Tensor:
         """Steps of each episode that count towards its time limit [B], int32; a copy. Assign
-        different values to spread the time-outs of episodes that began together."""
+        different values to spread the time-outs of episodes that began together.
+
+        Raises:
+          UserError: the values have another shape, or `reset` was never called.
+        """
         # A copy, because the next step reuses the state's memory.
         return torch.from_dlpack(jnp.copy(self._carried().state.clock))
 
     @clock.setter
     def clock(self, value: torch.Tensor) -> None:
+        if value.shape != (self.num_envs,):
+            raise UserError(
+                f"the clock has the shape {tuple(value.shape)}, but must have {(self.num_envs,)}, "
+                "a number of steps for each environment"
+            )
         clock = jax.dlpack.from_dlpack(value.to(self.device, torch.int32, copy=True).contiguous())
         carried = self._carried()
         state = carried.state._replace(clock=clock)
@@ -155,19 +171,22 @@ class TorchVectorEnv:
 
     def _carried(self) -> "_Carried":
         if self._block is None:
-            self.reset()
+            raise UserError("the clock was asked for before reset; call reset first")
         return self._carried_layout.unpack(self._block)
 
-    def _start(self, key: jax.Array) -> tuple["_Carried", jax.Array, jax.Array]:
+    def _start(
+        self, key: jax.Array, steps: jax.Array | None
+    ) -> tuple["_Carried", jax.Array, jax.Array]:
         key, reset_key = jax.random.split(key)
-        steps = jnp.int32(0) if self.env.warmup_steps else None
         ranges = vector.ranges_after(self.env, steps, self.num_envs)
         state = vector.reset(self.env, reset_key, self.num_envs, ranges)
         critic_metrics = self._critic_metrics(state.env.metrics)
         return _Carried(_slim(state), key, steps), vector.observe(state), critic_metrics
 
-    def _packed_start(self, key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        carried, observation, critic_metrics = self._start(key)
+    def _packed_start(
+        self, key: jax.Array, steps: jax.Array | None
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        carried, observation, critic_metrics = self._start(key, steps)
         return self._carried_layout.pack(carried), observation, critic_metrics
 
     def _packed_step(self, block: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -207,7 +226,7 @@ class _Carried(NamedTuple):
     state: vector.VectorState
     key: jax.Array
     steps: jax.Array | None
-    """Steps since the last reset of all environments [], int32; None without a warm-up."""
+    """Steps since the first reset, or the last with a seed [], int32; None without a warm-up."""
 
 
 def _slim(state: vector.VectorState) -> vector.VectorState:

@@ -13,8 +13,8 @@ from numpy.polynomial.polynomial import polyfit
 from scipy.ndimage import uniform_filter1d
 from scipy.optimize import linear_sum_assignment
 
-from bounce_mjx.identify.following import commanded, find_settled
-from bounce_mjx.identify.log import JOINT_GAP, Log
+from bounce_mjx.identify.following import SETTLING, commanded, find_settled
+from bounce_mjx.identify.log import Log, find_gaps
 
 # Delays that are searched, s: a trajectory server gets its targets seconds ahead.
 _SHORTEST = -0.5
@@ -59,6 +59,10 @@ _GRAVITY = 9.81
 # Time of a piece of flight that shows the ball's acceleration, s.
 _PIECE = 0.12
 _FEWEST_PIECES = 10
+# Distance of a piece's acceleration from gravity, in its size, up to which the ball falls.
+_NEAR_GRAVITY = 0.3
+# Share of the pictures without angles and targets beside them that is worth a note.
+_ALONE = 0.05
 _PIECES = 300
 
 
@@ -101,8 +105,9 @@ class Checkup(NamedTuple):
     """A log, looked at."""
 
     joints: tuple[Joint, ...]
-    delay: float
-    """The common delay, s: the median of the joints that move."""
+    delay: float | None
+    """The common delay, s: the median of the joints that follow their commands; None if none
+    does."""
     findings: tuple[Finding, ...]
 
     @property
@@ -128,7 +133,9 @@ def describe(logs: Sequence[Log], checkups: Sequence[Checkup]) -> list[str]:
     """What was seen in each log, a line each."""
     lines = []
     for log, checkup in zip(logs, checkups, strict=True):
-        late = f"its joints follow their commands {1e3 * checkup.delay:.0f} ms later"
+        late = "none of its joints follows its command"
+        if checkup.delay is not None:
+            late = f"its joints follow their commands {1e3 * checkup.delay:.0f} ms later"
         lines.append(f"{log.source}: {len(checkup.faults)} faults; {late}")
         lines += [f"  {finding}" for finding in checkup.findings]
     return lines
@@ -150,11 +157,13 @@ def _examine_one(log: Log, joint_names: Sequence[str]) -> Checkup:
     shown = log.joint_angles[rows]
     moves = np.minimum(np.ptp(sent, axis=0), np.ptp(shown, axis=0)) > _LITTLE
     strong = moves & (np.max(of_own, axis=0) > _FOLLOWS)
-    late = float(np.median(delays[best[strong]])) if np.any(strong) else 0.0
+    # A joint that does not follow its command is compared at the delay of the others.
+    others = float(np.median(delays[best[strong]])) if np.any(strong) else 0.0
     joints = tuple(
-        _compare(log, rows, j, name, float(delays[best[j]]) if strong[j] else late)
+        _compare(log, rows, j, name, float(delays[best[j]]) if strong[j] else others)
         for j, name in enumerate(joint_names)
     )
+    late = None
     if np.any(strong):
         late = float(np.median([joints[j].delay for j in np.flatnonzero(strong)]))
     checkup = Checkup(joints, late, ())
@@ -223,7 +232,7 @@ def _compare(log: Log, rows: np.ndarray, j: int, name: str, guess: float) -> Joi
         if min(sizes) < 0.2 * abs(np.median(angles - targets)):
             delay = float(tried[np.argmin(sizes)])
             angles, targets = _smoothed(log, rows, j, delay)
-    spread = np.var(targets)
+    spread = np.var(targets, ddof=1)
     slope = float(np.cov(targets, angles)[0, 1] / spread) if spread > 1e-10 else 0.0
     offset = float(np.median(angles - targets))
     late = np.interp(log.times[rows] - delay, log.target_times, log.servo_targets[:, j])
@@ -290,7 +299,8 @@ def _find_order(joints: Sequence[Joint], correlations: np.ndarray) -> list[Findi
         if j != k and strength[j, j] < _OWN and strength[j, k] > _OTHER:
             text = (
                 f"joint_angles.{joints[k].name} follows servo_targets.{joints[j].name}, as if "
-                "columns were swapped; give the joints' names in the log's order (--joint-names)"
+                "columns were swapped; correct the titles of one of both, or where messages are "
+                "numbers without names, give the names in their order (--joint-names)"
             )
             found.append(Finding("swapped", joints[k].name, text))
     return found
@@ -300,10 +310,13 @@ def _find_joint_faults(log: Log, rows: np.ndarray, joints: Sequence[Joint]) -> l
     """What is wrong with one joint alone."""
     found = []
     for j, joint in enumerate(joints):
+        unit = _find_unit(joint)
         jumps = np.flatnonzero(np.abs(np.diff(log.joint_angles[:, j])) > np.pi)
         if joint.commanded < _LITTLE and joint.measured < _LITTLE:
             text = "it hardly moves, and the log shows little about it"
             found.append(Finding("still", joint.name, text, is_fault=False))
+        elif unit is not None:
+            found.append(unit)
         elif joint.measured < max(0.02 * joint.commanded, _STILL):
             text = (
                 f"its angle stays within {joint.measured:.2g} rad although its command moves by "
@@ -328,6 +341,26 @@ def _find_joint_faults(log: Log, rows: np.ndarray, joints: Sequence[Joint]) -> l
     return found
 
 
+def _find_unit(joint: Joint) -> Finding | None:
+    """A joint that follows its command, but in another unit: of an angle whose command is in
+    degrees, the range is a 57th, as little as that of a frozen encoder's noise."""
+    if abs(joint.correlation) < _FOLLOWS:
+        return None
+    size = abs(joint.slope)
+    for factor, degrees, radians in (
+        (_DEGREES, "joint_angles", "servo_targets"),
+        (1.0 / _DEGREES, "servo_targets", "joint_angles"),
+    ):
+        if abs(size / factor - 1.0) < 0.15:
+            text = (
+                f"its angle changes by {size:.3g} times its command, as one of both is in degrees; "
+                f"write {degrees}.{joint.name} [deg], or, if {radians}.{joint.name} says [deg], "
+                "[rad] there"
+            )
+            return Finding("unit", joint.name, text)
+    return None
+
+
 def _find_gain(log: Log, rows: np.ndarray, j: int, joint: Joint) -> list[Finding]:
     """A slope or an offset that no servo has."""
     size = abs(joint.slope)
@@ -340,13 +373,6 @@ def _find_gain(log: Log, rows: np.ndarray, j: int, joint: Joint) -> list[Finding
             "at the order of the columns, and whether the servo was on"
         )
         return [Finding("does not follow", name, text)]
-    for factor, right in ((_DEGREES, "deg"), (1.0 / _DEGREES, "rad")):
-        if abs(size / factor - 1.0) < 0.15:
-            text = (
-                f"its angle changes by {size:.3g} times its command: one of both is in degrees; "
-                f"write joint_angles.{name} [{right}]"
-            )
-            return [Finding("unit", name, text)]
     if joint.slope < 0.0:
         text = (
             f"its angle goes against its command (slope {joint.slope:.2f}); change the sign of "
@@ -415,7 +441,7 @@ def _find_delays(log: Log, rows: np.ndarray, checkup: Checkup) -> list[Finding]:
         for j, joint in enumerate(checkup.joints)
         if abs(joint.correlation) > _OTHER and min(joint.commanded, joint.measured) > _LITTLE
     ]
-    if not moving:
+    if not moving or checkup.delay is None:
         return []
     late = checkup.delay
     thirds = [part for part in np.array_split(rows, 3) if len(part) > 100]
@@ -506,34 +532,38 @@ def _runs(mask: np.ndarray) -> list[tuple[int, int]]:
 def _find_stamps(log: Log) -> list[Finding]:
     found = []
     for name, times in (("joint angles", log.times), ("servo targets", log.target_times)):
-        steps = np.diff(times)
-        typical = float(np.median(steps))
-        gaps = np.flatnonzero(steps > max(JOINT_GAP, 5.0 * typical))
-        if len(gaps):
+        if gaps := find_gaps(times):
+            longest = max(first - last for last, first in gaps)
             text = (
-                f"the {name} have {len(gaps)} gaps of up to {np.max(steps):.2f} s, the first at "
-                f"{times[gaps[0]]:.3f} s; what follows a gap counts from 0.3 s on"
+                f"the {name} have {len(gaps)} gaps of up to {longest:.2f} s, the first at "
+                f"{gaps[0][0]:.3f} s; what follows a gap counts from {SETTLING:g} s on"
             )
             found.append(Finding("gaps", "the stamps", text, is_fault=False))
+    first = max(log.times[0], log.target_times[0])
+    last = min(log.times[-1], log.target_times[-1])
+    is_alone = (log.picture_times < first) | (log.picture_times > last)
+    if np.sum(is_alone) > max(_ALONE * len(is_alone), 1.0):
+        text = (
+            f"{np.sum(is_alone)} of {len(is_alone)} pictures of the ball have stamps before "
+            f"{first:.3f} s or after {last:.3f} s, without joint angles and servo targets; their "
+            "bounces do not count"
+        )
+        found.append(Finding("pictures alone", "the stamps", text, is_fault=False))
     return found
 
 
 def _find_ball(log: Log) -> list[Finding]:
-    """A ball whose pictures repeat, or that does not fall."""
+    """A ball that never falls."""
     if len(log.picture_times) < 30:
         return []
-    found = []
-    same = np.all(np.diff(log.ball_positions, axis=0) == 0.0, axis=1)
-    if np.mean(same) > 0.02:
-        first = log.picture_times[np.argmax(same) + 1]
-        text = (
-            f"{np.sum(same)} of {len(same) + 1} pictures repeat the position before them to the "
-            f"last digit under a new stamp, first at {first:.3f} s; keep each picture's own stamp"
-        )
-        found.append(Finding("repeated pictures", "the ball", text))
     pulls = _accelerations(log.picture_times, log.ball_positions)
     if len(pulls) < _FEWEST_PIECES:
-        return found
+        return []
+    found = []
+    falls = np.linalg.norm(pulls + [0.0, 0.0, _GRAVITY], axis=1) < _NEAR_GRAVITY * _GRAVITY
+    if np.sum(falls) >= _FEWEST_PIECES:
+        # A hand may carry it in between, for most of the log.
+        return []
     pull = np.median(pulls, axis=0)
     size = float(np.linalg.norm(pull))
     axis = int(np.argmax(np.abs(pull)))
