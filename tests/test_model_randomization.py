@@ -131,6 +131,9 @@ def test_terms_of_a_randomization_fn_have_their_shares(mj_model, base):
     ball_geom = mj_model.geom("ball").id
     is_new = np.any(np.asarray(resized.geom_size != sizes), axis=(0, 2))
     assert np.flatnonzero(is_new).tolist() == [ball_geom]
+    two = load_model(None, 0.001, num_balls=2)
+    with pytest.raises(UserError, match="is of another robot than the mj_model; bind"):
+        domain_randomize(two, base, jax.random.split(jax.random.key(0), 8), config)
     grows = RandomizationConfig(**terms, warmup_steps=100)
     with pytest.raises(UserError, match="the ranges of a randomization_fn do not grow"):
         domain_randomize(mj_model, base, jax.random.split(jax.random.key(0), 8), grows)

@@ -345,14 +345,14 @@ def test_table_tells_every_figure(report: RobustnessReport) -> None:
     stream = io.StringIO()
     Console(file=stream, width=80).print(robustness_table(report))
     lines = stream.getvalue().splitlines()
-    assert "4 of 5 conditions of s meet all judged results" in lines[0]
+    assert "4 of 5 conditions (s) meet all judged results" in lines[0]
     for suite, version, name in (
-        ("folder/mine.yaml", "", "mine"),
-        ("configs/robustness.yaml", "version 2", "version 2"),
-        ("twice or half what my.yaml assumes", "", "twice or half what my.yaml assumes"),
+        ("folder/mine.yaml", "", "(mine)"),
+        ("configs/robustness.yaml", "v2", "of v2"),
+        ("twice or half what my.yaml assumes", "", "(twice or half what my.yaml assumes)"),
     ):
         report = report.model_copy(update={"suite": suite, "version": version})
-        assert f"4 of 5 conditions of {name} meet" in robustness_table(report).title
+        assert f"4 of 5 conditions {name} meet" in robustness_table(report).title
     (row,) = [line.split() for line in lines if "10 ms" in line]
     assert row == ["10", "ms", "50.0*", "-", "-*", "1.80", "25.0*", "FAIL"]
     (row,) = [line.split() for line in lines if "1 ms" in line]

@@ -216,6 +216,9 @@ def test_wrong_environment_is_refused(task):
         TorchVectorEnv(task, NUM_ENVS, critic_metrics=("bounces",))
     with pytest.raises(UserError, match="call reset first"):
         TorchVectorEnv(task, NUM_ENVS).step(torch.zeros(NUM_ENVS, 6))
+    for wrong in (0, 2.5):
+        with pytest.raises(UserError, match=f"num_envs is {wrong}, but must be a whole number"):
+            TorchVectorEnv(task, wrong)
     with pytest.raises(UserError, match="call reset first"):
         _ = TorchVectorEnv(task, NUM_ENVS).clock
 

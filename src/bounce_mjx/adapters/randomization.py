@@ -61,13 +61,20 @@ def domain_randomize(
       (`parameters_of`).
 
     Raises:
-      UserError: the ranges would have to grow, which those of a model cannot.
+      UserError: the ranges would have to grow, which those of a model cannot; or the model is of
+        another robot.
     """
     config = config or default_terms()
     if config.warmup_steps:
         raise UserError(
             "the randomisation has warmup_steps, but the ranges of a randomization_fn do not grow; "
             "set warmup_steps to 0"
+        )
+    masses = np.asarray(model.body_mass)
+    if masses.shape != mj_model.body_mass.shape or not np.allclose(masses, mj_model.body_mass):
+        raise UserError(
+            "the model to randomise is of another robot than the mj_model; bind "
+            "adapters.randomization.domain_randomize to the mj_model of its environment"
         )
     addresses = find_addresses(mj_model)
     num_joints = len(addresses.arm_joints)

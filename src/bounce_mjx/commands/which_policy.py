@@ -158,9 +158,11 @@ class WhichPolicy(StrictModel):
         Raises:
           UserError: --log-dir is given, and no path stands for the newest run.
         """
+        if self.log_dir is None:
+            return
         from bounce_mjx.runs.folders import is_newest
 
-        if self.log_dir is not None and not any(map(is_newest, paths)):
+        if not any(map(is_newest, paths)):
             raise UserError(
                 f"--log-dir is where the newest run is looked for, and {paths[0]} is named; omit "
                 "one of them"

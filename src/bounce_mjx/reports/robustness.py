@@ -45,17 +45,17 @@ def load_robustness(folder: Path) -> RobustnessReport | None:
 def summary(report: RobustnessReport) -> str:
     """The score of a report in one sentence."""
     return (
-        f"{report.met} of {len(report.outcomes)} conditions of {_suite_name(report)} meet all "
-        f"judged results, with {report.episodes} episodes each"
+        f"{report.met} of {len(report.outcomes)} conditions {_suite_name(report)} meet all judged "
+        f"results, with {report.episodes} episodes each"
     )
 
 
 def _suite_name(report: RobustnessReport) -> str:
     """The suite by its version, or else by its file's name or what it consists of."""
     if report.version:
-        return report.version
+        return f"of {report.version}"
     path = Path(report.suite)
-    return path.stem if path.suffix in (".yaml", ".yml") else report.suite
+    return f"({path.stem if path.suffix in ('.yaml', '.yml') else report.suite})"
 
 
 def robustness_table(report: RobustnessReport) -> Table:

@@ -5,6 +5,7 @@ for the device, because DLPack makes each library's stream wait for the other's.
 donated to the next step, so a step returns no view of it.
 """
 
+import numbers
 import os
 from typing import NamedTuple
 
@@ -74,16 +75,18 @@ class TorchVectorEnv:
             sampled, or a named world.
 
         Raises:
-          UserError: torch cannot use JAX's device, a metric is unknown, or there is no such policy.
+          UserError: torch cannot use JAX's device, a metric or num_envs is wrong, or there is no
+            such policy.
         """
         for name, value in (("policy", policy), ("world", world)):
             if env is not None and value is not None:
                 raise UserError(f"env and {name} both say the environment; give one of them")
+        if not isinstance(num_envs, numbers.Integral) or num_envs < 1:
+            raise UserError(f"num_envs is {num_envs!r}, but must be a whole number of at least 1")
         self.env = env or Env(environment_config("TorchVectorEnv", None, policy, world, {}))
         self.num_envs = num_envs
         self.num_observations = self.env.observation_size
         self.num_actions = self.env.action_size
-        self.episode_steps = self.env.config.episode_steps
         self.device = _shared_device()
         self._reward_scale = reward_scale
         self._key = _committed_key(seed)
@@ -101,6 +104,11 @@ class TorchVectorEnv:
         self._jit_start = jax.jit(self._packed_start)
         self._jit_step = jax.jit(self._packed_step, donate_argnums=0)
         self._block: jax.Array | None = None
+
+    @property
+    def episode_steps(self) -> int:
+        """Time limit of an episode in steps: that of the environment's config."""
+        return self.env.config.episode_steps
 
     def reset(self, seed: int | None = None) -> tuple[torch.Tensor, torch.Tensor]:
         """Starts a new episode in every environment; a `seed` seeds all following resets. It
