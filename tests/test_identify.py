@@ -41,6 +41,7 @@ from bounce_mjx.identify.simulation import (
 from bounce_mjx.identify.stages import (
     Identified,
     _check_frame,
+    _is_seen,
     _late_servos,
     _own_servos,
     identify,
@@ -534,6 +535,22 @@ def test_a_ball_that_no_window_checks_is_said() -> None:
     assert not any("nothing checks" in line for line in sentences(found, NAMES))
     unchecked = found._replace(held_out={"joint_angles": 1.0})
     assert any("nothing checks" in line for line in sentences(unchecked, NAMES))
+
+
+def test_the_search_sees_a_bounce_of_each_log_that_has_one() -> None:
+    """Also where every fifth window, which it does not see, has all of them; and a simulation of no
+    window is of the same shape as one of some."""
+    windows = windows_of(at_home((0.0, 0.0, 0.0)))
+    every = np.arange(len(windows.first))
+    np.testing.assert_array_equal(_is_seen(windows), every % 5 != 4)
+    few = windows._replace(bounces=np.where(every % 5 == 4, 0.3, np.nan))
+    assert np.sum(few.has_ball) > 0
+    np.testing.assert_array_equal(_is_seen(few), every % 5 != 3)
+    config, layout = read_preset(Path("default")).env, Layout(6, True, 0.001)
+    simulate = make_simulator(config, layout, at_home((0.0, 0.0, 0.0)), windows)
+    none = np.zeros((1, len(every)), bool)
+    simulated = simulate(layout.mean[None], windows.starts[None], none)
+    assert simulated.shape == (1, *windows.measured.shape) and not np.any(simulated)
 
 
 def test_a_warning_states_one_quantity_in_one_unit() -> None:

@@ -109,12 +109,14 @@ def make_simulator(
         return np.concatenate(rows, axis=1)[:count].astype(float)
 
     def simulate(vectors: np.ndarray, starts: np.ndarray, used: np.ndarray) -> np.ndarray:
+        result = np.zeros((*used.shape, windows.measured.shape[1]))
+        if not np.any(used):
+            return result
         c, s = np.nonzero(used)
         blocks = [slice(i, i + _LANES) for i in range(0, len(c), _LANES)]
         with ThreadPoolExecutor() as pool:
             rows = pool.map(lambda b: simulate_block(vectors, starts, c[b], s[b]), blocks)
             measured = np.concatenate(list(rows))
-        result = np.zeros((*used.shape, measured.shape[1]))
         # Where a candidate does not count, it has the numbers of the first.
         result[:, s[c == 0]] = measured[c == 0]
         result[c, s] = measured

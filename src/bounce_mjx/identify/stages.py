@@ -356,7 +356,7 @@ def _halve_steps(config: WorldConfig) -> WorldConfig:
 def _held_out_rows(log: Log, windows: Windows) -> np.ndarray:
     """Which joint angles [T] of a log are in windows that the search does not see."""
     rows = np.zeros(len(log.times), bool)
-    for s in np.flatnonzero(~_is_seen(len(windows.first))):
+    for s in np.flatnonzero(~_is_seen(windows)):
         used = windows.angle_times[s, windows.angle_weights[s] > 0.0]
         if len(used):
             times = log.times - windows.zero[s]
@@ -379,14 +379,19 @@ def _squared_errors(windows: Windows, fit: Fit) -> float:
     return float(np.sum(_joint_errors(windows, fit) ** 2))
 
 
-def _is_seen(count: int) -> np.ndarray:
-    """Which windows [S] the search sees."""
-    return np.arange(count) % _HELD_OUT != _HELD_OUT - 1
+def _is_seen(windows: Windows) -> np.ndarray:
+    """Which windows [S] the search sees: all but every fifth; of a log whose few bounces are all in
+    these, all but those before them."""
+    place = np.arange(len(windows.first)) % _HELD_OUT
+    is_seen = place != _HELD_OUT - 1
+    if np.any(windows.has_ball) and not np.any(windows.has_ball & is_seen):
+        return place != _HELD_OUT - 2
+    return is_seen
 
 
 def _training(problem: Problem) -> np.ndarray:
     """1 for each window of the search [S, 1], 0 for those held out."""
-    return _is_seen(len(problem.windows.first))[:, None].astype(float)
+    return _is_seen(problem.windows)[:, None].astype(float)
 
 
 def _check_frame(windows: Windows, config: WorldConfig, source: str) -> None:
@@ -510,7 +515,7 @@ def _guess_spins(problem: Problem, fit: Fit) -> Fit:
         )
 
     # At first, each flight may have any drag; their median is then that of the ball.
-    seen = with_ball[_is_seen(len(windows.first))[with_ball]]
+    seen = with_ball[_is_seen(windows)[with_ball]]
     free = [fit_window(s, GUESSED_DRAG, 1.0).drag_deviation for s in seen]
     drag = GUESSED_DRAG * (1.0 + float(np.median(free)))
     vector[problem.layout.slices["air_drag"]] = drag
