@@ -27,7 +27,14 @@ from bounce_mjx.identify.fit import (
     picture_weights,
 )
 from bounce_mjx.identify.flight import acceleration, fit_flight
-from bounce_mjx.identify.following import command_delay, find_settled, follow, set_points
+from bounce_mjx.identify.following import (
+    command_delay,
+    does_move,
+    find_settled,
+    follow,
+    set_points,
+    shows_set_points,
+)
 from bounce_mjx.identify.inspection import examine
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.reading import read_csv
@@ -816,6 +823,25 @@ def test_set_points_are_commanded_when_they_are_due() -> None:
     # Commands that are held until the next are later than their stamps by half a step.
     late = log._replace(joint_angles=np.sin(np.outer(times - 0.0155, rates)))
     assert command_delay(late, follow(late, rows)) == pytest.approx(0.0115, abs=1e-4)
+
+
+def test_an_arm_at_rest_shows_no_delay_and_no_set_points() -> None:
+    """Nor does one that rests in two logs, elsewhere in each."""
+    log = flight_log()
+    rest = np.tile(0.2 * np.arange(6), (len(log.times), 1))
+    still = log._replace(joint_angles=rest + 1e-3, servo_targets=rest)
+    elsewhere = still._replace(joint_angles=rest + 0.301, servo_targets=rest + 0.3)
+    moving = log._replace(joint_angles=log.servo_targets + 1e-3)
+    cases = (([still], False), ([still, elsewhere], False), ([still, moving], True))
+    for logs, moves in cases:
+        joined = join(logs)
+        following = follow(joined, find_settled(joined))
+        assert does_move(joined) == shows_set_points(joined, following) == moves
+    assert not any("their sum is what it shows" in line for line in sentences(unseen(), NAMES))
+    found = unseen()._replace(is_still=True)
+    assert any("neither a delay nor servos" in line for line in sentences(found, NAMES))
+    model = world_model(read_preset(Path("default")).env, visual=False)
+    assert total_delay(found, model).endswith("(not shown by the log)")
 
 
 def test_a_controller_that_carries_the_arm_lets_no_servo_sag() -> None:

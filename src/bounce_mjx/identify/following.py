@@ -59,8 +59,11 @@ def find_settled(log: Log) -> np.ndarray:
 
 
 def does_move(log: Log) -> bool:
-    """Whether any command of a log changes."""
-    return bool(np.max(np.ptp(log.servo_targets, axis=0)) > _STILL)
+    """Whether any command of a log changes, within a stretch without gaps: the arm was also moved
+    between two logs that are joined."""
+    begins = [first for _, first in find_gaps(log.target_times)]
+    stretches = np.split(log.servo_targets, np.searchsorted(log.target_times, begins))
+    return any(np.max(np.ptp(targets, axis=0)) > _STILL for targets in stretches)
 
 
 def commanded(log: Log, times: np.ndarray) -> np.ndarray:
@@ -78,6 +81,7 @@ def follow(log: Log, rows: np.ndarray, shortest: float = -0.05, longest: float =
     """
     chosen = np.flatnonzero(rows)
     if not does_move(log):
+        # All delays explain it equally.
         shortest = 0.0
         longest = _STEP
     few = chosen[:: max(len(chosen) // _ROWS, 1)]
@@ -97,8 +101,9 @@ def follow(log: Log, rows: np.ndarray, shortest: float = -0.05, longest: float =
 
 def shows_set_points(log: Log, following: Following) -> bool:
     """Whether the joints follow too early for commands that are held until the next: the commands
-    of the log are then a controller's own set points, recorded now and then."""
-    return following.delay < _hold(log)
+    of the log are then a controller's own set points, recorded now and then. Those of an arm that
+    is still show nothing."""
+    return does_move(log) and following.delay < _hold(log)
 
 
 def command_delay(log: Log, following: Following) -> float:

@@ -114,6 +114,8 @@ class Identified(NamedTuple):
     """Those of the identified world [n], rad."""
     gravity_compensation: float = 0.0
     """Share of the arm's weight that its controller carries, if more than the model's own."""
+    is_still: bool = False
+    """Whether no command of the log changes: it shows no delay, and no servos but their offsets."""
     has_set_points: bool = False
     """Whether the log's targets are a controller's own set points: the arm is then a follower."""
     is_follower: bool = False
@@ -241,6 +243,7 @@ def identify(
     delay = command_delay(log, following)
     # Of the targets as they are in the log, which `following` was fitted to.
     following_errors = held_out_error(log, following, settled & held_out)
+    is_still = not does_move(log)
     has_set_points = shows_set_points(log, following)
     log = set_points(log, following, config.physics_dt)
     own = Problem(
@@ -254,14 +257,15 @@ def identify(
     carried = own._replace(
         simulate=make_simulator(config, layout, log, windows, carried=1.0), gravity_compensation=1.0
     )
-    progress(f"arm: {1e3 * following.delay:.1f} ms behind its commands")
-    if does_move(log):
+    if not is_still:
+        progress(f"arm: {1e3 * following.delay:.1f} ms behind its commands")
         searches = [_search_arm(problem, config, delay, following) for problem in (own, carried)]
         problem, fit = _choose(own, carried, searches)
         problem, fit = _fit_arm(problem, fit)
         follower = _stiff_follower(problem, config, delay, following)
         is_follower = has_set_points or _explains_better(problem, follower, fit)
     else:
+        progress("arm: its commands do not change")
         # Gravity's tilt would explain where an arm rests.
         problem = own
         is_follower = False
@@ -285,7 +289,7 @@ def identify(
         problem, fit, pictures = _fit_ball(problem, fit, make)
         stages = [*stages, "flight", "bounce"]
         free_states = None
-    if does_move(log) and not is_follower and np.max(problem.correlation) < _FEW_ALIKE:
+    if not is_still and not is_follower and np.max(problem.correlation) < _FEW_ALIKE:
         lift = AIR_LIFT * problem.has_lift
         finer = _halve_steps(config)
         # Latency and lag are the same; their delay and its variance depend on the lag's steps.
@@ -336,6 +340,7 @@ def identify(
         following_errors=following_errors,
         joint_errors=_joint_errors(windows, unseen),
         gravity_compensation=share,
+        is_still=is_still,
         has_set_points=has_set_points,
         is_follower=is_follower,
         has_lift=problem.has_lift,

@@ -154,6 +154,11 @@ def sentences(found: Identified, joint_names: Sequence[str]) -> list[str]:
     said = describe_doubts(found, joint_names)
     if found.gravity_compensation:
         said.append("The log shows that the controller carries the arm's weight.")
+    if found.is_still:
+        said.append(
+            "No command in the log changes, so it shows neither a delay nor servos; record motions "
+            "of the arm too (bounce-mjx excite)."
+        )
     if found.has_set_points:
         said.append(
             "The targets are the controller's own set points, which the joints follow at once: the "
@@ -184,8 +189,10 @@ def sentences(found: Identified, joint_names: Sequence[str]) -> list[str]:
             "The log shows no bounce, so only the arm was identified, without a zero that an "
             "encoder and its servo share (encoder_bias)."
         )
-    lag = found.layout.slices["delay_variance"]
-    if np.all(found.deviation[lag] >= _UNSEEN * found.layout.deviation[lag]):
+    delay = found.layout.slices["delay"].start
+    lag = found.layout.slices["delay_variance"].start
+    is_seen = found.deviation < _UNSEEN * found.layout.deviation
+    if is_seen[delay] and not is_seen[lag]:
         said.append(
             "The log does not tell action_latency and servo_lag apart; their sum is what it shows."
         )
@@ -256,7 +263,11 @@ def total_delay(found: Identified, model: mujoco.MjModel) -> str:
     wider = found.deviation[delay] / np.sqrt(covariance[delay, delay])
     width = _HALF_WIDTH * misfit(found) * wider * float(np.sqrt(slope @ covariance @ slope))
     late = max(total(vector), 0.0)
-    return f"total delay: {1e3 * late:.1f} +- {1e3 * width:.1f} ms, of latency, lag and servos"
+    is_shown = found.deviation[delay] < _UNSEEN * layout.deviation[delay]
+    return (
+        f"total delay: {1e3 * late:.1f} +- {1e3 * width:.1f} ms, of latency, lag and servos"
+        f"{'' if is_shown else ' (not shown by the log)'}"
+    )
 
 
 def _describe_mistakes(found: Identified, joint_names: Sequence[str]) -> list[str]:
