@@ -48,6 +48,7 @@ from bounce_mjx.identify.simulation import (
 from bounce_mjx.identify.stages import (
     Identified,
     _check_frame,
+    _cut_enough,
     _is_seen,
     _late_servos,
     _own_servos,
@@ -542,6 +543,25 @@ def test_a_ball_that_no_window_checks_is_said() -> None:
     assert not any("nothing checks" in line for line in sentences(found, NAMES))
     unchecked = found._replace(held_out={"joint_angles": 1.0})
     assert any("nothing checks" in line for line in sentences(unchecked, NAMES))
+
+
+def test_pictures_of_fewer_than_three_bounces_change_nothing() -> None:
+    """As the world then has no terms of a ball, which the arm would make good for."""
+    log = flight_log(8.0, gap=(9.0, 9.0))
+    every = _cut_enough(log, 0.001)
+    assert np.sum(every.has_ball) > 3
+    second, third = np.sort((every.zero + every.bounces)[every.has_ball])[1:3]
+    for last, count in ((second, 0), (third, 3)):
+        shown = log.picture_times < last + 0.25
+        few = log._replace(
+            picture_times=log.picture_times[shown],
+            ball_positions=log.ball_positions[shown],
+            arrivals=log.arrivals[shown],
+        )
+        windows = _cut_enough(few, 0.001)
+        assert np.sum(windows.has_ball) == count
+        assert np.any(windows.picture_weights) == (count > 0)
+        assert np.all(windows.starts[~windows.has_ball, 14] == 50.0)
 
 
 def test_the_search_sees_a_bounce_of_each_log_that_has_one() -> None:

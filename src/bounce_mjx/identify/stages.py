@@ -229,9 +229,9 @@ def identify(
     """
     times = {name: _straighten(getattr(log, name)) for name in ("times", "target_times")}
     log = log._replace(**times)
-    windows = cut(log, config.physics_dt)
+    windows = _cut_enough(log, config.physics_dt)
     bounces = int(np.sum(windows.has_ball))
-    with_ball = bounces >= _FEWEST_BOUNCES
+    with_ball = bounces > 0
     progress(f"{len(windows.first)} windows, {bounces} with a bounce")
     if with_ball:
         _check_frame(windows, config, log.source)
@@ -347,6 +347,17 @@ def identify(
         leaves_at_once=problem.leaves_at_once,
         stamp_age=least_age(log),
     )
+
+
+def _cut_enough(log: Log, physics_dt: float) -> Windows:
+    """The windows of a log; of the arm alone if it has too few bounces for the unknowns of the
+    ball, as the arm's unknowns would make good for these."""
+    windows = cut(log, physics_dt)
+    if np.sum(windows.has_ball) >= _FEWEST_BOUNCES:
+        return windows
+    none = np.zeros(0)
+    of_arm = log._replace(picture_times=none, ball_positions=np.zeros((0, 3)), arrivals=none)
+    return cut(of_arm, physics_dt)
 
 
 def _halve_steps(config: WorldConfig) -> WorldConfig:

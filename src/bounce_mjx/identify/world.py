@@ -186,8 +186,8 @@ def sentences(found: Identified, joint_names: Sequence[str]) -> list[str]:
         )
     if not np.any(found.windows.has_ball):
         said.append(
-            "The log shows no bounce, so only the arm was identified, without a zero that an "
-            "encoder and its servo share (encoder_bias)."
+            "The log shows fewer than three bounces, so only the arm was identified, without a "
+            "zero that an encoder and its servo share (encoder_bias)."
         )
     delay = found.layout.slices["delay"].start
     lag = found.layout.slices["delay_variance"].start
@@ -371,7 +371,7 @@ def to_yaml(
         unknown = BALL[name]
         ends = unknown.mean - unknown.deviation, unknown.mean + unknown.deviation
         ranges[name] = _clip(name, ends)
-        sources[name] = f"{log.source} shows no bounce; these are typical values."
+        sources[name] = f"{log.source} shows fewer than three bounces; these are typical values."
         assumed.append(name)
     for name, (low, high, words) in _measure_sensors(found, log).items():
         ranges[name] = _clip(name, (low, high))
