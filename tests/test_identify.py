@@ -864,6 +864,31 @@ def test_an_arm_at_rest_shows_no_delay_and_no_set_points() -> None:
     assert total_delay(found, model).endswith("(not shown by the log)")
 
 
+def test_what_was_chosen_for_a_follower_has_no_interval(tmp_path: Path) -> None:
+    """Nor does a motion show it; its range in the world is as wide as the prior."""
+    found = unseen()
+    layout = found.layout
+    vector = layout.vector({"servo_gain": np.full(6, 30.0)})
+    follower = found._replace(is_follower=True, fit=found.fit._replace(vector=vector))
+    chosen = {x.label.split(" ")[0] for x in estimates(follower, NAMES) if x.chosen}
+    assert chosen == {"servo_lag", "servo_gain", "servo_damping", "joint_frictionloss"}
+    assert not any(x.chosen for x in estimates(found, NAMES))
+    unshown = [x for x in sentences(follower, NAMES) if x.startswith("The log does not s")]
+    assert any("link_mass" in x for x in unshown)
+    assert not any(name in line for name in chosen for line in unshown)
+    path = tmp_path / "world.yaml"
+    path.write_text(to_yaml(follower, flight_log(), NAMES, None), encoding="utf-8")
+    world = read_world(path)
+    gain, mass = (world.sources[f"randomization.{name}"] for name in ("servo_gain", "link_mass"))
+    assert "30, 30" in gain and "+-" not in gain and "95%" not in gain
+    assert "+-" in mass and "95%" in mass
+    expected = [[30.0 * (2.0 - np.exp(0.2))] * 6, [30.0 * np.exp(0.2)] * 6]
+    np.testing.assert_allclose(world.settings["randomization"]["servo_gain"], expected, rtol=1e-3)
+    checkups = examine([flight_log()], NAMES)
+    page = identification_page(follower, [flight_log()], checkups, NAMES, path, [])
+    assert page.count("chosen for an arm that follows") == 19
+
+
 def test_a_controller_that_carries_the_arm_lets_no_servo_sag() -> None:
     """The forces of gravity and of its compensation cancel; and a share of it that is a parameter
     is the same in the fused engine and on C."""

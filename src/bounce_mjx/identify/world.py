@@ -62,6 +62,9 @@ class Estimate(NamedTuple):
     high: float
     seen: bool
     """Whether the log shows it; otherwise the interval is the prior's."""
+    chosen: bool
+    """Whether it was chosen for a follower: the interval is then the prior's about that number,
+    which says how far a training may vary it and nothing about the robot."""
     alone: float
     """Half-width of the interval if all other unknowns had their estimates."""
     typical: float
@@ -98,6 +101,7 @@ def estimates(found: Identified, joint_names: Sequence[str]) -> list[Estimate]:
             for array in (values, low, high):
                 array[place] = np.clip(array[place], *TERMS[name].bounds)
     seen = found.deviation < _UNSEEN * layout.deviation
+    chosen = _is_chosen(found)
     return [
         Estimate(
             label=label,
@@ -106,11 +110,20 @@ def estimates(found: Identified, joint_names: Sequence[str]) -> list[Estimate]:
             low=float(low[i]),
             high=float(high[i]),
             seen=bool(seen[i]),
+            chosen=bool(chosen[i]),
             alone=float(alone[i]),
             typical=float(typical[i]),
         )
         for i, label in enumerate(layout.labels(joint_names))
     ]
+
+
+def _is_chosen(found: Identified) -> np.ndarray:
+    """Which unknowns [P] were chosen for a follower, and not searched."""
+    chosen = np.zeros(len(found.fit.vector), bool)
+    for name in _OF_FOLLOWER if found.is_follower else ():
+        chosen[found.layout.terms[name]] = True
+    return chosen
 
 
 def _estimate_delays(found: Identified) -> dict[str, tuple[float, float]]:
@@ -289,10 +302,7 @@ def _describe_mistakes(found: Identified, joint_names: Sequence[str]) -> list[st
     typical[delay] = layout.mean[delay]
     late = layout.slices.get("ball_latency", slice(0, 0))
     typical[late] += found.stamp_age
-    is_judged = np.ones(len(vector), bool)
-    if found.is_follower:
-        for name in _OF_FOLLOWER:
-            is_judged[layout.terms[name]] = False
+    is_judged = ~_is_chosen(found)
     said = [
         f"warning: {entry.label} is {entry.value:.4g} {entry.unit}".rstrip()
         + f", {off[i]:.1f} deviations of the prior from {typical[i]:.3g}."
@@ -311,12 +321,14 @@ def _describe_mistakes(found: Identified, joint_names: Sequence[str]) -> list[st
 
 def _describe_unseen(found: Identified, joint_names: Sequence[str]) -> list[str]:
     """Combinations of unknowns that the log cannot show: the eigenvectors of its information, in
-    units of the prior, with small eigenvalues."""
+    units of the prior, with small eigenvalues; not of those that were chosen."""
     layout = found.layout
-    labels = layout.labels(joint_names)
+    searched = np.flatnonzero(~_is_chosen(found))
+    labels = np.array(layout.labels(joint_names))[searched]
     owners = [n for n, place in layout.terms.items() for _ in range(place.start, place.stop)]
+    owners = np.array(owners)[searched]
     scaled = found.information * np.outer(layout.deviation, layout.deviation)
-    values, vectors = np.linalg.eigh(scaled)
+    values, vectors = np.linalg.eigh(scaled[np.ix_(searched, searched)])
     said: dict[frozenset[str], str] = {}
     for value, vector in zip(values, vectors.T, strict=True):
         main = np.flatnonzero(np.abs(vector) > _SHARE)
@@ -363,10 +375,14 @@ def to_yaml(
             assumed.append(name)
         shown = any(entry.seen for entry in entries)
         how = "Identified" if shown else "Not shown, so the prior stands,"
-        if found.is_follower and name in _OF_FOLLOWER:
-            how = "Chosen, as a delay and offsets alone explain the joints,"
         values = ", ".join(map(_format, entries))
         sources[name] = f"{how} from {log.source}: {values} (95%)."
+        if all(entry.chosen for entry in entries):
+            values = ", ".join(f"{entry.value:.4g} {entry.unit}".rstrip() for entry in entries)
+            sources[name] = (
+                "Chosen, as a delay and offsets alone explain the joints, and not measured, from "
+                f"{log.source}: {values}."
+            )
     for name in [name for name in BALL if name not in ranges]:
         unknown = BALL[name]
         ends = unknown.mean - unknown.deviation, unknown.mean + unknown.deviation
