@@ -491,6 +491,21 @@ def test_what_is_not_shown_is_as_well_known_as_before() -> None:
             deviation = layout.unknowns[entry.label.split(" ")[0]].deviation
             assert entry.high - entry.value == pytest.approx(1.96 * deviation)
             assert not entry.seen
+    # Of latency, lag and their sum, also where errors in unseen windows widen the intervals.
+    vector = layout.vector({"action_latency": 0.03, "servo_lag": 0.01})
+    unseen_delays, twice = (
+        identified(layout, flight_log(), vector, np.diag((factor * layout.deviation) ** 2))
+        for factor in (1.0, 3.0)
+    )
+    poor = unseen_delays._replace(held_out={"joint_angles": 3.0, "ball_position": 1.0})
+    assert misfit(poor) == 3.0
+    model = world_model(read_preset(Path("default")).env, visual=False)
+    for found in (poor, twice):
+        for known, entry in zip(
+            estimates(unseen_delays, NAMES), estimates(found, NAMES), strict=True
+        ):
+            np.testing.assert_allclose(entry[2:5], known[2:5], rtol=1e-6, err_msg=entry.label)
+        assert total_delay(found, model) == total_delay(unseen_delays, model)
 
 
 def test_a_model_that_does_not_explain_a_log_is_named() -> None:

@@ -79,8 +79,7 @@ def estimates(found: Identified, joint_names: Sequence[str]) -> list[Estimate]:
     vector = found.fit.vector
     world = layout.world(vector)
     values = np.concatenate([np.ravel(world[name]) for name in layout.terms])
-    # What a log does not show is as well known as before it.
-    deviation = np.minimum(found.deviation * misfit(found), layout.deviation)
+    deviation = _known_deviation(found)
     low = layout.decode(layout.clip(vector - _HALF_WIDTH * deviation))
     high = layout.decode(layout.clip(vector + _HALF_WIDTH * deviation))
     given_others = misfit(found) / np.sqrt(np.diag(np.linalg.inv(found.covariance)))
@@ -126,6 +125,12 @@ def _is_chosen(found: Identified) -> np.ndarray:
     return chosen
 
 
+def _known_deviation(found: Identified) -> np.ndarray:
+    """Standard deviations [P] of the unknowns, widened by the misfit; what a log does not show is
+    as well known as before it."""
+    return np.minimum(found.deviation * misfit(found), found.layout.deviation)
+
+
 def _estimate_delays(found: Identified) -> dict[str, tuple[float, float]]:
     """Intervals of latency and lag from those of the delay and its variance. The latency is the
     delay less the lag, whose error is not normal near 0: its interval adds the change over the
@@ -135,12 +140,13 @@ def _estimate_delays(found: Identified) -> dict[str, tuple[float, float]]:
     places = found.layout.slices
     delay = places["delay"].start
     variance = places["delay_variance"].start
-    width = _HALF_WIDTH * found.deviation[variance] * misfit(found)
+    width = _HALF_WIDTH * _known_deviation(found)[variance]
     slope = found.covariance[delay, variance] / found.covariance[variance, variance]
     squared = found.covariance[delay, delay] - slope * found.covariance[delay, variance]
     if found.deviation[delay] >= _UNSEEN * layout.deviation[delay]:
         squared = found.covariance[delay, delay]
-    given_variance = _HALF_WIDTH * misfit(found) * np.sqrt(max(squared, 0.0))
+    of_delay = misfit(found) * np.sqrt(max(squared, 0.0))
+    given_variance = _HALF_WIDTH * min(of_delay, layout.deviation[delay])
     ends = np.repeat(vector[None], 3, axis=0)
     ends[:, variance] = np.maximum(vector[variance] + np.array([-width, 0.0, width]), 0.0)
     ends[:, delay] += slope * (ends[:, variance] - vector[variance])
@@ -274,7 +280,9 @@ def total_delay(found: Identified, model: mujoco.MjModel) -> str:
     covariance = np.linalg.inv(found.information + np.diag(layout.deviation**-2.0))
     # As much wider than for independent residuals as the interval of the delay.
     wider = found.deviation[delay] / np.sqrt(covariance[delay, delay])
-    width = _HALF_WIDTH * misfit(found) * wider * float(np.sqrt(slope @ covariance @ slope))
+    deviation = misfit(found) * wider * float(np.sqrt(slope @ covariance @ slope))
+    before = float(np.linalg.norm(slope * layout.deviation))
+    width = _HALF_WIDTH * min(deviation, before)
     late = max(total(vector), 0.0)
     is_shown = found.deviation[delay] < _UNSEEN * layout.deviation[delay]
     return (
