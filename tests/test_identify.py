@@ -52,6 +52,7 @@ from bounce_mjx.identify.stages import (
     _is_seen,
     _late_servos,
     _own_servos,
+    _stiff_follower,
     identify,
     join,
 )
@@ -877,6 +878,22 @@ def test_an_arm_at_rest_shows_no_delay_and_no_set_points() -> None:
     assert any("neither a delay nor servos" in line for line in sentences(found, NAMES))
     model = world_model(read_preset(Path("default")).env, visual=False)
     assert total_delay(found, model).endswith("(not shown by the log)")
+
+
+def test_a_follower_is_judged_by_windows_that_it_has_not_seen() -> None:
+    config, log = read_preset(Path("default")).env, flight_log(20.0)
+    problem = linear_problem(log, np.random.default_rng(3))
+    windows, following = problem.windows, follow(log, find_settled(log))
+    held_out = ~_is_seen(windows)
+    followers = []
+    for which in (~held_out, held_out):
+        angles = windows.angles + 0.1 * which[:, None, None]
+        other = problem._replace(windows=windows._replace(angles=angles))
+        followers.append(_stiff_follower(other, config, 0.02, following).vector)
+    place = problem.layout.slices["servo_offset"]
+    same = _stiff_follower(problem, config, 0.02, following).vector
+    np.testing.assert_array_equal(followers[1], same)
+    np.testing.assert_allclose(followers[0][place], same[place] + 0.1, atol=1e-3)
 
 
 def test_what_was_chosen_for_a_follower_has_no_interval(tmp_path: Path) -> None:

@@ -44,7 +44,8 @@ from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.model import model_nominals, world_model
 
 # Every fifth window is held out of the search for the unknowns until its last stage. Its residuals
-# give its outliers less weight, as in all windows, and choose between servos and a follower.
+# give its outliers less weight, as in all windows, and choose between servos and a follower: of the
+# two errors the smaller one is told, which is a little too small.
 _HELD_OUT = 5
 # Latencies of the ball, s, and its frictions, of the first candidates.
 _BALL_LATENCIES = np.arange(-0.004, 0.05, 0.008)
@@ -280,7 +281,8 @@ def identify(
             if has_set_points
             else "a delay and offsets explain the arm as well as its servos do"
         )
-        fit = follower
+        # As the last fit of servos, in all windows.
+        fit = _with_offsets(problem, follower)
         stages = []
     pictures = np.ones_like(windows.picture_weights)
     seen = _training(problem)
@@ -599,12 +601,13 @@ def _search_arm(
     return _in_units_of_errors(problem, fit), fit
 
 
-def _with_offsets(problem: Problem, fit: Fit) -> Fit:
-    """The fit with servo offsets, without which an unknown that is no servo's would have to explain
-    where the joints stand."""
+def _with_offsets(problem: Problem, fit: Fit, windows: np.ndarray | float = 1.0) -> Fit:
+    """The fit with the servo offsets of some windows [S, 1], by default of all; without these an
+    unknown that is no servo's would have to explain where the joints stand."""
     vector = fit.vector.copy()
     angles = problem.windows.split(problem.predict(fit.vector, fit.starts))[0]
-    residuals = (problem.windows.angles - angles)[problem.windows.angle_weights > 0.0]
+    counts = problem.windows.angle_weights * windows > 0.0
+    residuals = (problem.windows.angles - angles)[counts]
     vector[problem.layout.slices["servo_offset"]] += np.median(residuals, axis=0)
     return fit._replace(vector=vector)
 
@@ -651,7 +654,7 @@ def _stiff_follower(
     problem: Problem, config: WorldConfig, delay: float, following: Following
 ) -> Fit:
     """The arm that follows its commands as the simplest model does: late, with an offset of each
-    joint, by servos that are too stiff to matter."""
+    joint, by servos that are too stiff to matter. It knows nothing of held-out windows."""
     layout = problem.layout
     windows = problem.windows
     # A servo answers the mean command of a physics step, that of its middle, at the step's end: by
@@ -676,11 +679,12 @@ def _stiff_follower(
         for vector in vectors
     ]
     best = min(followers, key=lambda fit: _squared_errors(windows, fit))
-    return _with_offsets(problem, best._replace(starts=windows.starts))
+    return _with_offsets(problem, best._replace(starts=windows.starts), _training(problem))
 
 
 def _explains_better(problem: Problem, simple: Fit, fit: Fit) -> bool:
-    """Whether the simple arm leaves no more than the fit in windows that no search has seen."""
+    """Whether the simple arm leaves no more than the fit in windows that neither has seen. A tie is
+    the simple arm's, which has fewer unknowns."""
     windows = problem.windows
     unseen = problem.weights(0.0, 1.0 - _training(problem))
 
