@@ -53,6 +53,7 @@ from bounce_mjx.identify.stages import (
     _late_servos,
     _own_servos,
     _stiff_follower,
+    _straighten,
     identify,
     join,
 )
@@ -185,6 +186,16 @@ def test_no_window_spans_two_logs() -> None:
     is_early = np.nanmin(shown, axis=1) < 4.5
     assert 0 < np.sum(is_early) < len(shown)
     assert np.all(np.nanmax(shown[is_early], axis=1) < 4.51)
+
+
+def test_stamps_that_jitter_are_straightened_in_their_order() -> None:
+    """Also where a long step parts two short stretches, whose lines would overlap."""
+    steps = np.concatenate([np.full(200, 1e-3), [1.7e-3], np.full(39, 0.96e-3)])
+    steps = np.concatenate([steps, [1.51e-3], np.full(39, 0.96e-3)])
+    times = np.cumsum(steps)
+    straight = _straighten(times)
+    assert np.all(np.diff(straight) >= 0.0)
+    assert 5e-4 < np.max(np.abs(straight - times)) < 1e-3
 
 
 @pytest.mark.parametrize("latency, lag", [(0.0237, 0.0), (0.0082, 0.015)])

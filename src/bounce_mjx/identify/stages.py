@@ -207,7 +207,8 @@ def _straighten(times: np.ndarray) -> np.ndarray:
         slope = typical if len(part) < 50 else float(index @ part / (index @ index))
         line = np.mean(part) + slope * index
         stretches.append(line if np.std(part - line) < _JITTER else part)
-    return np.concatenate(stretches)
+    # Where jitter alone parts two stretches, their lines may overlap by less than it.
+    return np.sort(np.concatenate(stretches))
 
 
 def identify(
