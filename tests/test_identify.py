@@ -58,7 +58,7 @@ from bounce_mjx.identify.stages import (
     join,
 )
 from bounce_mjx.identify.unknowns import MOTIONS, Layout
-from bounce_mjx.identify.windows import Windows, cut
+from bounce_mjx.identify.windows import Windows, _joint_start, cut
 from bounce_mjx.identify.world import (
     compare,
     describe_doubts,
@@ -168,6 +168,21 @@ def test_what_follows_a_gap_of_the_targets_counts_once_the_arm_has_settled() -> 
     assert not np.any((times > 2.995) & (times < 4.305))
     bounces = (w.zero + w.bounces)[w.has_ball]
     assert not np.any((bounces > 2.995) & (bounces < 4.305))
+
+
+def test_a_window_that_begins_in_a_gap_begins_with_the_nearest_angles() -> None:
+    """A parabola through eight milliseconds of noisy angles says nothing of those 0.3 s before."""
+    random, times = np.random.default_rng(0), np.arange(0.0, 4.0, 0.001)
+    angles = 0.5 + 0.1 * times[:, None] + 1e-3 * random.normal(size=(len(times), 6))
+    measured = (times < 1.0) | (times >= 2.0)
+    log = flight_log()._replace(times=times[measured], joint_angles=angles[measured])
+    for begin, angle in ((1.3, 0.6), (1.7, 0.7), (-0.3, 0.5)):
+        start = _joint_start(log, begin)
+        np.testing.assert_allclose(start[:6], angle, atol=4e-3)
+        assert not np.any(start[6:])
+    start = _joint_start(log, 3.0)
+    np.testing.assert_allclose(start[:6], 0.8, atol=2e-3)
+    assert np.all(start[6:] != 0.0)
 
 
 def test_no_window_spans_two_logs() -> None:

@@ -255,9 +255,13 @@ def _pad(
 
 
 def _joint_start(log: Log, time: float) -> np.ndarray:
-    """Angles and velocities [2 n] at a time, by a parabola through the measurements near it."""
+    """Angles and velocities [2 n] at a time, by a parabola through the measurements near it; in a
+    gap or before the first one, the nearest angles at rest."""
     near = np.argsort(np.abs(log.times - time))[:9]
     t = log.times[near] - time
+    if np.min(t) > 0.0 or np.max(t) < 0.0:
+        nearest = log.joint_angles[near[0]]
+        return np.concatenate([nearest, np.zeros_like(nearest)])
     return polyfit(t, log.joint_angles[near], 2)[:2].ravel()
 
 
