@@ -13,7 +13,8 @@ from bounce_mjx.identify.log import Log, find_gaps
 
 SETTLING = 0.3
 """Time after the start of a log, or a gap, until the arm has forgotten the unknown commands before
-it, s: the longest latency and a few of the longest lags."""
+it, s: longer than latencies are, and a few of most lags. `follow` tries delays beyond it, up to
+0.4 s, whose first rows after a gap are compared with commands interpolated through it."""
 _STEP = 2e-3
 # Commands that change by less show no delay, rad.
 _STILL = 5e-3

@@ -308,7 +308,8 @@ def align_clocks(log: Log) -> Log:
     the slope of a line (Theil 1950 and Sen 1968, which no fourth of its points can bend) through
     the ages of the youngest picture in each stretch of the log. One of less than a millisecond, and
     an offset of less than a second, count as none. A drift faster than any clock's is not
-    corrected: pictures that wait longer and longer look like it, and a note says so.
+    corrected: pictures that wait longer and longer look like it, and a note says so. Fewer than 240
+    pictures stay as they are stamped.
 
     Raises:
       UserError: the stamps are no seconds.

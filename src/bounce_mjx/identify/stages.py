@@ -96,7 +96,7 @@ class Identified(NamedTuple):
     """Of the unknowns [P, P], with the prior."""
     before: dict[str, float]
     """Root of the mean squared residual of each sensor, in units of its noise: in the model's own
-    world."""
+    world, from the starts of the identified one."""
     after: dict[str, float]
     """In the identified world."""
     held_out: dict[str, float]
@@ -112,7 +112,8 @@ class Identified(NamedTuple):
     following_errors: np.ndarray = np.zeros(0)
     """Its errors [n] in the windows that the search had not seen, rad."""
     joint_errors: np.ndarray = np.zeros(0)
-    """Those of the identified world [n], rad."""
+    """Those of the identified world [n], rad. Where it is a follower, its offsets are medians over
+    all windows."""
     gravity_compensation: float = 0.0
     """Share of the arm's weight that its controller carries, if more than the model's own."""
     is_still: bool = False
@@ -243,7 +244,7 @@ def identify(
     held_out = _held_out_rows(log, windows)
     following = follow(log, settled & ~held_out)
     delay = command_delay(log, following)
-    # Of the targets as they are in the log, which `following` was fitted to.
+    # Before `log` has a command in each physics step, as `following` was fitted without these.
     following_errors = held_out_error(log, following, settled & held_out)
     is_still = not does_move(log)
     has_set_points = shows_set_points(log, following)
@@ -273,7 +274,7 @@ def identify(
         is_follower = False
         fit = _with_offsets(own, Fit(layout.mean, windows.starts))
     share = problem.gravity_compensation
-    # What the last searches vary.
+    # The unknowns and the entries of the starts that the last searches vary.
     stages = ["arm"]
     free_states = windows.arm_state
     if is_follower:
@@ -307,6 +308,7 @@ def identify(
     of_seen = problem.weights(pictures, seen, angles)
     of_unseen = problem.weights(pictures, 1.0 - seen, angles)
     of_all = problem.weights(pictures, 1.0, angles)
+    # Of the held-out windows, the starts alone are searched; then all counts.
     fit = minimise(problem, fit, stages, of_seen, 3, free_states)
     unseen = minimise(problem, fit, [], of_unseen, 3, free_states)
     fit = minimise(problem, unseen, stages, of_all, 3, free_states)
@@ -658,8 +660,8 @@ def _stiff_follower(
     joint, by servos that are too stiff to matter. It knows nothing of held-out windows."""
     layout = problem.layout
     windows = problem.windows
-    # A servo answers the mean command of a physics step, that of its middle, at the step's end: by
-    # half a step earlier than the sum of these delays.
+    # A servo answers the mean command of a physics step, that of its middle, at the step's end: the
+    # sum of latency and damping / stiffness counts half a step too much.
     total = max(delay + 0.5 * config.physics_dt, 0.0)
     own_delay = _servo_delays(config)
     vectors = []

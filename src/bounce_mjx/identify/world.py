@@ -162,8 +162,8 @@ def _estimate_delays(found: Identified) -> dict[str, tuple[float, float]]:
 
 
 def misfit(found: Identified) -> float:
-    """Factor by which the errors in windows that the search had not seen exceed those in all, at
-    least 1."""
+    """Factor by which the errors in windows that the search had not seen exceed those in all
+    windows, these included, at least 1."""
     ratios = [found.held_out[name] / found.after[name] for name in found.held_out]
     return float(np.max([1.0, *ratios]))
 
@@ -260,7 +260,8 @@ def total_delay(found: Identified, model: mujoco.MjModel) -> str:
     It is the action's latency, the mean delay of the lag's steps (shorter than the lag by half a
     step at most), and the delay of the servos themselves: damping divided by stiffness, which is
     the mean of a servo's answer to a step, less the half step by which a simulated servo answers
-    earlier.
+    earlier. Of commands that are held until the next, the delay that an inspection shows is longer
+    by half a control step, the mean time of holding.
     """
     layout = found.layout
     servos = list(find_addresses(model).actuators)
