@@ -36,7 +36,7 @@ from bounce_mjx.identify.following import (
     shows_set_points,
 )
 from bounce_mjx.identify.inspection import examine
-from bounce_mjx.identify.log import Log
+from bounce_mjx.identify.log import Log, find_gaps
 from bounce_mjx.identify.reading import read_csv
 from bounce_mjx.identify.simulation import (
     _paddle_speeds,
@@ -192,10 +192,10 @@ def test_no_window_spans_two_logs() -> None:
     joined = join(logs)
     assert np.all(np.diff(joined.picture_times) > 0.0)
     w = windows_of(joined)
-    # The first log ends at 4 s, and the second begins 1 s later.
+    # The first log ends at 4 s, and the second begins 1.5 s later.
     ends = w.zero + np.max(w.angle_times * w.angle_weights, axis=1)
     begins = w.zero + np.min(np.where(w.angle_weights > 0.0, w.angle_times, np.inf), axis=1)
-    assert np.all((ends < 4.01) | (begins > 6.295))
+    assert np.all((ends < 4.01) | (begins > 6.795))
     shown = w.zero[:, None] + w.picture_times
     shown = np.where(w.picture_weights > 0.0, shown, np.nan)[w.has_ball]
     is_early = np.nanmin(shown, axis=1) < 4.5
@@ -211,6 +211,16 @@ def test_stamps_that_jitter_are_straightened_in_their_order() -> None:
     straight = _straighten(times)
     assert np.all(np.diff(straight) >= 0.0)
     assert 5e-4 < np.max(np.abs(straight - times)) < 1e-3
+
+
+def test_logs_of_the_longest_steps_are_joined_with_a_gap() -> None:
+    """A step of the stamps of 0.2 s is allowed, and no gap."""
+    log = flight_log()
+    times = 0.2 * np.arange(len(log.times))
+    slow = log._replace(times=times, target_times=times)
+    joined = join([slow, slow])
+    for times in (joined.times, joined.target_times):
+        assert len(find_gaps(times)) == 1
 
 
 @pytest.mark.parametrize("latency, lag", [(0.0237, 0.0), (0.0082, 0.015)])

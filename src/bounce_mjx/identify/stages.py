@@ -76,8 +76,8 @@ _FEW_ALIKE = 3.0
 # Standard deviation of stamps about regular steps below which the steps count as regular, s.
 _JITTER = 5e-4
 _FEWEST_BOUNCES = 3
-# Time between two logs that are joined, s.
-_APART = 1.0
+# Time between two logs that are joined, s: a gap, also where steps are as long as a log may have.
+_APART = 1.5
 # Distance of the bounces from the paddle's height beyond which the search would not find them, m.
 _BESIDE = 0.03
 
