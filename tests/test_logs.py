@@ -669,6 +669,19 @@ def test_a_fault_of_a_log_is_named_with_its_place(name: str) -> None:
         assert all("[deg]" in fault.text and right in fault.text for fault in checkup.faults)
 
 
+def test_a_joint_that_moved_far_while_nothing_was_recorded_is_not_wrapped() -> None:
+    log = sound_log()
+    turn = 4.0 * (log.times > 15.0)[:, None] * (np.arange(6) == 0)
+    kept = np.abs(log.times - 15.0) > 2.0
+    log = log._replace(
+        times=log.times[kept],
+        joint_angles=(log.joint_angles + turn)[kept],
+        target_times=log.target_times[kept],
+        servo_targets=(log.servo_targets + turn)[kept],
+    )
+    assert [x for x in examine([log], ARM)[0].findings if x.where == "Joint1"] == []
+
+
 def test_pictures_without_an_arm_beside_them_are_counted() -> None:
     """Such as those of a camera whose clock is another one."""
     log = sound_log()
