@@ -289,6 +289,17 @@ def test_pictures_of_a_clock_of_its_own_come_into_that_of_the_robot(drift, offse
     assert len(said) == bool(drift)
 
 
+@pytest.mark.parametrize("speed, hint", [(0.0, "one clock"), (1.5, "one clock"), (1e3, "[ms]")])
+def test_stamps_that_advance_at_another_speed_are_refused(speed: float, hint: str) -> None:
+    """With a unit only where they may have one."""
+    log, _ = camera_log()
+    with pytest.raises(UserError, match="advance by") as refused:
+        align_clocks(log._replace(picture_times=speed * log.arrivals))
+    assert hint in str(refused.value)
+    assert f"by {speed:g} s each" in str(refused.value)
+    assert ("milliseconds" in str(refused.value)) == (hint == "[ms]")
+
+
 @pytest.mark.parametrize("lost", [0.0, 0.1])
 def test_a_picture_that_a_later_one_replaced_is_not_lost(lost: float) -> None:
     """Control steps of 100 Hz see five of six pictures of a camera of 120 Hz."""

@@ -39,6 +39,8 @@ _SAME_PICTURE = 1e-4
 _STRETCHES = 12
 _DRIFT = 1e-3
 _LARGEST_AGE = 1.0
+# Speed of the stamps, s each second, from which they may have another unit.
+_OTHER_UNIT = 30.0
 # Two quartz clocks drift by less; a stamp that drifts by more, s over the log, has another unit.
 _FASTEST_DRIFT = 2e-4
 _NO_CLOCK = 0.1
@@ -330,9 +332,13 @@ def align_clocks(log: Log) -> Log:
             f"{1e3 * total:.1f} ms over the log; the pictures' time stamps are corrected"
         )
     elif total > _NO_CLOCK:
+        speed = 1.0 - slope
+        hint = "stamp them with one clock, in seconds"
+        if abs(speed) > _OTHER_UNIT:
+            hint = f"if they are {_name_unit(abs(speed), 'ball_time')}"
         raise UserError(
-            f"the time stamps of the pictures in {log.source} advance by {1.0 - slope:.4g} s each "
-            f"second, and 1 s is expected; if they are {_name_unit(abs(1.0 - slope), 'ball_time')}"
+            f"the time stamps of the pictures in {log.source} advance by {speed:.4g} s each "
+            f"second, and 1 s is expected; {hint}"
         )
     elif total > _GROWING_AGE:
         notes.append(
