@@ -27,9 +27,16 @@ from bounce_mjx.identify.fit import (
     picture_weights,
 )
 from bounce_mjx.identify.flight import acceleration, fit_flight
-from bounce_mjx.identify.following import command_delay, find_settled, follow, set_points
+from bounce_mjx.identify.following import (
+    command_delay,
+    does_move,
+    find_settled,
+    follow,
+    set_points,
+    shows_set_points,
+)
 from bounce_mjx.identify.inspection import examine
-from bounce_mjx.identify.log import Log
+from bounce_mjx.identify.log import Log, find_gaps
 from bounce_mjx.identify.reading import read_csv
 from bounce_mjx.identify.simulation import (
     _paddle_speeds,
@@ -41,13 +48,17 @@ from bounce_mjx.identify.simulation import (
 from bounce_mjx.identify.stages import (
     Identified,
     _check_frame,
+    _cut_enough,
+    _is_seen,
     _late_servos,
     _own_servos,
+    _stiff_follower,
+    _straighten,
     identify,
     join,
 )
 from bounce_mjx.identify.unknowns import MOTIONS, Layout
-from bounce_mjx.identify.windows import Windows, cut
+from bounce_mjx.identify.windows import Windows, _joint_start, cut
 from bounce_mjx.identify.world import (
     compare,
     describe_doubts,
@@ -159,6 +170,21 @@ def test_what_follows_a_gap_of_the_targets_counts_once_the_arm_has_settled() -> 
     assert not np.any((bounces > 2.995) & (bounces < 4.305))
 
 
+def test_a_window_that_begins_in_a_gap_begins_with_the_nearest_angles() -> None:
+    """A parabola through eight milliseconds of noisy angles says nothing of those 0.3 s before."""
+    random, times = np.random.default_rng(0), np.arange(0.0, 4.0, 0.001)
+    angles = 0.5 + 0.1 * times[:, None] + 1e-3 * random.normal(size=(len(times), 6))
+    measured = (times < 1.0) | (times >= 2.0)
+    log = flight_log()._replace(times=times[measured], joint_angles=angles[measured])
+    for begin, angle in ((1.3, 0.6), (1.7, 0.7), (-0.3, 0.5)):
+        start = _joint_start(log, begin)
+        np.testing.assert_allclose(start[:6], angle, atol=4e-3)
+        assert not np.any(start[6:])
+    start = _joint_start(log, 3.0)
+    np.testing.assert_allclose(start[:6], 0.8, atol=2e-3)
+    assert np.all(start[6:] != 0.0)
+
+
 def test_no_window_spans_two_logs() -> None:
     """Of which the first has pictures beyond the arm's rows, and the second before them."""
     whole = flight_log(8.0, gap=(9.0, 9.0))
@@ -166,15 +192,35 @@ def test_no_window_spans_two_logs() -> None:
     joined = join(logs)
     assert np.all(np.diff(joined.picture_times) > 0.0)
     w = windows_of(joined)
-    # The first log ends at 4 s, and the second begins 1 s later.
+    # The first log ends at 4 s, and the second begins 1.5 s later.
     ends = w.zero + np.max(w.angle_times * w.angle_weights, axis=1)
     begins = w.zero + np.min(np.where(w.angle_weights > 0.0, w.angle_times, np.inf), axis=1)
-    assert np.all((ends < 4.01) | (begins > 6.295))
+    assert np.all((ends < 4.01) | (begins > 6.795))
     shown = w.zero[:, None] + w.picture_times
     shown = np.where(w.picture_weights > 0.0, shown, np.nan)[w.has_ball]
     is_early = np.nanmin(shown, axis=1) < 4.5
     assert 0 < np.sum(is_early) < len(shown)
     assert np.all(np.nanmax(shown[is_early], axis=1) < 4.51)
+
+
+def test_stamps_that_jitter_are_straightened_in_their_order() -> None:
+    """Also where a long step parts two short stretches, whose lines would overlap."""
+    steps = np.concatenate([np.full(200, 1e-3), [1.7e-3], np.full(39, 0.96e-3)])
+    steps = np.concatenate([steps, [1.51e-3], np.full(39, 0.96e-3)])
+    times = np.cumsum(steps)
+    straight = _straighten(times)
+    assert np.all(np.diff(straight) >= 0.0)
+    assert 5e-4 < np.max(np.abs(straight - times)) < 1e-3
+
+
+def test_logs_of_the_longest_steps_are_joined_with_a_gap() -> None:
+    """A step of the stamps of 0.2 s is allowed, and no gap."""
+    log = flight_log()
+    times = 0.2 * np.arange(len(log.times))
+    slow = log._replace(times=times, target_times=times)
+    joined = join([slow, slow])
+    for times in (joined.times, joined.target_times):
+        assert len(find_gaps(times)) == 1
 
 
 @pytest.mark.parametrize("latency, lag", [(0.0237, 0.0), (0.0082, 0.015)])
@@ -482,6 +528,21 @@ def test_what_is_not_shown_is_as_well_known_as_before() -> None:
             deviation = layout.unknowns[entry.label.split(" ")[0]].deviation
             assert entry.high - entry.value == pytest.approx(1.96 * deviation)
             assert not entry.seen
+    # Of latency, lag and their sum, also where errors in unseen windows widen the intervals.
+    vector = layout.vector({"action_latency": 0.03, "servo_lag": 0.01})
+    unseen_delays, twice = (
+        identified(layout, flight_log(), vector, np.diag((factor * layout.deviation) ** 2))
+        for factor in (1.0, 3.0)
+    )
+    poor = unseen_delays._replace(held_out={"joint_angles": 3.0, "ball_position": 1.0})
+    assert misfit(poor) == 3.0
+    model = world_model(read_preset(Path("default")).env, visual=False)
+    for found in (poor, twice):
+        for known, entry in zip(
+            estimates(unseen_delays, NAMES), estimates(found, NAMES), strict=True
+        ):
+            np.testing.assert_allclose(entry[2:5], known[2:5], rtol=1e-6, err_msg=entry.label)
+        assert total_delay(found, model) == total_delay(unseen_delays, model)
 
 
 def test_a_model_that_does_not_explain_a_log_is_named() -> None:
@@ -534,6 +595,41 @@ def test_a_ball_that_no_window_checks_is_said() -> None:
     assert not any("nothing checks" in line for line in sentences(found, NAMES))
     unchecked = found._replace(held_out={"joint_angles": 1.0})
     assert any("nothing checks" in line for line in sentences(unchecked, NAMES))
+
+
+def test_pictures_of_fewer_than_three_bounces_change_nothing() -> None:
+    """As the world then has no terms of a ball, which the arm would make good for."""
+    log = flight_log(8.0, gap=(9.0, 9.0))
+    every = _cut_enough(log, 0.001)
+    assert np.sum(every.has_ball) > 3
+    second, third = np.sort((every.zero + every.bounces)[every.has_ball])[1:3]
+    for last, count in ((second, 0), (third, 3)):
+        shown = log.picture_times < last + 0.25
+        few = log._replace(
+            picture_times=log.picture_times[shown],
+            ball_positions=log.ball_positions[shown],
+            arrivals=log.arrivals[shown],
+        )
+        windows = _cut_enough(few, 0.001)
+        assert np.sum(windows.has_ball) == count
+        assert np.any(windows.picture_weights) == (count > 0)
+        assert np.all(windows.starts[~windows.has_ball, 14] == 50.0)
+
+
+def test_the_search_sees_a_bounce_of_each_log_that_has_one() -> None:
+    """Also where every fifth window, which it does not see, has all of them; and a simulation of no
+    window is of the same shape as one of some."""
+    windows = windows_of(at_home((0.0, 0.0, 0.0)))
+    every = np.arange(len(windows.first))
+    np.testing.assert_array_equal(_is_seen(windows), every % 5 != 4)
+    few = windows._replace(bounces=np.where(every % 5 == 4, 0.3, np.nan))
+    assert np.sum(few.has_ball) > 0
+    np.testing.assert_array_equal(_is_seen(few), every % 5 != 3)
+    config, layout = read_preset(Path("default")).env, Layout(6, True, 0.001)
+    simulate = make_simulator(config, layout, at_home((0.0, 0.0, 0.0)), windows)
+    none = np.zeros((1, len(every)), bool)
+    simulated = simulate(layout.mean[None], windows.starts[None], none)
+    assert simulated.shape == (1, *windows.measured.shape) and not np.any(simulated)
 
 
 def test_a_warning_states_one_quantity_in_one_unit() -> None:
@@ -799,6 +895,66 @@ def test_set_points_are_commanded_when_they_are_due() -> None:
     # Commands that are held until the next are later than their stamps by half a step.
     late = log._replace(joint_angles=np.sin(np.outer(times - 0.0155, rates)))
     assert command_delay(late, follow(late, rows)) == pytest.approx(0.0115, abs=1e-4)
+
+
+def test_an_arm_at_rest_shows_no_delay_and_no_set_points() -> None:
+    """Nor does one that rests in two logs, elsewhere in each."""
+    log = flight_log()
+    rest = np.tile(0.2 * np.arange(6), (len(log.times), 1))
+    still = log._replace(joint_angles=rest + 1e-3, servo_targets=rest)
+    elsewhere = still._replace(joint_angles=rest + 0.301, servo_targets=rest + 0.3)
+    moving = log._replace(joint_angles=log.servo_targets + 1e-3)
+    cases = (([still], False), ([still, elsewhere], False), ([still, moving], True))
+    for logs, moves in cases:
+        joined = join(logs)
+        following = follow(joined, find_settled(joined))
+        assert does_move(joined) == shows_set_points(joined, following) == moves
+    assert not any("their sum is what it shows" in line for line in sentences(unseen(), NAMES))
+    found = unseen()._replace(is_still=True)
+    assert any("neither a delay nor servos" in line for line in sentences(found, NAMES))
+    model = world_model(read_preset(Path("default")).env, visual=False)
+    assert total_delay(found, model).endswith("(not shown by the log)")
+
+
+def test_a_follower_is_judged_by_windows_that_it_has_not_seen() -> None:
+    config, log = read_preset(Path("default")).env, flight_log(20.0)
+    problem = linear_problem(log, np.random.default_rng(3))
+    windows, following = problem.windows, follow(log, find_settled(log))
+    held_out = ~_is_seen(windows)
+    followers = []
+    for which in (~held_out, held_out):
+        angles = windows.angles + 0.1 * which[:, None, None]
+        other = problem._replace(windows=windows._replace(angles=angles))
+        followers.append(_stiff_follower(other, config, 0.02, following).vector)
+    place = problem.layout.slices["servo_offset"]
+    same = _stiff_follower(problem, config, 0.02, following).vector
+    np.testing.assert_array_equal(followers[1], same)
+    np.testing.assert_allclose(followers[0][place], same[place] + 0.1, atol=1e-3)
+
+
+def test_what_was_chosen_for_a_follower_has_no_interval(tmp_path: Path) -> None:
+    """Nor does a motion show it; its range in the world is as wide as the prior."""
+    found = unseen()
+    layout = found.layout
+    vector = layout.vector({"servo_gain": np.full(6, 30.0)})
+    follower = found._replace(is_follower=True, fit=found.fit._replace(vector=vector))
+    chosen = {x.label.split(" ")[0] for x in estimates(follower, NAMES) if x.chosen}
+    assert chosen == {"servo_lag", "servo_gain", "servo_damping", "joint_frictionloss"}
+    assert not any(x.chosen for x in estimates(found, NAMES))
+    unshown = [x for x in sentences(follower, NAMES) if x.startswith("The log does not s")]
+    assert any("link_mass" in x for x in unshown)
+    assert not any(name in line for name in chosen for line in unshown)
+    path = tmp_path / "world.yaml"
+    path.write_text(to_yaml(follower, flight_log(), NAMES, None), encoding="utf-8")
+    world = read_world(path)
+    gain, mass = (world.sources[f"randomization.{name}"] for name in ("servo_gain", "link_mass"))
+    assert "30, 30" in gain and "+-" not in gain and "95%" not in gain
+    assert "+-" in mass and "95%" in mass
+    expected = [[30.0 * (2.0 - np.exp(0.2))] * 6, [30.0 * np.exp(0.2)] * 6]
+    np.testing.assert_allclose(world.settings["randomization"]["servo_gain"], expected, rtol=1e-3)
+    checkups = examine([flight_log()], NAMES)
+    page = identification_page(follower, [flight_log()], checkups, NAMES, path, [])
+    assert page.count("chosen for an arm that follows") == 19
 
 
 def test_a_controller_that_carries_the_arm_lets_no_servo_sag() -> None:

@@ -289,6 +289,17 @@ def test_pictures_of_a_clock_of_its_own_come_into_that_of_the_robot(drift, offse
     assert len(said) == bool(drift)
 
 
+@pytest.mark.parametrize("speed, hint", [(0.0, "one clock"), (1.5, "one clock"), (1e3, "[ms]")])
+def test_stamps_that_advance_at_another_speed_are_refused(speed: float, hint: str) -> None:
+    """With a unit only where they may have one."""
+    log, _ = camera_log()
+    with pytest.raises(UserError, match="advance by") as refused:
+        align_clocks(log._replace(picture_times=speed * log.arrivals))
+    assert hint in str(refused.value)
+    assert f"by {speed:g} s each" in str(refused.value)
+    assert ("milliseconds" in str(refused.value)) == (hint == "[ms]")
+
+
 @pytest.mark.parametrize("lost", [0.0, 0.1])
 def test_a_picture_that_a_later_one_replaced_is_not_lost(lost: float) -> None:
     """Control steps of 100 Hz see five of six pictures of a camera of 120 Hz."""
@@ -667,6 +678,19 @@ def test_a_fault_of_a_log_is_named_with_its_place(name: str) -> None:
         right = "joint_angles" if name == "unit" else "servo_targets"
         assert f"write {right}.Joint3 [deg]" in checkup.faults[0].text or is_of_all
         assert all("[deg]" in fault.text and right in fault.text for fault in checkup.faults)
+
+
+def test_a_joint_that_moved_far_while_nothing_was_recorded_is_not_wrapped() -> None:
+    log = sound_log()
+    turn = 4.0 * (log.times > 15.0)[:, None] * (np.arange(6) == 0)
+    kept = np.abs(log.times - 15.0) > 2.0
+    log = log._replace(
+        times=log.times[kept],
+        joint_angles=(log.joint_angles + turn)[kept],
+        target_times=log.target_times[kept],
+        servo_targets=(log.servo_targets + turn)[kept],
+    )
+    assert [x for x in examine([log], ARM)[0].findings if x.where == "Joint1"] == []
 
 
 def test_pictures_without_an_arm_beside_them_are_counted() -> None:

@@ -97,6 +97,9 @@ def main(args: Sequence[str]) -> None:
     found = identify(config, log, command.camera_rotation, lambda line: print(f"  {line}"))
     print(total_delay(found, model))
     for entry in estimates(found, names):
+        if entry.chosen:
+            print(f"{entry.label}: {entry.value:.5g} {entry.unit}".rstrip() + "  (chosen)")
+            continue
         seen = "" if entry.seen else "  (not shown by the log)"
         interval = f"{entry.low:.5g} to {entry.high:.5g} {entry.unit}".rstrip()
         print(f"{entry.label}: {entry.value:.5g}, {interval}{seen}")

@@ -13,7 +13,8 @@ from bounce_mjx.identify.log import Log, find_gaps
 
 SETTLING = 0.3
 """Time after the start of a log, or a gap, until the arm has forgotten the unknown commands before
-it, s: the longest latency and a few of the longest lags."""
+it, s: longer than latencies are, and a few of most lags. `follow` tries delays beyond it, up to
+0.4 s, whose first rows after a gap are compared with commands interpolated through it."""
 _STEP = 2e-3
 # Commands that change by less show no delay, rad.
 _STILL = 5e-3
@@ -59,8 +60,11 @@ def find_settled(log: Log) -> np.ndarray:
 
 
 def does_move(log: Log) -> bool:
-    """Whether any command of a log changes."""
-    return bool(np.max(np.ptp(log.servo_targets, axis=0)) > _STILL)
+    """Whether any command of a log changes, within a stretch without gaps: the arm was also moved
+    between two logs that are joined."""
+    begins = [first for _, first in find_gaps(log.target_times)]
+    stretches = np.split(log.servo_targets, np.searchsorted(log.target_times, begins))
+    return any(np.max(np.ptp(targets, axis=0)) > _STILL for targets in stretches)
 
 
 def commanded(log: Log, times: np.ndarray) -> np.ndarray:
@@ -78,6 +82,7 @@ def follow(log: Log, rows: np.ndarray, shortest: float = -0.05, longest: float =
     """
     chosen = np.flatnonzero(rows)
     if not does_move(log):
+        # All delays explain it equally.
         shortest = 0.0
         longest = _STEP
     few = chosen[:: max(len(chosen) // _ROWS, 1)]
@@ -97,8 +102,9 @@ def follow(log: Log, rows: np.ndarray, shortest: float = -0.05, longest: float =
 
 def shows_set_points(log: Log, following: Following) -> bool:
     """Whether the joints follow too early for commands that are held until the next: the commands
-    of the log are then a controller's own set points, recorded now and then."""
-    return following.delay < _hold(log)
+    of the log are then a controller's own set points, recorded now and then. Those of an arm that
+    is still show nothing."""
+    return does_move(log) and following.delay < _hold(log)
 
 
 def command_delay(log: Log, following: Following) -> float:

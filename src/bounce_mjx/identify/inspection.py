@@ -309,9 +309,12 @@ def _find_order(joints: Sequence[Joint], correlations: np.ndarray) -> list[Findi
 def _find_joint_faults(log: Log, rows: np.ndarray, joints: Sequence[Joint]) -> list[Finding]:
     """What is wrong with one joint alone."""
     found = []
+    # In a gap, a joint may have turned as far as it likes.
+    is_gap = np.isin(log.times[:-1], [last for last, _ in find_gaps(log.times)])
     for j, joint in enumerate(joints):
         unit = _find_unit(joint)
-        jumps = np.flatnonzero(np.abs(np.diff(log.joint_angles[:, j])) > np.pi)
+        is_jump = np.abs(np.diff(log.joint_angles[:, j])) > np.pi
+        jumps = np.flatnonzero(is_jump & ~is_gap)
         if joint.commanded < _LITTLE and joint.measured < _LITTLE:
             text = "it hardly moves, and the log shows little about it"
             found.append(Finding("still", joint.name, text, is_fault=False))

@@ -39,6 +39,8 @@ _SAME_PICTURE = 1e-4
 _STRETCHES = 12
 _DRIFT = 1e-3
 _LARGEST_AGE = 1.0
+# Speed of the stamps, s each second, from which they may have another unit.
+_OTHER_UNIT = 30.0
 # Two quartz clocks drift by less; a stamp that drifts by more, s over the log, has another unit.
 _FASTEST_DRIFT = 2e-4
 _NO_CLOCK = 0.1
@@ -308,7 +310,8 @@ def align_clocks(log: Log) -> Log:
     the slope of a line (Theil 1950 and Sen 1968, which no fourth of its points can bend) through
     the ages of the youngest picture in each stretch of the log. One of less than a millisecond, and
     an offset of less than a second, count as none. A drift faster than any clock's is not
-    corrected: pictures that wait longer and longer look like it, and a note says so.
+    corrected: pictures that wait longer and longer look like it, and a note says so. Fewer than 240
+    pictures stay as they are stamped.
 
     Raises:
       UserError: the stamps are no seconds.
@@ -329,9 +332,13 @@ def align_clocks(log: Log) -> Log:
             f"{1e3 * total:.1f} ms over the log; the pictures' time stamps are corrected"
         )
     elif total > _NO_CLOCK:
+        speed = 1.0 - slope
+        hint = "stamp them with one clock, in seconds"
+        if abs(speed) > _OTHER_UNIT:
+            hint = f"if they are {_name_unit(abs(speed), 'ball_time')}"
         raise UserError(
-            f"the time stamps of the pictures in {log.source} advance by {1.0 - slope:.4g} s each "
-            f"second, and 1 s is expected; if they are {_name_unit(abs(1.0 - slope), 'ball_time')}"
+            f"the time stamps of the pictures in {log.source} advance by {speed:.4g} s each "
+            f"second, and 1 s is expected; {hint}"
         )
     elif total > _GROWING_AGE:
         notes.append(

@@ -56,8 +56,8 @@ def make_simulator(
         model's own.
       lift: acceleration of the ball across its flight, per spin and speed.
       leaves_at_once: whether the ball leaves the paddle as soon as it touches it. A real ball stays
-        for 1 ms. The model's stays for 10 ms and has not fallen in this time: at 2 m/s, it would
-        pass for one of 0.05 more restitution.
+        for 1 ms. The model's stays for 10 ms and has not fallen in this time: with it, a real ball
+        of 2 m/s would pass for one of 0.05 more restitution.
     """
     run = _compile(config, layout.num_joints)
     contact_time = _contact_time(config) if leaves_at_once else 0.0
@@ -109,12 +109,14 @@ def make_simulator(
         return np.concatenate(rows, axis=1)[:count].astype(float)
 
     def simulate(vectors: np.ndarray, starts: np.ndarray, used: np.ndarray) -> np.ndarray:
+        result = np.zeros((*used.shape, windows.measured.shape[1]))
+        if not np.any(used):
+            return result
         c, s = np.nonzero(used)
         blocks = [slice(i, i + _LANES) for i in range(0, len(c), _LANES)]
         with ThreadPoolExecutor() as pool:
             rows = pool.map(lambda b: simulate_block(vectors, starts, c[b], s[b]), blocks)
             measured = np.concatenate(list(rows))
-        result = np.zeros((*used.shape, measured.shape[1]))
         # Where a candidate does not count, it has the numbers of the first.
         result[:, s[c == 0]] = measured[c == 0]
         result[c, s] = measured
@@ -132,7 +134,8 @@ def _contact_time(config: WorldConfig) -> float:
 
 
 def _paddle_speeds(config: WorldConfig, windows: Windows) -> np.ndarray:
-    """Upward speed of the paddle at the bounce of each window [S], m/s, from the measured angles; 0
+    """Upward speed of the paddle at the stamp of each window's bounce [S], m/s, from the measured
+    angles: the pictures' latency after the bounce itself, as the search does not know it yet; 0
     without a bounce."""
     model = world_model(config, visual=False)
     data = mujoco.MjData(model)

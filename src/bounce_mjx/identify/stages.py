@@ -44,7 +44,8 @@ from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.model import model_nominals, world_model
 
 # Every fifth window is held out of the search for the unknowns until its last stage. Its residuals
-# give its outliers less weight, as in all windows, and choose between servos and a follower.
+# give its outliers less weight, as in all windows, and choose between servos and a follower: of the
+# two errors the smaller one is told, which is a little too small.
 _HELD_OUT = 5
 # Latencies of the ball, s, and its frictions, of the first candidates.
 _BALL_LATENCIES = np.arange(-0.004, 0.05, 0.008)
@@ -75,8 +76,8 @@ _FEW_ALIKE = 3.0
 # Standard deviation of stamps about regular steps below which the steps count as regular, s.
 _JITTER = 5e-4
 _FEWEST_BOUNCES = 3
-# Time between two logs that are joined, s.
-_APART = 1.0
+# Time between two logs that are joined, s: a gap, also where steps are as long as a log may have.
+_APART = 1.5
 # Distance of the bounces from the paddle's height beyond which the search would not find them, m.
 _BESIDE = 0.03
 
@@ -95,7 +96,7 @@ class Identified(NamedTuple):
     """Of the unknowns [P, P], with the prior."""
     before: dict[str, float]
     """Root of the mean squared residual of each sensor, in units of its noise: in the model's own
-    world."""
+    world, from the starts of the identified one."""
     after: dict[str, float]
     """In the identified world."""
     held_out: dict[str, float]
@@ -111,9 +112,12 @@ class Identified(NamedTuple):
     following_errors: np.ndarray = np.zeros(0)
     """Its errors [n] in the windows that the search had not seen, rad."""
     joint_errors: np.ndarray = np.zeros(0)
-    """Those of the identified world [n], rad."""
+    """Those of the identified world [n], rad. Where it is a follower, its offsets are medians over
+    all windows."""
     gravity_compensation: float = 0.0
     """Share of the arm's weight that its controller carries, if more than the model's own."""
+    is_still: bool = False
+    """Whether no command of the log changes: it shows no delay, and no servos but their offsets."""
     has_set_points: bool = False
     """Whether the log's targets are a controller's own set points: the arm is then a follower."""
     is_follower: bool = False
@@ -204,7 +208,8 @@ def _straighten(times: np.ndarray) -> np.ndarray:
         slope = typical if len(part) < 50 else float(index @ part / (index @ index))
         line = np.mean(part) + slope * index
         stretches.append(line if np.std(part - line) < _JITTER else part)
-    return np.concatenate(stretches)
+    # Where jitter alone parts two stretches, their lines may overlap by less than it.
+    return np.sort(np.concatenate(stretches))
 
 
 def identify(
@@ -227,9 +232,9 @@ def identify(
     """
     times = {name: _straighten(getattr(log, name)) for name in ("times", "target_times")}
     log = log._replace(**times)
-    windows = cut(log, config.physics_dt)
+    windows = _cut_enough(log, config.physics_dt)
     bounces = int(np.sum(windows.has_ball))
-    with_ball = bounces >= _FEWEST_BOUNCES
+    with_ball = bounces > 0
     progress(f"{len(windows.first)} windows, {bounces} with a bounce")
     if with_ball:
         _check_frame(windows, config, log.source)
@@ -239,8 +244,9 @@ def identify(
     held_out = _held_out_rows(log, windows)
     following = follow(log, settled & ~held_out)
     delay = command_delay(log, following)
-    # Of the targets as they are in the log, which `following` was fitted to.
+    # Before `log` has a command in each physics step, as `following` was fitted without these.
     following_errors = held_out_error(log, following, settled & held_out)
+    is_still = not does_move(log)
     has_set_points = shows_set_points(log, following)
     log = set_points(log, following, config.physics_dt)
     own = Problem(
@@ -254,20 +260,21 @@ def identify(
     carried = own._replace(
         simulate=make_simulator(config, layout, log, windows, carried=1.0), gravity_compensation=1.0
     )
-    progress(f"arm: {1e3 * following.delay:.1f} ms behind its commands")
-    if does_move(log):
+    if not is_still:
+        progress(f"arm: {1e3 * following.delay:.1f} ms behind its commands")
         searches = [_search_arm(problem, config, delay, following) for problem in (own, carried)]
         problem, fit = _choose(own, carried, searches)
         problem, fit = _fit_arm(problem, fit)
         follower = _stiff_follower(problem, config, delay, following)
         is_follower = has_set_points or _explains_better(problem, follower, fit)
     else:
+        progress("arm: its commands do not change")
         # Gravity's tilt would explain where an arm rests.
         problem = own
         is_follower = False
         fit = _with_offsets(own, Fit(layout.mean, windows.starts))
     share = problem.gravity_compensation
-    # What the last searches vary.
+    # The unknowns and the entries of the starts that the last searches vary.
     stages = ["arm"]
     free_states = windows.arm_state
     if is_follower:
@@ -276,7 +283,8 @@ def identify(
             if has_set_points
             else "a delay and offsets explain the arm as well as its servos do"
         )
-        fit = follower
+        # As the last fit of servos, in all windows.
+        fit = _with_offsets(problem, follower)
         stages = []
     pictures = np.ones_like(windows.picture_weights)
     seen = _training(problem)
@@ -285,7 +293,7 @@ def identify(
         problem, fit, pictures = _fit_ball(problem, fit, make)
         stages = [*stages, "flight", "bounce"]
         free_states = None
-    if does_move(log) and not is_follower and np.max(problem.correlation) < _FEW_ALIKE:
+    if not is_still and not is_follower and np.max(problem.correlation) < _FEW_ALIKE:
         lift = AIR_LIFT * problem.has_lift
         finer = _halve_steps(config)
         # Latency and lag are the same; their delay and its variance depend on the lag's steps.
@@ -300,6 +308,7 @@ def identify(
     of_seen = problem.weights(pictures, seen, angles)
     of_unseen = problem.weights(pictures, 1.0 - seen, angles)
     of_all = problem.weights(pictures, 1.0, angles)
+    # Of the held-out windows, the starts alone are searched; then all counts.
     fit = minimise(problem, fit, stages, of_seen, 3, free_states)
     unseen = minimise(problem, fit, [], of_unseen, 3, free_states)
     fit = minimise(problem, unseen, stages, of_all, 3, free_states)
@@ -336,12 +345,24 @@ def identify(
         following_errors=following_errors,
         joint_errors=_joint_errors(windows, unseen),
         gravity_compensation=share,
+        is_still=is_still,
         has_set_points=has_set_points,
         is_follower=is_follower,
         has_lift=problem.has_lift,
         leaves_at_once=problem.leaves_at_once,
         stamp_age=least_age(log),
     )
+
+
+def _cut_enough(log: Log, physics_dt: float) -> Windows:
+    """The windows of a log; of the arm alone if it has too few bounces for the unknowns of the
+    ball, as the arm's unknowns would make good for these."""
+    windows = cut(log, physics_dt)
+    if np.sum(windows.has_ball) >= _FEWEST_BOUNCES:
+        return windows
+    none = np.zeros(0)
+    of_arm = log._replace(picture_times=none, ball_positions=np.zeros((0, 3)), arrivals=none)
+    return cut(of_arm, physics_dt)
 
 
 def _halve_steps(config: WorldConfig) -> WorldConfig:
@@ -356,7 +377,7 @@ def _halve_steps(config: WorldConfig) -> WorldConfig:
 def _held_out_rows(log: Log, windows: Windows) -> np.ndarray:
     """Which joint angles [T] of a log are in windows that the search does not see."""
     rows = np.zeros(len(log.times), bool)
-    for s in np.flatnonzero(~_is_seen(len(windows.first))):
+    for s in np.flatnonzero(~_is_seen(windows)):
         used = windows.angle_times[s, windows.angle_weights[s] > 0.0]
         if len(used):
             times = log.times - windows.zero[s]
@@ -379,14 +400,19 @@ def _squared_errors(windows: Windows, fit: Fit) -> float:
     return float(np.sum(_joint_errors(windows, fit) ** 2))
 
 
-def _is_seen(count: int) -> np.ndarray:
-    """Which windows [S] the search sees."""
-    return np.arange(count) % _HELD_OUT != _HELD_OUT - 1
+def _is_seen(windows: Windows) -> np.ndarray:
+    """Which windows [S] the search sees: all but every fifth; of a log whose few bounces are all in
+    these, all but those before them."""
+    place = np.arange(len(windows.first)) % _HELD_OUT
+    is_seen = place != _HELD_OUT - 1
+    if np.any(windows.has_ball) and not np.any(windows.has_ball & is_seen):
+        return place != _HELD_OUT - 2
+    return is_seen
 
 
 def _training(problem: Problem) -> np.ndarray:
     """1 for each window of the search [S, 1], 0 for those held out."""
-    return _is_seen(len(problem.windows.first))[:, None].astype(float)
+    return _is_seen(problem.windows)[:, None].astype(float)
 
 
 def _check_frame(windows: Windows, config: WorldConfig, source: str) -> None:
@@ -510,7 +536,7 @@ def _guess_spins(problem: Problem, fit: Fit) -> Fit:
         )
 
     # At first, each flight may have any drag; their median is then that of the ball.
-    seen = with_ball[_is_seen(len(windows.first))[with_ball]]
+    seen = with_ball[_is_seen(windows)[with_ball]]
     free = [fit_window(s, GUESSED_DRAG, 1.0).drag_deviation for s in seen]
     drag = GUESSED_DRAG * (1.0 + float(np.median(free)))
     vector[problem.layout.slices["air_drag"]] = drag
@@ -578,12 +604,13 @@ def _search_arm(
     return _in_units_of_errors(problem, fit), fit
 
 
-def _with_offsets(problem: Problem, fit: Fit) -> Fit:
-    """The fit with servo offsets, without which an unknown that is no servo's would have to explain
-    where the joints stand."""
+def _with_offsets(problem: Problem, fit: Fit, windows: np.ndarray | float = 1.0) -> Fit:
+    """The fit with the servo offsets of some windows [S, 1], by default of all; without these an
+    unknown that is no servo's would have to explain where the joints stand."""
     vector = fit.vector.copy()
     angles = problem.windows.split(problem.predict(fit.vector, fit.starts))[0]
-    residuals = (problem.windows.angles - angles)[problem.windows.angle_weights > 0.0]
+    counts = problem.windows.angle_weights * windows > 0.0
+    residuals = (problem.windows.angles - angles)[counts]
     vector[problem.layout.slices["servo_offset"]] += np.median(residuals, axis=0)
     return fit._replace(vector=vector)
 
@@ -630,11 +657,11 @@ def _stiff_follower(
     problem: Problem, config: WorldConfig, delay: float, following: Following
 ) -> Fit:
     """The arm that follows its commands as the simplest model does: late, with an offset of each
-    joint, by servos that are too stiff to matter."""
+    joint, by servos that are too stiff to matter. It knows nothing of held-out windows."""
     layout = problem.layout
     windows = problem.windows
-    # A servo answers the mean command of a physics step, that of its middle, at the step's end: by
-    # half a step earlier than the sum of these delays.
+    # A servo answers the mean command of a physics step, that of its middle, at the step's end: the
+    # sum of latency and damping / stiffness counts half a step too much.
     total = max(delay + 0.5 * config.physics_dt, 0.0)
     own_delay = _servo_delays(config)
     vectors = []
@@ -655,11 +682,12 @@ def _stiff_follower(
         for vector in vectors
     ]
     best = min(followers, key=lambda fit: _squared_errors(windows, fit))
-    return _with_offsets(problem, best._replace(starts=windows.starts))
+    return _with_offsets(problem, best._replace(starts=windows.starts), _training(problem))
 
 
 def _explains_better(problem: Problem, simple: Fit, fit: Fit) -> bool:
-    """Whether the simple arm leaves no more than the fit in windows that no search has seen."""
+    """Whether the simple arm leaves no more than the fit in windows that neither has seen. A tie is
+    the simple arm's, which has fewer unknowns."""
     windows = problem.windows
     unseen = problem.weights(0.0, 1.0 - _training(problem))
 

@@ -16,7 +16,7 @@ class Unknown(NamedTuple):
     step: float
     """Difference at which derivatives are taken."""
     unit: str
-    """Of the term."""
+    """Of the term of the world: of `delay_variance`, that of the lag."""
     stage: str
     """First stage of the search that varies it: arm, flight or bounce."""
     size: int | None = 0
@@ -35,6 +35,7 @@ class Unknown(NamedTuple):
 
 
 _JOINTS = None
+# What moves the angles too. The last two, whose stages are the ball's, are searched with it alone.
 ARM = {
     # Of action_latency and servo_lag together, s and s^2: see Layout.
     "delay": Unknown(0.035, 0.03, 5e-4, "s", "arm", limits=(0.0, 0.4), ball_step=3e-3),
@@ -156,8 +157,10 @@ class Layout:
         return bounds
 
     def interior(self, vector: np.ndarray, steps: float) -> np.ndarray:
-        """The vector [P] with a delay from which the differences of derivatives, `steps` times
-        each, leave a latency of at least 0: at 0, delay and variance would have one effect."""
+        """The vector [P] with a delay from which the differences of the angles' derivatives,
+        `steps` times each, leave a latency of at least 0: at 0, delay and variance would have one
+        effect. The pictures' differences are larger, and near a latency of 0 up to half of each has
+        no effect: the pictures then count as less than they show of it."""
         delay_step = self.unknowns["delay"].step
         variance_step = self.unknowns["delay_variance"].step
         places = self.slices

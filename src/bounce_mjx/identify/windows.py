@@ -69,7 +69,8 @@ class Windows(NamedTuple):
     picture_weights: np.ndarray
     """1 for a picture, 0 for padding and at a bounce [S, B]."""
     bounces: np.ndarray
-    """Time [S] of the bounce since the window's start, s; NaN for the arm alone."""
+    """Time [S] of the bounce since the window's start, s, as the pictures are stamped: later than
+    the bounce by their latency; NaN for the arm alone."""
     starts: np.ndarray
     """First guess of the state at the start [S, 2 n + 10]: angles, velocities; the ball's position,
     velocity and spin; the relative deviation of its drag."""
@@ -136,7 +137,7 @@ def cut(log: Log, physics_dt: float) -> Windows:
         with_ball = _thin(with_ball, max(_MOST_BALLS, _MOST - len(others)))
         spans = with_ball + _thin(sorted(others), _MOST - len(with_ball))
     spans.sort()
-    # A span is that of the pictures; its simulation begins earlier, at the time `zero`.
+    # The simulation of a span begins earlier, at the time `zero`: a picture is late.
     begins = [start - MAX_DELAY for start, _, _ in spans]
     first = np.array([int((begin - origin) / physics_dt) for begin in begins], int)
     zero = origin + first * physics_dt
@@ -184,7 +185,7 @@ def _thin(spans: list, most: int) -> list:
 
 
 def _find_bounces(log: Log) -> list[tuple[float, float, float]]:
-    """Time of each bounce in the pictures, and the time before and after it in free flight, s."""
+    """Time stamp of each bounce, and the time before and after it in free flight, s."""
     found = []
     times = log.picture_times
     balls = log.ball_positions
@@ -255,9 +256,13 @@ def _pad(
 
 
 def _joint_start(log: Log, time: float) -> np.ndarray:
-    """Angles and velocities [2 n] at a time, by a parabola through the measurements near it."""
+    """Angles and velocities [2 n] at a time, by a parabola through the measurements near it; in a
+    gap or before the first one, the nearest angles at rest."""
     near = np.argsort(np.abs(log.times - time))[:9]
     t = log.times[near] - time
+    if np.min(t) > 0.0 or np.max(t) < 0.0:
+        nearest = log.joint_angles[near[0]]
+        return np.concatenate([nearest, np.zeros_like(nearest)])
     return polyfit(t, log.joint_angles[near], 2)[:2].ravel()
 
 

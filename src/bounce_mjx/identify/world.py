@@ -62,6 +62,9 @@ class Estimate(NamedTuple):
     high: float
     seen: bool
     """Whether the log shows it; otherwise the interval is the prior's."""
+    chosen: bool
+    """Whether it was chosen for a follower: the interval is then the prior's about that number,
+    which says how far a training may vary it and nothing about the robot."""
     alone: float
     """Half-width of the interval if all other unknowns had their estimates."""
     typical: float
@@ -76,8 +79,7 @@ def estimates(found: Identified, joint_names: Sequence[str]) -> list[Estimate]:
     vector = found.fit.vector
     world = layout.world(vector)
     values = np.concatenate([np.ravel(world[name]) for name in layout.terms])
-    # What a log does not show is as well known as before it.
-    deviation = np.minimum(found.deviation * misfit(found), layout.deviation)
+    deviation = _known_deviation(found)
     low = layout.decode(layout.clip(vector - _HALF_WIDTH * deviation))
     high = layout.decode(layout.clip(vector + _HALF_WIDTH * deviation))
     given_others = misfit(found) / np.sqrt(np.diag(np.linalg.inv(found.covariance)))
@@ -98,6 +100,7 @@ def estimates(found: Identified, joint_names: Sequence[str]) -> list[Estimate]:
             for array in (values, low, high):
                 array[place] = np.clip(array[place], *TERMS[name].bounds)
     seen = found.deviation < _UNSEEN * layout.deviation
+    chosen = _is_chosen(found)
     return [
         Estimate(
             label=label,
@@ -106,11 +109,26 @@ def estimates(found: Identified, joint_names: Sequence[str]) -> list[Estimate]:
             low=float(low[i]),
             high=float(high[i]),
             seen=bool(seen[i]),
+            chosen=bool(chosen[i]),
             alone=float(alone[i]),
             typical=float(typical[i]),
         )
         for i, label in enumerate(layout.labels(joint_names))
     ]
+
+
+def _is_chosen(found: Identified) -> np.ndarray:
+    """Which unknowns [P] were chosen for a follower, and not searched."""
+    chosen = np.zeros(len(found.fit.vector), bool)
+    for name in _OF_FOLLOWER if found.is_follower else ():
+        chosen[found.layout.terms[name]] = True
+    return chosen
+
+
+def _known_deviation(found: Identified) -> np.ndarray:
+    """Standard deviations [P] of the unknowns, widened by the misfit; what a log does not show is
+    as well known as before it."""
+    return np.minimum(found.deviation * misfit(found), found.layout.deviation)
 
 
 def _estimate_delays(found: Identified) -> dict[str, tuple[float, float]]:
@@ -122,12 +140,13 @@ def _estimate_delays(found: Identified) -> dict[str, tuple[float, float]]:
     places = found.layout.slices
     delay = places["delay"].start
     variance = places["delay_variance"].start
-    width = _HALF_WIDTH * found.deviation[variance] * misfit(found)
+    width = _HALF_WIDTH * _known_deviation(found)[variance]
     slope = found.covariance[delay, variance] / found.covariance[variance, variance]
     squared = found.covariance[delay, delay] - slope * found.covariance[delay, variance]
     if found.deviation[delay] >= _UNSEEN * layout.deviation[delay]:
         squared = found.covariance[delay, delay]
-    given_variance = _HALF_WIDTH * misfit(found) * np.sqrt(max(squared, 0.0))
+    of_delay = misfit(found) * np.sqrt(max(squared, 0.0))
+    given_variance = _HALF_WIDTH * min(of_delay, layout.deviation[delay])
     ends = np.repeat(vector[None], 3, axis=0)
     ends[:, variance] = np.maximum(vector[variance] + np.array([-width, 0.0, width]), 0.0)
     ends[:, delay] += slope * (ends[:, variance] - vector[variance])
@@ -143,8 +162,8 @@ def _estimate_delays(found: Identified) -> dict[str, tuple[float, float]]:
 
 
 def misfit(found: Identified) -> float:
-    """Factor by which the errors in windows that the search had not seen exceed those in all, at
-    least 1."""
+    """Factor by which the errors in windows that the search had not seen exceed those in all
+    windows, these included, at least 1."""
     ratios = [found.held_out[name] / found.after[name] for name in found.held_out]
     return float(np.max([1.0, *ratios]))
 
@@ -154,6 +173,11 @@ def sentences(found: Identified, joint_names: Sequence[str]) -> list[str]:
     said = describe_doubts(found, joint_names)
     if found.gravity_compensation:
         said.append("The log shows that the controller carries the arm's weight.")
+    if found.is_still:
+        said.append(
+            "No command in the log changes, so it shows neither a delay nor servos; record motions "
+            "of the arm too (bounce-mjx excite)."
+        )
     if found.has_set_points:
         said.append(
             "The targets are the controller's own set points, which the joints follow at once: the "
@@ -181,11 +205,13 @@ def sentences(found: Identified, joint_names: Sequence[str]) -> list[str]:
         )
     if not np.any(found.windows.has_ball):
         said.append(
-            "The log shows no bounce, so only the arm was identified, without a zero that an "
-            "encoder and its servo share (encoder_bias)."
+            "The log shows fewer than three bounces, so only the arm was identified, without a "
+            "zero that an encoder and its servo share (encoder_bias)."
         )
-    lag = found.layout.slices["delay_variance"]
-    if np.all(found.deviation[lag] >= _UNSEEN * found.layout.deviation[lag]):
+    delay = found.layout.slices["delay"].start
+    lag = found.layout.slices["delay_variance"].start
+    is_seen = found.deviation < _UNSEEN * found.layout.deviation
+    if is_seen[delay] and not is_seen[lag]:
         said.append(
             "The log does not tell action_latency and servo_lag apart; their sum is what it shows."
         )
@@ -234,7 +260,8 @@ def total_delay(found: Identified, model: mujoco.MjModel) -> str:
     It is the action's latency, the mean delay of the lag's steps (shorter than the lag by half a
     step at most), and the delay of the servos themselves: damping divided by stiffness, which is
     the mean of a servo's answer to a step, less the half step by which a simulated servo answers
-    earlier.
+    earlier. Of commands that are held until the next, the delay that an inspection shows is longer
+    by half a control step, the mean time of holding.
     """
     layout = found.layout
     servos = list(find_addresses(model).actuators)
@@ -254,9 +281,15 @@ def total_delay(found: Identified, model: mujoco.MjModel) -> str:
     covariance = np.linalg.inv(found.information + np.diag(layout.deviation**-2.0))
     # As much wider than for independent residuals as the interval of the delay.
     wider = found.deviation[delay] / np.sqrt(covariance[delay, delay])
-    width = _HALF_WIDTH * misfit(found) * wider * float(np.sqrt(slope @ covariance @ slope))
+    deviation = misfit(found) * wider * float(np.sqrt(slope @ covariance @ slope))
+    before = float(np.linalg.norm(slope * layout.deviation))
+    width = _HALF_WIDTH * min(deviation, before)
     late = max(total(vector), 0.0)
-    return f"total delay: {1e3 * late:.1f} +- {1e3 * width:.1f} ms, of latency, lag and servos"
+    is_shown = found.deviation[delay] < _UNSEEN * layout.deviation[delay]
+    return (
+        f"total delay: {1e3 * late:.1f} +- {1e3 * width:.1f} ms, of latency, lag and servos"
+        f"{'' if is_shown else ' (not shown by the log)'}"
+    )
 
 
 def _describe_mistakes(found: Identified, joint_names: Sequence[str]) -> list[str]:
@@ -278,10 +311,7 @@ def _describe_mistakes(found: Identified, joint_names: Sequence[str]) -> list[st
     typical[delay] = layout.mean[delay]
     late = layout.slices.get("ball_latency", slice(0, 0))
     typical[late] += found.stamp_age
-    is_judged = np.ones(len(vector), bool)
-    if found.is_follower:
-        for name in _OF_FOLLOWER:
-            is_judged[layout.terms[name]] = False
+    is_judged = ~_is_chosen(found)
     said = [
         f"warning: {entry.label} is {entry.value:.4g} {entry.unit}".rstrip()
         + f", {off[i]:.1f} deviations of the prior from {typical[i]:.3g}."
@@ -300,12 +330,14 @@ def _describe_mistakes(found: Identified, joint_names: Sequence[str]) -> list[st
 
 def _describe_unseen(found: Identified, joint_names: Sequence[str]) -> list[str]:
     """Combinations of unknowns that the log cannot show: the eigenvectors of its information, in
-    units of the prior, with small eigenvalues."""
+    units of the prior, with small eigenvalues; not of those that were chosen."""
     layout = found.layout
-    labels = layout.labels(joint_names)
+    searched = np.flatnonzero(~_is_chosen(found))
+    labels = np.array(layout.labels(joint_names))[searched]
     owners = [n for n, place in layout.terms.items() for _ in range(place.start, place.stop)]
+    owners = np.array(owners)[searched]
     scaled = found.information * np.outer(layout.deviation, layout.deviation)
-    values, vectors = np.linalg.eigh(scaled)
+    values, vectors = np.linalg.eigh(scaled[np.ix_(searched, searched)])
     said: dict[frozenset[str], str] = {}
     for value, vector in zip(values, vectors.T, strict=True):
         main = np.flatnonzero(np.abs(vector) > _SHARE)
@@ -352,15 +384,19 @@ def to_yaml(
             assumed.append(name)
         shown = any(entry.seen for entry in entries)
         how = "Identified" if shown else "Not shown, so the prior stands,"
-        if found.is_follower and name in _OF_FOLLOWER:
-            how = "Chosen, as a delay and offsets alone explain the joints,"
         values = ", ".join(map(_format, entries))
         sources[name] = f"{how} from {log.source}: {values} (95%)."
+        if all(entry.chosen for entry in entries):
+            values = ", ".join(f"{entry.value:.4g} {entry.unit}".rstrip() for entry in entries)
+            sources[name] = (
+                "Chosen, as a delay and offsets alone explain the joints, and not measured, from "
+                f"{log.source}: {values}."
+            )
     for name in [name for name in BALL if name not in ranges]:
         unknown = BALL[name]
         ends = unknown.mean - unknown.deviation, unknown.mean + unknown.deviation
         ranges[name] = _clip(name, ends)
-        sources[name] = f"{log.source} shows no bounce; these are typical values."
+        sources[name] = f"{log.source} shows fewer than three bounces; these are typical values."
         assumed.append(name)
     for name, (low, high, words) in _measure_sensors(found, log).items():
         ranges[name] = _clip(name, (low, high))

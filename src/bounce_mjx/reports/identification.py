@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from bounce_mjx.identify.inspection import Checkup, Joint
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.stages import Identified
-from bounce_mjx.identify.world import estimates, misfit, sentences
+from bounce_mjx.identify.world import Estimate, estimates, misfit, sentences
 from bounce_mjx.reports.figures import add_legend, make_panels, style
 from bounce_mjx.reports.html_page import figures_html, page, table
 
@@ -81,11 +81,7 @@ def identification_page(
     """
     source = ", ".join(log.source for log in logs)
     listed = estimates(found, joint_names)
-    marks = {True: "", False: "not shown by the log: the prior"}
-    rows = [
-        [e.label, f"{e.value:.3g}", f"{e.low:.3g} to {e.high:.3g} {e.unit}", marks[e.seen]]
-        for e in sorted(listed, key=lambda e: not e.seen)
-    ]
+    rows = [_row(entry) for entry in sorted(listed, key=lambda entry: not entry.seen)]
     parts = found.before, found.after, found.held_out
     fits = [
         [name, *(f"{part[name]:.3g}" if name in part else "-" for part in parts)]
@@ -111,6 +107,15 @@ below with the interval that contains it with 95% probability.</p>
 {said}</ul>
 {_describe_logs(logs, checkups)}"""
     return page(f"identified from {source}", body)
+
+
+def _row(entry: Estimate) -> list[str]:
+    """An estimate's row of the table."""
+    value = f"{entry.value:.3g}"
+    if entry.chosen:
+        return [entry.label, value, "-", "chosen for an arm that follows its commands"]
+    interval = f"{entry.low:.3g} to {entry.high:.3g} {entry.unit}"
+    return [entry.label, value, interval, "" if entry.seen else "not shown by the log: the prior"]
 
 
 def _describe_joints(found: Identified, joint_names: Sequence[str]) -> str:
