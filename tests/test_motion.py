@@ -600,10 +600,62 @@ def test_whatever_fails_the_arm_brakes_from_its_last_command(
         np.testing.assert_allclose(rows, np.tile(HOME[::-1], (10, 1)), atol=1e-12)
 
 
-def test_a_reset_before_a_start_moves_nothing() -> None:
+def play_beside(policy: DeployedPolicy, steps: int = 10) -> None:
+    """Steps of a policy whose commands nobody sends."""
+    for i in range(steps):
+        policy.step(measured(**flying(i)))
+
+
+@pytest.mark.parametrize("is_reset", [True, False], ids=["reset", "stepped"])
+def test_what_is_done_to_the_policy_of_a_resting_arm_moves_nothing(is_reset: bool) -> None:
     arm = Arm(limited().supervise(1000), HOME + 0.1)
+
+    def disturb() -> None:
+        if is_reset:
+            arm.supervisor._policy.reset()
+        else:
+            play_beside(arm.supervisor._policy)
+
     arm.until("ready")
-    arm.supervisor._policy.reset()
+    disturb()
+    arm.supervisor.start()
+    for i in range(25):
+        assert arm.step(**flying(i)) == "running"
+    arm.supervisor.stop("the operator")
+    arm.until("stopped", 100)
+    disturb()
+    arm.supervisor.restart()
+    arm.until("ready")
+    arm.check()
+
+
+def test_steps_beside_a_supervisor_without_commands_are_no_commands() -> None:
+    policy = limited()
+    supervisor = policy.supervise(1000)
+    play_beside(policy)
+    assert supervisor.commands(measured()).shape == (0, 6)
+    assert supervisor.fault == "error" and "call the supervisor alone" in supervisor.reason
+    supervisor.restart()
+    np.testing.assert_allclose(supervisor.commands(measured()), np.tile(HOME, (10, 1)))
+
+
+def test_a_policy_has_one_supervisor_at_a_time() -> None:
+    arm = running()
+    policy, first = arm.supervisor._policy, arm.supervisor
+    with pytest.raises(UserError, match="has a supervisor, whose arm is running; stop it"):
+        policy.supervise(1000)
+    assert arm.step(**flying(25)) == "running"
+    first.stop("the operator")
+    arm.until("stopped", 100)
+    arm.supervisor = policy.supervise(1000)
+    arm.until("ready")
+    arm.check()
+    # The first one has an end of its commands from before, to which it does not go back.
+    assert first.commands(measured(arm.angles)).shape == (0, 6)
+    assert first.fault == "error" and "the policy has a newer supervisor" in first.reason
+    for change in (first.restart, first.start):
+        with pytest.raises(UserError, match="the policy has a newer supervisor"):
+            change()
     arm.supervisor.start()
     for i in range(25):
         assert arm.step(**flying(i)) == "running"

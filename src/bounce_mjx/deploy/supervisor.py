@@ -25,6 +25,7 @@ _HOME_TOLERANCE = 2e-3
 # On the way home, rad/s.
 _HOME_SPEED = 0.3
 _OTHER_ORDER = "the policy's joints have another order than the supervisor's; call supervise again"
+_NEWER = "the policy has a newer supervisor; call that one"
 _MOVED = "the policy was reset or stepped beside its supervisor; call the supervisor alone"
 # In which an arm comes to rest where its commands do, s.
 _SETTLING = 1.0
@@ -44,7 +45,8 @@ class Supervisor:
     - braking: the commands slow down within the arm's limits, then it is
     - stopped: the commands rest, and `fault` and `reason` say why, until `restart`.
 
-    Each commands begin where the last ones ended, whatever happens to the policy meanwhile.
+    Each commands begin where the last ones ended, whatever happens to the policy meanwhile. Once
+    the policy has a newer supervisor, this one gives no commands.
     """
 
     def __init__(
@@ -62,7 +64,6 @@ class Supervisor:
         self._metadata = policy.metadata
         self._motion = policy.motion
         self._end: Setpoint | None = policy.motion.end
-        policy.samples.forget(policy.targets)
         metadata = policy.metadata
         age = picture_age(metadata) if max_picture_age is None else max_picture_age
         for name, value, most in (
@@ -88,20 +89,21 @@ class Supervisor:
         """Control steps in which the arm was not where its commands rest."""
         self._resting_angles = np.array(metadata.default_joint_angles)
         """Measured [J] in the last step at home, rad."""
+        # An arm may rest at the last commands, far from the start pose.
+        policy.samples.forget(policy.targets)
 
     def start(self) -> None:
         """Starts an episode.
 
         Raises:
-          UserError: the arm is not ready, or the joints have another order now.
+          UserError: the arm is not ready, or the policy is no longer this supervisor's.
         """
+        self._check_policy()
         if self.state != "ready":
             raise UserError(
                 f"the arm is {self.state}, and an episode starts when it is ready; call restart "
                 "after a stop, and commands until the arm is home"
             )
-        if self._has_other_order:
-            raise UserError(_OTHER_ORDER)
         self._take_back()
         self._policy.reset(self._targets)
         # A load and the servo hold the arm a little beside its command.
@@ -127,12 +129,11 @@ class Supervisor:
             it is measured, as the first ones did.
 
         Raises:
-          UserError: the arm has not stopped, or the joints have another order now.
+          UserError: the arm has not stopped, or the policy is no longer this supervisor's.
         """
+        self._check_policy()
         if self.state != "stopped":
             raise UserError(f"the arm is {self.state}; restart it when it has stopped")
-        if self._has_other_order:
-            raise UserError(_OTHER_ORDER)
         self._take_back()
         self.state = "homing"
         self.fault = None
@@ -159,6 +160,11 @@ class Supervisor:
           Exception: anything fails before there is a command, mostly a `UserError`, as the first
             joint angles are wrong. Afterwards nothing is raised, and the arm brakes.
         """
+        if self._policy.supervisor is not self:
+            self.state = "stopped"
+            self.fault = "error"
+            self.reason = _NEWER
+            return np.zeros((0, len(self._metadata.joint_names)))
         try:
             if self._has_other_order:
                 self.stop(_OTHER_ORDER, "error")
@@ -195,11 +201,20 @@ class Supervisor:
 
     def _take_back(self) -> bool:
         """Lets the commands go on where the last ones ended, and says whether anything else has
-        moved them since."""
-        if self._end is None or self._motion.end is self._end:
+        moved them since. Those of an arm that was moving go on with `hold`."""
+        if self._motion.end is self._end:
             return False
+        # Without a start, the commands are those of an arm that rests at the end.
+        self._motion.start = None
         self._motion.end = self._end
         return True
+
+    def _check_policy(self) -> None:
+        """Raises UserError if the policy is no longer this supervisor's."""
+        if self._policy.supervisor is not self:
+            raise UserError(_NEWER)
+        if self._has_other_order:
+            raise UserError(_OTHER_ORDER)
 
     @property
     def _has_other_order(self) -> bool:
