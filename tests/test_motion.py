@@ -502,10 +502,16 @@ def test_the_first_command_is_where_the_arm_is() -> None:
         assert commands[-1][1] < commands[0][1] - 1e-3
 
 
-def test_a_wrapped_angle_is_unwrapped_where_the_range_has_one_reading() -> None:
+def test_an_angle_whole_turns_outside_its_range_is_refused() -> None:
+    """A command for the joint without the turn would be a turn from its reading; and a joint that
+    is really so far outside has the same reading."""
     policy, turned = load_policy("robust"), HOME + [2.0 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0]
-    expected = load_policy("robust").step(measured_by_robust(HOME))
-    np.testing.assert_array_equal(policy.step(measured_by_robust(turned)), expected)
+    supervisor = policy.supervise(500)
+    for _ in range(3):
+        with pytest.raises(UserError, match="Joint1 is 6.28, .* and no whole turns"):
+            policy.step(measured_by_robust(turned))
+        with pytest.raises(UserError, match="Joint1 is 6.28, .* and no whole turns"):
+            supervisor.commands(measured_by_robust(turned))
 
 
 def measured_by_robust(angles: np.ndarray) -> dict[str, Any]:
