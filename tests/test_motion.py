@@ -555,6 +555,29 @@ def test_the_braking_distance_counts_in_the_box() -> None:
     assert 0.05 < np.abs(paddles - place).max() <= 0.1
 
 
+def test_a_velocity_that_cannot_be_true_is_bridged_also_at_a_repeated_position() -> None:
+    policy, right = load_policy("pretrained"), load_policy("pretrained")
+    policy.step(measured())
+    right.step(measured())
+    # One picture is bridged in all of its steps.
+    for _ in range(2):
+        policy.step(measured(ball_velocity=[0.0, 0.0, 500.0]))
+        right.step(measured())
+        np.testing.assert_array_equal(policy.observation, right.observation)
+    with pytest.raises(UserError, match="the ball has 501 m/s"):
+        policy.step(measured(ball_velocity=[0.0, 0.0, 501.0]))
+
+
+def test_velocities_between_two_pictures_make_no_later_picture() -> None:
+    """Here estimates for each step of a ball that a camera without ages sees every 50 ms."""
+    policy = load_policy("pretrained")
+    speed = 0.5 * policy.metadata.ball.speed
+    for step in range(20):
+        height = 0.3 + 0.05 * speed * (step // 5 % 2)
+        velocity = [0.0, 0.0, 0.01 * step]
+        policy.step(measured(ball_position=[0.589, 0.0, height], ball_velocity=velocity))
+
+
 def test_a_measurement_that_first_comes_when_it_is_doubted_is_left_out() -> None:
     """As a picture's age, from the second picture on."""
     policy = load_policy("pretrained")

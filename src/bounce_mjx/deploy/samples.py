@@ -105,9 +105,9 @@ class Samples:
         self._now = 0.0
         self._arm_time = 0.0
         self._taken = -math.inf
-        # The newest picture, what speaks against it, and whether the one before holds in its place
-        # already: one picture is bridged in all of its steps.
-        self._seen: np.ndarray | None = None
+        # The newest picture, with its velocities, what speaks against it, and whether the one
+        # before holds in its place already: one picture is bridged in all of its steps.
+        self._seen: bytes | None = None
         self._doubt: tuple[str, str] | None = None
         self._is_held = False
 
@@ -258,14 +258,19 @@ class Samples:
                 "taken, by one clock",
             )
         taken = self._now - age
-        is_new = self._seen is None or (balls != self._seen).any()
-        if is_new:
-            self._seen = balls
+        velocities = measured.get("ball_velocity")
+        # Bytes are compared faster than arrays.
+        seen = balls.tobytes() + (b"" if velocities is None else velocities.tobytes())
+        if seen != self._seen:
+            self._seen = seen
             self._is_held = False
-            self._doubt = self._doubt_of(balls, measured.get("ball_velocity"), taken)
+            self._doubt = self._doubt_of(balls, velocities, taken)
         if self._doubt is None:
+            # A velocity may come between two pictures.
+            last = self._last.get("ball_position")
+            if last is None or (measured["ball_position"] != last).any():
+                self._taken = max(taken, self._taken)
             self._believe(measured, _OF_BALL)
-            self._taken = max(taken, self._taken) if is_new else self._taken
         elif self._is_held:
             self._hold(measured, _OF_BALL)
         else:
