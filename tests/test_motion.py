@@ -629,6 +629,28 @@ def test_whatever_fails_the_arm_brakes_from_its_last_command(
         np.testing.assert_allclose(rows, np.tile(HOME[::-1], (10, 1)), atol=1e-12)
 
 
+def test_an_arm_that_rests_beside_home_says_why_it_waits_and_stops() -> None:
+    supervisor, angles = limited().supervise(1000), HOME + 0.3
+    off = np.array([0.0, 0.03, 0.0, 0.0, 0.0, 0.0])
+    seen = []
+    # Far from home, it waits for a second sample.
+    supervisor.commands(measured(angles) | {"time": -0.01})
+    for step in range(300):
+        rows = supervisor.commands(measured(angles) | {"time": 0.01 * step})
+        # It sinks under its load on the way.
+        angles = rows[-1] + off * min(0.0125 * step, 1.0)
+        seen.append((supervisor.state, supervisor.reason))
+    waiting = [reason for state, reason in seen if state == "homing" and reason]
+    assert 90 < len(waiting) <= 100
+    assert re.search("Joint2 is 0.0[0-9]+ rad from where its commands rest", waiting[-1])
+    assert (supervisor.state, supervisor.fault) == ("stopped", "joint_astray")
+    # The load is gone.
+    supervisor.restart()
+    for step in range(20):
+        rows = supervisor.commands(measured() | {"time": 3.0 + 0.01 * step})
+    assert (supervisor.state, supervisor.reason) == ("ready", None)
+
+
 def play_beside(policy: DeployedPolicy, steps: int = 10) -> None:
     """Steps of a policy whose commands nobody sends."""
     for i in range(steps):

@@ -39,7 +39,7 @@ class Supervisor:
 
     Call `commands` once each control step, in every state:
 
-    - homing: the arm goes slowly to the policy's first posture, then it is
+    - homing: the arm goes slowly to the policy's first posture, also back from a push, then it is
     - ready: it rests there until `start`;
     - running: it follows the policy, until a fault or `stop`;
     - braking: the commands slow down within the arm's limits, then it is
@@ -83,10 +83,10 @@ class Supervisor:
         """Code of the rule that was broken, such as `ball_lost`, of the tables in
         docs/real-robot.md; `stopped` after `stop`."""
         self.reason: str | None = None
-        """Why the arm has stopped or brakes, or what it waits for before it goes home."""
+        """Why the arm has stopped or brakes, or what it waits for on its way home."""
         self._is_moving_home = False
         self._waited = 0
-        """Control steps in which the arm was not where its commands rest."""
+        """Control steps in a row in which the arm was not where its commands rest."""
         self._resting_angles = np.array(metadata.default_joint_angles)
         """Measured [J] in the last step at home, rad."""
         # An arm may rest at the last commands, far from the start pose.
@@ -243,20 +243,28 @@ class Supervisor:
             policy.reset(angles)
             policy.samples.rest(angles)
             return angles
-        if self._are_near(self._targets, angles):
-            return angles
-        self._waited += 1
+        return angles if self._rests(angles) else None
+
+    def _rests(self, angles: np.ndarray) -> bool:
+        """Whether the arm is where its commands rest. Else there is a reason for which it waits,
+        and the arm is stopped when it has had time to settle."""
         beside = np.abs(angles - self._targets)
         joint = int(np.argmax(beside))
+        if beside[joint] <= self._watch.offset:
+            self._waited = 0
+            self.reason = None
+            return True
+        self._waited += 1
         reason = (
             f"{self._metadata.joint_names[joint]} is {beside[joint]:.2g} rad from where its "
-            "commands rest; if the arm was moved with its servos off, call restart(moved=True)"
+            "commands rest; check its load and its zero, or, if the arm was moved with its servos "
+            "off, call restart(moved=True)"
         )
         if self._waited * self._metadata.control_dt > _SETTLING:
             self.stop(reason, "joint_astray")
         else:
             self.reason = reason
-        return None
+        return False
 
     def _stop_at(self, faults: Iterable[Fault]) -> bool:
         """Brakes at the first of the faults, and says whether there is one."""
@@ -290,12 +298,13 @@ class Supervisor:
                 self._keep_in_box()
             return
         self._motion.hold()
-        is_home = self._motion.is_still and self._are_near(angles, home)
-        self.state = "ready" if is_home else "homing"
         self._resting_angles = angles
-
-    def _are_near(self, one: np.ndarray, other: np.ndarray) -> bool:
-        return bool(np.max(np.abs(one - other)) <= self._watch.offset)
+        if not self._motion.is_still:
+            return
+        if self._rests(angles):
+            self.state = "ready"
+        elif self.state == "ready":
+            self.state = "homing"
 
     def _follow(self, measurements: Mapping[str, Any]) -> None:
         """A step of the policy."""
