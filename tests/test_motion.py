@@ -320,6 +320,11 @@ def test_an_arm_that_was_moved_starts_from_where_it_is() -> None:
         np.testing.assert_array_equal(rows, np.tile(stopped, (10, 1)))
     assert arm.supervisor.state == "stopped" and arm.supervisor.fault == "joint_astray"
     assert "rad from where its commands rest" in arm.supervisor.reason
+    # Nor is anything raised before the next first command.
+    for wrong, fault in ((np.full(6, np.nan), "measurement"), (HOME + 9.0, "joint_range")):
+        arm.supervisor.restart(moved=True)
+        assert arm.supervisor.commands(measured(wrong)).shape == (0, 6)
+        assert (arm.supervisor.state, arm.supervisor.fault) == ("stopped", fault)
     arm.supervisor.restart(moved=True)
     # One sample could be wrong, so that nothing is sent until the next one confirms it.
     assert len(arm.supervisor.commands(measured(moved))) == 0

@@ -64,6 +64,7 @@ class Supervisor:
         self._metadata = policy.metadata
         self._motion = policy.motion
         self._end: Setpoint | None = policy.motion.end
+        self._has_begun = policy.motion.end is not None
         metadata = policy.metadata
         age = picture_age(metadata) if max_picture_age is None else max_picture_age
         for name, value, most in (
@@ -157,8 +158,8 @@ class Supervisor:
             changed.
 
         Raises:
-          Exception: anything fails before there is a command, mostly a `UserError`, as the first
-            joint angles are wrong. Afterwards nothing is raised, and the arm brakes.
+          Exception: anything fails before the supervisor has given a command, mostly a `UserError`,
+            as the first joint angles are wrong. Afterwards nothing is raised, and the arm brakes.
         """
         if self._policy.supervisor is not self:
             self.state = "stopped"
@@ -175,7 +176,7 @@ class Supervisor:
             elif self.state in ("homing", "ready"):
                 self._go_home(measurements)
         except Exception as error:
-            if self._targets is None:
+            if not self._has_begun:
                 raise
             self.stop(*_fault_of(error))
         if self._targets is None:
@@ -190,6 +191,7 @@ class Supervisor:
             if self.state == "braking" and self._motion.is_still:
                 self.state = "stopped"
         self._end = self._motion.end
+        self._has_begun = True
         return self._motion.at(self._times)
 
     @property
