@@ -126,7 +126,7 @@ class DeployedPolicy:
 
         Args:
           targets: servo targets [J] (rad) at which the arm rests, and from which the next command
-            moves; by default, the joint angles of the next step.
+            moves, wherever the arm is measured; by default, the joint angles of the next step.
 
         Raises:
           UserError: the targets are not J finite numbers; nothing is forgotten.
