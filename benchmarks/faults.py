@@ -356,7 +356,7 @@ def faults(joints: int) -> dict[str, Fault]:
         "all joints: frozen": Fault(_later(_frozen("joint_angles")), ARM),
         "all joints: wrapped by a turn": Fault(
             _later(_put("joint_angles", lambda m: m.measured["joint_angles"] + 2.0 * math.pi)),
-            (*JUMP, ""),
+            JUMP,
         ),
         "all joints: NaN": Fault(
             _later(_put("joint_angles", lambda m: np.nan * m.measured["joint_angles"])),

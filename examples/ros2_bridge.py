@@ -38,6 +38,8 @@ class Bridge(Node):
         """
         super().__init__("bounce_mjx")
         self.joint_names = policy.metadata.joint_names
+        # The arm rests, and the first command is where it is measured.
+        policy.reset()
         self.arm = policy.supervise(RATE)
         self.measurements = {"target_height": target_height}
         self.picture_stamp = None

@@ -84,6 +84,8 @@ def bounce(policy, rtde_c, rtde_r, camera, task_commands: dict, seconds: float) 
     Returns:
       Why the arm stopped, each time.
     """
+    # The arm rests, and the first command is where it is measured.
+    policy.reset()
     arm = policy.supervise(RATE)
     control_dt = policy.metadata.control_dt
     reasons = []

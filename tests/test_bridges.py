@@ -77,7 +77,7 @@ def test_ur_rtde_bridge() -> None:
     world, supervised = World(), []
     policy = load_policy("robust")
     make = policy.supervise
-    policy.supervise = lambda rate: supervised.append(make(rate)) or supervised[0]
+    policy.supervise = lambda rate: supervised.append(make(rate)) or supervised[-1]
     bridge = runpy.run_path(str(EXAMPLES / "ur_rtde_bridge.py"))
 
     class Control:
@@ -98,7 +98,7 @@ def test_ur_rtde_bridge() -> None:
             self.in_period = False
             knocked(world)
             world.tick(self.sent)
-            world.watch(supervised[0])
+            world.watch(supervised[-1])
 
         def servoStop(self) -> None:
             self.stopped = True

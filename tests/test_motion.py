@@ -320,6 +320,11 @@ def test_an_arm_that_was_moved_starts_from_where_it_is() -> None:
         np.testing.assert_array_equal(rows, np.tile(stopped, (10, 1)))
     assert arm.supervisor.state == "stopped" and arm.supervisor.fault == "joint_astray"
     assert "rad from where its commands rest" in arm.supervisor.reason
+    # Nor is anything raised before the next first command.
+    for wrong, fault in ((np.full(6, np.nan), "measurement"), (HOME + 9.0, "joint_range")):
+        arm.supervisor.restart(moved=True)
+        assert arm.supervisor.commands(measured(wrong)).shape == (0, 6)
+        assert (arm.supervisor.state, arm.supervisor.fault) == ("stopped", fault)
     arm.supervisor.restart(moved=True)
     # One sample could be wrong, so that nothing is sent until the next one confirms it.
     assert len(arm.supervisor.commands(measured(moved))) == 0
@@ -502,10 +507,16 @@ def test_the_first_command_is_where_the_arm_is() -> None:
         assert commands[-1][1] < commands[0][1] - 1e-3
 
 
-def test_a_wrapped_angle_is_unwrapped_where_the_range_has_one_reading() -> None:
+def test_an_angle_whole_turns_outside_its_range_is_refused() -> None:
+    """A command for the joint without the turn would be a turn from its reading; and a joint that
+    is really so far outside has the same reading."""
     policy, turned = load_policy("robust"), HOME + [2.0 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0]
-    expected = load_policy("robust").step(measured_by_robust(HOME))
-    np.testing.assert_array_equal(policy.step(measured_by_robust(turned)), expected)
+    supervisor = policy.supervise(500)
+    for _ in range(3):
+        with pytest.raises(UserError, match="Joint1 is 6.28, .* and no whole turns"):
+            policy.step(measured_by_robust(turned))
+        with pytest.raises(UserError, match="Joint1 is 6.28, .* and no whole turns"):
+            supervisor.commands(measured_by_robust(turned))
 
 
 def measured_by_robust(angles: np.ndarray) -> dict[str, Any]:
@@ -547,6 +558,29 @@ def test_the_braking_distance_counts_in_the_box() -> None:
     paddles = paddle_position(metadata, np.array(rows))
     assert arm.fault == "box" and "outside the box" in arm.reason
     assert 0.05 < np.abs(paddles - place).max() <= 0.1
+
+
+def test_a_velocity_that_cannot_be_true_is_bridged_also_at_a_repeated_position() -> None:
+    policy, right = load_policy("pretrained"), load_policy("pretrained")
+    policy.step(measured())
+    right.step(measured())
+    # One picture is bridged in all of its steps.
+    for _ in range(2):
+        policy.step(measured(ball_velocity=[0.0, 0.0, 500.0]))
+        right.step(measured())
+        np.testing.assert_array_equal(policy.observation, right.observation)
+    with pytest.raises(UserError, match="the ball has 501 m/s"):
+        policy.step(measured(ball_velocity=[0.0, 0.0, 501.0]))
+
+
+def test_velocities_between_two_pictures_make_no_later_picture() -> None:
+    """Here estimates for each step of a ball that a camera without ages sees every 50 ms."""
+    policy = load_policy("pretrained")
+    speed = 0.5 * policy.metadata.ball.speed
+    for step in range(20):
+        height = 0.3 + 0.05 * speed * (step // 5 % 2)
+        velocity = [0.0, 0.0, 0.01 * step]
+        policy.step(measured(ball_position=[0.589, 0.0, height], ball_velocity=velocity))
 
 
 def test_a_measurement_that_first_comes_when_it_is_doubted_is_left_out() -> None:
@@ -600,10 +634,84 @@ def test_whatever_fails_the_arm_brakes_from_its_last_command(
         np.testing.assert_allclose(rows, np.tile(HOME[::-1], (10, 1)), atol=1e-12)
 
 
-def test_a_reset_before_a_start_moves_nothing() -> None:
+def test_an_arm_that_rests_beside_home_says_why_it_waits_and_stops() -> None:
+    supervisor, angles = limited().supervise(1000), HOME + 0.3
+    off = np.array([0.0, 0.03, 0.0, 0.0, 0.0, 0.0])
+    seen = []
+    # Far from home, it waits for a second sample.
+    supervisor.commands(measured(angles) | {"time": -0.01})
+    for step in range(300):
+        rows = supervisor.commands(measured(angles) | {"time": 0.01 * step})
+        # It sinks under its load on the way.
+        angles = rows[-1] + off * min(0.0125 * step, 1.0)
+        seen.append((supervisor.state, supervisor.reason))
+    waiting = [reason for state, reason in seen if state == "homing" and reason]
+    assert 90 < len(waiting) <= 100
+    assert re.search("Joint2 is 0.0[0-9]+ rad from where its commands rest", waiting[-1])
+    assert (supervisor.state, supervisor.fault) == ("stopped", "joint_astray")
+    # The load is gone.
+    supervisor.restart()
+    for step in range(20):
+        rows = supervisor.commands(measured() | {"time": 3.0 + 0.01 * step})
+    assert (supervisor.state, supervisor.reason) == ("ready", None)
+
+
+def play_beside(policy: DeployedPolicy, steps: int = 10) -> None:
+    """Steps of a policy whose commands nobody sends."""
+    for i in range(steps):
+        policy.step(measured(**flying(i)))
+
+
+@pytest.mark.parametrize("is_reset", [True, False], ids=["reset", "stepped"])
+def test_what_is_done_to_the_policy_of_a_resting_arm_moves_nothing(is_reset: bool) -> None:
     arm = Arm(limited().supervise(1000), HOME + 0.1)
+
+    def disturb() -> None:
+        if is_reset:
+            arm.supervisor._policy.reset()
+        else:
+            play_beside(arm.supervisor._policy)
+
     arm.until("ready")
-    arm.supervisor._policy.reset()
+    disturb()
+    arm.supervisor.start()
+    for i in range(25):
+        assert arm.step(**flying(i)) == "running"
+    arm.supervisor.stop("the operator")
+    arm.until("stopped", 100)
+    disturb()
+    arm.supervisor.restart()
+    arm.until("ready")
+    arm.check()
+
+
+def test_steps_beside_a_supervisor_without_commands_are_no_commands() -> None:
+    policy = limited()
+    supervisor = policy.supervise(1000)
+    play_beside(policy)
+    assert supervisor.commands(measured()).shape == (0, 6)
+    assert supervisor.fault == "error" and "call the supervisor alone" in supervisor.reason
+    supervisor.restart()
+    np.testing.assert_allclose(supervisor.commands(measured()), np.tile(HOME, (10, 1)))
+
+
+def test_a_policy_has_one_supervisor_at_a_time() -> None:
+    arm = running()
+    policy, first = arm.supervisor._policy, arm.supervisor
+    with pytest.raises(UserError, match="has a supervisor, whose arm is running; stop it"):
+        policy.supervise(1000)
+    assert arm.step(**flying(25)) == "running"
+    first.stop("the operator")
+    arm.until("stopped", 100)
+    arm.supervisor = policy.supervise(1000)
+    arm.until("ready")
+    arm.check()
+    # The first one has an end of its commands from before, to which it does not go back.
+    assert first.commands(measured(arm.angles)).shape == (0, 6)
+    assert first.fault == "error" and "the policy has a newer supervisor" in first.reason
+    for change in (first.restart, first.start):
+        with pytest.raises(UserError, match="the policy has a newer supervisor"):
+            change()
     arm.supervisor.start()
     for i in range(25):
         assert arm.step(**flying(i)) == "running"

@@ -56,6 +56,8 @@ class DeployedPolicy:
             """Commands of the joints; a `Supervisor` also moves them without the policy."""
             self.samples = Samples(self.metadata)
             """What a robot may have measured: each sample, compared with the last one."""
+            self.supervisor: Supervisor | None = None
+            """The one that gives the policy's commands: the last that `supervise` made."""
             self._sizes = measurement_sizes(self.metadata)
             balls = self.metadata.num_balls
             self._defaults = {
@@ -124,7 +126,7 @@ class DeployedPolicy:
 
         Args:
           targets: servo targets [J] (rad) at which the arm rests, and from which the next command
-            moves; by default, the joint angles of the next step.
+            moves, wherever the arm is measured; by default, the joint angles of the next step.
 
         Raises:
           UserError: the targets are not J finite numbers; nothing is forgotten.
@@ -267,7 +269,8 @@ class DeployedPolicy:
         return self.motion.at(np.array([self.metadata.control_dt]))[0]
 
     def supervise(self, rate: float, **settings: Any) -> Supervisor:
-        """A supervisor that gives the commands of this policy at the robot's rate (Hz).
+        """A supervisor that gives the commands of this policy at the robot's rate (Hz), in place of
+        an earlier one.
 
         Args:
           settings: `box`, the lowest and the highest x, y and z of the paddle's centre, m;
@@ -276,9 +279,19 @@ class DeployedPolicy:
             steps, and calls in a row without a new step (2).
 
         Raises:
-          UserError: the rate is not a multiple of the policy's, or a setting is wrong.
+          UserError: the rate is not a multiple of the policy's, or a setting is wrong; or the arm
+            of an earlier supervisor has not stopped, and the policy was not reset since.
         """
-        return Supervisor(self, rate, **settings)
+        earlier = self.supervisor
+        # After a reset there are no commands that could go on.
+        if earlier is not None and earlier.state != "stopped" and self.motion.end is not None:
+            raise UserError(
+                f"the policy has a supervisor, whose arm is {earlier.state}; stop it, and call its "
+                "commands until it has stopped; or, if nothing moves the arm any more, reset the "
+                "policy"
+            )
+        self.supervisor = Supervisor(self, rate, **settings)
+        return self.supervisor
 
     def _act(self, action: np.ndarray) -> None:
         """Aims the commands of the control step at the targets of an action [J]."""

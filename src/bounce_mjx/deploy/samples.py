@@ -105,9 +105,9 @@ class Samples:
         self._now = 0.0
         self._arm_time = 0.0
         self._taken = -math.inf
-        # The newest picture, what speaks against it, and whether the one before holds in its place
-        # already: one picture is bridged in all of its steps.
-        self._seen: np.ndarray | None = None
+        # The newest picture, with its velocities, what speaks against it, and whether the one
+        # before holds in its place already: one picture is bridged in all of its steps.
+        self._seen: bytes | None = None
         self._doubt: tuple[str, str] | None = None
         self._is_held = False
 
@@ -174,9 +174,6 @@ class Samples:
         """Believes the arm's sample, or bridges it."""
         angles = measured["joint_angles"]
         last = self._last.get("joint_angles")
-        is_outside = self._outside(angles).max() > _OUTSIDE
-        if is_outside:
-            angles = measured["joint_angles"] = self._unwrapped(angles)
         if last is None:
             self._check_first(angles)
             last = angles
@@ -193,9 +190,8 @@ class Samples:
             remedy = "give unwrapped angles" if turned else "check the encoder, or call reset"
             self._bridge(measured, _OF_ARM, "joint_jump", reason + remedy)
             return
-        if is_outside:
-            # Not by a jump, so that the next sample will say the same.
-            self._check_range(angles)
+        # Not left by a jump, so that the next sample will say the same.
+        self._check_range(angles)
         velocities = measured.get("joint_velocities", self._still)
         too_fast = np.abs(velocities) - self._fastest
         if too_fast.max() > 0.0:
@@ -209,19 +205,17 @@ class Samples:
         self._believe(measured, _OF_ARM)
         self._arm_time = self._now
 
-    def _outside(self, angles: np.ndarray) -> np.ndarray:
-        """How far each joint is outside of its range [J], rad; negative inside."""
-        return np.maximum(self._low - angles, angles - self._high)
-
     def _check_range(self, angles: np.ndarray) -> None:
-        outside = self._outside(angles)
+        """Refuses angles [J] far outside of their ranges. Whole turns are not removed: a joint that
+        counts them would be commanded a turn away, and another one is really there."""
+        outside = np.maximum(self._low - angles, angles - self._high)
         if outside.max() > _OUTSIDE:
             joint = int(np.argmax(outside))
             raise ImpossibleMeasurement(
                 "joint_range",
                 f"the angle of {self._metadata.joint_names[joint]} is {angles[joint]:.3g}, but the "
                 f"training had {self._low[joint]:.3g} to {self._high[joint]:.3g} (rad); give this "
-                "unit, and the policy's order",
+                "unit, the policy's order, and no whole turns",
             )
 
     def _check_first(self, angles: np.ndarray) -> None:
@@ -253,13 +247,6 @@ class Samples:
                 "when the next sample confirms them"
             )
 
-    def _unwrapped(self, angles: np.ndarray) -> np.ndarray:
-        """Angles far outside of their range by whole turns, where the range has one reading."""
-        first = np.ceil((self._low - angles) / (2.0 * math.pi))
-        last = np.floor((self._high - angles) / (2.0 * math.pi))
-        has_one = (self._outside(angles) > _OUTSIDE) & (first == last)
-        return angles + 2.0 * math.pi * np.where(has_one, first, 0.0)
-
     def _take_picture(self, measured: Measurements) -> None:
         """Believes the picture of the balls, or bridges it until the next one."""
         balls = measured["ball_position"].reshape(-1, 3)
@@ -271,14 +258,19 @@ class Samples:
                 "taken, by one clock",
             )
         taken = self._now - age
-        is_new = self._seen is None or (balls != self._seen).any()
-        if is_new:
-            self._seen = balls
+        velocities = measured.get("ball_velocity")
+        # Bytes are compared faster than arrays.
+        seen = balls.tobytes() + (b"" if velocities is None else velocities.tobytes())
+        if seen != self._seen:
+            self._seen = seen
             self._is_held = False
-            self._doubt = self._doubt_of(balls, measured.get("ball_velocity"), taken)
+            self._doubt = self._doubt_of(balls, velocities, taken)
         if self._doubt is None:
+            # A velocity may come between two pictures.
+            last = self._last.get("ball_position")
+            if last is None or (measured["ball_position"] != last).any():
+                self._taken = max(taken, self._taken)
             self._believe(measured, _OF_BALL)
-            self._taken = max(taken, self._taken) if is_new else self._taken
         elif self._is_held:
             self._hold(measured, _OF_BALL)
         else:

@@ -25,6 +25,7 @@ _HOME_TOLERANCE = 2e-3
 # On the way home, rad/s.
 _HOME_SPEED = 0.3
 _OTHER_ORDER = "the policy's joints have another order than the supervisor's; call supervise again"
+_NEWER = "the policy has a newer supervisor; call that one"
 _MOVED = "the policy was reset or stepped beside its supervisor; call the supervisor alone"
 # In which an arm comes to rest where its commands do, s.
 _SETTLING = 1.0
@@ -38,13 +39,14 @@ class Supervisor:
 
     Call `commands` once each control step, in every state:
 
-    - homing: the arm goes slowly to the policy's first posture, then it is
+    - homing: the arm goes slowly to the policy's first posture, also back from a push, then it is
     - ready: it rests there until `start`;
     - running: it follows the policy, until a fault or `stop`;
     - braking: the commands slow down within the arm's limits, then it is
     - stopped: the commands rest, and `fault` and `reason` say why, until `restart`.
 
-    Each commands begin where the last ones ended, whatever happens to the policy meanwhile.
+    Each commands begin where the last ones ended, whatever happens to the policy meanwhile. Once
+    the policy has a newer supervisor, this one gives no commands.
     """
 
     def __init__(
@@ -62,7 +64,7 @@ class Supervisor:
         self._metadata = policy.metadata
         self._motion = policy.motion
         self._end: Setpoint | None = policy.motion.end
-        policy.samples.forget(policy.targets)
+        self._has_begun = policy.motion.end is not None
         metadata = policy.metadata
         age = picture_age(metadata) if max_picture_age is None else max_picture_age
         for name, value, most in (
@@ -82,26 +84,27 @@ class Supervisor:
         """Code of the rule that was broken, such as `ball_lost`, of the tables in
         docs/real-robot.md; `stopped` after `stop`."""
         self.reason: str | None = None
-        """Why the arm has stopped or brakes, or what it waits for before it goes home."""
+        """Why the arm has stopped or brakes, or what it waits for on its way home."""
         self._is_moving_home = False
         self._waited = 0
-        """Control steps in which the arm was not where its commands rest."""
+        """Control steps in a row in which the arm was not where its commands rest."""
         self._resting_angles = np.array(metadata.default_joint_angles)
         """Measured [J] in the last step at home, rad."""
+        # An arm may rest at the last commands, far from the start pose.
+        policy.samples.forget(policy.targets)
 
     def start(self) -> None:
         """Starts an episode.
 
         Raises:
-          UserError: the arm is not ready, or the joints have another order now.
+          UserError: the arm is not ready, or the policy is no longer this supervisor's.
         """
+        self._check_policy()
         if self.state != "ready":
             raise UserError(
                 f"the arm is {self.state}, and an episode starts when it is ready; call restart "
                 "after a stop, and commands until the arm is home"
             )
-        if self._has_other_order:
-            raise UserError(_OTHER_ORDER)
         self._take_back()
         self._policy.reset(self._targets)
         # A load and the servo hold the arm a little beside its command.
@@ -127,12 +130,11 @@ class Supervisor:
             it is measured, as the first ones did.
 
         Raises:
-          UserError: the arm has not stopped, or the joints have another order now.
+          UserError: the arm has not stopped, or the policy is no longer this supervisor's.
         """
+        self._check_policy()
         if self.state != "stopped":
             raise UserError(f"the arm is {self.state}; restart it when it has stopped")
-        if self._has_other_order:
-            raise UserError(_OTHER_ORDER)
         self._take_back()
         self.state = "homing"
         self.fault = None
@@ -156,9 +158,14 @@ class Supervisor:
             changed.
 
         Raises:
-          Exception: anything fails before there is a command, mostly a `UserError`, as the first
-            joint angles are wrong. Afterwards nothing is raised, and the arm brakes.
+          Exception: anything fails before the supervisor has given a command, mostly a `UserError`,
+            as the first joint angles are wrong. Afterwards nothing is raised, and the arm brakes.
         """
+        if self._policy.supervisor is not self:
+            self.state = "stopped"
+            self.fault = "error"
+            self.reason = _NEWER
+            return np.zeros((0, len(self._metadata.joint_names)))
         try:
             if self._has_other_order:
                 self.stop(_OTHER_ORDER, "error")
@@ -169,7 +176,7 @@ class Supervisor:
             elif self.state in ("homing", "ready"):
                 self._go_home(measurements)
         except Exception as error:
-            if self._targets is None:
+            if not self._has_begun:
                 raise
             self.stop(*_fault_of(error))
         if self._targets is None:
@@ -184,6 +191,7 @@ class Supervisor:
             if self.state == "braking" and self._motion.is_still:
                 self.state = "stopped"
         self._end = self._motion.end
+        self._has_begun = True
         return self._motion.at(self._times)
 
     @property
@@ -195,11 +203,20 @@ class Supervisor:
 
     def _take_back(self) -> bool:
         """Lets the commands go on where the last ones ended, and says whether anything else has
-        moved them since."""
-        if self._end is None or self._motion.end is self._end:
+        moved them since. Those of an arm that was moving go on with `hold`."""
+        if self._motion.end is self._end:
             return False
+        # Without a start, the commands are those of an arm that rests at the end.
+        self._motion.start = None
         self._motion.end = self._end
         return True
+
+    def _check_policy(self) -> None:
+        """Raises UserError if the policy is no longer this supervisor's."""
+        if self._policy.supervisor is not self:
+            raise UserError(_NEWER)
+        if self._has_other_order:
+            raise UserError(_OTHER_ORDER)
 
     @property
     def _has_other_order(self) -> bool:
@@ -228,20 +245,28 @@ class Supervisor:
             policy.reset(angles)
             policy.samples.rest(angles)
             return angles
-        if self._are_near(self._targets, angles):
-            return angles
-        self._waited += 1
+        return angles if self._rests(angles) else None
+
+    def _rests(self, angles: np.ndarray) -> bool:
+        """Whether the arm is where its commands rest. Else there is a reason for which it waits,
+        and the arm is stopped when it has had time to settle."""
         beside = np.abs(angles - self._targets)
         joint = int(np.argmax(beside))
+        if beside[joint] <= self._watch.offset:
+            self._waited = 0
+            self.reason = None
+            return True
+        self._waited += 1
         reason = (
             f"{self._metadata.joint_names[joint]} is {beside[joint]:.2g} rad from where its "
-            "commands rest; if the arm was moved with its servos off, call restart(moved=True)"
+            "commands rest; check its load and its zero, or, if the arm was moved with its servos "
+            "off, call restart(moved=True)"
         )
         if self._waited * self._metadata.control_dt > _SETTLING:
             self.stop(reason, "joint_astray")
         else:
             self.reason = reason
-        return None
+        return False
 
     def _stop_at(self, faults: Iterable[Fault]) -> bool:
         """Brakes at the first of the faults, and says whether there is one."""
@@ -275,12 +300,13 @@ class Supervisor:
                 self._keep_in_box()
             return
         self._motion.hold()
-        is_home = self._motion.is_still and self._are_near(angles, home)
-        self.state = "ready" if is_home else "homing"
         self._resting_angles = angles
-
-    def _are_near(self, one: np.ndarray, other: np.ndarray) -> bool:
-        return bool(np.max(np.abs(one - other)) <= self._watch.offset)
+        if not self._motion.is_still:
+            return
+        if self._rests(angles):
+            self.state = "ready"
+        elif self.state == "ready":
+            self.state = "homing"
 
     def _follow(self, measurements: Mapping[str, Any]) -> None:
         """A step of the policy."""
