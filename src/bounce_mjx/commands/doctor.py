@@ -82,11 +82,11 @@ def _packages(distribution: str, extra: str) -> Iterator[str]:
     from packaging.requirements import Requirement
 
     for needed in map(Requirement, importlib.metadata.requires(distribution) or []):
-        # Without an extra, a marker of the version of Python alone holds too.
-        with_extra, without = (
-            needed.marker is None or needed.marker.evaluate({"extra": name}) for name in (extra, "")
-        )
-        if with_extra and not without:
+        if needed.marker is None:
+            continue
+        # A marker of the version of Python alone holds without an extra too.
+        is_always_needed = needed.marker.evaluate({"extra": ""})
+        if needed.marker.evaluate({"extra": extra}) and not is_always_needed:
             yield needed.name
             for inner in needed.extras if version_of(needed.name) else ():
                 yield from _packages(needed.name, inner)

@@ -94,6 +94,20 @@ def with_settings(config: WorldConfig, settings: dict[str, Any], title: str) -> 
     return validate(type(config), merged(config.model_dump(), on_top), title)
 
 
+def refuse_beside(given: str, **others: Any) -> None:
+    """Refuses arguments that say the environment beside the one that is `given`.
+
+    Args:
+      others: arguments by name, None where they are not given.
+
+    Raises:
+      UserError: another one is given.
+    """
+    for name, value in others.items():
+        if value is not None:
+            raise UserError(f"{given} and {name} both say the environment; give one of them")
+
+
 def refuse_warmup(config: WorldConfig, title: str) -> None:
     """Refuses the settings of a warm-up in an environment that has no count of a training's steps,
     over which its ranges would grow.

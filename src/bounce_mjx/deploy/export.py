@@ -37,7 +37,13 @@ from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.robot.actuators import largest_torques
 from bounce_mjx.robot.arm import joint_name
 from bounce_mjx.robot.config import is_packaged
-from bounce_mjx.robot.model import find_addresses, joint_names, upper_face
+from bounce_mjx.robot.model import (
+    Addresses,
+    data_at,
+    find_addresses,
+    joint_names,
+    upper_face,
+)
 from bounce_mjx.runs.checkpoints import read_actor
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import Checkpoint
@@ -175,15 +181,15 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         paddle_normal=normal,
         environment=_environment(env),
         joint_damping=tuple(m.dof_damping[list(addresses.arm_qvel)].tolist()),
-        sag=_sag(m, env.default_joint_angles),
+        sag=_sag(m, addresses, env.default_joint_angles),
     )
 
 
-def _sag(m: mujoco.MjModel, joint_angles: Sequence[float]) -> tuple[float, ...]:
+def _sag(
+    m: mujoco.MjModel, addresses: Addresses, joint_angles: Sequence[float]
+) -> tuple[float, ...]:
     """How far the arm's weight takes each joint off its command at rest at these angles, rad."""
-    addresses = find_addresses(m)
-    data = mujoco.MjData(m)
-    data.qpos[list(addresses.arm_qpos)] = joint_angles
+    data = data_at(m, addresses, joint_angles)
     mujoco.mj_forward(m, data)
     dofs = list(addresses.arm_qvel)
     torques = (data.qfrc_bias - data.qfrc_passive)[dofs]

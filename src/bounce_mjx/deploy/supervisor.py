@@ -65,11 +65,10 @@ class Supervisor:
         self._motion = policy.motion
         self._end: Setpoint | None = policy.motion.end
         self._has_begun = policy.motion.end is not None
-        metadata = policy.metadata
-        age = picture_age(metadata) if max_picture_age is None else max_picture_age
+        age = picture_age(self._metadata) if max_picture_age is None else max_picture_age
         for name, value, most in (
             ("max_picture_age", age, 1.0),
-            ("max_steps_late", max_steps_late, 1.0 / metadata.control_dt),
+            ("max_steps_late", max_steps_late, 1.0 / self._metadata.control_dt),
         ):
             if not 0.0 < value <= most:
                 raise UserError(f"{name} is {value}; give a number above 0 and at most {most:g}")
@@ -78,7 +77,7 @@ class Supervisor:
         if self._box.shape != (2, 3) or not np.all(self._box[0] < self._box[1]):
             raise UserError(f"the box is {box}; give its lowest and its highest x, y and z, m")
         self._has_box = bool(np.any(np.isfinite(self._box)))
-        self._watch = Watch(metadata, age)
+        self._watch = Watch(self._metadata, age)
         self.state: State = "homing"
         self.fault: str | None = None
         """Code of the rule that was broken, such as `ball_lost`, of the tables in
@@ -88,7 +87,7 @@ class Supervisor:
         self._is_moving_home = False
         self._waited = 0
         """Control steps in a row in which the arm was not where its commands rest."""
-        self._resting_angles = np.array(metadata.default_joint_angles)
+        self._resting_angles = np.array(self._metadata.default_joint_angles)
         """Measured [J] in the last step at home, rad."""
         # An arm may rest at the last commands, far from the start pose.
         policy.samples.forget(policy.targets)
@@ -165,7 +164,7 @@ class Supervisor:
             self.state = "stopped"
             self.fault = "error"
             self.reason = _NEWER
-            return np.zeros((0, len(self._metadata.joint_names)))
+            return self._no_commands
         try:
             if self._has_other_order:
                 self.stop(_OTHER_ORDER, "error")
@@ -182,7 +181,7 @@ class Supervisor:
         if self._targets is None:
             if self.state == "braking":
                 self.state = "stopped"
-            return np.zeros((0, len(self._metadata.joint_names)))
+            return self._no_commands
         if self.state in ("braking", "stopped"):
             # What this step was to send is not sent.
             if self._end is not None:
@@ -193,6 +192,11 @@ class Supervisor:
         self._end = self._motion.end
         self._has_begun = True
         return self._motion.at(self._times)
+
+    @property
+    def _no_commands(self) -> np.ndarray:
+        """An array [0, J], of which nothing is sent."""
+        return np.zeros((0, len(self._metadata.joint_names)))
 
     @property
     def _targets(self) -> np.ndarray | None:
@@ -270,15 +274,17 @@ class Supervisor:
 
     def _stop_at(self, faults: Iterable[Fault]) -> bool:
         """Brakes at the first of the faults, and says whether there is one."""
-        for code, reason in faults:
-            self.stop(reason, code)
-            return True
-        return False
+        first = next(iter(faults), None)
+        if first is None:
+            return False
+        code, reason = first
+        self.stop(reason, code)
+        return True
 
     def _go_home(self, measurements: Mapping[str, Any]) -> None:
         """A step of the way home."""
         policy = self._policy
-        home = np.array(policy.metadata.default_joint_angles)
+        home = np.array(self._metadata.default_joint_angles)
         if self._is_moving_home:
             angles = self._angles(measurements)
         else:

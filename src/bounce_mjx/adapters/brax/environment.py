@@ -17,7 +17,12 @@ from brax.io import image, mjcf
 from flax import struct
 
 from bounce_mjx.adapters.randomization import randomized_task
-from bounce_mjx.deploy.environments import environment_config, refuse_warmup, with_settings
+from bounce_mjx.deploy.environments import (
+    environment_config,
+    refuse_beside,
+    refuse_warmup,
+    with_settings,
+)
 from bounce_mjx.env.env import Env, EnvState, State
 from bounce_mjx.errors import UserError
 from bounce_mjx.task.task import Task
@@ -102,9 +107,7 @@ class BraxBounceBall(brax.envs.Env):
         if config is None:
             config = environment_config(ENV_NAME, task, policy, world, settings)
         else:
-            for name, value in (("task", task), ("policy", policy), ("world", world)):
-                if value is not None:
-                    raise UserError(f"config and {name} both say the environment; give one of them")
+            refuse_beside("config", task=task, policy=policy, world=world)
             config = with_settings(config, settings, ENV_NAME)
         refuse_warmup(config, ENV_NAME)
         self.task = Env(config)

@@ -115,9 +115,9 @@ class PlaygroundBounceBall(MjxEnv):
             "physics_dt": self._config.sim_dt,
             "episode_seconds": self._config.episode_length * self._config.ctrl_dt,
         }
-        settings = environment_config(ENV_NAME, task, policy, world, settings)
-        refuse_warmup(settings, ENV_NAME)
-        self.task = Env(settings)
+        task_config = environment_config(ENV_NAME, task, policy, world, settings)
+        refuse_warmup(task_config, ENV_NAME)
+        self.task = Env(task_config)
 
     def reset(self, rng: jax.Array) -> State:
         """Starts an episode; consumes the key `rng`."""

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import torch
 
 from bounce_mjx.adapters.torch.packing import Layout
-from bounce_mjx.deploy.environments import environment_config
+from bounce_mjx.deploy.environments import environment_config, refuse_beside
 from bounce_mjx.env import vector
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
@@ -78,9 +78,8 @@ class TorchVectorEnv:
           UserError: torch cannot use JAX's device, a metric or num_envs is wrong, or there is no
             such policy.
         """
-        for name, value in (("policy", policy), ("world", world)):
-            if env is not None and value is not None:
-                raise UserError(f"env and {name} both say the environment; give one of them")
+        if env is not None:
+            refuse_beside("env", policy=policy, world=world)
         if not isinstance(num_envs, numbers.Integral) or num_envs < 1:
             raise UserError(f"num_envs is {num_envs!r}, but must be a whole number of at least 1")
         self.env = env or Env(environment_config("TorchVectorEnv", None, policy, world, {}))
