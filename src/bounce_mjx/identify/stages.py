@@ -257,61 +257,25 @@ def identify(
         noise=sensors,
         progress=progress,
     )
-    carried = own._replace(
-        simulate=make_simulator(config, layout, log, windows, carried=1.0), gravity_compensation=1.0
+    problem, fit, is_follower = _explain_arm(
+        own, config, log, following, delay, is_still, has_set_points
     )
-    if not is_still:
-        progress(f"arm: {1e3 * following.delay:.1f} ms behind its commands")
-        searches = [_search_arm(problem, config, delay, following) for problem in (own, carried)]
-        problem, fit = _choose(own, carried, searches)
-        problem, fit = _fit_arm(problem, fit)
-        follower = _stiff_follower(problem, config, delay, following)
-        is_follower = has_set_points or _explains_better(problem, follower, fit)
-    else:
-        progress("arm: its commands do not change")
-        # Gravity's tilt would explain where an arm rests.
-        problem = own
-        is_follower = False
-        fit = _with_offsets(own, Fit(layout.mean, windows.starts))
     share = problem.gravity_compensation
     # The unknowns and the entries of the starts that the last searches vary.
-    stages = ["arm"]
+    stages = [] if is_follower else ["arm"]
     free_states = windows.arm_state
-    if is_follower:
-        progress(
-            "the targets are set points, which the arm follows"
-            if has_set_points
-            else "a delay and offsets explain the arm as well as its servos do"
-        )
-        # As the last fit of servos, in all windows.
-        fit = _with_offsets(problem, follower)
-        stages = []
     pictures = np.ones_like(windows.picture_weights)
-    seen = _training(problem)
     if with_ball:
         make = partial(make_simulator, config, layout, log, windows, share)
         problem, fit, pictures = _fit_ball(problem, fit, make)
         stages = [*stages, "flight", "bounce"]
         free_states = None
     if not is_still and not is_follower and np.max(problem.correlation) < _FEW_ALIKE:
-        lift = AIR_LIFT * problem.has_lift
         finer = _halve_steps(config)
-        # Latency and lag are the same; their delay and its variance depend on the lag's steps.
-        world = layout.world(fit.vector)
         layout = Layout(config.num_joints, with_ball, finer.physics_dt, camera_rotation)
-        fit = fit._replace(vector=layout.vector(world))
-        at_once = problem.leaves_at_once
-        simulate = make_simulator(finer, layout, log, windows.finer(), share, lift, at_once)
-        problem = problem._replace(simulate=simulate, layout=layout)
+        problem, fit = _in_finer_steps(problem, fit, layout, finer, log)
     progress("all")
-    angles = angle_weights(problem, problem.predict(fit.vector, fit.starts))
-    of_seen = problem.weights(pictures, seen, angles)
-    of_unseen = problem.weights(pictures, 1.0 - seen, angles)
-    of_all = problem.weights(pictures, 1.0, angles)
-    # Of the held-out windows, the starts alone are searched; then all counts.
-    fit = minimise(problem, fit, stages, of_seen, 3, free_states)
-    unseen = minimise(problem, fit, [], of_unseen, 3, free_states)
-    fit = minimise(problem, unseen, stages, of_all, 3, free_states)
+    fit, unseen = _fit_all(problem, fit, pictures, stages, free_states)
     if not fit.cost < np.inf:
         raise UserError(
             f"the simulation of {log.source} diverges with {config.physics_dt:g} s steps; take a "
@@ -352,6 +316,91 @@ def identify(
         leaves_at_once=problem.leaves_at_once,
         stamp_age=least_age(log),
     )
+
+
+def _explain_arm(
+    own: Problem,
+    config: WorldConfig,
+    log: Log,
+    following: Following,
+    delay: float,
+    is_still: bool,
+    has_set_points: bool,
+) -> tuple[Problem, Fit, bool]:
+    """The arm alone: the problem and its fit with servos, or with the stiff ones of a follower, and
+    whether it is one.
+
+    Args:
+      own: the problem of an arm whose controller does not carry its weight.
+      log: where the commands are set points, with one for each physics step.
+      delay: from a command to the angle (`command_delay`), s.
+      is_still: whether no command changes. Then the servos' offsets alone are fitted.
+      has_set_points: whether the arm is a follower without a comparison.
+    """
+    windows = own.windows
+    if is_still:
+        own.progress("arm: its commands do not change")
+        # Gravity's tilt would explain where an arm rests.
+        return own, _with_offsets(own, Fit(own.layout.mean, windows.starts)), False
+    own.progress(f"arm: {1e3 * following.delay:.1f} ms behind its commands")
+    simulate = make_simulator(config, own.layout, log, windows, carried=1.0)
+    carried = own._replace(simulate=simulate, gravity_compensation=1.0)
+    searches = [_search_arm(problem, config, delay, following) for problem in (own, carried)]
+    problem, fit = _choose(own, carried, searches)
+    problem, fit = _fit_arm(problem, fit)
+    follower = _stiff_follower(problem, config, delay, following)
+    if has_set_points:
+        own.progress("the targets are set points, which the arm follows")
+    elif _explains_better(problem, follower, fit):
+        own.progress("a delay and offsets explain the arm as well as its servos do")
+    else:
+        return problem, fit, False
+    # As the last fit of servos, in all windows.
+    return problem, _with_offsets(problem, follower), True
+
+
+def _in_finer_steps(
+    problem: Problem, fit: Fit, layout: Layout, config: WorldConfig, log: Log
+) -> tuple[Problem, Fit]:
+    """The problem and its fit in the physics steps of another config, for which `layout` is:
+    windows and simulation have two in place of one."""
+    # Latency and lag are the same; their delay and its variance depend on the lag's steps.
+    world = problem.layout.world(fit.vector)
+    simulate = make_simulator(
+        config,
+        layout,
+        log,
+        problem.windows.finer(),
+        problem.gravity_compensation,
+        AIR_LIFT * problem.has_lift,
+        problem.leaves_at_once,
+    )
+    problem = problem._replace(simulate=simulate, layout=layout)
+    return problem, fit._replace(vector=layout.vector(world))
+
+
+def _fit_all(
+    problem: Problem,
+    fit: Fit,
+    pictures: np.ndarray,
+    stages: Sequence[str],
+    free_states: np.ndarray | None,
+) -> tuple[Fit, Fit]:
+    """The fit to all windows; and the one before it, of the windows that the search sees, with the
+    best starts of the others.
+
+    Args:
+      pictures: weights of the pictures [S, B].
+      stages, free_states: what is searched, as for `minimise`.
+    """
+    seen = _training(problem)
+    angles = angle_weights(problem, problem.predict(fit.vector, fit.starts))
+    of_seen = problem.weights(pictures, seen, angles)
+    of_unseen = problem.weights(pictures, 1.0 - seen, angles)
+    of_all = problem.weights(pictures, 1.0, angles)
+    fit = minimise(problem, fit, stages, of_seen, 3, free_states)
+    unseen = minimise(problem, fit, [], of_unseen, 3, free_states)
+    return minimise(problem, unseen, stages, of_all, 3, free_states), unseen
 
 
 def _cut_enough(log: Log, physics_dt: float) -> Windows:
