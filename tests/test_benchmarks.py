@@ -11,6 +11,7 @@ import pytest
 from bounce_mjx import load_policy
 from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.robustness import ConditionOutcome
+from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.resources import POLICIES, resource_path
 from bounce_mjx.runs.config import load_run_config
 
@@ -20,12 +21,14 @@ def script(name: str):
 
     @pytest.fixture(name=name)
     def module(monkeypatch):
-        monkeypatch.syspath_prepend(str(Path(__file__).parent.parent / "benchmarks"))
+        monkeypatch.syspath_prepend(str(BENCHMARKS))
         return importlib.import_module(name)
 
     return module
 
 
+BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
+PACKAGE = "src/bounce_mjx"
 endless, rank, simulators = map(script, ("endless", "rank", "simulators"))
 
 
@@ -34,6 +37,27 @@ def outcome(name: str, strength: float, lasted: float) -> ConditionOutcome:
         perturbation=name, group="", unit="", strength=strength, trained=False, physics="fused",
         values={"stable": 100.0 * lasted}, failed=[], lasted=lasted, mean_length_s=1.0,
     )  # fmt: skip
+
+
+TRAINERS = {
+    "brax_trainer.py": ("learning/policy.py", "adapters/brax/ppo.py"),
+    "rsl_rl_learner.py": ("torch_networks.py", "adapters/torch/rsl_rl_env.py"),
+    "skrl_learner.py": ("torch_networks.py", "adapters/torch/skrl_env.py"),
+}
+"""The PPO trainers of `jax_vs_torch.py`, and what else reads settings for them."""
+
+
+@pytest.mark.parametrize("trainer", TRAINERS)
+def test_a_trainer_has_each_setting_or_its_table_says_how_it_differs(trainer: str) -> None:
+    """A setting of which neither holds is another one in silence."""
+    page, code = (BENCHMARKS / trainer).read_text(encoding="utf-8").split('"""', 2)[1:]
+    for name in TRAINERS[trainer]:
+        folder = BENCHMARKS if (BENCHMARKS / name).is_file() else BENCHMARKS.parent / PACKAGE
+        code += (folder / name).read_text(encoding="utf-8")
+    listed = " ".join(row.split("|")[1] for row in page.splitlines() if row.startswith("|"))
+    for setting in PPOConfig.model_fields:
+        is_read = re.search(rf"\b(config|ppo)\.{setting}\b", code)
+        assert is_read or re.search(rf"\b{setting}\b", listed), setting
 
 
 def test_a_limit_ends_before_the_first_failure(rank) -> None:
