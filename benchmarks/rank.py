@@ -3,6 +3,8 @@
     python benchmarks/rank.py pretrained robust mirror
 
 A row is a policy, or the seeds of one training run: the mean over the seeds and its 95% interval.
+The default seed is that of `bounce-mjx eval`, and of the results with which a policy is shipped: to
+choose a policy by the table, give another one.
 """
 
 import functools

@@ -1,5 +1,8 @@
 """Makes a policy that comes with the package from a run, for maintainers:
-`python benchmarks/ship.py RUN --name NAME`."""
+`python benchmarks/ship.py RUN --name NAME`.
+
+A policy that misses a result is refused, on the episodes that its results.json reports. Do not try
+runs until one passes: choose the run by other seeds first (`bounce-mjx eval RUN --seed SEED`)."""
 
 import sys
 import tempfile

@@ -143,6 +143,29 @@ def test_a_start_that_is_interrupted_leaves_no_training_behind(
     assert processes[0].poll() is not None
 
 
+def test_an_interrupted_trial_is_repeated_once(sweep, tmp_path: Path, monkeypatch) -> None:
+    pytest.importorskip("optuna")
+    base = read_preset(Path("default"))
+    command = sweep.Command(trials=2, storage=tmp_path / "sweep.db")
+    preset = {name: pytest.approx(getattr(base.ppo, name)) for name in sweep.SPACE}
+    ends = iter([KeyboardInterrupt, KeyboardInterrupt, None, None])
+
+    def run_trial(trial, *_) -> float:
+        for name, (low, high, is_logarithmic) in sweep.SPACE.items():
+            trial.suggest_float(name, low, high, log=is_logarithmic)
+        if (end := next(ends)) is not None:
+            raise end
+        return 1.0
+
+    monkeypatch.setattr(sweep, "run_trial", run_trial)
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            sweep.search(command, base)
+    trials = sweep.search(command, base).trials
+    assert [trial.state.name for trial in trials] == ["FAIL", "FAIL", "COMPLETE", "COMPLETE"]
+    assert trials[1].params == preset and trials[2].params == preset != trials[3].params
+
+
 def test_a_limit_ends_before_the_first_failure(rank) -> None:
     rows = [outcome("late", s, x) for s, x in ((10, 1.0), (20, 0.99), (30, 0.98), (40, 1.0))]
     assert rank.largest_stable([*rows, outcome("push", 5, 0.0)], "late") == 20
