@@ -221,9 +221,9 @@ def versions() -> dict[str, str]:
         repositories[clone.name] = clone
     for name, folder in repositories.items():
         if (folder / ".git").exists():
-            command = ["git", "-C", folder, "rev-parse", "HEAD"]
-            commit = subprocess.run(command, capture_output=True, text=True, check=True)
-            found[name] = commit.stdout.strip()
+            command = ["git", "-C", folder, "describe", "--always", "--dirty", "--abbrev=40"]
+            commit = subprocess.run(command, capture_output=True, text=True)
+            found[name] = commit.stdout.strip() or "unknown"
     return found
 
 

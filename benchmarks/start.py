@@ -186,15 +186,20 @@ def main() -> None:
         subprocess.run([sys.executable, "-c", f"import {', '.join(MODULES)}"], check=True)
         quick = {name: quick_seconds(words, command.repetitions) for name, words in QUICK.items()}
         records = []
-        for seed in command.seeds:
-            with tempfile.TemporaryDirectory() as cache:
-                for start in ("cold", "second"):
-                    record = {"start": start} | start_once(seed, Path(cache), extra)
-                    records.append(record)
-                    print(record, flush=True)
-        device = device_name()
-        text = f"Device: {device}\n\n{table(records, quick)}"
-        write(command.out, "start", {"device": device, "starts": records, "quick": quick}, text)
+        try:
+            for seed in command.seeds:
+                with tempfile.TemporaryDirectory() as cache:
+                    for start in ("cold", "second"):
+                        times = {"start": start} | start_once(seed, Path(cache), extra)
+                        records.append(times)
+                        print(times, flush=True)
+        finally:
+            # Also where a later start failed.
+            if records:
+                device = device_name()
+                record = {"device": device, "starts": records, "quick": quick}
+                text = f"Device: {device}\n\n{table(records, quick)}"
+                write(command.out, "start", record, text)
 
 
 if __name__ == "__main__":

@@ -128,7 +128,7 @@ def run_trial(trial: "optuna.Trial", command: Command, base: TrainConfig) -> flo
     chosen["decay_steps"] = round(chosen["decay_steps"])
     config = validate(PPOConfig, dict(base.ppo) | chosen, f"trial {trial.number}")
     env = BounceBall(base.env)
-    init, train = population(PPO(config, env, env.config.episode_steps))
+    init, train = population(PPO(config, env, base.training_episode_steps))
     networks = make_networks(config, env.observation_size, env.action_size)
     evaluate = jax.jit(jax.vmap(make_evaluator(env, networks, command.episodes), in_axes=(0, None)))
     iterations = max(1, round(base.eval_every / config.batch_steps))
@@ -195,7 +195,7 @@ def main() -> None:
                 f"eval_seed is {DEFAULT_SEED}, the seed of bounce-mjx eval, on which nothing is to "
                 "be chosen; give another"
             )
-        set_up_jax()
+        set_up_jax(base.env)
         study = search(command, base)
         device = device_name()
         record = {
