@@ -246,8 +246,8 @@ def test_what_lies_below_a_falling_ball_is_not_it() -> None:
 
 @pytest.mark.parametrize("middle", [-0.001, 0.0, 0.001])
 def test_a_ball_that_bounces_within_the_exposure_is_seen(middle) -> None:
-    """It is blurred less than in the flight that goes before. Before a paddle, the pixels of its rim
-    have another colour."""
+    """It is blurred less than in the flight that goes before; before a paddle, the pixels of its
+    rim have another colour."""
     exposure = 0.004
     contact = 0.004
     tracker = cameras.Tracker(true_cameras(), cameras.COLOURS["orange"], exposure)
