@@ -101,7 +101,8 @@ class MeanActor:
 
 
 def _batch_norm(weights: dict[str, jax.Array], name: str, x: jax.Array) -> jax.Array:
-    mean, variance = weights[f"{name}.running_mean"], weights[f"{name}.running_var"]
+    mean = weights[f"{name}.running_mean"]
+    variance = weights[f"{name}.running_var"]
     x = (x - mean) * jax.lax.rsqrt(variance + 1e-5)
     return x * weights[f"{name}.weight"] + weights[f"{name}.bias"]
 

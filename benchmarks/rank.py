@@ -184,7 +184,8 @@ def own_figures(task: Task, episodes: Episodes) -> Figures:
         return {"moving point, cm": fast}
     if not isinstance(task, Bounce):
         return {}
-    sums, bounces = episodes.sums, episodes.sums["settled_bounces"]
+    sums = episodes.sums
+    bounces = sums["settled_bounces"]
     square, _ = mean_and_margin(sums["apex_error^2"], bounces)
     bias, _ = mean_and_margin(sums["apex_offset"], bounces)
     if square is None:
