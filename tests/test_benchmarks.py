@@ -120,3 +120,27 @@ def test_commands_and_pictures_are_late(simulators, timestep: float, steps: int)
     assert [x["ball_age"] for x in seen[:5]] == pytest.approx([0.0, 0.01, 0.02, 0.03, 0.03])
     begun = round(0.2 / timestep)
     assert seen[23]["ball_position"][0, 0] == begun
+
+
+@pytest.mark.parametrize("num_found, told", [((0, 3), "2 (40.00%)"), ((0, 0), "5 (100.00%)")])
+def test_episodes_in_which_no_ball_was_seen_are_told(monkeypatch, capsys, num_found, told) -> None:
+    pytest.importorskip("cv2")
+    monkeypatch.syspath_prepend(str(Path(__file__).parent.parent / "benchmarks"))
+    cameras = importlib.import_module("cameras")
+    played = [
+        cameras.Played(
+            qpos=np.zeros((2, 13)),
+            qvel=np.zeros((2, 12)),
+            alarm="",
+            calibration="",
+            num_pairs=num_pairs,
+            errors=np.full((found, 3), 0.001),
+            heights=np.full(found, 0.2),
+            tracking_times=np.full(num_pairs, 0.002),
+        )
+        for num_pairs, found in zip((2, 3), num_found, strict=True)
+    ]
+    cameras.print_seeing(played)
+    printed = capsys.readouterr().out
+    assert f"5 pairs, {told} without a ball" in printed
+    assert ("off by 1.00, 1.00, 1.00 mm" in printed) == any(num_found)
