@@ -2,6 +2,7 @@
 
 import importlib
 import re
+import sys
 from pathlib import Path
 
 import mujoco
@@ -144,3 +145,17 @@ def test_episodes_in_which_no_ball_was_seen_are_told(monkeypatch, capsys, num_fo
     printed = capsys.readouterr().out
     assert f"5 pairs, {told} without a ball" in printed
     assert ("off by 1.00, 1.00, 1.00 mm" in printed) == any(num_found)
+
+
+def test_logs_are_of_one_case_and_do_not_overwrite(simulators, monkeypatch, capsys, tmp_path):
+    def refusal(*words: str) -> str:
+        monkeypatch.setattr(sys, "argv", ["simulators.py", *words, "--logs", str(tmp_path)])
+        with pytest.raises(SystemExit):
+            simulators.main()
+        return capsys.readouterr().err
+
+    one_world = ("--simulators", "mujoco", "--worlds", "nominal")
+    assert "one policy in one simulator and world" in refusal("robust", "pretrained", *one_world)
+    assert "one policy in one simulator and world" in refusal("robust", *one_world[:2])
+    (tmp_path / "ball.csv").touch()
+    assert "ball.csv exists; give --logs another folder" in refusal("robust", *one_world)
