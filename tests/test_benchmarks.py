@@ -27,7 +27,7 @@ def script(name: str):
     return module
 
 
-endless, rank, simulators = map(script, ("endless", "rank", "simulators"))
+endless, identify, rank, simulators = map(script, ("endless", "identify", "rank", "simulators"))
 
 
 def outcome(name: str, strength: float, lasted: float) -> ConditionOutcome:
@@ -159,3 +159,26 @@ def test_logs_are_of_one_case_and_do_not_overwrite(simulators, monkeypatch, caps
     assert "one policy in one simulator and world" in refusal("robust", *one_world[:2])
     (tmp_path / "ball.csv").touch()
     assert "ball.csv exists; give --logs another folder" in refusal("robust", *one_world)
+
+
+def test_a_log_is_used_again_for_the_same_robot_alone(identify, monkeypatch, tmp_path) -> None:
+    config = load_run_config(resource_path(POLICIES["robust"])).env
+    finer = config.model_copy(update={"physics_dt": 5e-4})
+    recorded = []
+
+    def record(config, hidden, seed: int, path: Path) -> None:
+        path.write_text("time [s]")
+        recorded.append((config.physics_dt, hidden.flaw))
+        if len(recorded) == 1:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(identify, "record", record)
+    flawed = identify.Hidden(world={}, flaw="backlash")
+    flawless = identify.Hidden(world={}, flaw="nothing")
+    with pytest.raises(KeyboardInterrupt):
+        identify.log_in(tmp_path, config, flawed, 1001)
+    cases = [(config, flawed), (config, flawless), (finer, flawless), (config, flawed)]
+    paths = [identify.log_in(tmp_path, world, hidden, 1001) for world, hidden in cases]
+    # The interrupted one is recorded again, and the last one is there.
+    assert recorded[1:] == [(0.001, "backlash"), (0.001, "nothing"), (0.0005, "nothing")]
+    assert paths[3] == paths[0] and len(set(paths)) == 3 and all(p.exists() for p in paths)
