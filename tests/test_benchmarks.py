@@ -27,7 +27,8 @@ def script(name: str):
     return module
 
 
-endless, identify, rank, simulators = map(script, ("endless", "identify", "rank", "simulators"))
+NAMES = ("endless", "identify", "physics", "rank", "simulators")
+endless, identify, physics, rank, simulators = map(script, NAMES)
 
 
 def outcome(name: str, strength: float, lasted: float) -> ConditionOutcome:
@@ -182,3 +183,17 @@ def test_a_log_is_used_again_for_the_same_robot_alone(identify, monkeypatch, tmp
     # The interrupted one is recorded again, and the last one is there.
     assert recorded[1:] == [(0.001, "backlash"), (0.001, "nothing"), (0.0005, "nothing")]
     assert paths[3] == paths[0] and len(set(paths)) == 3 and all(p.exists() for p in paths)
+
+
+def test_fused_is_compared_with_the_engines_of_the_same_task(physics) -> None:
+    def row(task: str, engine: str, speed: float) -> dict:
+        record = {"batch": 64, "task": task, "engine": engine, "compile_seconds": 0.0}
+        return record | {"steps_per_second": speed, "median_steps_per_second": speed}
+
+    one_task = [row("bounce", "fused", 6e6), row("bounce", "c", 2e6)]
+    other_task = [row("juggle", "fused", 5e6), row("juggle", "c", 1e6)]
+    lines = physics.table(one_task + other_task).splitlines()[2:]
+    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
+    assert [row[1] for row in cells] == ["fused, bounce", "c, bounce", "fused, juggle", "c, juggle"]
+    assert [row[-1] for row in cells] == ["", "3", "", "5"]
+    assert physics.table(one_task).splitlines()[3].split("|")[2].strip() == "c"
