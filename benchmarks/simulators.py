@@ -7,14 +7,15 @@
 
 The last line records the logs from which `bounce-mjx identify` finds that simulator's world.
 
-The arm is rebuilt, link by link, from the environment's compiled model, as a URDF file. Two numbers
-of a simulator are set before any policy acts, and printed: the coefficient of restitution, such
-that a ball that drops onto the paddle of the arm at rest rebounds with the world's restitution; and
-the time constant of the motors, such that a step of 0.05 rad takes as long to 63% as MuJoCo's
-servos take. (`physx` has servos of the same stiffness and damping, and needs none.) The policy acts
-through `load_policy`, as on a robot: it sees the joints and the newest picture of the ball. The
-environment's own functions measure the results, and the supervisor's alarms but lost balls are
-counted. `mujoco` is the C engine, as a comparison.
+The arm is rebuilt, link by link, from the environment's compiled model, as a URDF file: masses,
+inertias, hinges, torques and the paddle's box, but not the joints' own limits, damping and
+friction, nor a gravity compensation. Two numbers of a simulator are set before any policy acts, and
+printed: the coefficient of restitution, such that a ball that drops onto the paddle of the arm at
+rest rebounds with the world's restitution; and the time constant of the motors, such that a step of
+0.05 rad takes as long to 63% as MuJoCo's servos take. (`physx` has servos of the same stiffness and
+damping, and needs none.) The policy acts through `load_policy`, as on a robot: it sees the joints
+and the newest picture of the ball. The environment's own functions measure the results, and the
+supervisor's alarms but lost balls are counted. `mujoco` is the C engine, as a comparison.
 """
 
 import argparse
@@ -180,13 +181,20 @@ def _add_link(robot: ET.Element, model: mujoco.MjModel, body: int, paddle: int) 
 
 
 def make_parts(model: mujoco.MjModel) -> Parts:
-    """The arm and the balls of a compiled model, whose arm's bodies have one hinge or none."""
+    """The arm and the balls of a compiled model, whose arm's bodies have one hinge or none.
+
+    Raises:
+      ValueError: the model has what is not rebuilt in the other simulators.
+    """
     addresses = find_addresses(model)
     balls = [ball.body for ball in addresses.balls]
-    geoms = [g for g in (*model.pair_geom1, *model.pair_geom2) if model.geom_bodyid[g] not in balls]
-    paddle = geoms[0]
+    paddle = addresses.paddle_geom
     if model.geom_type[paddle] != mujoco.mjtGeom.mjGEOM_BOX:
         raise ValueError("the paddle is no box")
+    if model.body_jntnum[model.geom_bodyid[paddle]] != 1:
+        raise ValueError("the paddle's body has no hinge")
+    if np.any(model.actuator_gear[:, 0] != 1.0):
+        raise ValueError(f"the servos have gears, {model.actuator_gear[:, 0]}; only 1 is rebuilt")
     robot = ET.Element("robot", name="arm")
     ET.SubElement(robot, "link", name="world")
     links = []
@@ -539,6 +547,8 @@ def lag(simulator: Simulator, parts: Parts, angles: np.ndarray, timestep: float)
                 times.append(timestep * (step + (level - before) / (moved - before)))
                 break
             before = moved
+        else:
+            raise ValueError(f"joint {j + 1} does not follow a step of {STEP} rad")
     return float(np.mean(times))
 
 

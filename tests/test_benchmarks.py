@@ -1,5 +1,6 @@
 """The benchmarks: figures of the ranking; the arm as URDF and the delays in other simulators."""
 
+import copy
 import importlib
 import re
 import sys
@@ -88,6 +89,10 @@ def test_the_urdf_is_the_models_arm(simulators, policy: str) -> None:
     expected = inertias[0][np.ix_(arm, arm)] - np.diag(parts.armature)
     np.testing.assert_allclose(inertias[1], expected, atol=1e-6)
     paddle = addresses.paddle_geom
+    geared = copy.copy(model)
+    geared.actuator_gear[0, 0] = 2.0
+    with pytest.raises(ValueError, match="gears"):
+        simulators.make_parts(geared)
     assert urdf.ngeom == 1
     np.testing.assert_allclose(theirs.geom_xpos[0], mine.geom_xpos[paddle], atol=1e-6)
     np.testing.assert_allclose(theirs.geom_xmat[0], mine.geom_xmat[paddle], atol=1e-6)
