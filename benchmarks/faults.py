@@ -496,7 +496,6 @@ def run(name: str, fault: Fault, seed: int = 0) -> Outcome:
     home = paddle_position(metadata, robot.home)
     arm = policy.supervise(RATE, box=(home - BOX, home + BOX))
     wished = {key: float(np.mean(command.range)) for key, command in metadata.commands.items()}
-    no_commands = np.zeros((0, len(robot.home)))
     last_commands: list[np.ndarray] = []
     """Of the control steps."""
     commanded: list[np.ndarray] = []
@@ -507,7 +506,7 @@ def run(name: str, fault: Fault, seed: int = 0) -> Outcome:
     code = reason = ""
     braking_after = math.nan
     first_distance = 0.0
-    commands = no_commands
+    commands = np.zeros((0, len(robot.home)))
     while robot.data.time < (started or 1.0) + SECONDS:
         measured = robot.measure() | wished
         fault_time = _time_since_fault(fault, robot.data.time, started)
