@@ -50,15 +50,19 @@ def make_variants(num_envs: int) -> dict[str, Callable[[int], None]]:
 
     def step(state, action, key):
         key, reset_key = jax.random.split(key)
-        return vector.step(env, state, action, reset_key, episode_steps), key
+        state, result = vector.step(env, state, action, reset_key, episode_steps)
+        return state, result, key
 
     jitted = jax.jit(step, donate_argnums=0)
-    holder = [vector.reset(env, jax.random.PRNGKey(0), num_envs), jax.random.PRNGKey(1)]
+    state = vector.reset(env, jax.random.PRNGKey(0), num_envs)
+    key = jax.random.PRNGKey(1)
     jax_action = jnp.zeros((num_envs, env.action_size))
 
     def jitted_alone(steps: int) -> None:
+        # A step gives the memory of its state to the next one.
+        nonlocal state, key
         for _ in range(steps):
-            (holder[0], result), holder[1] = jitted(holder[0], jax_action, holder[1])
+            state, result, key = jitted(state, jax_action, key)
         jax.block_until_ready(result)
 
     tensors = TorchVectorEnv(env, num_envs)
@@ -72,8 +76,7 @@ def make_variants(num_envs: int) -> dict[str, Callable[[int], None]]:
     def torch_vector_env(steps: int) -> None:
         for _ in range(steps):
             result = tensors.step(action)
-            used = result.observation, result.reward, result.terminated, result.truncated
-        wait(used[0])
+        wait(result.observation)
 
     def rsl_rl_vec_env(steps: int) -> None:
         for _ in range(steps):
@@ -106,7 +109,8 @@ def main() -> None:
     with exit_on_user_error():
         doc = __doc__.split("\n")[0]
         command = parse(Command, sys.argv[1:], prog="benchmarks/adapter.py", description=doc)
-        records, rows = [], []
+        records = []
+        rows = []
         for num_envs in command.num_envs:
             seconds = measure(command, num_envs)
             records.append({"num_envs": num_envs, "seconds": seconds})

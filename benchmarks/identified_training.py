@@ -39,14 +39,14 @@ def measure(path: Path, seed: int, episodes: int, physics: str) -> Report:
     randomization = RandomizationConfig(**{name: (value, value) for name, value in values.items()})
     env = Env(config.env.model_copy(update={"randomization": randomization}))
     set_up_jax(env.config)
-    checkpoint, policy, actor = read_actor(checkpoint, config)
+    _, policy, actor = read_actor(checkpoint, config)
     commands = neutral_commands(env.config)
     ranges = env.ranges() | commands
     ranges = jax.tree.map(lambda end: jnp.asarray(end, jnp.float32)[None], ranges)
     make = make_mujoco_evaluator if physics == "mujoco" else make_evaluator
     evaluate = make(env, actor(env), episodes)
-    measured = evaluate(policy, jax.random.PRNGKey(DEFAULT_SEED), ranges)
-    return judge(env, *measured, commands)
+    statistics, recording = evaluate(policy, jax.random.PRNGKey(DEFAULT_SEED), ranges)
+    return judge(env, statistics, recording, commands)
 
 
 def main() -> None:

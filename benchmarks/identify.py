@@ -64,14 +64,14 @@ class Hidden(NamedTuple):
 
 def hidden_robot(seed: int, flawless: bool = False) -> Hidden:
     """Draws a robot: about 30% of the terms of configs/transfer.yaml, and all that a servo differs
-    in.
+    in, and the ball's latency.
 
     Args:
       flawless: whether the model lacks nothing of it.
     """
     wide = read_preset(resource_path("configs/transfer.yaml")).env
     ranges = {k: v for k, v in wide.randomization.ranges().items() if k not in _FIXED}
-    key, rare, always = jax.random.split(jax.random.PRNGKey(seed), 3)
+    _, rare, always = jax.random.split(jax.random.PRNGKey(seed), 3)
     nominals = model_nominals(wide)
     world = sample_world(ranges, rare, np.dtype("float32"), 6, nominals, share=0.3)
     servos = RandomizationConfig(
@@ -119,7 +119,8 @@ class _Robot:
         self.filtered = self.home + self.bias
         self.play = np.zeros(6)
         self.due = self.random.uniform(0.0, 1.0 / _CAMERA_RATE)
-        self.pictures = []
+        self.pictures: list[tuple[float, np.ndarray]] = []
+        """Times of arrival and positions of the ball [3] that the program has not yet."""
         self.hold_ball()
 
     def hold_ball(self) -> None:
@@ -184,7 +185,8 @@ class _Robot:
             if self.random.uniform() > _LOST:
                 shown = shown + world.get("ball_position_bias", np.zeros(3))
                 noisy = shown + _BALL_NOISE * self.random.standard_normal(3)
-                self.pictures.append((self.due + world["ball_latency"], noisy))
+                arrival = self.due + world["ball_latency"]
+                self.pictures.append((arrival, noisy))
         while d.time >= self.due:
             self.due += 1.0 / _CAMERA_RATE
 
@@ -203,8 +205,8 @@ def record(
     playing = False
     height = 0.5
     with Recorder(path, policy.metadata.joint_names, {"target_height": "m"}) as recorder:
-        last = None
-        before = 0.0
+        last_picture = None
+        last_time = 0.0
         for k in range(round((excited + played) / config.control_dt)):
             now = robot.data.time
             if k % _HEIGHT_STEPS == 0:
@@ -218,24 +220,27 @@ def record(
             }
             arrived = [p for p in robot.pictures if p[0] <= now]
             robot.pictures = robot.pictures[len(arrived) :]
-            for taken, ball in arrived:
-                jittered = taken + _JITTER * random.standard_normal()
-                before = float(np.clip(jittered, before, stamp))
-                recorder.picture(before, ball, jittered)
-            last = arrived[-1] if arrived else last
+            for arrival, ball in arrived:
+                picture_stamp = arrival + _JITTER * random.standard_normal()
+                # The rows of a log do not go back.
+                last_time = float(np.clip(picture_stamp, last_time, stamp))
+                recorder.picture(last_time, ball, picture_stamp)
+            if arrived:
+                last_picture = arrived[-1]
             if robot.has_ball and robot.ball()[2] < 0.02:
                 robot.hold_ball()
                 playing = False
-                last = None
+                last_picture = None
                 drop_at = now + 1.5
             if k < len(motion.targets):
                 target = motion.targets[k]
-            elif playing and last is not None:
+            elif playing and last_picture is not None:
+                arrival, ball = last_picture
                 # The age since the arrival plus a latency that somebody guessed.
-                age = now - last[0] + 0.01
+                age = now - arrival + 0.01
                 action = policy.step(
                     measured
-                    | {"ball_position": last[1], "ball_age": age, "ball_velocity": np.zeros(3)}
+                    | {"ball_position": ball, "ball_age": age, "ball_velocity": np.zeros(3)}
                 )
                 target = policy.servo_targets(action)
             else:
@@ -245,10 +250,24 @@ def record(
                     policy.reset()
                     playing = True
             recorder.step(measured, target)
-            before = stamp
+            last_time = stamp
             robot.sent.append((now, np.array(target)))
             for _ in range(steps):
                 robot.step()
+
+
+def log_in(folder: Path, config: WorldConfig, hidden: Hidden, seed: int) -> Path:
+    """The log of a hidden robot in a folder, recorded unless it is there. Its name says all that
+    the robots of a seed differ in."""
+    flaw = hidden.flaw.replace(" ", "_")
+    path = folder / f"{seed}_{flaw}_{1e3 * config.physics_dt:g}ms.csv"
+    if not path.exists():
+        # One that was interrupted is no log.
+        unfinished = path.with_suffix(".unfinished")
+        unfinished.unlink(missing_ok=True)
+        record(config, hidden, seed, unfinished)
+        unfinished.rename(path)
+    return path
 
 
 def errors(found: Identified, hidden: Hidden, model: mujoco.MjModel, home) -> dict[str, float]:
@@ -352,7 +371,8 @@ def measure(config: WorldConfig, hidden: Hidden, path: Path) -> dict[str, Any]:
 
 
 def print_summary(rows: list[dict[str, Any]]) -> None:
-    """Medians of the errors, and the share of the intervals that hold the truth."""
+    """Medians of the errors of all robots, and the share of the intervals that hold the truth of
+    those whose model is right."""
     print(f"{'error':32}{'median':>10}{'worst':>10}")
     for name in rows[0]["errors"]:
         values = [row["errors"][name] for row in rows]
@@ -385,12 +405,10 @@ def main() -> None:
     rows = []
     for seed in given.seeds:
         hidden = hidden_robot(seed, given.flawless)
-        path = folder / f"{seed}.csv"
-        if not path.exists():
-            record(finer, hidden, seed, path)
+        path = log_in(folder, finer, hidden, seed)
         paths = [path]
         if given.spike:
-            spiked = folder / f"{seed}_spike.csv"
+            spiked = path.with_name(f"{path.stem}_spike.csv")
             add_spike(path, spiked, seed)
             paths.append(spiked)
         for log in paths:

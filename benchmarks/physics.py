@@ -2,9 +2,10 @@
 
     python benchmarks/physics.py --batch-sizes 512 4096 --engines fused mjx c
 
-One measurement is a program of `--control-steps` control steps (10 physics steps each) under random
-actions. The engines take turns. The fastest repeat counts, because other work on the machine can
-only slow a repeat down.
+One measurement is a program of `--control-steps` control steps (2 of the slower engines, 10 physics
+steps each) under random actions. The engines take turns. Those of JAX draw the actions in it; the C
+engine's are drawn before. The fastest repeat counts, because other work on the machine can only
+slow a repeat down.
 """
 
 import itertools
@@ -13,7 +14,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import mujoco
@@ -49,10 +50,19 @@ class Command(StrictModel):
     """Folder for physics.json and physics.md."""
 
 
-def jax_program(
-    task: str, engine: str, batch: int, control_steps: int
-) -> tuple[Callable[[], None], float]:
-    """A compiled program of a JAX engine, and its compile time in seconds."""
+class Program(NamedTuple):
+    """What is measured."""
+
+    task: str
+    engine: EngineName
+    run: Callable[[], Any]
+    physics_steps: int
+    """In a run, of all environments."""
+    compile_seconds: float
+
+
+def jax_program(task: str, engine: EngineName, batch: int, control_steps: int) -> Program:
+    """The compiled program of a JAX engine."""
     env = Env(task_config(task)(physics=engine))
     batch_last = {"in_axes": -1, "out_axes": -1}
 
@@ -75,80 +85,99 @@ def jax_program(
     started = time.perf_counter()
     program = jax.jit(run).lower(now, keys[0]).compile()
     compile_seconds = time.perf_counter() - started
-    return lambda: jax.block_until_ready(program(now, keys[0])), compile_seconds
+    return Program(
+        task=task,
+        engine=engine,
+        run=lambda: jax.block_until_ready(program(now, keys[0])),
+        physics_steps=batch * control_steps * env.config.num_substeps,
+        compile_seconds=compile_seconds,
+    )
 
 
-def c_program(task: str, batch: int, control_steps: int) -> tuple[Callable[[], None], float]:
-    """A function that runs the C engine on all cores, and its compile time, 0."""
+def c_program(task: str, batch: int, control_steps: int) -> Program:
+    """The C engine on all cores; nothing is compiled."""
     env = Env(task_config(task)())
-    model, threads = env.mj_model, os.cpu_count() or 1
+    model = env.mj_model
+    threads = os.cpu_count() or 1
     rng = np.random.default_rng(0)
     state = np.zeros((batch, mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
     physics = jax.jit(env.reset)(jax.random.PRNGKey(0)).pipeline_state.physics
     state[:, 1:] = np.concatenate([physics.qpos, physics.qvel])
     steps = control_steps * env.config.num_substeps
-    noise = rng.uniform(-1.0, 1.0, (batch, control_steps, 6)).repeat(
-        env.config.num_substeps, axis=1
-    )
+    actions = rng.uniform(-1.0, 1.0, (batch, control_steps, env.action_size))
+    noise = actions.repeat(env.config.num_substeps, axis=1)
     control = np.asarray(env.config.default_joint_angles) + env.config.action_scale * noise
     assert control.shape == (batch, steps, model.nu)
     data = [mujoco.MjData(model) for _ in range(threads)]
     pool = rollout.Rollout(nthread=threads)
-    return lambda: pool.rollout(model, data, state, control) and None, 0.0
+    return Program(
+        task=task,
+        engine="c",
+        run=lambda: pool.rollout(model, data, state, control),
+        physics_steps=batch * steps,
+        compile_seconds=0.0,
+    )
 
 
 def measure(command: Command) -> list[dict]:
-    """One record for each batch size and engine."""
+    """One record for each batch size, task and engine."""
     records = []
     for batch in command.batch_sizes:
-        programs = {}
+        programs = []
         for task, engine in itertools.product(command.tasks, command.engines):
             steps = command.control_steps if engine == "fused" else min(2, command.control_steps)
-            names = (task,) if engine == "c" else (task, engine)
-            make = c_program if engine == "c" else jax_program
-            label = engine if len(command.tasks) == 1 else f"{engine}, {task}"
-            programs[label] = (*make(*names, batch, steps), steps)
-        times = {engine: [] for engine in programs}
+            if engine == "c":
+                programs.append(c_program(task, batch, steps))
+            else:
+                programs.append(jax_program(task, engine, batch, steps))
+        times: list[list[float]] = [[] for _ in programs]
         for repeat in range(command.repeats + 1):
-            for engine, (run, _, _) in programs.items():
+            for program, seconds in zip(programs, times, strict=True):
                 started = time.perf_counter()
-                run()
+                program.run()
+                # The first turn warms up.
                 if repeat:
-                    times[engine].append(time.perf_counter() - started)
-        for engine, (_, compile_seconds, steps) in programs.items():
-            physics_steps = batch * steps * task_config(command.tasks[0])().num_substeps
+                    seconds.append(time.perf_counter() - started)
+        for program, seconds in zip(programs, times, strict=True):
             records.append(
                 {
                     "batch": batch,
-                    "engine": engine,
-                    "steps_per_second": physics_steps / min(times[engine]),
-                    "median_steps_per_second": physics_steps / float(np.median(times[engine])),
-                    "compile_seconds": compile_seconds,
+                    "task": program.task,
+                    "engine": program.engine,
+                    "steps_per_second": program.physics_steps / min(seconds),
+                    "median_steps_per_second": program.physics_steps / float(np.median(seconds)),
+                    "compile_seconds": program.compile_seconds,
                 }
             )
     return records
 
 
 def table(records: list[dict]) -> str:
-    """Steps per second by batch size and engine, and the speedup of fused over each engine."""
+    """Steps per second by batch size, task and engine, and the speedup of fused over each engine
+    in the same world."""
+    fused = {
+        (record["batch"], record["task"]): record["steps_per_second"]
+        for record in records
+        if record["engine"] == "fused"
+    }
+    has_tasks = len({record["task"] for record in records}) > 1
     rows = []
-    for batch in dict.fromkeys(r["batch"] for r in records):
-        at_batch = {r["engine"]: r for r in records if r["batch"] == batch}
-        for engine, record in at_batch.items():
-            ratio = ""
-            if "fused" in at_batch and engine != "fused":
-                faster = at_batch["fused"]["steps_per_second"] / record["steps_per_second"]
-                ratio = f"{faster:.3g}"
-            rows.append(
-                [
-                    f"{batch:,}",
-                    engine,
-                    f"{record['steps_per_second'] / 1e6:,.3f}",
-                    f"{record['median_steps_per_second'] / 1e6:,.3f}",
-                    f"{record['compile_seconds']:.1f}",
-                    ratio,
-                ]
-            )
+    for record in records:
+        place = record["batch"], record["task"]
+        ratio = ""
+        if place in fused and record["engine"] != "fused":
+            ratio = f"{fused[place] / record['steps_per_second']:.3g}"
+        engine = record["engine"]
+        rows.append(
+            [
+                f"{record['batch']:,}",
+                f"{engine}, {record['task']}" if has_tasks else engine,
+                f"{record['steps_per_second'] / 1e6:,.3f}",
+                f"{record['median_steps_per_second'] / 1e6:,.3f}",
+                f"{record['compile_seconds']:.1f}",
+                ratio,
+            ]
+        )
     header = [
         "environments",
         "engine",

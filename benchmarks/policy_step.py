@@ -20,8 +20,13 @@ from bounce_mjx import load_policy
 from bounce_mjx.deploy.motion import paddle_position
 from bounce_mjx.resources import POLICIES
 
-STEPS, WARM_UP = 1200, 200
-GRAVITY, LAUNCH_SPEED = 9.81, 3.0
+STEPS = 1200
+WARM_UP = 200
+"""First steps, whose times do not count."""
+GRAVITY = 9.81
+"""m/s^2"""
+LAUNCH_SPEED = 3.0
+"""Of the ball from the paddle, m/s."""
 
 
 def run(name: str) -> np.ndarray:

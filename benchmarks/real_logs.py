@@ -1,5 +1,5 @@
-"""Identification of real robots and real balls from public logs: errors on unseen data, beside the
-simplest models.
+"""Identification of real robots and real balls from public logs: an arm's errors on unseen data,
+and a flight's errors of the fit itself, beside the simplest models.
 
 `python benchmarks/real_logs.py FOLDER... [--toolbox] [--out FILE.json]`. A folder is a clone of
 
@@ -10,9 +10,10 @@ simplest models.
 or a CSV file, a log of the project's own arm, of which the arm's part counts.
 
 An arm's log is cut into halves: each is fitted alone, and the world is tested on the other on
-MuJoCo's C engine, open loop from its first row, with nothing refitted. With --toolbox, so is
-MuJoCo's own identification. Flights are moved over the paddle of the project's arm, which rests,
-and compared with a direct fit of the same air.
+MuJoCo's C engine, open loop from its first angles, at rest, with nothing refitted; the first
+moments, in which the arm gets into its motion, do not count. With --toolbox, so is MuJoCo's own
+identification. All flights are fitted at once, moved over the paddle of the project's arm, which
+rests, and compared with a direct fit of the same air to each side of each flight.
 """
 
 import argparse
@@ -55,8 +56,9 @@ from bounce_mjx.world.sampling import physics_parameters
 _EXPLAINED = 3e-3
 # Pictures this close to a bounce do not count, s.
 _AT_BOUNCE = 0.012
-# Gravity, m/s^2; the flights' step of integration, s.
+# m/s^2.
 _GRAVITY = np.array([0.0, 0.0, -9.81])
+# Of the flights' integration, s.
 _STEP = 4e-3
 # Height of a table's bounce below which a minimum of the height is one, m.
 _LOW = 0.06
@@ -134,7 +136,8 @@ def halves(log: Log) -> tuple[Log, Log]:
 
 def open_loop(config: WorldConfig, world: dict[str, np.ndarray], log: Log) -> np.ndarray:
     """Errors [n] of an arm's world on a log, root mean square, rad: one simulation on MuJoCo's C
-    engine from the log's first row."""
+    engine from the log's first angles, at rest, of which the first `SETTLING` seconds do not
+    count."""
     plain = world_model(config, visual=False)
     dt = config.physics_dt
     model = edited_model(plain, physics_parameters(world, plain))
@@ -202,16 +205,16 @@ def measure_arm(arm: ArmLog, toolbox: bool) -> list[dict[str, Any]]:
         row["seconds"] = time.perf_counter() - begin
         row["processor seconds"] = time.process_time() - begin_processor
         of_arm = compensated(config) if found.gravity_compensation else config
-        fitted, tested = (
-            set_points(part, found.following, config.physics_dt) for part in (fitted, tested)
-        )
+        # As `identify` reads them: a follower may go on between its commands.
+        fitted_points = set_points(fitted, found.following, config.physics_dt)
+        tested_points = set_points(tested, found.following, config.physics_dt)
         world = found.layout.world(found.fit.vector)
-        row["identified, mrad"] = (1e3 * open_loop(of_arm, world, tested)).tolist()
+        row["identified, mrad"] = (1e3 * open_loop(of_arm, world, tested_points)).tolist()
         row["total delay"] = total_delay(found, model)
         row["gravity compensation"] = found.gravity_compensation
         row["doubts"] = describe_doubts(found, names)
         if toolbox:
-            row |= measure_toolbox(of_arm, fitted, tested)
+            row |= measure_toolbox(of_arm, fitted_points, tested_points)
         rows.append(row)
     return rows
 
@@ -450,10 +453,14 @@ def main() -> None:
     rows: list[dict[str, Any]] = []
     for folder in given.folders:
         own = [own_log(folder)] if folder.suffix == ".csv" else []
-        for arm in (*own, *panda_logs(folder), *ur5_logs(folder)):
+        arms = [*own, *panda_logs(folder), *ur5_logs(folder)]
+        has_flights = any(folder.rglob("3D_gt/*.csv"))
+        if not arms and not has_flights:
+            parser.error(f"{folder} has none of the logs that --help lists")
+        for arm in arms:
             rows += measure_arm(arm, given.toolbox)
             print(json.dumps(rows[-2:], indent=1), flush=True)
-        if any(folder.rglob("3D_gt/*.csv")):
+        if has_flights:
             rows.append(measure_flights(folder, given.flights))
             print(json.dumps(rows[-1], indent=1), flush=True)
         if given.out is not None:

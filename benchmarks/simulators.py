@@ -7,14 +7,15 @@
 
 The last line records the logs from which `bounce-mjx identify` finds that simulator's world.
 
-The arm is rebuilt, link by link, from the environment's compiled model, as a URDF file. Two numbers
-of a simulator are set before any policy acts, and printed: the coefficient of restitution, such
-that a ball that drops onto the paddle of the arm at rest rebounds with the world's restitution; and
-the time constant of the motors, such that a step of 0.05 rad takes as long to 63% as MuJoCo's
-servos take. (`physx` has servos of the same stiffness and damping, and needs none.) The policy acts
-through `load_policy`, as on a robot: it sees the joints and the newest picture of the ball. The
-environment's own functions measure the results, and the supervisor's alarms but lost balls are
-counted. `mujoco` is the C engine, as a comparison.
+The arm is rebuilt, link by link, from the environment's compiled model, as a URDF file: masses,
+inertias, hinges, torques and the paddle's box, but not the joints' own limits, damping and
+friction, nor a gravity compensation. Two numbers of a simulator are set before any policy acts, and
+printed: the coefficient of restitution, such that a ball that drops onto the paddle of the arm at
+rest rebounds with the world's restitution; and the time constant of the motors, such that a step of
+0.05 rad takes as long to 63% as MuJoCo's servos take. (`physx` has servos of the same stiffness and
+damping, and needs none.) The policy acts through `load_policy`, as on a robot: it sees the joints
+and the newest picture of the ball. The environment's own functions measure the results, and the
+supervisor's alarms but lost balls are counted. `mujoco` is the C engine, as a comparison.
 """
 
 import argparse
@@ -52,10 +53,14 @@ DROP = 0.3
 """Height of a drop, m."""
 STEP = 0.05
 """Step of a servo's target, rad."""
-ENCODER_NOISE, CAMERA_NOISE = 1e-4, 0.002
-"""Standard deviations of the joint angles (rad) and the ball's position (m) in a log."""
+ENCODER_NOISE = 1e-4
+"""Standard deviation of the joint angles in a log, rad."""
+CAMERA_NOISE = 0.002
+"""Standard deviation of the ball's position in a log, m."""
 BALL_SECONDS = 40.0
 """Length of a log with the ball, s."""
+LOGS = ("arm.csv", "ball.csv")
+"""Files of the logs: of the arm's motion, and of the policy with the ball."""
 RATE = 1000.0
 """Rate of the policy's commands, Hz."""
 
@@ -64,11 +69,15 @@ class World(NamedTuple):
     """What a simulation differs in; the rest is the environment's model."""
 
     restitution: float = 0.85
+    """Of the ball on the paddle; the default is that of `mjcf/bounce_ball.xml`."""
     friction: float | None = None
     """None for that of the environment's model."""
     action_latency: float = 0.0
+    """From a command to the servos, s."""
     ball_latency: float = 0.0
+    """Of the pictures, rounded to control steps, s."""
     timestep: float = 0.001
+    """Of the physics, s."""
 
 
 WORLDS = {
@@ -172,13 +181,20 @@ def _add_link(robot: ET.Element, model: mujoco.MjModel, body: int, paddle: int) 
 
 
 def make_parts(model: mujoco.MjModel) -> Parts:
-    """The arm and the balls of a compiled model, whose arm's bodies have one hinge or none."""
+    """The arm and the balls of a compiled model, whose arm's bodies have one hinge or none.
+
+    Raises:
+      ValueError: the model has what is not rebuilt in the other simulators.
+    """
     addresses = find_addresses(model)
     balls = [ball.body for ball in addresses.balls]
-    geoms = [g for g in (*model.pair_geom1, *model.pair_geom2) if model.geom_bodyid[g] not in balls]
-    paddle = geoms[0]
+    paddle = addresses.paddle_geom
     if model.geom_type[paddle] != mujoco.mjtGeom.mjGEOM_BOX:
         raise ValueError("the paddle is no box")
+    if model.body_jntnum[model.geom_bodyid[paddle]] != 1:
+        raise ValueError("the paddle's body has no hinge")
+    if np.any(model.actuator_gear[:, 0] != 1.0):
+        raise ValueError(f"the servos have gears, {model.actuator_gear[:, 0]}; only 1 is rebuilt")
     robot = ET.Element("robot", name="arm")
     ET.SubElement(robot, "link", name="world")
     links = []
@@ -245,7 +261,11 @@ def bullet(parts: Parts, world: World, tuning: Tuning) -> Simulator:
         p.createMultiBody(parts.mass, shape, basePosition=(0, i, 5), physicsClientId=client)
         for i in range(parts.balls)
     ]
-    touching = {"restitution": np.sqrt(tuning.restitution), "lateralFriction": world.friction**0.5}
+    # Bullet multiplies the two bodies' coefficients.
+    touching = {
+        "restitution": np.sqrt(tuning.restitution),
+        "lateralFriction": np.sqrt(world.friction),
+    }
     free = {"linearDamping": 0.0, "angularDamping": 0.0, "rollingFriction": 0.0}
     for body, link in [(arm, i) for i in joints] + [(ball, -1) for ball in balls]:
         p.changeDynamics(body, link, jointDamping=0.0, **touching, **free, physicsClientId=client)
@@ -299,7 +319,8 @@ def physx(parts: Parts, world: World, tuning: Tuning) -> Simulator:
     import sapien
 
     config = sapien.physx.PhysxSceneConfig()
-    config.bounce_threshold, config.gravity = 0.01, np.array([0.0, 0.0, -9.81])
+    config.bounce_threshold = 0.01
+    config.gravity = np.array([0.0, 0.0, -9.81])
     sapien.physx.set_scene_config(config)
     scene = sapien.Scene([sapien.physx.PhysxCpuSystem()])
     scene.set_timestep(world.timestep)
@@ -387,7 +408,8 @@ def dart(parts: Parts, world: World, tuning: Tuning) -> Simulator:
         for k in range(skeleton.getNumBodyNodes()):
             for node in skeleton.getBodyNode(k).getShapeNodes():
                 if node.hasDynamicsAspect():
-                    node.getDynamicsAspect().setRestitutionCoeff(tuning.restitution**0.5)
+                    # DART multiplies the two bodies' restitutions, and takes the lesser friction.
+                    node.getDynamicsAspect().setRestitutionCoeff(np.sqrt(tuning.restitution))
                     node.getDynamicsAspect().setFrictionCoeff(world.friction)
         scene.addSkeleton(skeleton)
     targets = np.zeros(len(joints))
@@ -425,8 +447,10 @@ def dart(parts: Parts, world: World, tuning: Tuning) -> Simulator:
 
 def own_engine(model: mujoco.MjModel) -> Simulator:
     """MuJoCo itself, in whose servos' time a step is measured for the others."""
-    addresses, data = find_addresses(model), mujoco.MjData(model)
-    qpos, qvel = list(addresses.arm_qpos), list(addresses.arm_qvel)
+    addresses = find_addresses(model)
+    data = mujoco.MjData(model)
+    qpos = list(addresses.arm_qpos)
+    qvel = list(addresses.arm_qvel)
 
     def reset(angles, positions, velocities):
         mujoco.mj_resetData(model, data)
@@ -437,7 +461,8 @@ def own_engine(model: mujoco.MjModel) -> Simulator:
             data.qvel[list(ball.qvel[:3])] = velocity
 
     def ball_state():
-        rows, spin_and_velocity = [], np.zeros(6)
+        rows = []
+        spin_and_velocity = np.zeros(6)
         for ball in addresses.balls:
             kind = mujoco.mjtObj.mjOBJ_BODY
             mujoco.mj_objectVelocity(model, data, kind, ball.body, spin_and_velocity, 0)
@@ -513,7 +538,8 @@ def lag(simulator: Simulator, parts: Parts, angles: np.ndarray, timestep: float)
         simulator.reset(angles, far, np.zeros_like(far))
         goal = angles + STEP * (np.arange(len(angles)) == j)
         simulator.servo_targets(goal)
-        before, level = 0.0, (1.0 - np.exp(-1.0)) * STEP
+        level = (1.0 - np.exp(-1.0)) * STEP
+        before = 0.0
         for step in range(1000):
             simulator.step()
             moved = simulator.joint_state()[0][j] - angles[j]
@@ -521,6 +547,8 @@ def lag(simulator: Simulator, parts: Parts, angles: np.ndarray, timestep: float)
                 times.append(timestep * (step + (level - before) / (moved - before)))
                 break
             before = moved
+        else:
+            raise ValueError(f"joint {j + 1} does not follow a step of {STEP} rad")
     return float(np.mean(times))
 
 
@@ -529,7 +557,8 @@ def tune(name: str, model: mujoco.MjModel, world: World, angles: np.ndarray) -> 
     and MuJoCo's time of a step, by bisection."""
     parts = make_parts(model)
     wanted = lag(own_engine(model), parts, angles, model.opt.timestep)
-    addresses, data = find_addresses(model), mujoco.MjData(model)
+    addresses = find_addresses(model)
+    data = mujoco.MjData(model)
     data.qpos[list(addresses.arm_qpos)] = angles
     mujoco.mj_forward(model, data)
     thickness = np.min(model.geom_size[addresses.paddle_geom])
@@ -538,7 +567,10 @@ def tune(name: str, model: mujoco.MjModel, world: World, angles: np.ndarray) -> 
     def bisect(low: float, high: float, goal: float, measure: Callable[[float], float]) -> float:
         for _ in range(12):
             middle = 0.5 * (low + high)
-            low, high = (middle, high) if measure(middle) < goal else (low, middle)
+            if measure(middle) < goal:
+                low = middle
+            else:
+                high = middle
         return 0.5 * (low + high)
 
     def with_tuning(measure: Callable[[Simulator], float], tuning: Tuning) -> float:
@@ -551,7 +583,9 @@ def tune(name: str, model: mujoco.MjModel, world: World, angles: np.ndarray) -> 
     steps = functools.partial(lag, parts=parts, angles=angles, timestep=world.timestep)
     drops = functools.partial(drop, parts=parts, angles=angles, above=above)
     constant = wanted
-    if name != "physx":
+    # PhysX has the servos' own stiffness and damping.
+    has_motors = name != "physx"
+    if has_motors:
         constant = bisect(
             world.timestep, 4.0 * wanted, wanted, lambda x: with_tuning(steps, Tuning(0.85, x))
         )
@@ -559,10 +593,11 @@ def tune(name: str, model: mujoco.MjModel, world: World, angles: np.ndarray) -> 
         0.5, 1.0, world.restitution, lambda x: with_tuning(drops, Tuning(x, constant))
     )
     tuning = Tuning(coefficient, constant)
+    of_motors = f" with the constant {1e3 * constant:.1f} ms" if has_motors else ""
     print(
         f"{name}: restitution {with_tuning(drops, tuning):.3f} with the coefficient "
         f"{coefficient:.3f}; a step takes {1e3 * with_tuning(steps, tuning):.1f} ms "
-        f"({1e3 * wanted:.1f} in MuJoCo) with the constant {1e3 * constant:.1f} ms",
+        f"({1e3 * wanted:.1f} in MuJoCo){of_motors}",
         flush=True,
     )
     return tuning
@@ -572,11 +607,18 @@ class Episode:
     """One policy in one simulator: what it sees, and its late commands."""
 
     def __init__(self, policy: DeployedPolicy, simulator: Simulator, world: World):
-        self.policy, self.simulator, self.world = policy, simulator, world
+        self.policy = policy
+        self.simulator = simulator
+        self.world = world
         self.alarm = ""
         """Code of the first fault that a supervisor would stop for, but a lost ball's."""
         self._watch = Watch(policy.metadata, picture_age(policy.metadata))
-        self._steps, self._targets, self._balls = 0, [], []
+        self._steps = 0
+        """Time steps of the physics."""
+        self._targets: list[np.ndarray] = []
+        """Commanded angles [J] at the start, and of each interval of `RATE`."""
+        self._balls: list[np.ndarray] = []
+        """States [B, 9] at the start, and after each control step."""
 
     @property
     def balls(self) -> np.ndarray:
@@ -589,12 +631,14 @@ class Episode:
         self.policy.reset()
         self._watch.rest(angles, angles)
         self._watch.begin()
-        self._steps, self._targets = 0, [angles]
+        self._steps = 0
+        self._targets = [angles]
         self._balls = [self.simulator.ball_state()]
 
     def measure(self) -> dict[str, np.ndarray | float]:
         """What the robot measures: its joints, and the newest picture of the ball."""
-        dt, number = self.policy.metadata.control_dt, len(self._balls) - 1
+        dt = self.policy.metadata.control_dt
+        number = len(self._balls) - 1
         angles, velocities = self.simulator.joint_state()
         age = min(round(self.world.ball_latency / dt), number)
         position, velocity, spin = np.split(self._balls[number - age], 3, axis=1)
@@ -609,16 +653,18 @@ class Episode:
         except ImpossibleMeasurement as error:
             self.alarm = self.alarm or error.fault
         else:
-            last, is_bridged = self._targets[-1], self.policy.samples.is_arm_bridged
-            faults = self._watch.faults(measured, last, is_bridged)
+            is_bridged = self.policy.samples.is_arm_bridged
+            faults = self._watch.faults(measured, self._targets[-1], is_bridged)
             codes = [code for code, _ in faults if code != "ball_lost"]
-            self.alarm = self.alarm or "".join(codes[:1])
+            if codes and not self.alarm:
+                self.alarm = codes[0]
             self.policy.act(measured)
         self.run(self.policy.commands(RATE))
 
     def run(self, targets: np.ndarray) -> None:
         """The physics runs until the next control step, with targets [n, J] at `RATE`."""
-        dt, number = self.policy.metadata.control_dt, len(self._balls) - 1
+        dt = self.policy.metadata.control_dt
+        number = len(self._balls) - 1
         self._targets.extend(targets)
         # A time step may be longer or shorter than the interval of the commands.
         timestep = self.world.timestep
@@ -671,22 +717,24 @@ def evaluate(
     positions [T, nq] of the first episode, and the supervisor's alarms."""
     env = nominal_env(policy)
     addresses = env.addresses
-    arm_qpos, arm_qvel = list(addresses.arm_qpos), list(addresses.arm_qvel)
+    arm_qpos = list(addresses.arm_qpos)
+    arm_qvel = list(addresses.arm_qvel)
     ball_qpos = np.array([ball.qpos[:3] for ball in addresses.balls])
     ball_qvel = np.array([ball.qvel[:3] for ball in addresses.balls])
     home = np.array(load_policy(policy).metadata.default_joint_angles)
     make = maker(name, env.mj_model, world, home)
-    running = [Episode(load_policy(policy), make(), world) for _ in range(episodes)]
+    played = [Episode(load_policy(policy), make(), world) for _ in range(episodes)]
     states = jax.jit(reset_episodes, static_argnums=(0, 2))(env, jax.random.key(seed), episodes)
     qpos, qvel = (np.array(x, float) for x in states.pipeline_state.physics[:2])
 
-    for i, episode in enumerate(running):
+    for i, episode in enumerate(played):
         episode.reset(qpos[arm_qpos, i], qpos[ball_qpos, i], qvel[ball_qvel, i])
-    statistics, path = empty_statistics(env, states), [qpos[:, 0].copy()]
+    statistics = empty_statistics(env, states)
+    path = [qpos[:, 0].copy()]
     for step in range(env.config.episode_steps):
         commands = jax.tree.map(np.asarray, states.pipeline_state.command)
         for i in np.flatnonzero(statistics.running):
-            episode = running[i]
+            episode = played[i]
             episode.control_step({key: value[..., i] for key, value in commands.items()})
             qpos[arm_qpos, i], qvel[arm_qvel, i] = episode.simulator.joint_state()
             qpos[ball_qpos, i], qvel[ball_qvel, i] = np.split(episode.balls[:, :6], 2, axis=1)
@@ -694,21 +742,28 @@ def evaluate(
         states, statistics = judge_step(env, states, qpos, qvel, statistics, step)
         if not np.any(statistics.running):
             break
-    for episode in running:
+    for episode in played:
         episode.simulator.close()
-    alarms = [episode.alarm for episode in running if episode.alarm]
+    alarms = [episode.alarm for episode in played if episode.alarm]
     return judge(env, statistics), np.array(path), alarms
 
 
 def record_logs(policy: str, name: str, world: World, folder: Path) -> None:
     """Writes the logs for `bounce-mjx identify`: the arm in the motion of `bounce-mjx excite`
-    (arm.csv), and the policy, with a new target height every 3 s (ball.csv)."""
+    (arm.csv), and the policy, with a new target height every 3 s (ball.csv).
+
+    Raises:
+      UserError: one of the files exists, or cannot be made.
+    """
     config = load_run_config(choose_checkpoint(Path(policy), Path()).run).env
-    env, acting = Env(config), load_policy(policy)
-    joints, home = acting.metadata.joint_names, np.array(acting.metadata.default_joint_angles)
+    env = Env(config)
+    acting = load_policy(policy)
+    joints = acting.metadata.joint_names
+    home = np.array(acting.metadata.default_joint_angles)
     dt = acting.metadata.control_dt
     simulator = maker(name, env.mj_model, world, home)()
-    episode, random = Episode(acting, simulator, world), np.random.default_rng(0)
+    episode = Episode(acting, simulator, world)
+    random = np.random.default_rng(0)
 
     def measure() -> dict[str, np.ndarray | float]:
         measured = episode.measure()
@@ -717,16 +772,17 @@ def record_logs(policy: str, name: str, world: World, folder: Path) -> None:
             measured[quantity] = value + noise * random.standard_normal(np.shape(value))
         return measured
 
+    arm_file, ball_file = LOGS
     folder.mkdir(parents=True, exist_ok=True)
     motion = excite(config, seconds=20.0, max_velocity=1.0)
     episode.reset(home, np.array([[0.0, 10.0, 10.0]]), np.zeros((1, 3)))
-    with Recorder(folder / "arm.csv", joints) as log:
+    with Recorder(folder / arm_file, joints) as log:
         for time, target in zip(motion.times, motion.targets, strict=True):
             measured = {k: x for k, x in measure().items() if k.startswith("joint")}
             log.step(measured | {"time": time}, target)
             episode.run(np.tile(target, (round(dt * RATE), 1)))
     episode.reset(home, np.array([config.ball_init_pos]), np.zeros((1, 3)))
-    with Recorder(folder / "ball.csv", joints, {"target_height": "m"}) as log:
+    with Recorder(folder / ball_file, joints, {"target_height": "m"}) as log:
         for step in range(round(BALL_SECONDS / dt)):
             heights = {"target_height": (0.4, 0.5, 0.6)[int(step * dt / 3.0) % 3]}
             measured = measure() | heights
@@ -737,11 +793,11 @@ def record_logs(policy: str, name: str, world: World, folder: Path) -> None:
     simulator.close()
 
 
-def measure(policy: str, name: str, world: str, given: argparse.Namespace) -> str:
+def row_of(policy: str, name: str, world: str, given: argparse.Namespace) -> str:
     """One row of the table; stores the first episode if asked to."""
     if given.logs:
         record_logs(policy, name, WORLDS[world], given.logs)
-        return f"written: {given.logs}/arm.csv, {given.logs}/ball.csv"
+        return f"written: {', '.join(str(given.logs / file) for file in LOGS)}"
     report, path, alarms = evaluate(policy, name, WORLDS[world], given.episodes, given.seed)
     if given.out:
         given.out.mkdir(parents=True, exist_ok=True)
@@ -774,10 +830,16 @@ def main() -> None:
     parser.add_argument("--logs", type=Path, help="folder for logs, instead of results")
     given = parser.parse_args()
     cases = list(itertools.product(given.policies, given.simulators, given.worlds))
+    if given.logs is not None:
+        if len(cases) > 1:
+            parser.error("--logs records one policy in one simulator and world; give one of each")
+        for name in LOGS:
+            if (given.logs / name).exists():
+                parser.error(f"{given.logs / name} exists; give --logs another folder")
     # A simulator keeps settings for its process.
     spawn = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(given.jobs, spawn, max_tasks_per_child=1) as pool:
-        rows = [pool.submit(measure, *case, given) for case in cases]
+        rows = [pool.submit(row_of, *case, given) for case in cases]
         for row in rows:
             print(row.result(), flush=True)
 

@@ -5,9 +5,11 @@ the arm brakes.
     python benchmarks/supervisor.py robust --episodes 1024 --latencies 0.06 0.03
     python benchmarks/supervisor.py --episodes 128
 
-The last line is for every policy that comes with the package, each in its own worlds. An alarm is
-false if it comes before the episode ends, and the ball is not lost. The faults: from a random step
-on, the encoder of one joint repeats its last angle, or the camera its last picture.
+The last line is for every policy that comes with the package, each in its own worlds. What a policy
+measured in an episode is given to the rules step by step; the first alarm is printed, and it is
+false unless the ball is lost (`ball_lost`). The faults: from a random step on, the encoder of one
+joint repeats its last angle, or the camera its last picture; the commands and the other readings
+stay as they were in the episode.
 """
 
 import argparse
@@ -34,6 +36,7 @@ from bounce_mjx.runs.folders import find_checkpoint
 from bounce_mjx.training.setup import set_up_jax
 
 _BATCH = 128
+"""Episodes that are simulated at once."""
 MEASURED = ("joint_angles", "joint_velocities", "ball_position", "ball_age")
 
 
@@ -41,7 +44,8 @@ def recorder(name: str, episodes: int, latencies: list[float] | None) -> Any:
     """Function: key -> what the robot's computer knows in each step of episodes [N, T, ...]."""
     checkpoint = find_checkpoint(resource_path(POLICIES[name]))
     config = load_run_config(checkpoint.run)
-    settings, policy = config.env, read_policy(checkpoint, config)
+    settings = config.env
+    policy = read_policy(checkpoint, config)
     if latencies:
         fixed = {"action_latency": (latencies[0],) * 2, "ball_latency": (latencies[1],) * 2}
         worlds = settings.randomization.model_copy(update=fixed)
@@ -52,12 +56,15 @@ def recorder(name: str, episodes: int, latencies: list[float] | None) -> Any:
     def row(state: State, action: jax.Array) -> dict[str, jax.Array]:
         now = state.pipeline_state
         truth = env.kinematics(now)
-        angles, velocities = truth.joint_angles, truth.joint_velocities
-        ball, age = truth.ball_position, jnp.zeros(())
+        angles = truth.joint_angles
+        velocities = truth.joint_velocities
+        ball = truth.ball_position
+        age = jnp.zeros(())
         if now.sensing is not None:
-            seen = now.sensing.histories
-            angles, velocities = seen["joint_angles"][0], seen["joint_velocities"][0]
-            ball, age = now.sensing.picture.position, now.sensing.picture.age
+            angles = now.sensing.histories["joint_angles"][0]
+            velocities = now.sensing.histories["joint_velocities"][0]
+            ball = now.sensing.picture.position
+            age = now.sensing.picture.age
         control, actuation = env.control(now, action)
         if actuation.setpoint is not None:
             command = actuation.setpoint.position
@@ -82,8 +89,8 @@ def recorder(name: str, episodes: int, latencies: list[float] | None) -> Any:
             states = jax.vmap(env.step, in_axes=-1, out_axes=-1)(states, actions)
             return (states, running & (states.done == 0)), seen | {"running": running}
 
-        start = reset_episodes(env, key, episodes), jnp.ones(episodes, bool)
-        rows = jax.lax.scan(step, start, None, length=env.config.episode_steps)[1]
+        start = (reset_episodes(env, key, episodes), jnp.ones(episodes, bool))
+        _, rows = jax.lax.scan(step, start, None, length=env.config.episode_steps)
         return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), rows)
 
     return run
@@ -95,13 +102,13 @@ class Found(NamedTuple):
     length: int
     """Control steps."""
     at: int
-    """Step of the first fault."""
+    """Step of the first alarm."""
     alarm: str
-    """Code of the first fault; empty if there is none before the last step."""
+    """Code of the first alarm; empty if there is none."""
     bridged: int
     """Samples that were taken as impossible."""
     delays: dict[str, float]
-    """Times from injected faults until a rule is broken, s; infinite where none is in 2 s."""
+    """Times from injected faults until a rule is broken, s; infinite where none is in 200 steps."""
 
 
 def first_alarm(
@@ -109,8 +116,10 @@ def first_alarm(
 ) -> tuple[int, str, int]:
     """The first step from one on that breaks a rule, the rule's code, and the number of bridged
     samples until then."""
-    samples, watch = Samples(metadata), Watch(metadata, picture_age(metadata))
-    angles, commands = episode["joint_angles"], episode["commands"]
+    samples = Samples(metadata)
+    watch = Watch(metadata, picture_age(metadata))
+    angles = episode["joint_angles"]
+    commands = episode["commands"]
     samples.rest(angles[0])
     watch.rest(angles[0], angles[0])
     watch.begin()
@@ -135,21 +144,24 @@ def first_alarm(
 def delays(
     metadata: Metadata, episode: dict[str, np.ndarray], rng: np.random.Generator
 ) -> dict[str, float]:
-    """Times from a fault until a rule is broken, s; infinite where none is in 2 s."""
-    length, before = len(episode["ball_age"]), 100
+    """Times from a fault until a rule is broken, s; infinite where none is in 200 steps. Empty for
+    an episode of less than 400 steps."""
+    before = 100
+    length = len(episode["ball_age"])
     if length < 400:
         return {}
-    step, found = int(rng.integers(before, length - 200)), {}
+    step = int(rng.integers(before, length - 200))
     part = {key: value[step - before : step + 200] for key, value in episode.items()}
-    repeated = {
-        f"the angle of joint {j + 1}": ("joint_angles", j) for j in range(len(metadata.joint_names))
-    }
-    for name, (kind, entry) in ({"a picture": ("ball_position", ...)} | repeated).items():
+    repeated: dict[str, tuple[str, int | slice]] = {"a picture": ("ball_position", slice(None))}
+    for joint in range(len(metadata.joint_names)):
+        repeated[f"the angle of joint {joint + 1}"] = ("joint_angles", joint)
+    times = {}
+    for name, (quantity, entry) in repeated.items():
         changed = {key: value.copy() for key, value in part.items()}
-        changed[kind][before:, entry] = changed[kind][before, entry]
+        changed[quantity][before:, entry] = changed[quantity][before, entry]
         at, fault, _ = first_alarm(metadata, changed, before)
-        found[name] = (at - before) * metadata.control_dt if fault else np.inf
-    return found
+        times[name] = (at - before) * metadata.control_dt if fault else np.inf
+    return times
 
 
 def judge(metadata: Metadata, episode: dict[str, np.ndarray], seed: int) -> Found:
@@ -183,9 +195,9 @@ def report(name: str, found: list[Found], steps: int) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("policies", nargs="*", default=list(POLICIES), help="names")
-    parser.add_argument("--episodes", type=int, default=128)
+    parser.add_argument("--episodes", type=int, default=128, help="rounded up to whole batches")
     parser.add_argument("--latencies", type=float, nargs=2, help="of action and ball, s")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0, help="of the episodes")
     parser.add_argument("--jobs", type=int, default=1, help="processes at once")
     given = parser.parse_args()
     set_up_jax()
@@ -194,7 +206,8 @@ def main() -> None:
         waiting = []
         for name in given.policies:
             batch = min(_BATCH, given.episodes)
-            metadata, run = load_policy(name).metadata, recorder(name, batch, given.latencies)
+            metadata = load_policy(name).metadata
+            run = recorder(name, batch, given.latencies)
             found = []
             for number in range(-(-given.episodes // batch)):
                 rows = jax.tree.map(np.asarray, run(jax.random.key(1000 * given.seed + number)))

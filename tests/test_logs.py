@@ -481,8 +481,10 @@ def test_an_excitation_moves_each_joint_or_says_which_cannot() -> None:
         home[0] = start
         with pytest.raises(UserError, match=r"Joint1 cannot move, as it starts at .+ its range is"):
             excite(config.model_copy(update={"default_joint_angles": tuple(home)}), 20.0, 1.0)
-    with pytest.raises(UserError, match="0.001 s are too short to move 6 joints; give at least"):
-        excite(config, 0.001, 1.0)
+    with pytest.raises(UserError, match="0.001 s are too short to move 6 joints; give") as refused:
+        excite(config, 0.001, 1.5)
+    seconds = float(re.search(r"at least (\d+) s", str(refused.value))[1])
+    assert np.ptp(excite(config, seconds, 1.5).targets, axis=0).min() > 0.0
 
 
 def test_excite_command_writes_a_motion(tmp_path: Path, capsys) -> None:

@@ -1,6 +1,7 @@
 """Motions of the arm without a ball that show its servos: each joint alone, slow and fast, then all
 together, without contacts."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -100,10 +101,11 @@ def excite(
         )
     times = np.arange(round(seconds / dt)) * dt
     lifting = max(_LIFTING, _time_of_step(np.abs(centre - home), bounds))
-    if not len(times) or times[-1] < 2.0 * lifting + 1.0 * n:
+    shortest = 2.0 * lifting + 1.0 * n
+    if not len(times) or times[-1] < shortest:
         raise UserError(
             f"{seconds:g} s are too short to move {n} joints; give at least "
-            f"{2.0 * lifting + 1.0 * n:.0f} s"
+            f"{math.ceil(shortest + dt)} s"
         )
     rests = home + np.outer(
         _smooth_step(np.minimum(times, times[-1] - times) / lifting), centre - home
