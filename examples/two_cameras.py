@@ -417,13 +417,17 @@ class Tracker:
           taken: middle of the exposure, s.
         """
         motion = self._predict(taken)
-        circles = []
-        for camera, picture, background in zip(
-            self.cameras, pictures, self._backgrounds, strict=True
-        ):
-            expected = None if motion is None else self._expected(camera, *motion)
-            circles.append(find_circles(picture, self.colour, background, expected))
-        fix = self._best_fix(circles, taken, None if motion is None else motion[0])
+        if motion is None:
+            fix, _ = self._look(pictures, taken, None, [None] * len(self.cameras))
+        else:
+            expected = [self._expected(camera, *motion) for camera in self.cameras]
+            fix, score = self._look(pictures, taken, motion[0], expected)
+            if score <= _CLEAR_SCORE:
+                # A ball that turns around within the exposure is hardly blurred.
+                still = [place._replace(blur=np.zeros(2)) for place in expected]
+                bounced, bounced_score = self._look(pictures, taken, motion[0], still)
+                if bounced_score > score:
+                    fix = bounced
         if fix is None:
             self._missed += 1
             if self._missed >= _SEARCHED_NEAR:
@@ -456,13 +460,25 @@ class Tracker:
         start, centre, end = camera.project(np.stack([position - half, position, position + half]))
         return Expected(centre, camera.radius_at(position), end - start)
 
-    def _best_fix(
-        self, circles: list[list[Circle]], taken: float, predicted: np.ndarray | None
-    ) -> Fix | None:
-        """The place of the most complete pair of circles that can be the ball.
+    def _look(
+        self,
+        pictures: Sequence[np.ndarray],
+        taken: float,
+        predicted: np.ndarray | None,
+        expected: Sequence[Expected | None],
+    ) -> tuple[Fix | None, float]:
+        """The place of the most complete pair of circles that can be the ball, and the score of its
+        less complete circle; None and 0 if there is none.
 
         The rays of two other things of its colour may meet better by chance.
+
+        Args:
+          predicted: where a ball in free flight is [3], m; None if that is not known.
+          expected: where to search in the picture of each camera; None for the whole picture.
         """
+        circles = []
+        for picture, background, place in zip(pictures, self._backgrounds, expected, strict=True):
+            circles.append(find_circles(picture, self.colour, background, place))
         best = None
         best_score = 0.0
         for first in circles[0]:
@@ -474,7 +490,7 @@ class Tracker:
                 if fix is not None:
                     best = fix
                     best_score = score
-        return best
+        return best, best_score
 
     def _fix(
         self, pair: Sequence[Circle], taken: float, predicted: np.ndarray | None

@@ -244,6 +244,32 @@ def test_what_lies_below_a_falling_ball_is_not_it() -> None:
         assert fix is not None and np.linalg.norm(fix.position - place) < 5e-3
 
 
+@pytest.mark.parametrize("middle", [-0.001, 0.0, 0.001])
+def test_a_ball_that_bounces_within_the_exposure_is_seen(middle) -> None:
+    """It is blurred less than in the flight that goes before; before a paddle, the pixels of its
+    rim have another colour."""
+    exposure = 0.004
+    contact = 0.004
+    tracker = cameras.Tracker(true_cameras(), cameras.COLOURS["orange"], exposure)
+    lowest = np.array([0.6, 0.02, 0.3])
+
+    def place_at(time: float) -> np.ndarray:
+        """The ball falls at 4.5 m/s to a contact around the time `middle`, and rises at 4 m/s."""
+        before = min(time - middle + 0.5 * contact, 0.0)
+        after = max(time - middle - 0.5 * contact, 0.0)
+        path = np.array([0.0, 0.0, 4.0 * after - 4.5 * before])
+        return lowest + path + 0.5 * cameras.GRAVITY * (before + after) ** 2
+
+    for k in range(-8, 3):
+        taken = k / 120.0
+        instants = taken + exposure * ((np.arange(16) + 0.5) / 16.0 - 0.5)
+        frames = [scene(place_at(instant), (), 100 + k, 0.9) for instant in instants]
+        pictures = [np.mean(frame, axis=0).astype(np.uint8) for frame in zip(*frames, strict=True)]
+        fix = tracker.update(pictures, taken)
+        seen = np.mean([place_at(instant) for instant in instants], axis=0)
+        assert fix is not None and np.linalg.norm(fix.position - seen) < 3e-3
+
+
 def test_how_high_the_cameras_see_is_told_beside_how_high_the_policy_plays() -> None:
     metadata = load_policy("robust").metadata
     home = cameras.paddle_position(metadata, np.array(metadata.default_joint_angles))
@@ -262,14 +288,19 @@ def test_how_high_the_cameras_see_is_told_beside_how_high_the_policy_plays() -> 
     assert cameras.highest_seen(true_cameras(), SIZE, home) > 0.9
 
 
-def scene(place: np.ndarray | None, others: tuple = (), seed: int = 0) -> list[np.ndarray]:
-    """Pictures of both cameras: a ball, and other discs of its colour at pixels (x, y, radius)."""
+def scene(
+    place: np.ndarray | None, others: tuple = (), seed: int = 0, share: float = 1.0
+) -> list[np.ndarray]:
+    """Pictures of both cameras: a ball, and other discs of its colour at pixels (x, y, radius); of
+    the ball's radius, a share has its colour."""
     rng = np.random.default_rng(seed)
     pictures = []
     for camera in true_cameras():
         picture = np.full((SIZE[1], SIZE[0], 3), 110, np.uint8)
         discs = (
-            [] if place is None else [(*camera.project(place[None])[0], camera.radius_at(place))]
+            []
+            if place is None
+            else [(*camera.project(place[None])[0], share * camera.radius_at(place))]
         )
         for x, y, radius in (*discs, *others):
             centre = (round(16 * x), round(16 * y))

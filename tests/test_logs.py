@@ -115,7 +115,10 @@ def swapped(lines: list[str]) -> list[str]:
             lambda lines: [",".join(np.delete(line.split(","), 2)) for line in lines],
             r"has no column joint_angles\.right \[rad\]; its columns are time, joint_angles\.left",
         ),
-        (lambda lines: [*lines[:5], lines[5] + ",1", *lines[6:]], r"got 13 columns instead of 12"),
+        (
+            lambda lines: [*lines[:5], lines[5] + ",1", *lines[6:]],
+            r"Line #6 \(got 13 columns instead of 12",
+        ),
         (
             scaled("joint_angles", 57.3),
             r"is -28\.\d+ rad .+ if these are degrees, write .+ \[deg\]",
@@ -158,6 +161,11 @@ def test_a_wrong_log_is_refused_by_one_sentence(change, sentence: str, tmp_path:
         (with_cell(9, 7, "99"), "1 of the 60 pictures of the ball in {}: row 10 is farther away"),
         (with_cell(9, 0, "0"), "joint angles in {}: row 10 has a time far from the others"),
         (swapped, "1 of the 120 joint angles in {}: row 41 has a time out of order"),
+        (
+            # Blank lines, as some loggers write them, are rows of the file.
+            lambda lines: [*lines[:4], "", *lines[4:6], " ", *with_cell(9, 7, "99")(lines)[6:]],
+            "1 of the 60 pictures of the ball in {}: row 12 is farther away",
+        ),
         (
             lambda lines: [*lines[:50], lines[49], *lines[50:]],
             "1 of the 121 joint angles in {}: row 51 repeats the one before",

@@ -42,7 +42,7 @@ from bounce_mjx.reports.curves import (
     read_curves,
 )
 from bounce_mjx.reports.figures import curves_figure, rewards_figure
-from bounce_mjx.reports.tables import results_table
+from bounce_mjx.reports.tables import result_cells, results_table, unsolved_line
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import save_config
 from bounce_mjx.runs.progress import load_results
@@ -359,6 +359,24 @@ def test_each_result_that_is_not_judged_is_explained() -> None:
     lines = [line.strip() for line in printed.getvalue().splitlines()]
     assert lines[-2:] == ["height: not judged (of 3 episodes)", "[speed]: not judged"]
     assert lines[3].startswith("[speed]")
+
+
+@pytest.mark.parametrize(
+    "value, bound, passed, text",
+    [
+        (98.997, ">= 99", False, "98.997"),
+        (98.99, ">= 99", False, "98.99"),
+        (99.004, ">= 99", True, "99.004"),
+        (99.0, ">= 99", True, "99.00"),
+        (1.5004, "0.1 to 1.5 (targets 0.4 to 0.6 only)", False, "1.5004"),
+        (None, ">= 99", False, "-"),
+    ],
+)
+def test_a_missed_bound_is_not_printed_as_its_value(value, bound, passed, text: str) -> None:
+    result = Result("stable", "episodes, %", value, bound, passed)
+    assert result_cells(result)[2] == text
+    if not passed:
+        assert f"stable {text} ({bound})" in unsolved_line(Report((result,), {}))
 
 
 def as_shown(value: float | None) -> str:

@@ -58,7 +58,7 @@ def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
       UserError: the file cannot be read, a column is missing or states an unknown unit, or as
         `make_log`.
     """
-    columns = _read_columns(path)
+    columns, line_numbers = _read_columns(path)
 
     def column(name: str, unit: str) -> np.ndarray:
         if name not in columns:
@@ -85,8 +85,7 @@ def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
         rows = Rows(
             name=f"{what} in {path}",
             place="row {}",
-            # The first row below the header is the file's second.
-            numbers=2 + np.arange(len(times)),
+            numbers=line_numbers,
             times=column(stamp, "s"),
             arrivals=times,
             values=values,
@@ -113,9 +112,9 @@ def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
     return make_log(str(path), angles, targets, balls)
 
 
-def _read_columns(path: Path) -> dict[str, tuple[str, np.ndarray]]:
-    """The stated unit and the numbers [R] of each column of a CSV file, by its name; NaN for a cell
-    that holds none."""
+def _read_columns(path: Path) -> tuple[dict[str, tuple[str, np.ndarray]], np.ndarray]:
+    """The stated unit and the numbers [R] of each column of a CSV file, by its name, NaN for a cell
+    that holds none; and the line [R] of the file that each row is."""
     try:
         header, *lines = path.read_text("utf-8-sig").splitlines() or [""]
         _check_form(path, header, lines)
@@ -124,8 +123,9 @@ def _read_columns(path: Path) -> dict[str, tuple[str, np.ndarray]]:
         lines = [line.replace('"', "") for line in lines]
         if delimiter != ",":
             lines = [line.replace(",", ".") for line in lines]
-        options = dict(delimiter=delimiter, comments=None, ndmin=2)
-        cells = np.genfromtxt(lines, **options) if lines else np.zeros((0, 0))
+        # With the header, so that NumPy's errors count the lines of the file.
+        options = dict(delimiter=delimiter, comments=None, ndmin=2, skip_header=1)
+        cells = np.genfromtxt([header, *lines], **options) if lines else np.zeros((0, 0))
     except (OSError, ValueError) as error:
         raise UserError(
             f"the log {path} cannot be read ({shorten(reason_of(error))}); give a CSV file in "
@@ -142,7 +142,9 @@ def _read_columns(path: Path) -> dict[str, tuple[str, np.ndarray]]:
         if name in columns:
             raise UserError(f"{path} has two columns {shorten(name)}; leave one")
         columns[name] = (unit or "").strip(), numbers
-    return columns
+    # NumPy passes over blank lines.
+    is_row = np.array([line.strip(" ") != "" for line in lines])
+    return columns, 2 + np.flatnonzero(is_row)
 
 
 def _check_form(path: Path, header: str, lines: Sequence[str]) -> None:

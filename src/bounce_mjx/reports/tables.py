@@ -17,6 +17,17 @@ def figure_text(value: float | None, spec: str = ".2f") -> str:
     return "-" if value is None else f"{value:{spec}}"
 
 
+def result_text(result: Result, spec: str = ".2f") -> str:
+    """A result's value as text, with more digits where it would read as its bound: 98.997 is no
+    99.00 that misses 99."""
+    text = figure_text(result.value, spec)
+    if result.value is None:
+        return text
+    limits = [float(number) for number in re.findall(r"\d+(?:\.\d+)?", result.bound)]
+    reads_as_limit = float(text) in limits and float(text) != result.value
+    return f"{result.value:.8g}" if reads_as_limit else text
+
+
 def count_text(count: float) -> str:
     """A large number in short, such as 1.23M, 45k or 678."""
     if count >= 1e6:
@@ -41,7 +52,7 @@ def results_table(report: Report, title: str) -> Table:
         if result.passed is None:
             not_judged.append(f"{result.name}: not judged" + (condition and f" ({condition}"))
         colour = {True: "[green]pass", False: "[red]FAIL", None: "-"}[result.passed]
-        texts = [result.name, result.measured, figure_text(result.value), bound]
+        texts = [result.name, result.measured, result_text(result), bound]
         table.add_row(*map(escape, texts), colour)
     if not_judged:
         table.caption = escape("\n".join(not_judged))
@@ -66,7 +77,7 @@ def seeds_table(reports: dict[int, Report | None]) -> Table:
             table.add_row(str(seed), "diverged")
             continue
         met = "[green]pass" if report.passed else "[red]FAIL"
-        table.add_row(str(seed), *(figure_text(result.value) for result in report.results), met)
+        table.add_row(str(seed), *map(result_text, report.results), met)
     means = []
     deviations = []
     for i in range(len(known[0].results)):
@@ -86,7 +97,7 @@ def seeds_table(reports: dict[int, Report | None]) -> Table:
 def result_cells(result: Result) -> list[str]:
     """A result as texts: name, measured quantity, value, bound and verdict."""
     verdict = {True: "pass", False: "FAIL", None: "not judged"}[result.passed]
-    return [result.name, result.measured, figure_text(result.value), result.bound, verdict]
+    return [result.name, result.measured, result_text(result), result.bound, verdict]
 
 
 def unsolved_line(report: Report) -> str:
@@ -94,7 +105,7 @@ def unsolved_line(report: Report) -> str:
     missed = []
     for result in report.results:
         if result.passed is False:
-            missed.append(f"{result.name} {figure_text(result.value)} ({result.bound})")
+            missed.append(f"{result.name} {result_text(result)} ({result.bound})")
     if not missed:
         return ""
     return (

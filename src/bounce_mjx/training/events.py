@@ -11,7 +11,7 @@ from rich.console import Console
 
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import Policy
-from bounce_mjx.reports.tables import count_text, figure_text
+from bounce_mjx.reports.tables import count_text, result_text
 from bounce_mjx.runs.config import TrainConfig
 
 
@@ -116,7 +116,7 @@ def evaluation_line(num_seeds: int, steps: int, reports: Sequence[Report]) -> st
     missing = f", {sure} with a margin"
     if num_seeds == 1:
         (report,) = reports
-        figures = (f"{r.name} {figure_text(r.value, '.4g')}" for r in report.results)
+        figures = (f"{r.name} {result_text(r, '.4g')}" for r in report.results)
         line = f"{report.summary} ({', '.join(figures)})"
         missing = ", not yet with a margin"
     kind = "evaluation"
