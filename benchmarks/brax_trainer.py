@@ -1,15 +1,27 @@
 """brax's PPO as a trainer of `jax_vs_torch.py`, on the fused or on the mjx physics.
 
-The differences of the hyperparameters from ours:
+The networks, the normalisation and the environments' step are this project's, the wrappers and the
+trainer brax's. The differences of the hyperparameters from ours:
 
-| PPOConfig                         | brax                                             |
-|-----------------------------------|--------------------------------------------------|
-| settings not listed below         | the same                                         |
-| value_cost                        | the same; passed doubled, as brax halves it      |
-| learning_rate, its limits, target_kl | the same; adapted by a factor of 1.5 (ours 1.1) |
-| decay_steps                       | none                                             |
-| advantages                        | recomputed by the current network for each minibatch |
-| resets                            | each environment always resets to its first state |
+| PPOConfig                            | brax                                                     |
+|--------------------------------------|----------------------------------------------------------|
+| settings not listed below            | the same                                                 |
+| compute_dtype                        | float32 (configs/default.yaml: bfloat16)                 |
+| min_noise_std                        | none (configs/default.yaml: 0.1)                         |
+| value_cost                           | the same; passed doubled, as brax halves it              |
+| learning_rate, its limits, target_kl | the same; adapted by a factor of 1.5 (ours 1.1)          |
+| final_max_learning_rate, decay_steps | none: max_learning_rate stays                            |
+| KL                                   | exact for two Gaussians (ours Schulman's estimate)       |
+| optimizer                            | Adam's epsilon is 1e-8 (ours 1e-5)                       |
+| minibatches                          | of whole rollouts (ours of single steps)                 |
+| advantages                           | anew by the current network in each minibatch            |
+| gae_lambda                           | not on the first of the later errors                     |
+| statistics                           | updated after the update (ours before)                   |
+| value at a time-out                  | none; the step's advantage is 0 (ours of the last state) |
+| start of the training                | all episodes together (ours at different times)          |
+| resets                               | each environment always resets to its first state        |
+| training_episode_seconds             | not used by any trainer here, but env.episode_seconds    |
+| shared_critic                        | refused                                                  |
 """
 
 import time
@@ -27,6 +39,7 @@ from trainers import OnBlock, TrainingEnded, block_iterations
 from bounce_mjx.adapters.brax import device_put_replicated
 from bounce_mjx.adapters.brax.ppo import ppo_settings
 from bounce_mjx.env.bounce_ball import BounceBall
+from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import NetworkFunctions, Policy, make_networks
 from bounce_mjx.learning.statistics import MIN_VARIANCE, Normalizer, normalize
@@ -44,7 +57,9 @@ class CriticObservation(Wrapper):
         return self._observe(self.env.reset(rng))
 
     def step(self, state: State, action: jax.Array) -> State:
-        return self._observe(self.env.step(state.replace(obs=state.obs["state"]), action))
+        # The environment knows one array.
+        inner = state.replace(obs=state.obs["state"])
+        return self._observe(self.env.step(inner, action))
 
     def _observe(self, state: State) -> State:
         extra = [state.metrics[name][None] for name in self._names]
@@ -68,9 +83,10 @@ def train(physics: Literal["auto", "mjx"], config: TrainConfig, on_block: OnBloc
     def on_params(steps: int, _, params) -> None:
         nonlocal started
         seconds = time.perf_counter() - started
+        # brax also calls it before the first step.
         if steps:
-            statistics = params[0]
-            policy = Policy(_normalizer(statistics, "state"), params[1])
+            statistics, policy_params, _ = params
+            policy = Policy(_normalizer(statistics, "state"), policy_params)
             if on_block(steps, seconds, policy):
                 raise TrainingEnded
         started = time.perf_counter()
@@ -97,7 +113,13 @@ def train(physics: Literal["auto", "mjx"], config: TrainConfig, on_block: OnBloc
 
 
 def brax_networks(config: PPOConfig, observation_size: int, action_size: int) -> PPONetworks:
-    """This project's networks, with its normalisation, for brax's trainer."""
+    """This project's networks, with its normalisation, for brax's trainer.
+
+    Raises:
+      UserError: the config has a shared critic, which brax's networks lack.
+    """
+    if config.shared_critic:
+        raise UserError("brax's networks share no layers; leave --shared-critic out")
     networks = make_networks(config, observation_size, action_size, len(config.critic_metrics))
 
     def adapt(network: NetworkFunctions, key: str) -> FeedForwardNetwork:

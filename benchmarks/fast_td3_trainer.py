@@ -7,10 +7,11 @@ checkpoints is evaluated. The settings are theirs for Playground's LeapCubeReori
 object too (1,024 environments, batches of 32,768, two updates a step, returns over three steps),
 except for these:
 
-| setting              | value                                                              |
-|----------------------|--------------------------------------------------------------------|
-| reward_normalization | on, as in their settings for MTBench, to fit the critic's range       |
-| logs, videos         | none                                                               |
+| setting               | value                                                         |
+|-----------------------|---------------------------------------------------------------|
+| reward_normalization  | on, as in their settings for MTBench, to fit the critic's range |
+| start of the training | the episodes begin at different times, not all together       |
+| logs, videos          | none                                                          |
 """
 
 import contextlib
@@ -23,7 +24,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import torch
-from trainers import OnBlock, TrainingEnded
+from trainers import OnBlock, TrainingEnded, use_source
 
 from bounce_mjx.adapters.torch import TorchVectorEnv
 from bounce_mjx.env.bounce_ball import BounceBall
@@ -39,7 +40,8 @@ class PlaygroundEnv:
 
     def __init__(self, env: TorchVectorEnv):
         self._env = env
-        self.num_envs, self.num_actions = env.num_envs, env.num_actions
+        self.num_envs = env.num_envs
+        self.num_actions = env.num_actions
         self.num_obs = env.num_observations
         self.num_privileged_obs = env.num_observations + len(env.critic_metrics)
         self.max_episode_steps = env.episode_steps
@@ -48,7 +50,7 @@ class PlaygroundEnv:
 
     def reset_with_critic_obs(self) -> tuple[torch.Tensor, torch.Tensor]:
         observation, critic_metrics = self._env.reset()
-        # The script starts all episodes together; their time-outs are spread, as for all trainers.
+        # The script starts all episodes together; their time-outs are spread, as in our trainer.
         self._env.clock = torch.randint_like(self._env.clock, self.max_episode_steps)
         return observation, torch.cat([observation, critic_metrics], -1)
 
@@ -95,7 +97,8 @@ def train(config: TrainConfig, on_block: OnBlock, **settings: Any) -> None:
     Args:
       settings: settings of the script in place of those above.
     """
-    sys.path.insert(0, str(SOURCE))
+    use_source(SOURCE)
+    # The script imports it even without `use_wandb`.
     sys.modules.setdefault("wandb", types.ModuleType("wandb"))
     playground = types.ModuleType("environments.mujoco_playground_env")
     sys.modules["environments.mujoco_playground_env"] = playground
@@ -118,8 +121,8 @@ def train(config: TrainConfig, on_block: OnBlock, **settings: Any) -> None:
     args.save_interval = max(1, round(config.eval_every / args.num_envs))
     env = PlaygroundEnv(TorchVectorEnv(BounceBall(config.env), args.num_envs, seed=config.seed))
     untrained = Actor(env.num_obs, env.num_actions, 1, args.init_scale, args.actor_hidden_dim)
-    normalizer = EmpiricalNormalization(env.num_obs, "cpu")
-    on_block.prepare(MeanActor(), policy_of(untrained, normalizer))
+    fresh_normalizer = EmpiricalNormalization(env.num_obs, "cpu")
+    on_block.prepare(MeanActor(), policy_of(untrained, fresh_normalizer))
     started = 0.0
 
     def make_env(*_, **__) -> tuple[PlaygroundEnv, None, None]:

@@ -3,6 +3,7 @@
 python benchmarks/figures.py
 
 A table stands in a page after a line <!-- figures: NAME -->, and ends before the next empty line.
+A figure that no table names is in no page.
 """
 
 import math
@@ -16,11 +17,17 @@ import yaml
 CHECKOUT = Path(__file__).resolve().parent.parent
 PAGES = [CHECKOUT / "README.md", CHECKOUT / "benchmarks/RESULTS.md", *CHECKOUT.glob("docs/*.md")]
 COLUMNS = {
-    name if name != "value" else "figure": name
-    for name in ("claim", "value", "target", "command", "device", "date", "commit")
+    "claim": "claim",
+    "figure": "value",
+    "target": "target",
+    "command": "command",
+    "device": "device",
+    "date": "date",
+    "commit": "commit",
 }
-_NUMBER = r"\d[\d,]*(?:\.\d+)?(?:e-?\d+)?"
-_RANGE = re.compile(rf"({_NUMBER})(?: to ({_NUMBER}))?")
+"""The keys of a figure by the titles of their columns, where a table says no others."""
+_NUMBER = r"-?\d[\d,]*(?:\.\d+)?(?:e-?\d+)?"
+_NUMBERS = re.compile(rf"({_NUMBER})%?(?: (?:to|and) ({_NUMBER}))?")
 TABLE = re.compile(r"(<!-- figures: (\w+) -->\n)(?:.+\n)*")
 
 
@@ -35,19 +42,31 @@ def tables() -> dict[str, str]:
 
 
 def drawn(text: str, known: dict[str, str]) -> str:
-    """A page's text with its tables as they are in figures.yaml."""
+    """A page's text with its tables as they are in figures.yaml.
+
+    Raises:
+      KeyError: figures.yaml has no table of that name.
+    """
     return TABLE.sub(lambda found: found[1] + known[found[2]], text)
 
 
 def verdict(target: str, measured: str) -> str:
-    """Whether a figure, by the worst of its numbers, reaches a target: see figures.yaml."""
-    is_upper, is_lower = target.startswith("at most "), target.startswith("at least ")
+    """Whether a figure, by the worst of its numbers, reaches a target: see figures.yaml.
+
+    Raises:
+      ValueError: the target is a number, and the figure does not begin with one.
+    """
+    is_upper = target.startswith("at most ")
+    is_lower = target.startswith("at least ")
     bounds = _numbers(target.removeprefix("at most ").removeprefix("at least "))
     if not bounds:
         return "reached" if measured == target else "missed"
+    numbers = _numbers(measured)
+    if not numbers:
+        raise ValueError(f"{measured!r} begins with no number, for {target!r}; add `measured`")
     low = -math.inf if is_upper else bounds[0]
     high = math.inf if is_lower else bounds[-1]
-    is_reached = all(low <= number <= high for number in _numbers(measured))
+    is_reached = all(low <= number <= high for number in numbers)
     return "reached" if is_reached else "missed"
 
 
@@ -55,7 +74,8 @@ def _judged_target(figure: dict[str, Any]) -> dict[str, str]:
     """The target with its verdict and its note, where there is one."""
     if "target" not in figure:
         return {}
-    measured = figure.get("measured", figure.get(figure.get("judged", "value")))
+    judged = figure.get("judged", "value")
+    measured = figure["measured"] if "measured" in figure else figure[judged]
     note = f": {figure['note']}" if "note" in figure else ""
     return {"target": f"{figure['target']}, {verdict(figure['target'], str(measured))}{note}"}
 
@@ -69,19 +89,19 @@ def _judged_shares(figure: dict[str, Any], criteria: dict[str, float]) -> dict[s
 
 
 def _numbers(text: str) -> list[float]:
-    """The number with which a text begins, or both of a range; none of another text."""
-    found = _RANGE.match(text)
+    """The number with which a text begins, or both of a range or of two; none of another text."""
+    found = _NUMBERS.match(text)
     numbers = found.groups() if found else ()
     return [float(number.replace(",", "")) for number in numbers if number is not None]
 
 
-def _table(table: str | dict[str, Any], figures: dict[str, dict[str, Any]]) -> str:
-    if isinstance(table, str):
+def _table(source: str | dict[str, Any], figures: dict[str, dict[str, Any]]) -> str:
+    if isinstance(source, str):
         named = {name: SimpleNamespace(**figure) for name, figure in figures.items()}
-        return table.format_map(named)
-    columns = table.get("columns", COLUMNS)
+        return source.format_map(named)
+    columns = source.get("columns", COLUMNS)
     rows = [
-        [str(figures[name].get(key, "")) for key in columns.values()] for name in table["figures"]
+        [str(figures[name].get(key, "")) for key in columns.values()] for name in source["figures"]
     ]
     head = [name.strip() for name in columns]
     lines = ["| " + " | ".join(row) + " |\n" for row in [head, *rows]]
@@ -89,10 +109,11 @@ def _table(table: str | dict[str, Any], figures: dict[str, dict[str, Any]]) -> s
 
 
 def main() -> None:
-    """Writes the pages."""
+    """Writes the pages, all or none."""
     known = tables()
-    for page in PAGES:
-        page.write_text(drawn(page.read_text(encoding="utf-8"), known), encoding="utf-8")
+    texts = [drawn(page.read_text(encoding="utf-8"), known) for page in PAGES]
+    for page, text in zip(PAGES, texts, strict=True):
+        page.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -2,16 +2,16 @@
 
     git clone https://github.com/Holiday-Robot/FlashSAC benchmarks/sources/FlashSAC
 
-Their `train.py` runs as it is, with `TorchVectorEnv` in place of MuJoCo Playground, and each of its
-evaluations is ours. The settings are those of their `scripts/run_mujoco_playground.sh` (1,024
-environments, batches of 2,048, two updates a step, a critic that sees more than the policy), except
-for `compile_mode`: theirs for today's PyTorch, max-autotune, was still compiling after 355 s on an
-H100. The script needs the packages hydra-core and gymnasium.
+Their `train.py` runs as it is, with `TorchVectorEnv` in place of MuJoCo Playground, and ours in
+place of each of its evaluations. The settings are those of their `scripts/run_mujoco_playground.sh`
+(1,024 environments, batches of 2,048, two updates a step, a critic that sees more than the policy),
+except for `compile_mode`: theirs for today's PyTorch, max-autotune, was still compiling after 355 s
+on an H100; and the episodes begin at different times, so that not all time out together. The script
+needs the packages hydra-core and gymnasium.
 """
 
 import argparse
 import contextlib
-import sys
 import time
 import types
 from pathlib import Path
@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box
 from gymnasium.vector.utils import batch_space
-from trainers import OnBlock, TrainingEnded
+from trainers import OnBlock, TrainingEnded, use_source
 
 from bounce_mjx.adapters.torch import TorchVectorEnv
 from bounce_mjx.env.bounce_ball import BounceBall
@@ -62,7 +62,7 @@ class NumpyEnv:
 
     def reset(self) -> tuple[np.ndarray, dict[str, Any]]:
         observation, critic_metrics = self._env.reset()
-        # The script starts all episodes together; their time-outs are spread, as for all trainers.
+        # The script starts all episodes together; their time-outs are spread, as in our trainer.
         self._env.clock = torch.randint_like(self._env.clock, self._env.episode_steps)
         sizes = {"actor_observation_size": (self._env.num_observations,)}
         return _joined(observation, critic_metrics), sizes
@@ -101,7 +101,8 @@ class MeanActor:
 
 
 def _batch_norm(weights: dict[str, jax.Array], name: str, x: jax.Array) -> jax.Array:
-    mean, variance = weights[f"{name}.running_mean"], weights[f"{name}.running_var"]
+    mean = weights[f"{name}.running_mean"]
+    variance = weights[f"{name}.running_var"]
     x = (x - mean) * jax.lax.rsqrt(variance + 1e-5)
     return x * weights[f"{name}.weight"] + weights[f"{name}.bias"]
 
@@ -119,7 +120,7 @@ def train(config: TrainConfig, on_block: OnBlock, **overrides: Any) -> None:
     Args:
       overrides: of the script's config, besides those above.
     """
-    sys.path.insert(0, str(SOURCE))
+    use_source(SOURCE)
     import train as script
 
     env: NumpyEnv | None = None
@@ -128,6 +129,7 @@ def train(config: TrainConfig, on_block: OnBlock, **overrides: Any) -> None:
     def create_envs(num_train_envs: int, **_) -> tuple[NumpyEnv, NumpyEnv, NumpyEnv]:
         nonlocal env
         env = NumpyEnv(TorchVectorEnv(BounceBall(config.env), num_train_envs, seed=config.seed))
+        # Of the three, the script steps only the first: what uses the others is replaced below.
         return env, env, env
 
     def evaluate(agent: Any, *_) -> dict[str, float]:
@@ -143,7 +145,8 @@ def train(config: TrainConfig, on_block: OnBlock, **overrides: Any) -> None:
     nothing = types.SimpleNamespace(
         update_metric=lambda **_: None, log_metric=lambda **_: None, reset=lambda: None
     )
-    script.create_envs, script.evaluate = create_envs, evaluate
+    script.create_envs = create_envs
+    script.evaluate = evaluate
     script.record_video = lambda *_: {}
     script.create_logger = lambda _: nothing
     interval = max(1, round(config.eval_every / OVERRIDES["num_train_envs"]))

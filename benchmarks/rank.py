@@ -3,6 +3,8 @@
     python benchmarks/rank.py pretrained robust mirror
 
 A row is a policy, or the seeds of one training run: the mean over the seeds and its 95% interval.
+The default seed is that of `bounce-mjx eval`, and of the results with which a policy is shipped: to
+choose a policy by the table, give another one.
 """
 
 import functools
@@ -27,9 +29,11 @@ from bounce_mjx.evaluation.config import (
     DEFAULT_SEED,
     EvaluationOptions,
     Physics,
+    command_ranges,
     on_engine,
 )
 from bounce_mjx.evaluation.episodes import begin, reset_episodes, run_until
+from bounce_mjx.evaluation.results import episodes_of
 from bounce_mjx.evaluation.robustness import ConditionOutcome, measure_conditions
 from bounce_mjx.evaluation.suite import load_suite, neutral_commands
 from bounce_mjx.learning.policy import Actor, Policy
@@ -47,8 +51,10 @@ MOST_HITS = 10_000
 """Hits after which an episode without a time limit ends."""
 MOST_SECONDS = 20_000.0
 """Longest episode without a time limit, s; a ball that rests on the paddle is never lost."""
-HIT_EPISODES, TIMED_EPISODES = 16, 256
-"""Episodes without a time limit, and those of a task that counts no hits."""
+HIT_EPISODES = 16
+"""Episodes without a time limit, of a task that counts hits."""
+TIMED_EPISODES = 256
+"""Episodes of the usual length, of another task."""
 MIN_STABLE = 0.99
 """Share of the episodes that last within a policy's limits."""
 LIMITS = {"latency, ms": "action latency", "push, m/s": "push every 2 s"}
@@ -117,7 +123,8 @@ def measure(command: RankCommand, checkpoint: Checkpoint) -> Figures:
     limits = load_suite(Path(__file__).with_name("limits.yaml"), config.env)
     options = EvaluationOptions(command.episodes, command.seed, command.physics)
     outcomes = measure_conditions(policy, actor, [*suite, *limits], options)
-    in_suite, in_limits = outcomes[: len(suite)], outcomes[len(suite) :]
+    in_suite = outcomes[: len(suite)]
+    in_limits = outcomes[len(suite) :]
     return {
         "suite met": sum(outcome.passed for outcome in in_suite),
         "suite conditions": len(suite),
@@ -143,22 +150,29 @@ def measure_nominal(
     """The task's own figures in the nominal world, and the median of the hits of bouncing: in
     episodes without a time limit, else in episodes of the usual length."""
     env = Env(trained.model_copy(update={"randomization": RandomizationConfig()}))
-    acting, commands, hits = actor(env), neutral_commands(trained), isinstance(env.task, Bounce)
+    commands = neutral_commands(trained)
     ranges = {name: (jnp.array([low]), jnp.array([high])) for name, (low, high) in commands.items()}
-    episodes = HIT_EPISODES if hits else TIMED_EPISODES
-    limit = round(MOST_SECONDS / env.dt) if hits else env.config.episode_steps
-    states = jax.jit(lambda key: reset_episodes(env, key, episodes, ranges or None))
-    now = begin(env, states(jax.random.PRNGKey(seed)), recorded=0)
-    advance = jax.jit(functools.partial(run_until, env, acting))
-    for step in range(0, limit, env.config.episode_steps):
-        now = advance(policy, now, min(step + env.config.episode_steps, limit))
-        statistics = jax.tree.map(lambda x: jax.device_get(x).astype(float), now.statistics)
-        counted = np.minimum(statistics.tally.sums["hits"], MOST_HITS) if hits else np.inf
-        if not np.any(now.statistics.running & (counted < MOST_HITS)):
-            break
-    figures = {"hits": float(np.median(counted))} if hits else {}
-    tally, spans = statistics.tally, {n: (c.low, c.high) for n, c in env.config.commands.items()}
-    episodes = Episodes(tally.sums, tally.maxima, statistics.running, spans | commands)
+    counts_hits = isinstance(env.task, Bounce)
+    num_episodes = HIT_EPISODES if counts_hits else TIMED_EPISODES
+    reset = jax.jit(lambda key: reset_episodes(env, key, num_episodes, ranges or None))
+    now = begin(env, reset(jax.random.PRNGKey(seed)), recorded=0)
+    advance = jax.jit(functools.partial(run_until, env, actor(env)))
+    figures: Figures = {}
+    if counts_hits:
+        limit = round(MOST_SECONDS / env.dt)
+        step = 0
+        are_going_on = True
+        while step < limit and are_going_on:
+            step = min(step + env.config.episode_steps, limit)
+            now = advance(policy, now, step)
+            statistics = jax.device_get(now.statistics)
+            hits = np.minimum(statistics.tally.sums["hits"].astype(float), MOST_HITS)
+            are_going_on = np.any(statistics.running & (hits < MOST_HITS))
+        figures["hits"] = float(np.median(hits))
+    else:
+        now = advance(policy, now, env.config.episode_steps)
+        statistics = jax.device_get(now.statistics)
+    episodes = episodes_of(statistics, command_ranges(env.config) | commands)
     return figures | own_figures(env.task, episodes)
 
 
@@ -170,7 +184,8 @@ def own_figures(task: Task, episodes: Episodes) -> Figures:
         return {"moving point, cm": fast}
     if not isinstance(task, Bounce):
         return {}
-    sums, bounces = episodes.sums, episodes.sums["settled_bounces"]
+    sums = episodes.sums
+    bounces = sums["settled_bounces"]
     square, _ = mean_and_margin(sums["apex_error^2"], bounces)
     bias, _ = mean_and_margin(sums["apex_offset"], bounces)
     if square is None:

@@ -1,17 +1,23 @@
 """rsl_rl's PPO for `jax_vs_torch.py`, with this project's hyperparameters, networks and
 normalisation.
 
-| PPOConfig               | rsl_rl                                                              |
-|-------------------------|---------------------------------------------------------------------|
-| settings not listed below | the same                                                          |
-| learning_rate           | the same start; steered by a factor of 1.5 (here 1.1)               |
-| limits of the rate, decay_steps | 1e-5 to 1e-2, no decay: fixed in rsl_rl                     |
-| min_noise_std           | none                                                                |
-| max_grad_norm           | for the actor and the critic separately (here together)             |
-| KL                      | exact for two Gaussians (here Schulman's estimate)                  |
-| minibatches             | shuffled once per iteration (here once per epoch)                   |
-| statistics              | grow step by step (here by rollouts)                                |
-| value at a time-out     | of the state before it (here of the last state)                     |
+| PPOConfig                            | rsl_rl                                                  |
+|--------------------------------------|---------------------------------------------------------|
+| settings not listed below            | the same                                                |
+| compute_dtype                        | float32 (configs/default.yaml: bfloat16)                |
+| min_noise_std                        | none (configs/default.yaml: 0.1)                        |
+| learning_rate                        | the same start; steered by a factor of 1.5 (here 1.1)   |
+| min_learning_rate, max_learning_rate | 1e-5 and 1e-2: fixed in rsl_rl                          |
+| final_max_learning_rate, decay_steps | none                                                    |
+| max_grad_norm                        | for the actor and the critic separately (here together) |
+| KL                                   | exact for two Gaussians (here Schulman's estimate)      |
+| optimizer                            | Adam's epsilon is 1e-8 (here 1e-5)                      |
+| minibatches                          | shuffled once per iteration (here once per epoch)       |
+| statistics                           | updated after the update (here before)                  |
+| value at a time-out                  | of the state before it (here of the last state)         |
+| training_episode_seconds             | not used by any trainer here, but env.episode_seconds   |
+| activation                           | SiLU; others are refused                                |
+| critic_layers, shared_critic         | the policy's hidden_layers, none; others are refused    |
 """
 
 from typing import Any
@@ -64,6 +70,7 @@ class Network(MLPModel):
     """rsl_rl's model with this project's normalisation and initial weights."""
 
     def __init__(self, *args: Any, **kwargs: Any):
+        # Otherwise it would make a normaliser of its own.
         super().__init__(*args, obs_normalization=False, **kwargs)
         self.obs_normalization = True
         self.obs_normalizer = InputNormalizer(self.obs_dim)

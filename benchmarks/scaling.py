@@ -5,7 +5,8 @@
 
 Each program trains the same environments per seed on all its devices together, so that the global
 batch is equal. The programs take turns: a turn is one compiled block of each, and the table has the
-median of the blocks and of each turn's ratio to the first program with the same environments.
+median of the blocks and of each turn's ratio to the first program with the same environments, in
+the order of the flags' values.
 `--profile` also says, from one more block of each program, how long a device computes, exchanges,
 and waits.
 """
@@ -78,7 +79,7 @@ def configs(command: Command) -> list[TrainConfig]:
 
 
 def programs(configs: list[TrainConfig]) -> list[Callable[[], object]]:
-    """Compiles each training and runs its first block; each function runs one more block."""
+    """Compiles each training and runs its first block; each function runs one more block of it."""
     trainers = [PPOTrainer(config, Env(config.env)) for config in configs]
     with concurrent.futures.ThreadPoolExecutor() as pool:
         for trainer in trainers:
@@ -104,8 +105,6 @@ def profile(block: Callable[[], object]) -> dict[str, float]:
             seconds = seconds_of(block)
         (file,) = Path(folder).rglob("*.xplane.pb")
         plane = ProfileData.from_file(str(file)).find_plane_with_name("/device:GPU:0")
-        if plane is None:
-            raise UserError(f"--profile needs a GPU, but JAX runs on {device_name()}; leave it out")
         kernels = [
             ("nccl" in event.name.lower(), event.start_ns, event.start_ns + event.duration_ns)
             for line in plane.lines
@@ -123,7 +122,8 @@ def profile(block: Callable[[], object]) -> dict[str, float]:
 
 def covered(intervals: Iterable[tuple[float, float]]) -> float:
     """Length of the union of intervals."""
-    total, reached = 0.0, -float("inf")
+    total = 0.0
+    reached = -float("inf")
     for start, end in sorted(intervals):
         total += max(0.0, end - max(start, reached))
         reached = max(reached, end)
@@ -131,27 +131,37 @@ def covered(intervals: Iterable[tuple[float, float]]) -> float:
 
 
 def measure(command: Command) -> list[dict]:
-    """The blocks of every program, alternating."""
+    """The blocks of every program, alternating.
+
+    Raises:
+      UserError: there is no GPU to profile.
+    """
+    if command.profile and jax.default_backend() != "gpu":
+        raise UserError(f"--profile needs a GPU, but JAX runs on {device_name()}; leave it out")
     measured = configs(command)
     blocks = programs(measured)
     turns = [[seconds_of(block) for block in blocks] for _ in range(command.turns)]
-    records, first = [], {}
+    records = []
+    # The speeds of the first program with each number of environments.
+    reference: dict[int, list[float]] = {}
     for config, block, seconds in zip(measured, blocks, zip(*turns, strict=True), strict=True):
+        num_envs = config.ppo.num_envs
         speeds = [steps_of(config) / s for s in seconds]
-        reference = first.setdefault(config.ppo.num_envs, speeds)
-        ratios = [own / other for own, other in zip(speeds, reference, strict=True)]
-        records.append(
-            {
-                "num_seeds": config.num_seeds,
-                "num_devices": config.num_devices,
-                "num_envs": config.ppo.num_envs,
-                "seconds": seconds,
-                "steps_per_second": statistics.median(speeds),
-                "ratio": statistics.median(ratios),
-                "ratios": ratios,
-            }
-            | (profile(block) if command.profile else {})
-        )
+        if num_envs not in reference:
+            reference[num_envs] = speeds
+        ratios = [speed / other for speed, other in zip(speeds, reference[num_envs], strict=True)]
+        record = {
+            "num_seeds": config.num_seeds,
+            "num_devices": config.num_devices,
+            "num_envs": num_envs,
+            "seconds": seconds,
+            "steps_per_second": statistics.median(speeds),
+            "ratio": statistics.median(ratios),
+            "ratios": ratios,
+        }
+        if command.profile:
+            record |= profile(block)
+        records.append(record)
     return records
 
 

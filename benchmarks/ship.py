@@ -1,7 +1,9 @@
 """Makes a policy that comes with the package from a run, for maintainers:
-`python benchmarks/ship.py RUN --name NAME`."""
+`python benchmarks/ship.py RUN --name NAME`.
 
-import shutil
+A policy that misses a result is refused, on the episodes that its results.json reports. Do not try
+runs until one passes: choose the run by other seeds first (`bounce-mjx eval RUN --seed SEED`)."""
+
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -19,7 +21,7 @@ from bounce_mjx.evaluation.config import DEFAULT_SEED, EvaluationOptions
 from bounce_mjx.evaluation.policy_evaluation import PolicyEvaluation, evaluate_policy
 from bounce_mjx.learning.policy import networks_of
 from bounce_mjx.reports.tables import details_line, results_table
-from bounce_mjx.resources import ARM_POLICIES, POLICIES, PRETRAINED
+from bounce_mjx.resources import ARM_POLICIES, POLICIES, PRETRAINED, resource_path
 from bounce_mjx.runs.checkpoints import (
     NETWORKS,
     POLICY,
@@ -30,6 +32,7 @@ from bounce_mjx.runs.checkpoints import (
 from bounce_mjx.runs.config import CONFIG_FILE, ROBOT, TrainConfig, load_run_config, runs_folder
 from bounce_mjx.runs.files import MANIFEST_FILE, to_json, write_atomically
 from bounce_mjx.runs.folders import (
+    CHECKPOINTS,
     Checkpoint,
     best_checkpoint,
     copy_robot,
@@ -64,7 +67,7 @@ def main(args: Sequence[str] | None = None) -> None:
             description="Makes a policy that comes with the package from a run.",
         )
         set_up_jax()
-        out = command.out or Path(POLICIES[command.name])
+        out = command.out or resource_path(POLICIES[command.name])
         ship(command.run, out, Console(), command.name, command.networks)
 
 
@@ -140,8 +143,10 @@ def write_policy(
       UserError: the folder cannot be written.
     """
     report = evaluation.report
-    policy = read_policy(checkpoint, trained_with)
-    start = read_networks(checkpoint, trained_with)[:2] if networks else None
+    items = {POLICY: read_policy(checkpoint, trained_with)}
+    if networks:
+        params, statistics, _ = read_networks(checkpoint, trained_with)
+        items[NETWORKS] = {"params": params, "statistics": statistics}
     made_by = load_results(checkpoint.run)
     # The location of the run's folder is not part of the result.
     config = trained_with.model_copy(update={"log_dir": runs_folder(trained_with.env.task)})
@@ -164,26 +169,32 @@ def write_policy(
             made = Path(scratch) / name
             made.mkdir()
             write_config(made, config)
-            items = {POLICY: policy}
-            if networks:
-                items[NETWORKS] = dict(zip(("params", "statistics"), start, strict=True))
             save_checkpoint(made, config, checkpoint.steps, items, report=report)
             write_atomically(made / RESULTS_FILE, to_json(results))
             onnx_file = export_onnx(best_checkpoint(made))
             (made / f"{name}.onnx").write_bytes(onnx_file)
-            for other in _policies_inside(out):
-                other.rename(made / other.name)
-            shutil.rmtree(out, ignore_errors=True)
-            made.rename(out)
+            replaced = Path(scratch) / "replaced"
+            replaced.mkdir()
+            replace_policy(out, made, replaced)
     except OSError as error:
         raise UserError(
             f"--out {out} cannot be written ({error.strerror}); give another folder"
         ) from error
 
 
-def _policies_inside(out: Path) -> list[Path]:
-    """Folders of other policies in the folder of a policy."""
-    return [path.parent for path in out.glob(f"*/{CONFIG_FILE}")]
+def replace_policy(out: Path, made: Path, replaced: Path) -> None:
+    """Moves a policy from `out` to `replaced`, and another from `made` to `out`. Other folders in
+    `out`, which are those of other policies, are not touched.
+
+    Raises:
+      OSError: a file cannot be moved.
+    """
+    out.mkdir(exist_ok=True)
+    for path in list(out.iterdir()):
+        if path.is_file() or path.name in (CHECKPOINTS, ROBOT):
+            path.rename(replaced / path.name)
+    for path in list(made.iterdir()):
+        path.rename(out / path.name)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,18 @@
 """skrl's PPO for `jax_vs_torch.py`, with this project's hyperparameters, networks and
 normalisation.
 
-| PPOConfig               | skrl                                                                |
-|-------------------------|---------------------------------------------------------------------|
-| settings not listed below | the same                                                          |
-| target_kl               | adapts once per epoch by 1.5 (here once per minibatch by 1.1)       |
-| min_noise_std           | none                                                                |
-| advantages              | normalised over the whole rollout (here in each minibatch)          |
-| statistics              | updated in the first epoch                                          |
+| PPOConfig                    | skrl                                                          |
+|------------------------------|---------------------------------------------------------------|
+| settings not listed below    | the same                                                      |
+| compute_dtype                | float32 (configs/default.yaml: bfloat16)                      |
+| min_noise_std                | none (configs/default.yaml: 0.1)                              |
+| target_kl                    | adapts once per epoch by 1.5 (here once per minibatch by 1.1) |
+| optimizer                    | Adam's epsilon is 1e-8 (here 1e-5)                            |
+| advantages                   | normalised over the whole rollout (here in each minibatch)    |
+| statistics                   | updated during the first epoch (here before the update)       |
+| training_episode_seconds     | not used by any trainer here, but env.episode_seconds         |
+| activation                   | SiLU; others are refused                                      |
+| critic_layers, shared_critic | the policy's hidden_layers, none; others are refused          |
 """
 
 from typing import Any
@@ -70,7 +75,8 @@ class SkrlLearner:
 
     def policy(self) -> Policy:
         """The current policy, without action noise."""
-        actor, seen = self.agent.policy, self.agent.checkpoint_modules["observation_preprocessor"]
+        actor = self.agent.policy
+        seen = self.agent.checkpoint_modules["observation_preprocessor"]
         return to_policy(actor.mlp, seen.mean, seen.std, actor.log_std).policy
 
     def _step(self) -> None:

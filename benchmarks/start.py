@@ -4,15 +4,21 @@
 
 A cold start has an empty compilation cache; each second start uses the cache of the cold start
 before it. Each is a process of `bounce-mjx train --stop-when-solved`, as a user starts it, with
-the flags that follow `--`. "results" is the end of the first evaluation that meets all five; the
-training, and its phases, continue until they have a margin. (Code without a margin ended there, and
-its "results" include the final evaluation.) The benchmark also times `import bounce_mjx`, the
-import of the environment, and `--help`. Python keeps its bytecode, as it does by default: the
-benchmark unsets PYTHONDONTWRITEBYTECODE, and imports the modules of a training run once before.
+the flags that follow `--`.
+
+The phases setup to save are the training's own. "import" is the rest of the time until it prints
+them: Python, the imports, the config, and the end of the last save. So these six add up to that
+moment; "total" also has the end of the process. "tracing", "lowering" and "xla" overlap the phases
+and each other: at least one such event was in progress, in any thread.
+
+"results" is the end of the first evaluation that meets all five; the training, and its phases,
+continue until they have a margin. (Code without a margin ended there, and its "results" include the
+final evaluation.) The benchmark also times `import bounce_mjx`, the import of the environment, and
+`--help`. Python keeps its bytecode, as it does by default: the benchmark unsets
+PYTHONDONTWRITEBYTECODE, and imports the modules of a training run once before.
 """
 
 import json
-import math
 import os
 import subprocess
 import sys
@@ -45,8 +51,7 @@ QUICK = {
     "bounce-mjx train --help": ["-m", "bounce_mjx", "train", "--help"],
     "bounce-mjx plot --help": ["-m", "bounce_mjx", "plot", "--help"],
 }
-
-
+# Imported once before, so that Python has their bytecode.
 MODULES = (
     "bounce_mjx.commands.train",
     "bounce_mjx.training.job",
@@ -83,30 +88,38 @@ def start_once(seed: int, cache: Path, extra: Sequence[str]) -> dict:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         flags = ["--seed", str(seed), "--stop-when-solved", "--log-dir", str(folder / "runs")]
+        environment = os.environ | {
+            "JAX_COMPILATION_CACHE_DIR": str(cache),
+            "PYTHONUNBUFFERED": "1",
+            "TIMED_TRAIN_EVENTS": str(folder / "events.json"),
+        }
         started = time.time()
         process = subprocess.Popen(
-            [sys.executable, "-u", TIMED, *flags, *extra],
-            env=os.environ
-            | {
-                "JAX_COMPILATION_CACHE_DIR": str(cache),
-                "PYTHONUNBUFFERED": "1",
-                "TIMED_TRAIN_EVENTS": str(folder / "events.json"),
-            },
+            [sys.executable, TIMED, *flags, *extra],
+            env=environment,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
         )
-        printed, lines = {}, []
-        for line in process.stdout:
-            printed[line.split(":")[0]] = time.time() - started
-            lines.append(line)
-        if process.wait():
+        printed = {}
+        lines = []
+        with process:
+            try:
+                for line in process.stdout:
+                    printed[line.split(":")[0]] = time.time() - started
+                    lines.append(line)
+            except BaseException:
+                # Otherwise it would go on training in a folder that is deleted.
+                process.kill()
+                raise
+        if process.returncode:
             raise UserError(f"the training with seed {seed} failed: {''.join(lines)[-500:]}")
         total = time.time() - started
         run = next((folder / "runs").iterdir())
         results = json.loads((run / "results.json").read_text(encoding="utf-8"))
         events = json.loads((folder / "events.json").read_text(encoding="utf-8"))
-    seconds, solved = results["seconds"], results["solved_seconds"]
+    seconds = results["seconds"]
+    solved = results["solved_seconds"]
     imports = printed["time"] - sum(seconds.values())
     return {
         "seed": seed,
@@ -114,7 +127,7 @@ def start_once(seed: int, cache: Path, extra: Sequence[str]) -> dict:
         "solved_steps": results["solved_steps"],
         "import": imports,
         **{phase: seconds[phase] for phase in PHASES},
-        "results": math.nan if solved is None else imports + solved,
+        "results": None if solved is None else imports + solved,
         "total": total,
         "tracing": covered(events, TRACE),
         "lowering": covered(events, LOWER),
@@ -127,7 +140,8 @@ def start_once(seed: int, cache: Path, extra: Sequence[str]) -> dict:
 def covered(events: Sequence[Sequence], name: str) -> float:
     """Time in which at least one event of this name was in progress, s."""
     spans = sorted((end - duration, end) for event, end, duration in events if event == name)
-    total, until = 0.0, 0.0
+    total = 0.0
+    until = 0.0
     for start, end in spans:
         total += max(0.0, end - max(start, until))
         until = max(until, end)
@@ -147,7 +161,7 @@ def table(records: Sequence[dict], quick: dict[str, float]) -> str:
             str(r["seed"]),
             r["start"],
             "-" if r["solved_steps"] is None else f"{r['solved_steps'] / 1e6:.2f}",
-            *[f"{r[column]:.1f}" for column in columns],
+            *["-" if r[column] is None else f"{r[column]:.1f}" for column in columns],
             str(r["compiled"]),
             str(r["read"]),
         ]
@@ -163,23 +177,29 @@ def main() -> None:
     """Runs the command line."""
     with exit_on_user_error():
         args = sys.argv[1:]
-        own, extra = args, []
-        if "--" in args:
-            own, extra = args[: args.index("--")], args[args.index("--") + 1 :]
+        end = args.index("--") if "--" in args else len(args)
+        own = args[:end]
+        extra = args[end + 1 :]
         description = (__doc__ or "").split("\n")[0]
         command = parse(Command, own, prog="benchmarks/start.py", description=description)
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
         subprocess.run([sys.executable, "-c", f"import {', '.join(MODULES)}"], check=True)
         quick = {name: quick_seconds(words, command.repetitions) for name, words in QUICK.items()}
         records = []
-        for seed in command.seeds:
-            with tempfile.TemporaryDirectory() as cache:
-                for start in ("cold", "second"):
-                    records.append({"start": start} | start_once(seed, Path(cache), extra))
-                    print({k: v for k, v in records[-1].items() if k != "seed"}, flush=True)
-        device = device_name()
-        text = f"Device: {device}\n\n{table(records, quick)}"
-        write(command.out, "start", {"device": device, "starts": records, "quick": quick}, text)
+        try:
+            for seed in command.seeds:
+                with tempfile.TemporaryDirectory() as cache:
+                    for start in ("cold", "second"):
+                        times = {"start": start} | start_once(seed, Path(cache), extra)
+                        records.append(times)
+                        print(times, flush=True)
+        finally:
+            # Also where a later start failed.
+            if records:
+                device = device_name()
+                record = {"device": device, "starts": records, "quick": quick}
+                text = f"Device: {device}\n\n{table(records, quick)}"
+                write(command.out, "start", record, text)
 
 
 if __name__ == "__main__":

@@ -5,8 +5,11 @@
 A trial's value is the share of results met over all evaluations and seeds. It rewards both early
 learning and lasting success. The storage file holds the study. The same command continues an
 interrupted search and repeats its interrupted trials, so run only one process at a time. Needs
-optuna (the extra `sweep`). Evaluations use the training's evaluation seed, never the seed of
-`bounce-mjx eval`.
+optuna (the extra `sweep`).
+
+Evaluations use the training's evaluation seed, and never the seed of `bounce-mjx eval`. The best
+trials are chosen on the very episodes of their figures, which are therefore too good: train with
+their settings and other seeds.
 """
 
 import sys
@@ -23,6 +26,7 @@ from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.evaluation.config import DEFAULT_SEED
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import Report, judge
 from bounce_mjx.learning.config import PPOConfig
@@ -93,9 +97,7 @@ def search(command: Command, base: TrainConfig) -> "optuna.Study":
     if not study.trials:
         # The search starts from the preset.
         study.enqueue_trial({name: getattr(base.ppo, name) for name in SPACE})
-    for interrupted in study.get_trials(states=(optuna.trial.TrialState.RUNNING,)):
-        study.tell(interrupted.number, state=optuna.trial.TrialState.FAIL)
-        study.enqueue_trial(interrupted.params)
+    repeat_interrupted(study)
 
     def count(study: "optuna.Study", _) -> None:
         if len(study.get_trials(deepcopy=False, states=finished)) >= command.trials:
@@ -104,6 +106,17 @@ def search(command: Command, base: TrainConfig) -> "optuna.Study":
     if done < command.trials:
         study.optimize(lambda trial: run_trial(trial, command, base), callbacks=[count])
     return study
+
+
+def repeat_interrupted(study: "optuna.Study") -> None:
+    """Enqueues the trials again that a kill or Ctrl-C ended, each once."""
+    # A killed process leaves its trial as running.
+    for trial in study.get_trials(states=(optuna.trial.TrialState.RUNNING,)):
+        study.tell(trial.number, state=optuna.trial.TrialState.FAIL)
+    repeated = {trial.user_attrs.get("repeats") for trial in study.trials}
+    for trial in study.get_trials(states=(optuna.trial.TrialState.FAIL,)):
+        if trial.params and trial.number not in repeated:
+            study.enqueue_trial(trial.params, user_attrs={"repeats": trial.number})
 
 
 def run_trial(trial: "optuna.Trial", command: Command, base: TrainConfig) -> float:
@@ -115,7 +128,7 @@ def run_trial(trial: "optuna.Trial", command: Command, base: TrainConfig) -> flo
     chosen["decay_steps"] = round(chosen["decay_steps"])
     config = validate(PPOConfig, dict(base.ppo) | chosen, f"trial {trial.number}")
     env = BounceBall(base.env)
-    init, train = population(PPO(config, env, env.config.episode_steps))
+    init, train = population(PPO(config, env, base.training_episode_steps))
     networks = make_networks(config, env.observation_size, env.action_size)
     evaluate = jax.jit(jax.vmap(make_evaluator(env, networks, command.episodes), in_axes=(0, None)))
     iterations = max(1, round(base.eval_every / config.batch_steps))
@@ -124,7 +137,8 @@ def run_trial(trial: "optuna.Trial", command: Command, base: TrainConfig) -> flo
 
     state = jax.jit(init)(jax.vmap(jax.random.PRNGKey)(base.seed + np.arange(command.seeds)))
     eval_key = jax.random.PRNGKey(base.eval_seed)
-    met, steps = [], 0
+    met = []
+    steps = 0
     while steps < command.steps:
         state, _ = run(state)
         steps += iterations * config.batch_steps
@@ -175,8 +189,14 @@ def main() -> None:
                 "benchmarks/sweep.py needs optuna, which is not installed; run "
                 "pip install 'bounce_mjx[sweep]'"
             )
-        set_up_jax()
-        study = search(command, read_preset(command.config))
+        base = read_preset(command.config)
+        if base.eval_seed == DEFAULT_SEED:
+            raise UserError(
+                f"eval_seed is {DEFAULT_SEED}, the seed of bounce-mjx eval, on which nothing is to "
+                "be chosen; give another"
+            )
+        set_up_jax(base.env)
+        study = search(command, base)
         device = device_name()
         record = {
             "device": device,

@@ -18,7 +18,8 @@ events: list[tuple[str, float, float]] = []
 
 
 def listen(event: str, arguments: tuple) -> None:
-    """Listens to JAX's events from one of Python's own events on."""
+    """Listens to JAX's events from the import of that module on: its event comes once, before the
+    module is read."""
     if event != "import" or arguments[0] != AFTER_JAX:
         return
     import jax

@@ -44,22 +44,22 @@ def fit_with_toolbox(config: WorldConfig, log: Log, optimizer: Optimizer) -> dic
             params.add(sysid.Parameter(f"{term} {joint}", first, low, high))
     params.add(sysid.Parameter("delay", *_DELAY))
 
-    def world(values: sysid.ParameterDict) -> dict[str, np.ndarray]:
+    def terms_of(values: sysid.ParameterDict) -> dict[str, np.ndarray]:
         return {
             term: np.array([float(values[f"{term} {j}"].value[0]) for j in range(len(names))])
             for term in _OF_JOINTS
         }
 
-    def build(values: sysid.ParameterDict, spec: mujoco.MjSpec) -> mujoco.MjModel:
-        built = spec.compile()
-        servos = world(values)
-        stiffness = servos["servo_gain"] * model.actuator_gainprm[actuators, 0]
-        damping = servos["servo_damping"] * model.actuator_biasprm[actuators, 2]
+    def build(values: sysid.ParameterDict, arm: mujoco.MjSpec) -> mujoco.MjModel:
+        built = arm.compile()
+        terms = terms_of(values)
+        stiffness = terms["servo_gain"] * model.actuator_gainprm[actuators, 0]
+        damping = terms["servo_damping"] * model.actuator_biasprm[actuators, 2]
         built.actuator_gainprm[actuators, 0] = stiffness
-        built.actuator_biasprm[actuators, 0] = stiffness * servos["servo_offset"]
+        built.actuator_biasprm[actuators, 0] = stiffness * terms["servo_offset"]
         built.actuator_biasprm[actuators, 1] = -stiffness
         built.actuator_biasprm[actuators, 2] = damping
-        built.dof_frictionloss[list(addresses.arm_qvel)] = servos["joint_frictionloss"]
+        built.dof_frictionloss[list(addresses.arm_qvel)] = terms["joint_frictionloss"]
         return built
 
     transform = sysid.SignalTransform()
@@ -73,7 +73,7 @@ def fit_with_toolbox(config: WorldConfig, log: Log, optimizer: Optimizer) -> dic
     found, _ = sysid.optimize(params, residual, optimizer=optimizer, verbose=False, **options)
     # The toolbox stamps a sensor with the end of the step at whose start it was computed.
     delay = found["delay"].value[0] + config.physics_dt
-    return world(found) | {"action_latency": np.array(delay)}
+    return terms_of(found) | {"action_latency": np.array(delay)}
 
 
 def _arm_alone(config: WorldConfig, names: tuple[str, ...]) -> mujoco.MjSpec:
@@ -101,13 +101,16 @@ def _rollout(
     dt = model.opt.timestep
     start = log.times[0]
     count = int((log.times[-1] - start) / dt) + 1
-    # Targets are held between two control steps; the toolbox would interpolate them.
-    send = make_targets(log, start + dt * np.arange(count + 1))
+    # Targets are held between two control steps; the toolbox would interpolate them. There is one
+    # target between each two of these times.
+    targets_after = make_targets(log, start + dt * np.arange(count + 1))
     ctrl = np.zeros((count, model.nu))
-    ctrl[:, list(addresses.actuators)] = send(0.0, 0.0)
+    latency = 0.0
+    lag = 0.0
+    ctrl[:, list(addresses.actuators)] = targets_after(latency, lag)
     data = mujoco.MjData(model)
     data.qpos[list(addresses.arm_qpos)] = log.joint_angles[0]
-    counts = log.times - start > SETTLING
+    is_settled = log.times - start > SETTLING
     return sysid.ModelSequences(
         "arm",
         spec,
@@ -115,8 +118,8 @@ def _rollout(
         sysid.create_initial_state(model, data.qpos),
         sysid.TimeSeries.from_control_names(dt * np.arange(count), ctrl, model),
         sysid.TimeSeries.from_names(
-            log.times[counts] - start,
-            log.joint_angles[counts],
+            log.times[is_settled] - start,
+            log.joint_angles[is_settled],
             model,
             [f"{name}_angle" for name in names],
         ),

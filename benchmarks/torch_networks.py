@@ -8,12 +8,26 @@ from torch import nn
 
 from bounce_mjx.adapters.torch import TorchVectorEnv
 from bounce_mjx.env.env import Env
+from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.statistics import MAX_NORMALIZED, MIN_STD, MIN_VARIANCE
 
 
 def make_vector_env(config: PPOConfig, env: Env, seed: int) -> TorchVectorEnv:
-    """The environments of a learner."""
+    """The environments of a learner.
+
+    Raises:
+      UserError: the config has networks that the learners here do not make.
+    """
+    has_other_critic = config.shared_critic or config.critic_layers not in (
+        None,
+        config.hidden_layers,
+    )
+    if config.activation != "silu" or has_other_critic:
+        raise UserError(
+            "rsl_rl and skrl are compared with SiLU and a value network as large as the policy's; "
+            "leave --activation, --critic-layers and --shared-critic out"
+        )
     torch.manual_seed(seed)
     return TorchVectorEnv(
         env,

@@ -5,20 +5,24 @@ number of environment steps so far, the block's time in seconds, and the policy.
 
 The differences of the libraries' hyperparameters from ours are in the tables of
 `rsl_rl_learner.py`, `skrl_learner.py` and `brax_trainer.py`; `fast_td3_trainer.py` and
-`flash_sac_trainer.py` run their authors' scripts with their settings. A process imports only the
+`flash_sac_trainer.py` run their authors' scripts with their settings. All but brax spread the
+episodes' beginnings, and sample a new start at each reset. A process imports only the
 library that it measures.
 """
 
 import concurrent.futures
 import functools
+import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import jax
 import jax.numpy as jnp
 
 from bounce_mjx.env.bounce_ball import BounceBall
+from bounce_mjx.errors import UserError
 from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.learning.ppo import PPO, policy_of
 from bounce_mjx.runs.config import TrainConfig
@@ -35,7 +39,9 @@ class OnBlock(Protocol):
     """Callbacks of a trainer."""
 
     def prepare(self, actor: Actor | None = None, policy: Any = None) -> None:
-        """Called once before the first block, when it does not delay the trainer's own tracing.
+        """Called once before the first block: starts to compile the evaluation, in a thread. Ours
+        calls it after its own tracing; the tracing of brax, and the setup of the others, share
+        Python's lock with that of the evaluation.
 
         Args:
           actor: what acts with the policies of the blocks; None for this project's networks.
@@ -49,6 +55,7 @@ class OnBlock(Protocol):
 def train_ours(config: TrainConfig, on_block: OnBlock) -> None:
     """This project's trainer."""
     env = BounceBall(config.env)
+    # As the others, and unlike `bounce-mjx train`, it does not use `training_episode_seconds`.
     trainer = PPO(config.ppo, env, config.env.episode_steps)
     iterations = block_iterations(config)
     key = jax.random.PRNGKey(config.seed)
@@ -61,21 +68,23 @@ def train_ours(config: TrainConfig, on_block: OnBlock) -> None:
     )
     with concurrent.futures.ThreadPoolExecutor() as pool:
         shapes = jax.eval_shape(init, key)
-        compiled_run = pool.submit(run.lower(shapes, iterations).compile)
-        compiled_init = pool.submit(init.lower(key).compile)
+        lowered_run = run.lower(shapes, iterations)
+        compiled_run = pool.submit(lowered_run.compile)
+        lowered_init = init.lower(key)
+        compiled_init = pool.submit(lowered_init.compile)
         on_block.prepare()
         state = jax.block_until_ready(compiled_init.result()(key))
         run_block = compiled_run.result()
-    steps, ended = 0, False
+    steps = 0
+    ended = False
     while not ended:
         started = time.perf_counter()
         state, _ = jax.block_until_ready(run_block(state))
         seconds = time.perf_counter() - started
         steps += iterations * config.ppo.batch_steps
         # Copied because the next block reuses the state's memory.
-        ended = on_block(
-            steps, seconds, jax.tree.map(jnp.copy, policy_of(state, env.observation_size))
-        )
+        policy = jax.tree.map(jnp.copy, policy_of(state, env.observation_size))
+        ended = on_block(steps, seconds, policy)
 
 
 def train_rsl_rl(config: TrainConfig, on_block: OnBlock) -> None:
@@ -94,10 +103,21 @@ def train_skrl(config: TrainConfig, on_block: OnBlock) -> None:
     _train_learner(learner, config, on_block)
 
 
-def _train_learner(learner, config: TrainConfig, on_block: OnBlock) -> None:
+class Learner(Protocol):
+    """PPO of a PyTorch library."""
+
+    def learn(self) -> None:
+        """Trains for an iteration."""
+
+    def policy(self) -> Policy:
+        """The current policy, without action noise."""
+
+
+def _train_learner(learner: Learner, config: TrainConfig, on_block: OnBlock) -> None:
     on_block.prepare()
     iterations = block_iterations(config)
-    steps, ended = 0, False
+    steps = 0
+    ended = False
     while not ended:
         started = time.perf_counter()
         for _ in range(iterations):
@@ -128,6 +148,17 @@ def train_flash_sac(config: TrainConfig, on_block: OnBlock) -> None:
     import flash_sac_trainer
 
     flash_sac_trainer.train(config, on_block)
+
+
+def use_source(folder: Path) -> None:
+    """Makes the modules of a cloned repository importable.
+
+    Raises:
+      UserError: it was not cloned.
+    """
+    if not folder.is_dir():
+        raise UserError(f"{folder} is missing; clone it as the head of its trainer says")
+    sys.path.insert(0, str(folder))
 
 
 def block_iterations(config: TrainConfig) -> int:

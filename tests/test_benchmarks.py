@@ -2,6 +2,8 @@
 
 import importlib
 import re
+import subprocess
+import types
 from pathlib import Path
 
 import mujoco
@@ -10,9 +12,12 @@ import pytest
 
 from bounce_mjx import load_policy
 from bounce_mjx.env.env import Env
+from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.robustness import ConditionOutcome
+from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.resources import POLICIES, resource_path
 from bounce_mjx.runs.config import load_run_config
+from bounce_mjx.runs.settings import read_preset
 
 
 def script(name: str):
@@ -20,13 +25,16 @@ def script(name: str):
 
     @pytest.fixture(name=name)
     def module(monkeypatch):
-        monkeypatch.syspath_prepend(str(Path(__file__).parent.parent / "benchmarks"))
+        monkeypatch.syspath_prepend(str(BENCHMARKS))
         return importlib.import_module(name)
 
     return module
 
 
+BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
+PACKAGE = "src/bounce_mjx"
 endless, rank, simulators = map(script, ("endless", "rank", "simulators"))
+figures, jax_vs_torch, start, sweep = map(script, ("figures", "jax_vs_torch", "start", "sweep"))
 
 
 def outcome(name: str, strength: float, lasted: float) -> ConditionOutcome:
@@ -34,6 +42,128 @@ def outcome(name: str, strength: float, lasted: float) -> ConditionOutcome:
         perturbation=name, group="", unit="", strength=strength, trained=False, physics="fused",
         values={"stable": 100.0 * lasted}, failed=[], lasted=lasted, mean_length_s=1.0,
     )  # fmt: skip
+
+
+TRAINERS = {
+    "brax_trainer.py": ("learning/policy.py", "adapters/brax/ppo.py"),
+    "rsl_rl_learner.py": ("torch_networks.py", "adapters/torch/rsl_rl_env.py"),
+    "skrl_learner.py": ("torch_networks.py", "adapters/torch/skrl_env.py"),
+}
+"""The PPO trainers of `jax_vs_torch.py`, and what else reads settings for them."""
+
+
+@pytest.mark.parametrize("trainer", TRAINERS)
+def test_a_trainer_has_each_setting_or_its_table_says_how_it_differs(trainer: str) -> None:
+    """A setting of which neither holds is another one in silence."""
+    page, code = (BENCHMARKS / trainer).read_text(encoding="utf-8").split('"""', 2)[1:]
+    for name in TRAINERS[trainer]:
+        folder = BENCHMARKS if (BENCHMARKS / name).is_file() else BENCHMARKS.parent / PACKAGE
+        code += (folder / name).read_text(encoding="utf-8")
+    listed = " ".join(row.split("|")[1] for row in page.splitlines() if row.startswith("|"))
+    for setting in PPOConfig.model_fields:
+        is_read = re.search(rf"\b(config|ppo)\.{setting}\b", code)
+        assert is_read or re.search(rf"\b{setting}\b", listed), setting
+
+
+def evaluations(run: str, blocks: list[float], **values) -> list[dict]:
+    """The records of a run with an evaluation after each block."""
+    method, seed, _ = run.split("-")
+    begun = {"run": run, "method": method, "seed": int(seed)}
+    measured = {
+        "device": "CPU", "num_envs": 64, "total_steps": len(blocks), "process_seconds": 1.0,
+        "passed": False, "return": 5.0,
+    } | values  # fmt: skip
+    records = [
+        begun | measured | {"steps": step, "block_seconds": seconds}
+        for step, seconds in enumerate(blocks, start=1)
+    ]
+    return [begun, *records]
+
+
+def test_a_run_replaces_the_earlier_one_also_where_it_fails(jax_vs_torch) -> None:
+    ours = evaluations("ours-0-2.0", [1.0])
+    records = [*evaluations("brax-0-1.0", [1.0]), *evaluations("brax-0-3.0", []), *ours]
+    assert list(jax_vs_torch.newest_runs(records)) == [("ours", 0)]
+    later = evaluations("brax-0-4.0", [1.0, 1.0])
+    runs = jax_vs_torch.newest_runs([*later, *records])
+    assert [record["steps"] for record in runs["brax", 0]] == [1, 2]
+
+
+def test_the_training_clock_is_without_what_the_first_blocks_compile(jax_vs_torch) -> None:
+    """Two files with the same records are those of one run."""
+    records = evaluations("skrl-1-1.0", [30.0, 1.5, 1.0, 2.0, 3.0])
+    (run,) = jax_vs_torch.newest_runs(records + records).values()
+    assert [record["train_seconds"] for record in run] == [2.0, 3.5, 4.5, 6.5, 9.5]
+    (run,) = jax_vs_torch.newest_runs(records[:3]).values()
+    assert run[-1]["train_seconds"] == 31.5
+
+
+def test_the_comparison_names_each_device_and_length(jax_vs_torch) -> None:
+    ours = evaluations("ours-0-1.0", [1.0], device="H100", total_steps=20_000_000)
+    runs = jax_vs_torch.newest_runs([*ours, *evaluations("skrl-0-1.0", [1.0], total_steps=10**6)])
+    text = jax_vs_torch.table(runs)
+    assert "Device: CPU or H100, 64 environments" in text
+    assert "return after 1 or 20 M steps" in text
+
+
+def test_the_comparison_refuses_what_it_would_ignore(jax_vs_torch) -> None:
+    for flags in (["--stop-when-solved"], ["--num-seeds", "2"], ["--screening-episodes", "8"]):
+        with pytest.raises(UserError, match=flags[0]):
+            jax_vs_torch.read_command(flags)
+    with pytest.raises(UserError, match="the task track"):
+        jax_vs_torch.read_command(["--config", str(resource_path("configs/track/default.yaml"))])
+    command = jax_vs_torch.read_command(["--config", "default", "--eval-episodes", "9"])
+    config = command.training(seed=7)
+    assert (config.seed, config.eval_episodes, config.stop_when_solved) == (7, 9, False)
+    assert config.ppo == read_preset(Path("default")).ppo
+
+
+def test_a_start_that_is_interrupted_leaves_no_training_behind(
+    start, tmp_path: Path, monkeypatch
+) -> None:
+    training = tmp_path / "train.py"
+    training.write_text("import os, time\nprint(os.getpid())\ntime.sleep(60)\n")
+    processes = []
+    popen = subprocess.Popen
+
+    def started(*args, **options) -> subprocess.Popen:
+        processes.append(popen(*args, **options))
+        return processes[0]
+
+    def moment() -> float:
+        if processes:
+            raise KeyboardInterrupt
+        return 0.0
+
+    monkeypatch.setattr(start, "TIMED", training)
+    monkeypatch.setattr(subprocess, "Popen", started)
+    monkeypatch.setattr(start, "time", types.SimpleNamespace(time=moment))
+    with pytest.raises(KeyboardInterrupt):
+        start.start_once(1, tmp_path, [])
+    assert processes[0].poll() is not None
+
+
+def test_an_interrupted_trial_is_repeated_once(sweep, tmp_path: Path, monkeypatch) -> None:
+    pytest.importorskip("optuna")
+    base = read_preset(Path("default"))
+    command = sweep.Command(trials=2, storage=tmp_path / "sweep.db")
+    preset = {name: pytest.approx(getattr(base.ppo, name)) for name in sweep.SPACE}
+    ends = iter([KeyboardInterrupt, KeyboardInterrupt, None, None])
+
+    def run_trial(trial, *_) -> float:
+        for name, (low, high, is_logarithmic) in sweep.SPACE.items():
+            trial.suggest_float(name, low, high, log=is_logarithmic)
+        if (end := next(ends)) is not None:
+            raise end
+        return 1.0
+
+    monkeypatch.setattr(sweep, "run_trial", run_trial)
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            sweep.search(command, base)
+    trials = sweep.search(command, base).trials
+    assert [trial.state.name for trial in trials] == ["FAIL", "FAIL", "COMPLETE", "COMPLETE"]
+    assert trials[1].params == preset and trials[2].params == preset != trials[3].params
 
 
 def test_a_limit_ends_before_the_first_failure(rank) -> None:

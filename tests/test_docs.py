@@ -455,6 +455,12 @@ def test_verdicts_of_figures_are_by_their_worst_number() -> None:
     assert verdict("90 to 99%", "89.9%") == "missed"
     assert verdict("at most 1e-11", "5.6e-13") == "reached"
     assert verdict("all five results", "four of them") == "missed"
+    assert verdict("at most 12 s", "11.5 and 14.5 s") == "missed"
+    assert verdict("at least 95%", "97% and 93%") == "missed"
+    assert verdict("at most 0.02", "-0.008") == "reached"
+    for text in ("below 13.8", "None"):
+        with pytest.raises(ValueError, match="begins with no number"):
+            verdict("at most 15", text)
 
 
 HAND_WRITTEN = [page for page in PAGES if page.name not in ("api.md", "config.md")]

@@ -2,6 +2,7 @@
 
 import json
 import runpy
+import shutil
 from pathlib import Path
 
 import jax
@@ -18,7 +19,7 @@ from bounce_mjx.evaluation.policy_evaluation import PolicyEvaluation, evaluate_p
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import make_networks, networks_of
 from bounce_mjx.resources import ARM_POLICIES, POLICIES, TASK_POLICIES, resource_path
-from bounce_mjx.runs.checkpoints import read_policy
+from bounce_mjx.runs.checkpoints import read_policy, read_record
 from bounce_mjx.runs.config import TrainConfig, load_run_config, runs_folder
 from bounce_mjx.runs.folders import (
     MIRROR_LAW,
@@ -124,21 +125,41 @@ def test_the_policy_keeps_two_balls_up() -> None:
     assert values["kept"] > 95.0 and min(values["turns"], values["apart"], values["height"]) > 98.0
 
 
-def test_a_shipped_policy_is_shipped_again_as_it_is(tmp_path: Path) -> None:
-    """With the report of another measurement."""
-    write_policy = runpy.run_path(str(FOLDER.parent / "benchmarks/ship.py"))["write_policy"]
+def test_a_shipped_policy_is_shipped_again_as_it_is(tmp_path: Path, monkeypatch) -> None:
+    """With the report of another measurement. The policies in its folder stay, also where nothing
+    can be deleted, and a later rewrite keeps the report."""
+    benchmarks = FOLDER.parent / "benchmarks"
+    write_policy = runpy.run_path(str(benchmarks / "ship.py"))["write_policy"]
+    rewrite = runpy.run_path(str(benchmarks / "rewrite_policies.py"))["rewrite"]
     folder = resource_path(POLICIES["track"])
     checkpoint, config = best_checkpoint(folder), load_run_config(folder)
     shipped = json.loads((folder / "results.json").read_text(encoding="utf-8"))
     report = pydantic.TypeAdapter(Report).validate_python(shipped)
     evaluation = PolicyEvaluation(report, engine="fused", warning=None, setup=None, statistics=None)
-    write_policy(checkpoint, config, evaluation, tmp_path / "again", "track")
-    again = json.loads((tmp_path / "again" / "results.json").read_text(encoding="utf-8"))
+    out = tmp_path / "again"
+    other = out / "other" / "config.yaml"
+    stale = out / "checkpoints" / "1" / "record"
+    for file in (other, stale, out / "config.yaml"):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text("old", encoding="utf-8")
+    remove = shutil.rmtree
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            shutil, "rmtree", lambda path, **options: path == out or remove(path, **options)
+        )
+        write_policy(checkpoint, config, evaluation, out, "track")
+    assert other.read_text(encoding="utf-8") == "old" and not stale.exists()
+    again = json.loads((out / "results.json").read_text(encoding="utf-8"))
     for machine in ("device", "jax"):
         del shipped["evaluation"][machine], again["evaluation"][machine]
     assert again == shipped
-    assert load_run_config(tmp_path / "again") == config
-    assert (tmp_path / "again" / "track.onnx").read_bytes() == (folder / "track.onnx").read_bytes()
+    assert load_run_config(out) == config
+    assert (out / "track.onnx").read_bytes() == (folder / "track.onnx").read_bytes()
+    record = read_record(best_checkpoint(out))
+    rewrite(out)
+    rewritten = best_checkpoint(out)
+    assert read_record(rewritten) == record and record.report == report
+    assert rewritten.number == checkpoint.number
 
 
 def test_its_training_command_gives_its_config(shipped: dict, monkeypatch) -> None:
