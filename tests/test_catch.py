@@ -113,6 +113,23 @@ def test_a_resting_ball_moves_with_the_paddle() -> None:
         assert steps(ball, velocity, paddle).metrics["caught"][-1] == is_caught
 
 
+def test_a_resting_ball_pays_more_the_less_it_moves_against_the_paddle() -> None:
+    """Not just below the limit: there the noise of a training hides for how long a ball rests."""
+    paid = {}
+    for speed in (0.0, 0.03, 0.048, 0.052):
+        ball, velocity, paddle = landing(0.3)
+        ball[:, 0] = speed * DT * np.arange(len(ball))
+        velocity[:, 0] = speed
+        paid[speed] = float(steps(ball, velocity, paddle).reward["rest"][-1])
+    weight = Config().reward.rest.weight
+    assert paid[0.0] == pytest.approx(2.0 * weight, rel=1e-3) and paid[0.052] == 0.0
+    assert paid[0.0] > paid[0.03] + 0.3 * weight > paid[0.048] + 0.6 * weight
+    # A ball that flies over the paddle at its speed does not rest.
+    ball, velocity, paddle = landing(2.9)
+    ball[:, 0] = paddle[:, 0]
+    assert not steps(ball, velocity, paddle).reward["rest"][:100].any()
+
+
 @pytest.mark.parametrize(("until", "is_caught"), [(1.4, True), (1.6, False)])
 def test_the_rest_must_come_within_two_seconds_of_the_first_contact(
     until: float, is_caught: bool

@@ -214,16 +214,17 @@ class WorldConfig(RobotSettings):
         the config of a run names all settings."""
         unused = {}
         if not self.robot.site:
-            unused |= {f"robot.{name}": "robot.site" for name in NEED_SITE}
+            unused |= {f"robot.{name}": ("robot.site", "leave it out") for name in NEED_SITE}
         if self.action.base == "measured":
-            unused["action.max_lead"] = "the action.base target"
-            unused["observation.servo_lead"] = "the action.base target"
-        for key, needed in unused.items():
+            unused["action.max_lead"] = ("the action.base target", "leave it out")
+            # It may be the task's.
+            unused["observation.servo_lead"] = ("the action.base target", "set it to 0")
+        for key, (needed, remedy) in unused.items():
             group_name, name = key.split(".")
             group = getattr(self, group_name)
             if getattr(group, name) != settings.default_of(type(group).model_fields[name]):
                 raise ValueError(
-                    f"{key} has no effect without {needed}; set that too, or leave {key} out"
+                    f"{key} has no effect without {needed}; set that too, or {remedy}"
                 )
         return self
 
