@@ -223,9 +223,7 @@ class WorldConfig(RobotSettings):
             group_name, name = key.split(".")
             group = getattr(self, group_name)
             if getattr(group, name) != settings.default_of(type(group).model_fields[name]):
-                raise ValueError(
-                    f"{key} has no effect without {needed}; set that too, or {remedy}"
-                )
+                raise ValueError(f"{key} has no effect without {needed}; set that too, or {remedy}")
         return self
 
     @pydantic.field_validator("mjcf")
