@@ -40,6 +40,7 @@ from bounce_mjx.runs.folders import (
 from bounce_mjx.runs.presets import preset_files
 from bounce_mjx.runs.progress import Progress, load_results
 from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.task import Proportional
 from bounce_mjx.training import run as training_run
 from bounce_mjx.world.config import ActionConfig
 from tiny_runs import contents
@@ -344,12 +345,13 @@ def test_a_group_given_in_part_keeps_its_other_defaults(tmp_path: Path) -> None:
     """Those of the task, where they differ from those of the group's class."""
     file = tmp_path / "preset.yaml"
     file.write_text(
-        "task: catch\nenv: {action: {max_lead: 0.2}, reward: {rest: {}, fall: {scale: 0.3}}}"
+        "task: catch\nenv: {action: {max_lead: 0.2}, reward: {action_rate: {}, fall: {scale: 0.3}}}"
     )
-    env, default = read_preset(file).env, read_preset(CATCH).env
+    env = read_preset(file).env
+    default = read_preset(CATCH).env
     assert env.action.base == "target" and env.action.max_lead == 0.2
-    assert env.reward.fall.scale == 0.3 and env.reward.rest == default.reward.rest
-    assert default.reward.rest.weight != type(default.reward.rest)().weight
+    assert env.reward.fall.scale == 0.3 and env.reward.action_rate == default.reward.action_rate
+    assert default.reward.action_rate != Proportional()
     # Also a default that is made anew.
     made = Field(default_factory=lambda: ActionConfig(base="target", max_lead=0.3))
     own = pydantic.create_model("Own", __base__=StrictModel, action=(ActionConfig, made))
