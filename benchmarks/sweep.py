@@ -26,7 +26,6 @@ from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.evaluation.config import DEFAULT_SEED
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import Report, judge
 from bounce_mjx.learning.config import PPOConfig
@@ -190,11 +189,7 @@ def main() -> None:
                 "pip install 'bounce_mjx[sweep]'"
             )
         base = read_preset(command.config)
-        if base.eval_seed == DEFAULT_SEED:
-            raise UserError(
-                f"eval_seed is {DEFAULT_SEED}, the seed of bounce-mjx eval, on which nothing is to "
-                "be chosen; give another"
-            )
+        base.check_eval_seed()
         set_up_jax(base.env)
         study = search(command, base)
         device = device_name()

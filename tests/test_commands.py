@@ -98,6 +98,7 @@ MISTAKES = (
     ("eval mirror --robot nope", "no robot is named nope"),
     ("plot {run} --formats gif", "--formats is gif", "'png' or 'svg'"),
     ("plot {run} --out {run}/config.yaml", "cannot be written", "--out"),
+    ("train --eval-seed 20000", "eval_seed is 20000, the seed of bounce-mjx eval,", "give another"),
     ("train --warm-start robust", "without its value network; give robust_small"),
     ("train --warm-start robust_small --hidden-layers 8", "other hidden layers"),
     ("train --warm-start robust_small --observation.action 1", "another observation"),

@@ -23,6 +23,7 @@ def main(args: Sequence[str]) -> None:
         # A config that training refuses is no answer; what the devices and the robot's file allow
         # is seen only as it starts.
         config.ppo.check_rollout(config.training_episode_steps)
+        config.check_eval_seed()
         print(dump_with_sources(config.model_dump(mode="json"), config.sources), end="")
         return
     import jax

@@ -14,6 +14,7 @@ from bounce_mjx.config.settings import Count, NonNegativeInt, Steps, StrictModel
 from bounce_mjx.config.user_code import admit, is_file, is_same_code, known_class, source_file
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation.config import DEFAULT_SEED
 from bounce_mjx.learning.config import PPO_NAME, PPOConfig
 from bounce_mjx.learning.registry import find_algorithm
 from bounce_mjx.robot.config import is_packaged
@@ -108,6 +109,19 @@ class TrainConfig(StrictModel):
             if key:
                 sources[key] = source
         return sources
+
+    def check_eval_seed(self) -> None:
+        """Checks that the training chooses its checkpoint by episodes that are not those of
+        `bounce-mjx eval`.
+
+        Raises:
+          UserError: they are the same.
+        """
+        if self.eval_seed == DEFAULT_SEED:
+            raise UserError(
+                f"eval_seed is {DEFAULT_SEED}, the seed of bounce-mjx eval, whose results would be "
+                "of the episodes by which the training chose its best checkpoint; give another"
+            )
 
     @property
     def training_episode_steps(self) -> int:

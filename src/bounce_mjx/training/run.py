@@ -214,7 +214,13 @@ def run_training(
     callbacks: Sequence[Callback],
     report: bool,
 ) -> Run:
-    """Trains with a config, which has its settings from layers, and returns the run."""
+    """Trains with a config, which has its settings from layers, and returns the run.
+
+    Raises:
+      UserError: the training would choose its checkpoint by the episodes of `bounce-mjx eval`, or
+        as `job.train`.
+    """
+    config.check_eval_seed()
     if layers.resume is None:
         say(console, f"config: {layers.title}")
     for note in (*layers.notes, *notes_on_starts(config), *notes_on_worlds(config)):
