@@ -25,7 +25,6 @@ physics.
 Of a preset, only the flags below count: it says neither when a run here ends nor what it saves.
 """
 
-import contextlib
 import itertools
 import json
 import os
@@ -36,7 +35,6 @@ import tempfile
 import time
 import typing
 from collections.abc import Callable
-from importlib import metadata
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -44,6 +42,7 @@ import jax
 from tables import device_name, markdown_table
 from trainers import TRAINERS, Method
 
+from bounce_mjx.commands.doctor import version_of
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import Count, NonNegativeInt, Positive, StrictModel
 from bounce_mjx.env.bounce_ball import BounceBall
@@ -213,8 +212,9 @@ def versions() -> dict[str, str]:
     cloned repositories."""
     found = {}
     for library in _LIBRARIES:
-        with contextlib.suppress(metadata.PackageNotFoundError):
-            found[library] = metadata.version(library)
+        version = version_of(library)
+        if version is not None:
+            found[library] = version
     benchmarks = Path(__file__).resolve().parent
     repositories = {"bounce_mjx": benchmarks.parent}
     for clone in (benchmarks / "sources").glob("*"):
