@@ -9,7 +9,10 @@ import pytest
 from against_c import (
     BATCH,
     DT,
+    HALF_SIZE,
+    HOME,
     MODEL,
+    RADIUS,
     XML,
     States,
     assert_same_step,
@@ -21,6 +24,7 @@ from against_c import (
     free_run,
     fused_steps,
     num_contacts,
+    paddle_frame,
     touching_states,
 )
 from bounce_mjx.errors import UserError
@@ -234,3 +238,27 @@ def test_mjx_refuses_given_dry_friction(mj_model):
     given = PhysicsParameters(frictionloss=jnp.full(6, 10.0))
     with pytest.raises(UserError, match="dry friction .*--physics fused"):
         engine.step(given, state, Control(jnp.zeros(mj_model.nu)), 1)
+
+
+@pytest.mark.parametrize("friction", [0.1, 1.0])
+def test_a_bounce_takes_a_tenth_of_the_horizontal_speed_whatever_the_friction(friction):
+    """MuJoCo damps a contact's sliding as softly as its bounce. Coulomb's friction stops it, and a
+    sphere loses more than a quarter of its speed."""
+    model = frictional('friction="0.3 0.3"', f'friction="{friction} {friction}"')
+    centre, axes = paddle_frame(model, HOME)
+    speed, impact_speed = 1.0, 3.0
+    data = mujoco.MjData(model)
+    data.qpos[:6] = data.ctrl[:] = HOME
+    data.qpos[6:9] = centre + (HALF_SIZE[2] + RADIUS + 1e-3) * axes[:, 2]
+    data.qvel[6:9] = speed, 0.0, -impact_speed
+    mujoco.mj_forward(model, data)
+    while data.qvel[8] < 0.0 or data.ncon:
+        mujoco.mj_step(model, data)
+    lost = speed - data.qvel[6]
+    assert 0.05 < lost / speed < 0.15
+
+    ball = model.body("ball_link").id
+    inertia_share = model.body_inertia[ball, 0] / (model.body_mass[ball] * RADIUS**2)
+    lost_until_it_rolls = inertia_share / (1.0 + inertia_share) * speed
+    most_of_coulomb = friction * (impact_speed + data.qvel[8])
+    assert 0.25 * speed < lost_until_it_rolls < most_of_coulomb
