@@ -116,13 +116,14 @@ def main(args: Sequence[str]) -> None:
         for line in changed or [f"the robot still matches {command.check}"]:
             print(line)
         sys.exit(1 if changed else 0)
-    write_output(page, identification_page(found, logs, checkups, names, command.out, doubts))
+    robot = command.robot and str(command.robot)
+    text = identification_page(found, logs, checkups, names, command.out, doubts, robot)
+    write_output(page, text)
     print(str(page))
     if doubts and not command.force:
         raise UserError(
             f"{command.out} is not written, because no world explains the log: {doubts[0]} "
             "Read the page, or write the world all the same with --force"
         )
-    robot = command.robot and str(command.robot)
     write_output(command.out, to_yaml(found, log, names, robot, doubts))
     print(str(command.out))
