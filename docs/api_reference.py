@@ -34,7 +34,7 @@ _SECTIONS = (
     ("Batches of environments", "", "env.vector"),
     (
         "Tasks",
-        "All of these are names of `bounce_mjx.task`. [Write a task](tasks.md#write-a-task) shows "
+        "All but `find_task` are names of `bounce_mjx.task`. [Write a task](tasks.md#write-a-task) shows "
         "their use.",
         "task.task world.config.WorldConfig world.config.Command world.observation.Quantity "
         "task.results task.registry.find_task",

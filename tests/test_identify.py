@@ -224,6 +224,20 @@ def test_logs_of_the_longest_steps_are_joined_with_a_gap() -> None:
         assert len(find_gaps(times)) == 1
 
 
+@pytest.mark.parametrize("lost", [1, 5])
+def test_a_lost_row_of_an_even_log_is_a_gap(lost: int) -> None:
+    """In 50 ms an arm moves by targets that the log lacks, and a fit would take the last one."""
+    random = np.random.default_rng(0)
+    times = 0.01 * np.arange(400.0)
+    rows = np.r_[:200, 200 + lost : 400]
+    for noise in (0.0, 3e-4):
+        stamps = times[rows] + random.uniform(-noise, noise, len(rows))
+        assert find_gaps(stamps) == [(stamps[199], stamps[200])]
+    # Of stamps that wait for a busy computer, a long step is no lost row.
+    waits = np.sort(times + random.choice([0.0, 0.008], len(times)))
+    assert find_gaps(waits) == []
+
+
 @pytest.mark.parametrize("latency, lag", [(0.0237, 0.0), (0.0082, 0.015)])
 def test_targets_are_late_and_lagged(latency: float, lag: float) -> None:
     """Against a simulation with steps a hundred times as short."""
