@@ -59,6 +59,7 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.reports.identification import identification_page, inspection_page
     from bounce_mjx.robot.model import joint_names
     from bounce_mjx.runs.files import check_output, write_output
+    from bounce_mjx.runs.worlds import robot_in_world
     from bounce_mjx.training.setup import set_up_jax
     from bounce_mjx.world.model import world_model
     from bounce_mjx.world.named import read_world
@@ -125,5 +126,6 @@ def main(args: Sequence[str]) -> None:
             f"{command.out} is not written, because no world explains the log: {doubts[0]} "
             "Read the page, or write the world all the same with --force"
         )
-    write_output(command.out, to_yaml(found, log, names, robot, doubts))
+    robot_here = command.robot and robot_in_world(command.robot, command.out)
+    write_output(command.out, to_yaml(found, log, names, robot_here, doubts))
     print(str(command.out))
