@@ -25,6 +25,7 @@ from bounce_mjx.config.files import dump_config
 from bounce_mjx.env.env import Env, EnvState
 from bounce_mjx.env.vector import VectorStep
 from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation.statistics import empty_statistics
 from bounce_mjx.learning.metrics import rollout_metrics, step_metrics
 from bounce_mjx.runs import checkpoints
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
@@ -168,6 +169,106 @@ def test_a_curve_with_the_tag_of_another_is_refused(tag) -> None:
 
     with pytest.raises(UserError, match=f"the tag {tag} of a curve of the task Twice is taken"):
         jax.eval_shape(Env(Twice.Config()).reset, jax.random.PRNGKey(0))
+
+
+class _Wrong(rest_task.Rest):
+    """The tests give it a wrong method."""
+
+    class Config(rest_task.Rest.Config):
+        commands: ClassVar = {"height": task.Command(0.4, 0.4)}
+
+
+@pytest.fixture(scope="module")
+def wrong() -> Env:
+    return Env(_Wrong.Config())
+
+
+TWO_BOOLS = jnp.zeros(2, bool)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        (
+            {"reward": {"still": jnp.ones(3)}},
+            r"reward term still .* _Wrong is float32 of .* \(3,\)",
+        ),
+        ({"reward": {"still": None}}, "reward term still .* _Wrong is None; return one number"),
+        ({"reward": jnp.ones(())}, "the reward of .* _Wrong is float32 of .*; return a dictionary"),
+        ({"metrics": {"drop": jnp.ones((1,))}}, r"the metric drop .* is float32 of .* \(1,\)"),
+        ({"ended": jnp.zeros(())}, "ended of .* _Wrong is float32 of .*; return one bool"),
+        ({"ended": TWO_BOOLS}, r"ended of .* _Wrong is bool of the shape \(2,\); return one bool"),
+        ({"state": jnp.zeros(())}, r"state of .* is a tuple at a reset and float32 .* structure"),
+    ],
+)
+def test_a_step_that_returns_something_else_is_refused(
+    changes: dict, words: str, wrong: Env, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By its name, where JAX would stack it, or end in an error of its own."""
+
+    def step(self, state: tuple, step: task.Step) -> task.TaskStep:
+        return rest_task.Rest.step(self, state, step)._replace(**changes)
+
+    monkeypatch.setattr(_Wrong, "step", step)
+    with pytest.raises(UserError, match=words):
+        jax.eval_shape(lambda key: wrong.reset(key), jax.random.key(0))
+
+
+COMMAND = "of the task _Wrong returns"
+
+
+@pytest.mark.parametrize(
+    ("method", "returned", "words"),
+    [
+        ("step", None, "step of the task _Wrong returns None; return a task.TaskStep"),
+        ("reset", {"rose": False}, "state of the task _Wrong is a dict at a reset and a tuple"),
+        ("first_command", None, f"first_command {COMMAND} None; return a dictionary"),
+        ("first_command", {"height": jnp.ones(1)}, r"float32 of the shape \(1,\) for the command"),
+        ("next_command", {"height": jnp.ones(1)}, rf"next_command {COMMAND} .* command height;"),
+        ("next_command", {"height": 1}, f"next_command {COMMAND} a int for the command height"),
+        ("next_command", {"height": jnp.int32(1)}, f"{COMMAND} int32 .* of a floating-point type"),
+        ("throw", np.zeros(3), r"throw of the task _Wrong returns float64 of the shape \(3,\)"),
+        ("throw", (np.zeros(2), np.zeros(3)), r"a tuple of the shapes \(2,\), \(3,\); return"),
+    ],
+)
+def test_a_method_that_returns_something_else_is_refused(
+    method: str, returned: object, words: str, wrong: Env, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_Wrong, method, lambda *_: returned)
+    with pytest.raises(UserError, match=words):
+        jax.eval_shape(lambda key: wrong.reset(key), jax.random.key(0))
+
+
+def test_a_state_that_changes_its_type_is_refused(
+    wrong: Env, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the name of its part."""
+
+    def step(self, state: dict, step: task.Step) -> task.TaskStep:
+        return rest_task.Rest.step(self, (), step)._replace(state={"rose": jnp.zeros(())})
+
+    monkeypatch.setattr(_Wrong, "step", step)
+    monkeypatch.setattr(_Wrong, "reset", lambda *_: {"rose": False})
+    with pytest.raises(UserError, match=r"state\['rose'\] of .* is bool .* reset and float32 of"):
+        jax.eval_shape(lambda key: wrong.reset(key), jax.random.key(0))
+
+
+@pytest.mark.parametrize(
+    ("tally", "words"),
+    [
+        ({"speed": 1.0}, "tally of the task _Wrong returns a dict; return a task.Tally"),
+        (task.Tally({"p": jnp.ones(3)}), r"the sum p in .* _Wrong is float32 of the shape \(3,\)"),
+        (task.Tally({}, {"p": jnp.ones(3)}), "the maximum p in the maxima of the tally of .* _Wr"),
+    ],
+)
+def test_a_tally_that_is_not_numbers_is_refused(
+    tally: object, words: str, wrong: Env, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_Wrong, "tally", lambda *_: tally)
+    keys = jax.random.split(jax.random.key(0), 2)
+    states = jax.eval_shape(jax.vmap(wrong.reset, out_axes=-1), keys)
+    with pytest.raises(UserError, match=words):
+        jax.eval_shape(lambda states: empty_statistics(wrong, states), states)
 
 
 def test_settings_without_a_task_are_refused() -> None:
