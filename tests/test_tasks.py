@@ -271,6 +271,61 @@ def test_a_tally_that_is_not_numbers_is_refused(
         jax.eval_shape(lambda states: empty_statistics(wrong, states), states)
 
 
+@pytest.mark.parametrize(
+    ("commands", "words"),
+    [
+        ({"height": task.Command(0.5, 0.4)}, "the command height .* sampled from 0.5 to 0.4; give"),
+        ({"height": task.Command(np.nan, 0.4)}, "the command height .* sampled from nan to 0.4"),
+        ({"height": task.Command(0.4, np.inf)}, "the command height .* two finite numbers"),
+        ({"height": (0.4, 0.5)}, r"the command height .* is \(0.4, 0.5\); give a task.Command"),
+        ([task.Command(0.4, 0.5)], "the commands of .* _Wrong are .*; return a dictionary of a"),
+    ],
+)
+def test_a_command_from_which_nothing_can_be_sampled_is_refused(
+    commands: object, words: str, wrong: Env, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_Wrong.Config, "commands", commands)
+    with pytest.raises(UserError, match=words):
+        Env(wrong.config)
+
+
+@pytest.mark.parametrize(
+    ("quantity", "words"),
+    [
+        (
+            task.Quantity(2, "m", "command"),
+            r"height as Quantity\(size=2, .* number; give it task.Quantity\(1, 'm', ",
+        ),
+        (task.Quantity(None, "", "command"), "shows the command height as .* is one number"),
+        (task.Quantity(1, "m", "command", per_ball=True), "shows the command height as .* is one"),
+    ],
+)
+def test_a_command_is_shown_as_one_number(quantity: task.Quantity, words: str, wrong: Env) -> None:
+    """Of a larger size, the observation would repeat it."""
+
+    class Seen(task.ObservationConfig):
+        height: Annotated[int, quantity] = 1
+
+    with pytest.raises(UserError, match=words):
+        Env(wrong.config.model_copy(update={"observation": Seen()}))
+
+
+def test_a_command_that_is_shown_but_not_there_is_refused(wrong: Env) -> None:
+    class Seen(task.ObservationConfig):
+        heigth: Annotated[int, task.Quantity(1, "m", "command")] = 1
+
+    with pytest.raises(UserError, match="the command heigth, which there is not; .*: height"):
+        Env(wrong.config.model_copy(update={"observation": Seen()}))
+
+
+@pytest.mark.parametrize("size", [1, 3])
+def test_a_quantity_of_another_size_is_refused(size: int) -> None:
+    """JAX would cut it off, or repeat its last entry."""
+    layout = ObservationLayout((Part("aim", 2, "m", 1),))
+    with pytest.raises(UserError, match=f"quantity aim gets {size} numbers, but takes 2, which"):
+        layout.pack({"aim": jnp.zeros(size)})
+
+
 def test_settings_without_a_task_are_refused() -> None:
     with pytest.raises(UserError, match="WorldConfig has the settings of a world without a task"):
         Env(task.WorldConfig())

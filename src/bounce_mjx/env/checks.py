@@ -2,6 +2,7 @@
 have, and what a task's code returns that an environment cannot use. Each check raises a `UserError`
 of one sentence. None is part of a compiled program: they read names, shapes and types alone."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -14,7 +15,7 @@ from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.robot.model import Addresses, joint_names, joint_ranges
 from bounce_mjx.task.rewards import check_names
 from bounce_mjx.task.task import Curve, Tally, Task, TaskStep
-from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.config import Command, WorldConfig
 from bounce_mjx.world.randomization import TERMS
 
 ENDS = ("non_finite", "too_fast")
@@ -60,9 +61,34 @@ def check_has_task(config: WorldConfig) -> None:
 
 def check_task(config: WorldConfig, task: Task) -> None:
     """Refuses what the task cannot have, whatever the model."""
+    _check_commands(config, task)
     _check_names_of_commands(config)
     _check_commands_are_seen(config)
+    _check_quantities_of_commands(config)
     _check_num_balls(config, task)
+
+
+def _check_commands(config: WorldConfig, task: Task) -> None:
+    """Refuses commands of another type, and ranges from which nothing can be sampled."""
+    of_task = f"of the task {type(task).__name__}"
+    commands = config.commands
+    if not isinstance(commands, Mapping):
+        raise UserError(
+            f"the commands {of_task} are {shorten(repr(commands))}; return a dictionary of a "
+            "task.Command for each name"
+        )
+    for name, command in commands.items():
+        if not isinstance(command, Command):
+            raise UserError(
+                f"the command {name} {of_task} is {shorten(repr(command))}; give a "
+                "task.Command(low, high)"
+            )
+        low, high = command.low, command.high
+        if not (math.isfinite(low) and math.isfinite(high) and low <= high):
+            raise UserError(
+                f"the command {name} {of_task} is sampled from {low:g} to {high:g}; give two "
+                "finite numbers, the lower one first"
+            )
 
 
 def _check_names_of_commands(config: WorldConfig) -> None:
@@ -122,6 +148,25 @@ def _check_commands_are_seen(config: WorldConfig) -> None:
                 f"the policy does not see the command {name}, which varies from "
                 f"{command.low:g} to {command.high:g}; give the observation a quantity {name}, "
                 "fix the command, or mark it as hidden if it acts through others"
+            )
+
+
+def _check_quantities_of_commands(config: WorldConfig) -> None:
+    """Refuses a quantity of the observation that shows a command that there is not, or shows one,
+    which is one number, as something else."""
+    quantities = config.observation.quantities()
+    for name in config.observation.counts("command"):
+        if name not in config.commands:
+            there_are = ", ".join(config.commands) or "none"
+            raise UserError(
+                f"the observation shows the command {name}, which there is not; there are: "
+                f"{there_are}"
+            )
+        quantity = quantities[name]
+        if quantity.size != 1 or quantity.per_ball:
+            raise UserError(
+                f"the observation shows the command {name} as {quantity}, but a command is one "
+                f'number; give it task.Quantity(1, {quantity.unit!r}, "command")'
             )
 
 

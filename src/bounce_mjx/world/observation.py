@@ -8,6 +8,7 @@ from typing import Annotated, Literal, NamedTuple, get_args
 from pydantic import Field
 
 from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.errors import UserError
 from bounce_mjx.lazy import jax, jnp
 
 History = Annotated[int, Field(ge=0, le=100)]
@@ -142,10 +143,21 @@ class ObservationLayout:
         raise KeyError(name)
 
     def pack(self, values: dict[str, jax.Array]) -> jax.Array:
-        """The observation [size] from the values of every part, [part.length]."""
+        """The observation [size] from the values of every part, [part.length].
+
+        Raises:
+          UserError: a part has another number of entries, which JAX would cut off or repeat.
+        """
         # One scalar per entry, which XLA fuses with the physics; whole arrays would be copied.
         entries = []
         for part in self.parts:
+            num_entries = len(values[part.name])
+            if num_entries != part.length:
+                raise UserError(
+                    f"the observation's quantity {part.name} gets {num_entries} numbers, but takes "
+                    f"{part.length}, which are {part.count} values of the size {part.size}; return "
+                    "as many, or change the size of its Quantity"
+                )
             for i in range(part.length):
                 entries.append(values[part.name][i])
         return jnp.stack(entries)
