@@ -271,6 +271,61 @@ def test_a_tally_that_is_not_numbers_is_refused(
         jax.eval_shape(lambda states: empty_statistics(wrong, states), states)
 
 
+@pytest.mark.parametrize("method", ["reset", "step", "results"])
+def test_a_task_without_a_method_is_refused(
+    method: str, wrong: Env, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_Wrong, method, getattr(task.Task, method))
+    words = f"the task _Wrong has no method {method}; write one, which"
+    arguments = (None,) if method != "step" else (None, None)
+    with pytest.raises(UserError, match=words):
+        getattr(wrong.task, method)(*arguments)
+
+
+class _Still(task.RewardTerm):
+    pass
+
+
+class _Nothing(task.RewardTerm):
+    def value(self, speed: jax.Array) -> None:
+        """It forgets its return."""
+
+
+@pytest.mark.parametrize(
+    ("term", "words"),
+    [
+        (_Still, "the reward term _Still has no method value; write one, which returns"),
+        (_Nothing, "the reward term still, a _Nothing, returns None; return one number"),
+    ],
+)
+def test_a_reward_term_without_a_value_is_refused(term: type, words: str) -> None:
+    class Rewards(task.StrictModel):
+        still: term = term()
+
+    with pytest.raises(UserError, match=words):
+        task.weighted_terms(Rewards(), 1.0)
+
+
+@pytest.mark.parametrize(
+    ("attribute", "value", "words"),
+    [
+        ("num_balls", 1, r"num_balls of the task _Wrong is 1; give a tuple .* such as \(1,\)"),
+        (
+            "curves",
+            task.Curve("a", "speed"),
+            r"curves of the task _Wrong is Curve\(.*; give a tuple",
+        ),
+        ("curves", ("speed",), r"curves of the task _Wrong is \('speed',\); give a tuple of"),
+    ],
+)
+def test_an_attribute_of_another_type_is_refused(
+    attribute: str, value: object, words: str, wrong: Env, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_Wrong, attribute, value)
+    with pytest.raises(UserError, match=words):
+        Env(wrong.config)
+
+
 @pytest.mark.parametrize(
     ("commands", "words"),
     [
@@ -298,6 +353,7 @@ def test_a_command_from_which_nothing_can_be_sampled_is_refused(
         ),
         (task.Quantity(None, "", "command"), "shows the command height as .* is one number"),
         (task.Quantity(1, "m", "command", per_ball=True), "shows the command height as .* is one"),
+        (task.Quantity(1, "m", "commands"), "the quantity height of Seen has the group 'commands'"),
     ],
 )
 def test_a_command_is_shown_as_one_number(quantity: task.Quantity, words: str, wrong: Env) -> None:

@@ -3,7 +3,7 @@ have, and what a task's code returns that an environment cannot use. Each check 
 of one sentence. None is part of a compiled program: they read names, shapes and types alone."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -61,11 +61,23 @@ def check_has_task(config: WorldConfig) -> None:
 
 def check_task(config: WorldConfig, task: Task) -> None:
     """Refuses what the task cannot have, whatever the model."""
+    _check_curves(task)
     _check_commands(config, task)
     _check_names_of_commands(config)
     _check_commands_are_seen(config)
     _check_quantities_of_commands(config)
     _check_num_balls(config, task)
+
+
+def _check_curves(task: Task) -> None:
+    """Refuses curves that are not a tuple of them, such as a single one without its comma."""
+    curves = task.curves
+    is_sequence = isinstance(curves, Sequence) and not isinstance(curves, Curve)
+    if not is_sequence or not all(isinstance(curve, Curve) for curve in curves):
+        raise UserError(
+            f"curves of the task {type(task).__name__} is {shorten(repr(curves))}; give a tuple of "
+            "task.Curve, such as (task.Curve(...),)"
+        )
 
 
 def _check_commands(config: WorldConfig, task: Task) -> None:
@@ -172,6 +184,11 @@ def _check_quantities_of_commands(config: WorldConfig) -> None:
 
 def _check_num_balls(config: WorldConfig, task: Task) -> None:
     """Refuses a number of balls that the task does not take."""
+    if not isinstance(task.num_balls, Collection):
+        raise UserError(
+            f"num_balls of the task {type(task).__name__} is {task.num_balls!r}; give a tuple of "
+            f"the numbers that it takes, such as ({task.num_balls!r},)"
+        )
     if config.num_balls in task.num_balls:
         return
     takes = " or ".join(map(str, task.num_balls))

@@ -84,13 +84,22 @@ class ObservationConfig(StrictModel):
 
     @classmethod
     def quantities(cls) -> dict[str, Quantity]:
-        """All quantities by name, in the order of the observation."""
+        """All quantities by name, in the order of the observation.
+
+        Raises:
+          UserError: a quantity has no such group.
+        """
+        groups = get_args(Group)
         quantities = {}
         for name, field in cls.model_fields.items():
             for mark in field.metadata:
                 if isinstance(mark, Quantity):
+                    if mark.group not in groups:
+                        raise UserError(
+                            f"the quantity {name} of {cls.__name__} has the group {mark.group!r}; "
+                            f"choose from {', '.join(groups)}"
+                        )
                     quantities[name] = mark
-        groups = get_args(Group)
         in_order = sorted(quantities.items(), key=lambda item: groups.index(item[1].group))
         return dict(in_order)
 
