@@ -113,7 +113,11 @@ def test_a_command_that_the_policy_does_not_see_is_refused() -> None:
 
 @pytest.mark.parametrize(
     ("name", "kind"),
-    [("ball_mass", "a term of the randomisation"), ("joint_angles", "a measurement")],
+    [
+        ("ball_mass", "a term of the randomisation"),
+        ("joint_angles", "a measurement"),
+        ("apex_error", "a quantity of the task; choose .* give the quantity the group command"),
+    ],
 )
 def test_a_command_with_the_name_of_something_else_is_refused(name, kind) -> None:
     class Config(find_task("bounce").Config):

@@ -111,7 +111,11 @@ def _check_names_of_commands(config: WorldConfig) -> None:
         is_measurement = name in quantities and quantities[name].group != "command"
         if name in TERMS or is_measurement:
             kind = "a term of the randomisation" if name in TERMS else "a measurement"
-            raise UserError(f"the command {name} has the name of {kind}; choose another name")
+            remedy = "choose another name"
+            if name in quantities and quantities[name].group == "task":
+                kind = "a quantity of the task"
+                remedy += ", or give the quantity the group command if it shows the command"
+            raise UserError(f"the command {name} has the name of {kind}; {remedy}")
 
 
 def check_metrics(names: Iterable[str], task: Task) -> None:
