@@ -31,7 +31,7 @@ from bounce_mjx.learning.statistics import init_normalizer
 from bounce_mjx.physics import PhysicsParameters
 from bounce_mjx.reports.tables import details_line, seeds_table
 from bounce_mjx.resources import TASK_POLICIES
-from bounce_mjx.task import Tally, share_of_episodes
+from bounce_mjx.task import Tally, mean_of_events, share_of_episodes, share_of_events
 from bounce_mjx.task.registry import find_task
 
 AUTORESET = int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
@@ -467,6 +467,45 @@ def test_another_task_is_counted_and_judged_by_itself(dribbling):
 def test_a_result_may_not_have_the_name_of_a_records_own_key(name: str) -> None:
     with pytest.raises(UserError, match=f"has the name '{name}', .*; choose another name"):
         share_of_episodes(name, "episodes", np.ones(3, bool), 0.9)
+
+
+@pytest.mark.parametrize("least", [95.0, -0.1, np.nan])
+def test_a_least_share_that_is_no_share_is_refused(least: float) -> None:
+    words = f"the result high has the least share {least:g}; give one from 0 to 1"
+    with pytest.raises(UserError, match=words):
+        share_of_episodes("high", "episodes", np.ones(3, bool), least)
+    with pytest.raises(UserError, match=words):
+        share_of_events("high", "apexes", np.ones(3), np.ones(3), least)
+
+
+def test_bounds_between_which_nothing_lies_are_refused() -> None:
+    with pytest.raises(UserError, match="the result rate has the bounds 5 and 3; give the lower"):
+        mean_of_events("rate", "apexes a second", np.ones(3), np.ones(3), (5.0, 3.0))
+
+
+LASTS = share_of_episodes("lasts", "episodes", np.ones(3, bool), 0.9)
+
+
+@pytest.mark.parametrize(
+    ("method", "returned", "words"),
+    [
+        ("results", (), "results of the task Dribble returns none, by which nothing is judged"),
+        ("results", (LASTS, LASTS), "Dribble returns 2 of the name 'lasts'; give each its own"),
+        ("results", LASTS, r"results of the task Dribble returns Result\(.*; return a tuple of"),
+        ("results", None, "results of the task Dribble returns None; return a tuple of"),
+        ("details", {"apexes": np.ones(3)}, r"an array of the shape \(3,\) for apexes; return one"),
+        ("details", [1.0], r"details of the task Dribble returns \[1.0\]; return a dictionary"),
+    ],
+)
+def test_figures_that_a_report_cannot_hold_are_refused(
+    method: str, returned: object, words: str, dribbling: Env, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    zeros = np.zeros(3)
+    sums = dict.fromkeys(("apexes", "low_apexes", "seconds"), zeros)
+    statistics = Statistics(np.ones(3, bool), zeros, zeros, Tally(sums))
+    monkeypatch.setattr(dribbling.task, method, lambda _: returned)
+    with pytest.raises(UserError, match=words):
+        judge(dribbling, statistics)
 
 
 @pytest.mark.parametrize("name", ["bounce", *TASK_POLICIES])

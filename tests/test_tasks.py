@@ -25,6 +25,7 @@ from bounce_mjx.config.files import dump_config
 from bounce_mjx.env.env import Env, EnvState
 from bounce_mjx.env.vector import VectorStep
 from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation.statistics import empty_statistics
 from bounce_mjx.learning.metrics import rollout_metrics, step_metrics
 from bounce_mjx.runs import checkpoints
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
@@ -112,7 +113,11 @@ def test_a_command_that_the_policy_does_not_see_is_refused() -> None:
 
 @pytest.mark.parametrize(
     ("name", "kind"),
-    [("ball_mass", "a term of the randomisation"), ("joint_angles", "a measurement")],
+    [
+        ("ball_mass", "a term of the randomisation"),
+        ("joint_angles", "a measurement"),
+        ("apex_error", "a quantity of the task; choose .* give the quantity the group command"),
+    ],
 )
 def test_a_command_with_the_name_of_something_else_is_refused(name, kind) -> None:
     class Config(find_task("bounce").Config):
@@ -168,6 +173,217 @@ def test_a_curve_with_the_tag_of_another_is_refused(tag) -> None:
 
     with pytest.raises(UserError, match=f"the tag {tag} of a curve of the task Twice is taken"):
         jax.eval_shape(Env(Twice.Config()).reset, jax.random.PRNGKey(0))
+
+
+class _Wrong(rest_task.Rest):
+    """The tests give it a wrong method."""
+
+    class Config(rest_task.Rest.Config):
+        commands: ClassVar = {"height": task.Command(0.4, 0.4)}
+
+
+@pytest.fixture(scope="module")
+def wrong() -> Env:
+    return Env(_Wrong.Config())
+
+
+TWO_BOOLS = jnp.zeros(2, bool)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        (
+            {"reward": {"still": jnp.ones(3)}},
+            r"reward term still .* _Wrong is float32 of .* \(3,\)",
+        ),
+        ({"reward": {"still": None}}, "reward term still .* _Wrong is None; return one number"),
+        ({"reward": jnp.ones(())}, "the reward of .* _Wrong is float32 of .*; return a dictionary"),
+        ({"metrics": {"drop": jnp.ones((1,))}}, r"the metric drop .* is float32 of .* \(1,\)"),
+        ({"ended": jnp.zeros(())}, "ended of .* _Wrong is float32 of .*; return one bool"),
+        ({"ended": TWO_BOOLS}, r"ended of .* _Wrong is bool of the shape \(2,\); return one bool"),
+        ({"state": jnp.zeros(())}, r"state of .* is a tuple at a reset and float32 .* structure"),
+    ],
+)
+def test_a_step_that_returns_something_else_is_refused(
+    changes: dict, words: str, wrong: Env, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By its name, where JAX would stack it, or end in an error of its own."""
+
+    def step(self, state: tuple, step: task.Step) -> task.TaskStep:
+        return rest_task.Rest.step(self, state, step)._replace(**changes)
+
+    monkeypatch.setattr(_Wrong, "step", step)
+    with pytest.raises(UserError, match=words):
+        jax.eval_shape(lambda key: wrong.reset(key), jax.random.key(0))
+
+
+COMMAND = "of the task _Wrong returns"
+
+
+@pytest.mark.parametrize(
+    ("method", "returned", "words"),
+    [
+        ("step", None, "step of the task _Wrong returns None; return a task.TaskStep"),
+        ("reset", {"rose": False}, "state of the task _Wrong is a dict at a reset and a tuple"),
+        ("first_command", None, f"first_command {COMMAND} None; return a dictionary"),
+        ("first_command", {"height": jnp.ones(1)}, r"float32 of the shape \(1,\) for the command"),
+        ("next_command", {"height": jnp.ones(1)}, rf"next_command {COMMAND} .* command height;"),
+        ("next_command", {"height": 1}, f"next_command {COMMAND} a int for the command height"),
+        ("next_command", {"height": jnp.int32(1)}, f"{COMMAND} int32 .* of a floating-point type"),
+        ("throw", np.zeros(3), r"throw of the task _Wrong returns float64 of the shape \(3,\)"),
+        ("throw", (np.zeros(2), np.zeros(3)), r"a tuple of the shapes \(2,\), \(3,\); return"),
+    ],
+)
+def test_a_method_that_returns_something_else_is_refused(
+    method: str, returned: object, words: str, wrong: Env, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_Wrong, method, lambda *_: returned)
+    with pytest.raises(UserError, match=words):
+        jax.eval_shape(lambda key: wrong.reset(key), jax.random.key(0))
+
+
+def test_a_state_that_changes_its_type_is_refused(
+    wrong: Env, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the name of its part."""
+
+    def step(self, state: dict, step: task.Step) -> task.TaskStep:
+        return rest_task.Rest.step(self, (), step)._replace(state={"rose": jnp.zeros(())})
+
+    monkeypatch.setattr(_Wrong, "step", step)
+    monkeypatch.setattr(_Wrong, "reset", lambda *_: {"rose": False})
+    with pytest.raises(UserError, match=r"state\['rose'\] of .* is bool .* reset and float32 of"):
+        jax.eval_shape(lambda key: wrong.reset(key), jax.random.key(0))
+
+
+@pytest.mark.parametrize(
+    ("tally", "words"),
+    [
+        ({"speed": 1.0}, "tally of the task _Wrong returns a dict; return a task.Tally"),
+        (task.Tally({"p": jnp.ones(3)}), r"the sum p in .* _Wrong is float32 of the shape \(3,\)"),
+        (task.Tally({}, {"p": jnp.ones(3)}), "the maximum p in the maxima of the tally of .* _Wr"),
+    ],
+)
+def test_a_tally_that_is_not_numbers_is_refused(
+    tally: object, words: str, wrong: Env, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_Wrong, "tally", lambda *_: tally)
+    keys = jax.random.split(jax.random.key(0), 2)
+    states = jax.eval_shape(jax.vmap(wrong.reset, out_axes=-1), keys)
+    with pytest.raises(UserError, match=words):
+        jax.eval_shape(lambda states: empty_statistics(wrong, states), states)
+
+
+@pytest.mark.parametrize("method", ["reset", "step", "results"])
+def test_a_task_without_a_method_is_refused(
+    method: str, wrong: Env, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_Wrong, method, getattr(task.Task, method))
+    words = f"the task _Wrong has no method {method}; write one, which"
+    arguments = (None,) if method != "step" else (None, None)
+    with pytest.raises(UserError, match=words):
+        getattr(wrong.task, method)(*arguments)
+
+
+class _Still(task.RewardTerm):
+    pass
+
+
+class _Nothing(task.RewardTerm):
+    def value(self, speed: jax.Array) -> None:
+        """It forgets its return."""
+
+
+@pytest.mark.parametrize(
+    ("term", "words"),
+    [
+        (_Still, "the reward term _Still has no method value; write one, which returns"),
+        (_Nothing, "the reward term still, a _Nothing, returns None; return one number"),
+    ],
+)
+def test_a_reward_term_without_a_value_is_refused(term: type, words: str) -> None:
+    class Rewards(task.StrictModel):
+        still: term = term()
+
+    with pytest.raises(UserError, match=words):
+        task.weighted_terms(Rewards(), 1.0)
+
+
+@pytest.mark.parametrize(
+    ("attribute", "value", "words"),
+    [
+        ("num_balls", 1, r"num_balls of the task _Wrong is 1; give a tuple .* such as \(1,\)"),
+        (
+            "curves",
+            task.Curve("a", "speed"),
+            r"curves of the task _Wrong is Curve\(.*; give a tuple",
+        ),
+        ("curves", ("speed",), r"curves of the task _Wrong is \('speed',\); give a tuple of"),
+    ],
+)
+def test_an_attribute_of_another_type_is_refused(
+    attribute: str, value: object, words: str, wrong: Env, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_Wrong, attribute, value)
+    with pytest.raises(UserError, match=words):
+        Env(wrong.config)
+
+
+@pytest.mark.parametrize(
+    ("commands", "words"),
+    [
+        ({"height": task.Command(0.5, 0.4)}, "the command height .* sampled from 0.5 to 0.4; give"),
+        ({"height": task.Command(np.nan, 0.4)}, "the command height .* sampled from nan to 0.4"),
+        ({"height": task.Command(0.4, np.inf)}, "the command height .* two finite numbers"),
+        ({"height": (0.4, 0.5)}, r"the command height .* is \(0.4, 0.5\); give a task.Command"),
+        ([task.Command(0.4, 0.5)], "the commands of .* _Wrong are .*; return a dictionary of a"),
+    ],
+)
+def test_a_command_from_which_nothing_can_be_sampled_is_refused(
+    commands: object, words: str, wrong: Env, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_Wrong.Config, "commands", commands)
+    with pytest.raises(UserError, match=words):
+        Env(wrong.config)
+
+
+@pytest.mark.parametrize(
+    ("quantity", "words"),
+    [
+        (
+            task.Quantity(2, "m", "command"),
+            r"height as Quantity\(size=2, .* number; give it task.Quantity\(1, 'm', ",
+        ),
+        (task.Quantity(None, "", "command"), "shows the command height as .* is one number"),
+        (task.Quantity(1, "m", "command", per_ball=True), "shows the command height as .* is one"),
+        (task.Quantity(1, "m", "commands"), "the quantity height of Seen has the group 'commands'"),
+    ],
+)
+def test_a_command_is_shown_as_one_number(quantity: task.Quantity, words: str, wrong: Env) -> None:
+    """Of a larger size, the observation would repeat it."""
+
+    class Seen(task.ObservationConfig):
+        height: Annotated[int, quantity] = 1
+
+    with pytest.raises(UserError, match=words):
+        Env(wrong.config.model_copy(update={"observation": Seen()}))
+
+
+def test_a_command_that_is_shown_but_not_there_is_refused(wrong: Env) -> None:
+    class Seen(task.ObservationConfig):
+        heigth: Annotated[int, task.Quantity(1, "m", "command")] = 1
+
+    with pytest.raises(UserError, match="the command heigth, which there is not; .*: height"):
+        Env(wrong.config.model_copy(update={"observation": Seen()}))
+
+
+@pytest.mark.parametrize("size", [1, 3])
+def test_a_quantity_of_another_size_is_refused(size: int) -> None:
+    """JAX would cut it off, or repeat its last entry."""
+    layout = ObservationLayout((Part("aim", 2, "m", 1),))
+    with pytest.raises(UserError, match=f"quantity aim gets {size} numbers, but takes 2, which"):
+        layout.pack({"aim": jnp.zeros(size)})
 
 
 def test_settings_without_a_task_are_refused() -> None:

@@ -1,15 +1,21 @@
 """What an environment refuses before its first step: settings that its task or its model cannot
-have. Each check raises a `UserError` of one sentence."""
+have, and what a task's code returns that an environment cannot use. Each check raises a `UserError`
+of one sentence. None is part of a compiled program: they read names, shapes and types alone."""
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.robot.model import Addresses, joint_names, joint_ranges
-from bounce_mjx.task.task import Curve, Task
-from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.task.rewards import check_names
+from bounce_mjx.task.task import Curve, Tally, Task, TaskStep
+from bounce_mjx.world.config import Command, WorldConfig
 from bounce_mjx.world.randomization import TERMS
 
 ENDS = ("non_finite", "too_fast")
@@ -55,9 +61,46 @@ def check_has_task(config: WorldConfig) -> None:
 
 def check_task(config: WorldConfig, task: Task) -> None:
     """Refuses what the task cannot have, whatever the model."""
+    _check_curves(task)
+    _check_commands(config, task)
     _check_names_of_commands(config)
     _check_commands_are_seen(config)
+    _check_quantities_of_commands(config)
     _check_num_balls(config, task)
+
+
+def _check_curves(task: Task) -> None:
+    """Refuses curves that are not a tuple of them, such as a single one without its comma."""
+    curves = task.curves
+    is_sequence = isinstance(curves, Sequence) and not isinstance(curves, Curve)
+    if not is_sequence or not all(isinstance(curve, Curve) for curve in curves):
+        raise UserError(
+            f"curves of the task {type(task).__name__} is {shorten(repr(curves))}; give a tuple of "
+            "task.Curve, such as (task.Curve(...),)"
+        )
+
+
+def _check_commands(config: WorldConfig, task: Task) -> None:
+    """Refuses commands of another type, and ranges from which nothing can be sampled."""
+    of_task = f"of the task {type(task).__name__}"
+    commands = config.commands
+    if not isinstance(commands, Mapping):
+        raise UserError(
+            f"the commands {of_task} are {shorten(repr(commands))}; return a dictionary of a "
+            "task.Command for each name"
+        )
+    for name, command in commands.items():
+        if not isinstance(command, Command):
+            raise UserError(
+                f"the command {name} {of_task} is {shorten(repr(command))}; give a "
+                "task.Command(low, high)"
+            )
+        low, high = command.low, command.high
+        if not (math.isfinite(low) and math.isfinite(high) and low <= high):
+            raise UserError(
+                f"the command {name} {of_task} is sampled from {low:g} to {high:g}; give two "
+                "finite numbers, the lower one first"
+            )
 
 
 def _check_names_of_commands(config: WorldConfig) -> None:
@@ -68,7 +111,11 @@ def _check_names_of_commands(config: WorldConfig) -> None:
         is_measurement = name in quantities and quantities[name].group != "command"
         if name in TERMS or is_measurement:
             kind = "a term of the randomisation" if name in TERMS else "a measurement"
-            raise UserError(f"the command {name} has the name of {kind}; choose another name")
+            remedy = "choose another name"
+            if name in quantities and quantities[name].group == "task":
+                kind = "a quantity of the task"
+                remedy += ", or give the quantity the group command if it shows the command"
+            raise UserError(f"the command {name} has the name of {kind}; {remedy}")
 
 
 def check_metrics(names: Iterable[str], task: Task) -> None:
@@ -120,8 +167,32 @@ def _check_commands_are_seen(config: WorldConfig) -> None:
             )
 
 
+def _check_quantities_of_commands(config: WorldConfig) -> None:
+    """Refuses a quantity of the observation that shows a command that there is not, or shows one,
+    which is one number, as something else."""
+    quantities = config.observation.quantities()
+    for name in config.observation.counts("command"):
+        if name not in config.commands:
+            there_are = ", ".join(config.commands) or "none"
+            raise UserError(
+                f"the observation shows the command {name}, which there is not; there are: "
+                f"{there_are}"
+            )
+        quantity = quantities[name]
+        if quantity.size != 1 or quantity.per_ball:
+            raise UserError(
+                f"the observation shows the command {name} as {quantity}, but a command is one "
+                f'number; give it task.Quantity(1, {quantity.unit!r}, "command")'
+            )
+
+
 def _check_num_balls(config: WorldConfig, task: Task) -> None:
     """Refuses a number of balls that the task does not take."""
+    if not isinstance(task.num_balls, Collection):
+        raise UserError(
+            f"num_balls of the task {type(task).__name__} is {task.num_balls!r}; give a tuple of "
+            f"the numbers that it takes, such as ({task.num_balls!r},)"
+        )
     if config.num_balls in task.num_balls:
         return
     takes = " or ".join(map(str, task.num_balls))
@@ -178,3 +249,132 @@ def check_start(config: WorldConfig, task: Task) -> None:
             f"ball_init_pos has the height {ball_height:g} m, but a ball of the radius "
             f"{geometry.ball_radius:g} m rests on the paddle at {rest_height:.4g} m; raise it"
         )
+
+
+def check_throw(thrown: Any, num_balls: int, task: Task) -> None:
+    """Refuses a throw that is not a position and a velocity of each ball."""
+    if thrown is None:
+        return
+    parts = []
+    if isinstance(thrown, tuple | list) or _has_shape(thrown):
+        # The shapes alone, also of a list of coordinates.
+        parts = jax.eval_shape(lambda: [jnp.asarray(part) for part in thrown])
+    allowed = [(num_balls, 3)] if num_balls > 1 else [(3,), (1, 3)]
+    shapes = [part.shape for part in parts]
+    if len(shapes) != 2 or not all(shape in allowed for shape in shapes):
+        returned = _described(thrown)
+        if isinstance(thrown, tuple | list):
+            returned += f" of the shapes {', '.join(map(str, shapes)) or 'none'}"
+        raise UserError(
+            f"throw of the task {type(task).__name__} returns {returned}; return the position and "
+            f"the velocity of the ball, two arrays of the shape {allowed[0]}"
+        )
+
+
+def check_commands(code: str, commands: Any, expected: Mapping[str, Any]) -> None:
+    """Refuses what a method of the task returns for commands, unless it has the expected names, and
+    one number of floating point for each.
+
+    Args:
+      code: the method, for the error.
+    """
+    if not isinstance(commands, Mapping):
+        raise UserError(
+            f"{code} returns {_described(commands)}; return a dictionary of one number for each "
+            "command"
+        )
+    check_names(code, "command", commands, expected)
+    for name, command in commands.items():
+        is_number = _has_shape(command) and command.shape == ()
+        if not (is_number and jnp.issubdtype(command.dtype, jnp.floating)):
+            raise UserError(
+                f"{code} returns {_described(command)} for the command {name}; return one number, "
+                "a JAX array of the shape () and of a floating-point type"
+            )
+
+
+def check_task_step(result: Any, state: Any, task: Task) -> None:
+    """Refuses what the step of a task returns, where a training could not use it.
+
+    Args:
+      result: what it returns, as the shapes and types of its arrays (`jax.eval_shape`).
+      state: the task's state before it, likewise.
+    """
+    name = type(task).__name__
+    if not isinstance(result, TaskStep):
+        raise UserError(
+            f"step of the task {name} returns {_described(result)}; return a task.TaskStep"
+        )
+    _check_numbers("reward term", result.reward, f"reward of the step of the task {name}")
+    _check_numbers("metric", result.metrics, f"metrics of the step of the task {name}")
+    ended = result.ended
+    if not (_has_shape(ended) and ended.shape == () and ended.dtype == bool):
+        raise UserError(
+            f"ended of the step of the task {name} is {_described(ended)}; return one bool, such "
+            "as height < 0"
+        )
+    _check_state(result.state, state, task)
+    check_metrics(result.metrics, task)
+
+
+def _check_state(after: Any, before: Any, task: Task) -> None:
+    """Refuses a state after a step that is of another kind than that of the reset, both as shapes
+    and types: no loop of JAX could carry it."""
+    name = type(task).__name__
+    if jax.tree.structure(after) != jax.tree.structure(before):
+        raise UserError(
+            f"the state of the task {name} is {_described(before)} at a reset and "
+            f"{_described(after)} after a step; return the same structure from both"
+        )
+    places, _ = jax.tree_util.tree_flatten_with_path(before)
+    for (path, old), new in zip(places, jax.tree.leaves(after), strict=True):
+        if (new.shape, new.dtype) != (old.shape, old.dtype):
+            raise UserError(
+                f"the state{jax.tree_util.keystr(path)} of the task {name} is {_described(old)} at "
+                f"a reset and {_described(new)} after a step; return the same shape and type from "
+                "both"
+            )
+
+
+def check_tally(tally: Any, task: Task) -> None:
+    """Refuses a tally that is not numbers by name."""
+    name = type(task).__name__
+    if not isinstance(tally, Tally):
+        raise UserError(
+            f"tally of the task {name} returns {_described(tally)}; return a task.Tally, such as "
+            "task.Tally(sums)"
+        )
+    _check_numbers("sum", tally.sums, f"sums of the tally of the task {name}")
+    _check_numbers("maximum", tally.maxima, f"maxima of the tally of the task {name}")
+
+
+def _check_numbers(kind: str, numbers: Any, code: str) -> None:
+    """Refuses anything but one number for each name.
+
+    Args:
+      kind: what a number is, for the error.
+      code: what the numbers are of, for the error.
+    """
+    if not isinstance(numbers, Mapping):
+        raise UserError(
+            f"the {code} is {_described(numbers)}; return a dictionary of one number for each name"
+        )
+    for name, number in numbers.items():
+        is_number = number.shape == () if _has_shape(number) else isinstance(number, int | float)
+        if not is_number:
+            raise UserError(
+                f"the {kind} {name} in the {code} is {_described(number)}; return one number, an "
+                "array of the shape ()"
+            )
+
+
+def _has_shape(value: Any) -> bool:
+    """Whether a value is an array, or stands for one."""
+    return hasattr(value, "shape") and hasattr(value, "dtype")
+
+
+def _described(value: Any) -> str:
+    """What a task's code returned, for an error."""
+    if _has_shape(value):
+        return f"{value.dtype} of the shape {value.shape}"
+    return "None" if value is None else shorten(f"a {type(value).__name__}")

@@ -11,12 +11,14 @@ import numpy as np
 
 from bounce_mjx.env.checks import (
     ENDS,
+    check_commands,
     check_has_task,
     check_joint_angles,
-    check_metrics,
     check_start,
     check_tags,
     check_task,
+    check_task_step,
+    check_throw,
 )
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState
@@ -217,8 +219,8 @@ class Env:
 
         Raises:
           UserError: the ranges lack a term, or have an unknown one; the task's code returns wrong
-            names; the model lacks what a term changes, or was edited; or the engine does not
-            support what a term changes.
+            names, or arrays where one number is expected; the model lacks what a term changes, or
+            was edited; or the engine does not support what a term changes.
         """
         robot_model.check_unedited(self.mj_model, self._fingerprint)
         if ranges is None:
@@ -231,7 +233,9 @@ class Env:
 
         command_ranges = self._command_ranges(ranges)
         sampled = sample_commands(command_ranges, draws.commands)
-        physics = self._first_physics(draws, world, self.task.throw(draws.task, sampled))
+        thrown = self.task.throw(draws.task, sampled)
+        check_throw(thrown, self.config.num_balls, self.task)
+        physics = self._first_physics(draws, world, thrown)
         truth = self._kinematics(physics, parameters)
         first_command = self._task_command(sampled)
         task = self.task.reset(Start(truth, first_command, draws.task))
@@ -326,7 +330,7 @@ class Env:
         }
 
         after = self._redraw_commands(after)
-        # Its names were checked at the reset.
+        # Its names and shapes were checked at the reset.
         command = self.task.next_command(result.state, after.command)
         after = after._replace(task=result.state, command=command)
         if after.clock is not None:
@@ -447,7 +451,7 @@ class Env:
         """The task's commands from their samples, at a reset and at each redraw, each []."""
         command = self.task.first_command(sampled)
         named = f"first_command of the task {type(self.task).__name__}"
-        check_names(named, "command", command, sampled)
+        check_commands(named, command, sampled)
         return command
 
     def _checked_next_command(
@@ -456,7 +460,7 @@ class Env:
         """The commands of a reset from now on, each []; `task` is the task's state."""
         following = self.task.next_command(task, command)
         named = f"next_command of the task {type(self.task).__name__}"
-        check_names(named, "command", following, command)
+        check_commands(named, following, command)
         return following
 
     def _first_redraw(self, world: World, ranges: Ranges, dtype: jnp.dtype) -> Redraw | None:
@@ -493,7 +497,7 @@ class Env:
     def _first_metrics(self, state: EnvState, truth: Kinematics) -> dict[str, jax.Array]:
         """The metrics of a reset, which are zero except for the privileged ones."""
         zero = jnp.zeros((), truth.joint_angles.dtype)
-        # A step of the task is traced for the names of its metrics, and not computed.
+        # A step of the task is traced for its names, shapes and types, and not computed.
         step = Step(
             truth=truth,
             command=state.command,
@@ -501,7 +505,7 @@ class Env:
             last_action=state.last_action,
         )
         result = jax.eval_shape(lambda: self.task.step(state.task, step))
-        check_metrics(result.metrics, self.task)
+        check_task_step(result, jax.eval_shape(lambda: state.task), self.task)
         rewards = [f"reward/{name}" for name in result.reward]
         metrics = dict.fromkeys([*rewards, *result.metrics, *ENDS], zero)
         metrics |= self._privileged_metrics(state.world, truth)

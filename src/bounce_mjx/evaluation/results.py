@@ -1,6 +1,7 @@
 """The report of an evaluation: the task's expected results, and further figures."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import jax
@@ -8,6 +9,7 @@ import numpy as np
 from pydantic import Field, InstanceOf
 
 from bounce_mjx.env.env import Env
+from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.evaluation.config import command_ranges
 from bounce_mjx.evaluation.statistics import Statistics
 from bounce_mjx.task.results import Episodes, Figure, Result
@@ -96,14 +98,56 @@ def judge(
       recording: of the first episodes.
       commands: ranges of commands in these episodes, where they are not the config's.
       task: the task with the settings of these episodes, where they are not the environment's.
+
+    Raises:
+      UserError: the task gives no results, two of one name, or a detail that is not one number.
     """
     task = task or env.task
     measured = jax.device_get(statistics)
     episodes = episodes_of(measured, command_ranges(env.config) | (commands or {}))
+    results = task.results(episodes)
+    task_details = task.details(episodes)
+    _check_results(results, task)
+    _check_details(task_details, task)
     details = {
         "episodes": float(len(measured.running)),
-        **task.details(episodes),
+        **task_details,
         "mean_return": float(measured.episode_return.astype(float).mean()),
         "mean_length_s": float(measured.steps.astype(float).mean() * env.dt),
     }
-    return Report(task.results(episodes), details, jax.device_get(recording))
+    return Report(tuple(results), details, jax.device_get(recording))
+
+
+def _check_results(results: Any, task: Task) -> None:
+    """Refuses results by which nothing is judged, or of which one would take another's place."""
+    code = f"results of the task {type(task).__name__}"
+    is_sequence = isinstance(results, tuple | list)
+    if not is_sequence or not all(isinstance(result, Result) for result in results):
+        raise UserError(
+            f"{code} returns {shorten(repr(results))}; return a tuple of task.Result, such as "
+            "(task.share_of_episodes(...),)"
+        )
+    if not results:
+        raise UserError(f"{code} returns none, by which nothing is judged; return at least one")
+    names = [result.name for result in results]
+    for name in names:
+        if names.count(name) > 1:
+            raise UserError(
+                f"{code} returns {names.count(name)} of the name {name!r}; give each its own name"
+            )
+
+
+def _check_details(details: Any, task: Task) -> None:
+    """Refuses further figures that are not one number each."""
+    code = f"details of the task {type(task).__name__}"
+    if not isinstance(details, Mapping):
+        raise UserError(
+            f"{code} returns {shorten(repr(details))}; return a dictionary of one number for each "
+            "name"
+        )
+    for name, figure in details.items():
+        if np.ndim(figure) != 0:
+            raise UserError(
+                f"{code} returns an array of the shape {np.shape(figure)} for {name}; return one "
+                "number of all episodes, such as its mean"
+            )

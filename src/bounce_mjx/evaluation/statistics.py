@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from bounce_mjx.env.checks import ENDS
+from bounce_mjx.env.checks import ENDS, check_tally
 from bounce_mjx.env.env import Env, State
 from bounce_mjx.task.task import Moment, Recording, Tally
 
@@ -104,7 +104,12 @@ def accumulate(env: Env, statistics: Statistics, states: State, step: jax.Array)
 
 def _tallies(env: Env, states: State, step: jax.Array) -> Tally:
     """What the task tallies of the step in each of E environments, [E]."""
-    tally = lambda state: env.task.tally(moment(env, state, step))  # noqa: E731
+
+    def tally(state: State) -> Tally:
+        tallied = env.task.tally(moment(env, state, step))
+        check_tally(tallied, env.task)
+        return tallied
+
     return jax.vmap(tally, in_axes=-1, out_axes=-1)(states)
 
 

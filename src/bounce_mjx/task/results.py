@@ -73,8 +73,13 @@ def share_of_episodes(name: str, measured: str, met: np.ndarray, least: float) -
       name: of the result.
       measured: description of the measured quantity.
       met: whether each episode meets the condition [E], bool.
-      least: least share; 1 leaves no room for a margin, and training to it does not stop early.
+      least: least share, from 0 to 1; 1 leaves no room for a margin, and training to it does not
+        stop early.
+
+    Raises:
+      UserError: the least share is not from 0 to 1.
     """
+    _check_share(name, least)
     share = float(met.mean())
     return Result(
         name=name,
@@ -97,8 +102,12 @@ def share_of_events(
       measured: description of the measured quantity.
       met: number that meet the condition in each episode [E].
       events: number of all in each episode [E].
-      least: least share.
+      least: least share, from 0 to 1.
+
+    Raises:
+      UserError: the least share is not from 0 to 1.
     """
+    _check_share(name, least)
     share = mean_of_events(name, f"{measured}, %", met, events, (least, math.inf))
     percentage = None if share.value is None else 100.0 * share.value
     return dataclasses.replace(share, value=percentage, bound=f">= {100 * least:g}")
@@ -122,9 +131,16 @@ def mean_of_events(
       bounds: least and greatest mean, of which one may be infinite.
       condition: the condition that the bounds need and that does not hold, in words; "" where the
         bounds judge.
+
+    Raises:
+      UserError: no mean could lie between the bounds.
     """
-    mean, margin = mean_and_margin(totals, events)
     low, high = bounds
+    if not low <= high:
+        raise UserError(
+            f"the result {name} has the bounds {low:g} and {high:g}; give the lower one first"
+        )
+    mean, margin = mean_and_margin(totals, events)
     if math.isinf(low):
         bound = f"<= {high:g}"
     elif math.isinf(high):
@@ -167,6 +183,15 @@ def mean_and_margin(totals: np.ndarray, events: np.ndarray) -> tuple[float | Non
     mean = float(totals.sum() / count)
     spread = float((totals - mean * events).std() / events.mean())
     return mean, MARGIN_ERRORS * spread / math.sqrt(MARGIN_EPISODES)
+
+
+def _check_share(name: str, least: float) -> None:
+    """Refuses a least share that is not from 0 to 1, such as one in %."""
+    if not 0.0 <= least <= 1.0:
+        raise UserError(
+            f"the result {name} has the least share {least:g}; give one from 0 to 1, such as 0.95 "
+            "for 95 %"
+        )
 
 
 def _clearness(distance: float, margin: float) -> float:

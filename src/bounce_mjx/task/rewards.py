@@ -36,7 +36,10 @@ class RewardTerm(StrictModel):
         Args:
           inputs: what the task gives to its terms.
         """
-        raise NotImplementedError
+        raise UserError(
+            f"the reward term {type(self).__name__} has no method value; write one, which returns "
+            "the unweighted term"
+        )
 
 
 class Near(RewardTerm):
@@ -104,8 +107,8 @@ def weighted_terms(
       term_inputs: by a term's name, what its formula takes instead.
 
     Raises:
-      UserError: a name of `term_inputs` is no term, a term has no inputs, or a ready-made one gets
-        something else than numbers.
+      UserError: a name of `term_inputs` is no term, a term has no inputs or returns nothing, or a
+        ready-made one gets something else than numbers.
     """
     names = term_names(type(reward))
     provided = set(term_inputs)
@@ -118,7 +121,12 @@ def weighted_terms(
         term = getattr(reward, name)
         given = term_inputs.get(name, inputs)
         _check_numbers(name, term, given)
-        weighted[name] = term.weight * term.value(given)
+        value = term.value(given)
+        if value is None:
+            raise UserError(
+                f"the reward term {name}, a {type(term).__name__}, returns None; return one number"
+            )
+        weighted[name] = term.weight * value
     return weighted
 
 

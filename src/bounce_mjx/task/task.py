@@ -236,7 +236,7 @@ class Task:
 
     def reset(self, start: Start) -> TaskState:
         """The task's state at the start of an episode."""
-        raise NotImplementedError
+        raise self._lacking("reset", "returns its state at the start of an episode")
 
     def step(self, state: TaskState, step: Step) -> TaskStep:
         """The task's part of a control step: events, reward, end and metrics. The new state has
@@ -245,7 +245,7 @@ class Task:
         Args:
           state: the task's state before the step.
         """
-        raise NotImplementedError
+        raise self._lacking("step", "returns a task.TaskStep")
 
     def first_command(self, command: Values) -> Values:
         """The commands from a new sample, at a reset or within an episode, for a task in which a
@@ -296,7 +296,7 @@ class Task:
 
     def results(self, episodes: Episodes) -> tuple[Result, ...]:
         """The expected results, from the figures of E episodes."""
-        raise NotImplementedError
+        raise self._lacking("results", "returns a tuple of task.Result")
 
     def details(self, episodes: Episodes) -> dict[str, Figure]:
         """Further figures by name; a unit is the end of the name, such as `mean_error_m`."""
@@ -330,6 +330,12 @@ class Task:
         """Point at which a viewer looks, m: the paddle below the ball at a reset."""
         x, y, z = self.config.ball_init_pos
         return x, y, z - 0.4
+
+    def _lacking(self, method: str, purpose: str) -> UserError:
+        """The error of a task without a method that it needs."""
+        return UserError(
+            f"the task {type(self).__name__} has no method {method}; write one, which {purpose}"
+        )
 
 
 def latest(

@@ -8,6 +8,7 @@ from typing import Annotated, Literal, NamedTuple, get_args
 from pydantic import Field
 
 from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.errors import UserError
 from bounce_mjx.lazy import jax, jnp
 
 History = Annotated[int, Field(ge=0, le=100)]
@@ -83,13 +84,22 @@ class ObservationConfig(StrictModel):
 
     @classmethod
     def quantities(cls) -> dict[str, Quantity]:
-        """All quantities by name, in the order of the observation."""
+        """All quantities by name, in the order of the observation.
+
+        Raises:
+          UserError: a quantity has no such group.
+        """
+        groups = get_args(Group)
         quantities = {}
         for name, field in cls.model_fields.items():
             for mark in field.metadata:
                 if isinstance(mark, Quantity):
+                    if mark.group not in groups:
+                        raise UserError(
+                            f"the quantity {name} of {cls.__name__} has the group {mark.group!r}; "
+                            f"choose from {', '.join(groups)}"
+                        )
                     quantities[name] = mark
-        groups = get_args(Group)
         in_order = sorted(quantities.items(), key=lambda item: groups.index(item[1].group))
         return dict(in_order)
 
@@ -142,10 +152,21 @@ class ObservationLayout:
         raise KeyError(name)
 
     def pack(self, values: dict[str, jax.Array]) -> jax.Array:
-        """The observation [size] from the values of every part, [part.length]."""
+        """The observation [size] from the values of every part, [part.length].
+
+        Raises:
+          UserError: a part has another number of entries, which JAX would cut off or repeat.
+        """
         # One scalar per entry, which XLA fuses with the physics; whole arrays would be copied.
         entries = []
         for part in self.parts:
+            num_entries = len(values[part.name])
+            if num_entries != part.length:
+                raise UserError(
+                    f"the observation's quantity {part.name} gets {num_entries} numbers, but takes "
+                    f"{part.length}, which are {part.count} values of the size {part.size}; return "
+                    "as many, or change the size of its Quantity"
+                )
             for i in range(part.length):
                 entries.append(values[part.name][i])
         return jnp.stack(entries)
