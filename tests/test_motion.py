@@ -418,6 +418,33 @@ def test_zeros_of_a_driver_without_data_are_no_command() -> None:
             policy.step(seen(np.zeros(joints), 0, 0.3))
 
 
+def test_targets_at_which_the_arm_does_not_rest_are_no_command() -> None:
+    """Neither in degrees nor as zeros of a driver without data; the measured angles are right."""
+    for name in ("robust", "ur5e", "panda"):
+        _, home, seen = supervised(name)
+        policy = load_policy(name)
+        policy.reset(home)
+        with pytest.raises(UserError, match=r"the target of .* is -?\d+, but .* \(rad\); give"):
+            policy.reset(np.degrees(home))
+        # Nothing was forgotten.
+        np.testing.assert_array_equal(policy.targets, home)
+        policy.reset(0.0 * home)
+        arm = policy.supervise(500)
+        for step in range(120):
+            assert arm.commands(seen(home + 0.05, step, 0.3)).shape == (0, len(home))
+            if step == 0:
+                assert "the commands at which the arm is said to rest" in arm.reason
+        assert (arm.state, arm.fault) == ("stopped", "joint_astray")
+        assert "check its load, its zero and the targets given to reset" in arm.reason
+        arm.restart(moved=True)
+        assert len(arm.commands(seen(home + 0.05, 120, 0.3))) == 5
+        # True targets are where the commands begin.
+        policy = load_policy(name)
+        policy.reset(home + 0.5)
+        arm = policy.supervise(500)
+        assert np.max(np.abs(arm.commands(seen(home + 0.5, 0, 0.3)) - home - 0.5)) < 4e-3
+
+
 def test_an_arm_without_lag_and_one_wrong_sample_are_no_fault() -> None:
     for name in ("robust", "robust_small", "pretrained"):
         arm, home, seen = supervised(name)

@@ -129,11 +129,13 @@ class DeployedPolicy:
             moves, wherever the arm is measured; by default, the joint angles of the next step.
 
         Raises:
-          UserError: the targets are not J finite numbers; nothing is forgotten.
+          UserError: the targets are not J finite numbers, or 0.5 rad outside the joint ranges;
+            nothing is forgotten.
         """
         count = len(self.metadata.joint_names)
         if targets is not None:
             targets = _array("the targets", targets, count, "rad", _LARGEST)
+            self.samples.check_range("target", targets)
         self._network.reset()
         self.samples.forget(targets)
         self._measured: Measurements = {}

@@ -84,6 +84,8 @@ class Supervisor:
         docs/real-robot.md; `stopped` after `stop`."""
         self.reason: str | None = None
         """Why the arm has stopped or brakes, or what it waits for on its way home."""
+        self._has_found_arm = False
+        """Whether the arm has been measured where its commands rest; nothing is sent before."""
         self._is_moving_home = False
         self._waited = 0
         """Control steps in a row in which the arm was not where its commands rest."""
@@ -148,7 +150,8 @@ class Supervisor:
 
     def commands(self, measurements: Mapping[str, Any]) -> np.ndarray:
         """Commands [M, J] of a control step at the robot's rate, rad; none ([0, J]) until a first
-        sample is believed (`Samples`), so that nothing is sent.
+        sample is believed (`Samples`), and the arm is where `DeployedPolicy.reset` was told that it
+        rests, so that nothing is sent.
 
         Args:
           measurements: as for `DeployedPolicy.step`. Before `start`, only the joint angles are
@@ -191,6 +194,8 @@ class Supervisor:
                 self.state = "stopped"
         self._end = self._motion.end
         self._has_begun = True
+        if not self._has_found_arm:
+            return self._no_commands
         return self._motion.at(self._times)
 
     @property
@@ -263,8 +268,8 @@ class Supervisor:
         self._waited += 1
         reason = (
             f"{self._metadata.joint_names[joint]} is {beside[joint]:.2g} rad from where its "
-            "commands rest; check its load and its zero, or, if the arm was moved with its servos "
-            "off, call restart(moved=True)"
+            "commands rest; check its load, its zero and the targets given to reset, or, if the "
+            "arm was moved with its servos off, call restart(moved=True)"
         )
         if self._waited * self._metadata.control_dt > _SETTLING:
             self.stop(reason, "joint_astray")
@@ -294,6 +299,7 @@ class Supervisor:
                     self._motion.hold()
                 return
             self._watch.rest(angles, self._targets)
+            self._has_found_arm = True
             self._is_moving_home = True
             self.reason = None
         is_bridged = policy.samples.is_arm_bridged
