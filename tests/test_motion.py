@@ -712,6 +712,58 @@ def test_what_is_done_to_the_policy_of_a_resting_arm_moves_nothing(is_reset: boo
     arm.check()
 
 
+@pytest.mark.parametrize("moment", ["homing", "ready", "start", "running", "restart"])
+def test_a_stop_that_comes_while_a_call_works_stays(moment: str) -> None:
+    """As from another thread, or from a signal handler within the call."""
+    arm = Arm(limited().supervise(1000))
+    supervisor, policy = arm.supervisor, arm.supervisor._policy
+    if moment != "homing":
+        arm.until("ready")
+    if moment == "running":
+        supervisor.start()
+        for i in range(25):
+            arm.step(**flying(i))
+    if moment == "restart":
+        supervisor.stop("the operator")
+        arm.until("stopped")
+
+    def press_stop() -> None:
+        supervisor.stop("the operator pressed stop")
+
+    class PressedWhileRead(dict):
+        def items(self) -> Any:
+            press_stop()
+            return super().items()
+
+    if moment in ("start", "restart"):
+        reset = policy.reset
+
+        def pressed_reset(*targets: Any) -> None:
+            press_stop()
+            reset(*targets)
+
+        policy.reset = pressed_reset
+        if moment == "start":
+            supervisor.start()
+        else:
+            supervisor.restart(moved=True)
+        policy.reset = reset
+    else:
+        given = measured(arm.angles, **flying(25)) | {"time": arm.time}
+        arm.rows.extend(supervisor.commands(PressedWhileRead(given)))
+        arm.angles, arm.time = arm.rows[-1], arm.time + 0.01
+    for _ in range(50):
+        assert supervisor.state in ("braking", "stopped") and supervisor.fault == "stopped"
+        assert supervisor.reason == "the operator pressed stop"
+        with pytest.raises(UserError, match="starts when it is ready"):
+            supervisor.start()
+        arm.rows.extend(supervisor.commands({}))
+    assert supervisor.state == "stopped"
+    arm.check()
+    supervisor.restart()
+    assert (supervisor.state, supervisor.fault) == ("homing", None)
+
+
 def test_steps_beside_a_supervisor_without_commands_are_no_commands() -> None:
     policy = limited()
     supervisor = policy.supervise(1000)

@@ -4,7 +4,7 @@ import math
 import traceback
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -29,6 +29,15 @@ _NEWER = "the policy has a newer supervisor; call that one"
 _MOVED = "the policy was reset or stepped beside its supervisor; call the supervisor alone"
 # In which an arm comes to rest where its commands do, s.
 _SETTLING = 1.0
+
+
+class Stop(NamedTuple):
+    """Why an arm stops."""
+
+    fault: str
+    reason: str
+    is_at_rest: bool = False
+    """Whether the commands rest."""
 
 
 class Supervisor:
@@ -78,12 +87,13 @@ class Supervisor:
             raise UserError(f"the box is {box}; give its lowest and its highest x, y and z, m")
         self._has_box = bool(np.any(np.isfinite(self._box)))
         self._watch = Watch(self._metadata, age)
-        self.state: State = "homing"
-        self.fault: str | None = None
-        """Code of the rule that was broken, such as `ball_lost`, of the tables in
-        docs/real-robot.md; `stopped` after `stop`."""
-        self.reason: str | None = None
-        """Why the arm has stopped or brakes, or what it waits for on its way home."""
+        # A stop may come within any other call, from another thread or a signal handler: it is one
+        # assignment, which `restart` alone takes back.
+        self._stop: Stop | None = None
+        self._phase: State = "homing"
+        """The state unless there is a stop."""
+        self._waits_for: str | None = None
+        """Why the arm waits on its way home."""
         self._has_found_arm = False
         """Whether the arm has been measured where its commands rest; nothing is sent before."""
         self._is_moving_home = False
@@ -93,6 +103,26 @@ class Supervisor:
         """Measured [J] in the last step at home, rad."""
         # An arm may rest at the last commands, far from the start pose.
         policy.samples.forget(policy.targets)
+
+    @property
+    def state(self) -> State:
+        stop = self._stop
+        if stop is None:
+            return self._phase
+        return "stopped" if stop.is_at_rest else "braking"
+
+    @property
+    def fault(self) -> str | None:
+        """Code of the rule that was broken, such as `ball_lost`, of the tables in
+        docs/real-robot.md; `stopped` after `stop`."""
+        stop = self._stop
+        return None if stop is None else stop.fault
+
+    @property
+    def reason(self) -> str | None:
+        """Why the arm has stopped or brakes, or what it waits for on its way home."""
+        stop = self._stop
+        return self._waits_for if stop is None else stop.reason
 
     def start(self) -> None:
         """Starts an episode.
@@ -113,14 +143,14 @@ class Supervisor:
         self._end = self._motion.end
         self._watch.begin()
         self._idle = 0
-        self.state = "running"
+        self._phase = "running"
 
     def stop(self, reason: str, fault: str = "stopped") -> None:
-        """Brakes, from any state."""
-        if self.state not in ("braking", "stopped"):
-            self.state = "braking"
-            self.fault = fault
-            self.reason = reason
+        """Brakes, from any state. It may be called at any time, also by another thread or a signal
+        handler while `commands` works; the commands of the next control step brake, at the
+        latest."""
+        if self._stop is None:
+            self._stop = Stop(fault, reason)
 
     def restart(self, moved: bool = False) -> None:
         """Goes home after a stop, for the next `start`. The commands go on where they rest, and
@@ -137,9 +167,10 @@ class Supervisor:
         if self.state != "stopped":
             raise UserError(f"the arm is {self.state}; restart it when it has stopped")
         self._take_back()
-        self.state = "homing"
-        self.fault = None
-        self.reason = None
+        self._phase = "homing"
+        self._waits_for = None
+        # A stop from here on stays.
+        self._stop = None
         self._is_moving_home = False
         self._waited = 0
         if moved:
@@ -164,9 +195,7 @@ class Supervisor:
             as the first joint angles are wrong. Afterwards nothing is raised, and the arm brakes.
         """
         if self._policy.supervisor is not self:
-            self.state = "stopped"
-            self.fault = "error"
-            self.reason = _NEWER
+            self._stop = Stop("error", _NEWER, is_at_rest=True)
             return self._no_commands
         try:
             if self._has_other_order:
@@ -181,17 +210,18 @@ class Supervisor:
             if not self._has_begun:
                 raise
             self.stop(*_fault_of(error))
+        stop = self._stop
         if self._targets is None:
-            if self.state == "braking":
-                self.state = "stopped"
+            if stop is not None:
+                self._stop = stop._replace(is_at_rest=True)
             return self._no_commands
-        if self.state in ("braking", "stopped"):
+        if stop is not None:
             # What this step was to send is not sent.
             if self._end is not None:
                 self._motion.end = self._end
             self._motion.hold()
-            if self.state == "braking" and self._motion.is_still:
-                self.state = "stopped"
+            if self._motion.is_still:
+                self._stop = stop._replace(is_at_rest=True)
         self._end = self._motion.end
         self._has_begun = True
         if not self._has_found_arm:
@@ -248,7 +278,7 @@ class Supervisor:
         try:
             angles = self._angles(measurements)
         except UnconfirmedSample as error:
-            self.reason = str(error)
+            self._waits_for = str(error)
             return None
         if self._targets is None:
             policy.reset(angles)
@@ -263,7 +293,7 @@ class Supervisor:
         joint = int(np.argmax(beside))
         if beside[joint] <= self._watch.offset:
             self._waited = 0
-            self.reason = None
+            self._waits_for = None
             return True
         self._waited += 1
         reason = (
@@ -274,7 +304,7 @@ class Supervisor:
         if self._waited * self._metadata.control_dt > _SETTLING:
             self.stop(reason, "joint_astray")
         else:
-            self.reason = reason
+            self._waits_for = reason
         return False
 
     def _stop_at(self, faults: Iterable[Fault]) -> bool:
@@ -301,7 +331,7 @@ class Supervisor:
             self._watch.rest(angles, self._targets)
             self._has_found_arm = True
             self._is_moving_home = True
-            self.reason = None
+            self._waits_for = None
         is_bridged = policy.samples.is_arm_bridged
         if self._stop_at(self._watch.arm_faults(angles, self._targets, is_bridged)):
             return
@@ -316,9 +346,9 @@ class Supervisor:
         if not self._motion.is_still:
             return
         if self._rests(angles):
-            self.state = "ready"
-        elif self.state == "ready":
-            self.state = "homing"
+            self._phase = "ready"
+        else:
+            self._phase = "homing"
 
     def _follow(self, measurements: Mapping[str, Any]) -> None:
         """A step of the policy."""
