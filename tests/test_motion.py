@@ -239,6 +239,45 @@ def test_a_call_without_a_new_step_goes_on_where_the_last_ended(late: float) -> 
     arm.check()
 
 
+@pytest.mark.parametrize("is_limited", [False, True], ids=["without limits", "limits"])
+@pytest.mark.parametrize("rate, fault", [(50, None), (100, None), (200, None), (500, "no_step")])
+def test_the_way_home_has_its_speed_at_any_rate_of_calls(
+    rate: int, fault: str | None, is_limited: bool
+) -> None:
+    """As of a robot that calls at its own rate, and sends the first one of the commands."""
+    policy = limited() if is_limited else load_policy("pretrained")
+    arm = policy.supervise(500)
+    start = HOME + [0.4, 0.0, 0.0, 0.0, 0.0, 0.0]
+    angles = start
+    for call in range(4 * rate):
+        commands = arm.commands(measured(angles, time=7.0 + call / rate))
+        if len(commands):
+            # A step begins up to half a step early, and goes on to its end.
+            allowed = 0.3 * (call / rate + 0.015)
+            assert np.max(np.abs(commands - start)) <= allowed + 1e-9
+            angles = angles + (commands[0] - angles) * (1.0 - np.exp(-1.0 / rate / 0.02))
+    assert (arm.state, arm.fault) == (("stopped", fault) if fault else ("ready", None))
+
+
+def test_a_clock_that_stands_at_home_is_noticed_and_may_begin_anew_after_a_restart() -> None:
+    arm = Arm(limited().supervise(1000))
+    arm.until("ready")
+    time = arm.time
+    for _ in range(2):
+        assert arm.step(time=time) == "ready"
+    # A new step ends the row.
+    arm.time = time + 0.01
+    assert arm.step() == "ready"
+    for repeats in range(1, 4):
+        assert arm.step(time=time + 0.01) == ("ready" if repeats < 3 else "stopped")
+    assert arm.supervisor.fault == "no_step" and "3 calls in a row" in arm.supervisor.reason
+    arm.supervisor.restart()
+    arm.time = 0.0
+    arm.until("ready", 20)
+    for _ in range(20):
+        assert arm.step() == "ready"
+
+
 def supervised(name: str) -> tuple[Any, np.ndarray, Any]:
     """A supervisor of a shipped policy, the arm's home, and measurements of a ball above it."""
     policy = load_policy(name)

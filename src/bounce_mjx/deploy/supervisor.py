@@ -10,7 +10,7 @@ import numpy as np
 
 from bounce_mjx.deploy.faults import Fault, Watch, picture_age
 from bounce_mjx.deploy.motion import paddle_position
-from bounce_mjx.deploy.samples import UnconfirmedSample, check_mapping
+from bounce_mjx.deploy.samples import Measurements, UnconfirmedSample, check_mapping
 from bounce_mjx.errors import UserError
 from bounce_mjx.robot.setpoints import Setpoint
 
@@ -99,6 +99,10 @@ class Supervisor:
         self._is_moving_home = False
         self._waited = 0
         """Control steps in a row in which the arm was not where its commands rest."""
+        self._idle = 0
+        """Calls in a row that are no new control step."""
+        self._due: float | None = None
+        """Time at which the last step on the way home was due, s; None before it."""
         self._resting_angles = np.array(self._metadata.default_joint_angles)
         """Measured [J] in the last step at home, rad."""
         # An arm may rest at the last commands, far from the start pose.
@@ -262,29 +266,30 @@ class Supervisor:
         """Whether the policy's joints have another order than when the supervisor began."""
         return self._policy.motion is not self._motion
 
-    def _angles(self, measurements: Mapping[str, Any]) -> np.ndarray:
-        """The joint angles [J], whatever else is measured."""
+    def _read_arm(self, measurements: Mapping[str, Any]) -> Measurements:
+        """`joint_angles` [J] and, if it is given, `time` [1], whatever else is measured."""
         check_mapping(measurements)
         of_arm = {
             name: value for name, value in measurements.items() if name in ("joint_angles", "time")
         }
-        return self._policy.read(of_arm, ("joint_angles",))["joint_angles"]
+        return self._policy.read(of_arm, ("joint_angles",))
 
-    def _find_arm(self, measurements: Mapping[str, Any]) -> np.ndarray | None:
-        """The joint angles [J] of the arm at rest, from which it goes home; None while that is not
-        known. The first command is where the arm is; after a stop, the arm has to be where its
-        commands rest."""
+    def _find_arm(self, measurements: Mapping[str, Any]) -> Measurements | None:
+        """What is measured (`_read_arm`) of the arm at rest, from which it goes home; None while
+        that is not known. The first command is where the arm is; after a stop, the arm has to be
+        where its commands rest."""
         policy = self._policy
         try:
-            angles = self._angles(measurements)
+            measured = self._read_arm(measurements)
         except UnconfirmedSample as error:
             self._waits_for = str(error)
             return None
+        angles = measured["joint_angles"]
         if self._targets is None:
             policy.reset(angles)
             policy.samples.rest(angles)
-            return angles
-        return angles if self._rests(angles) else None
+            return measured
+        return measured if self._rests(angles) else None
 
     def _rests(self, angles: np.ndarray) -> bool:
         """Whether the arm is where its commands rest. Else there is a reason for which it waits,
@@ -321,22 +326,29 @@ class Supervisor:
         policy = self._policy
         home = np.array(self._metadata.default_joint_angles)
         if self._is_moving_home:
-            angles = self._angles(measurements)
+            measured = self._read_arm(measurements)
         else:
-            angles = self._find_arm(measurements)
-            if angles is None:
+            measured = self._find_arm(measurements)
+            if measured is None:
                 if self._targets is not None:
                     self._motion.hold()
                 return
-            self._watch.rest(angles, self._targets)
+            self._watch.rest(measured["joint_angles"], self._targets)
+            self._idle = 0
+            self._due = None
             self._has_found_arm = True
             self._is_moving_home = True
             self._waits_for = None
+        # Each call moves the commands for a whole control step, so that those of one share its way.
+        speed = _HOME_SPEED / (1 + self._idle)
+        if not self._is_new_step(self._steps_since_due(measured)):
+            return
+        angles = measured["joint_angles"]
         is_bridged = policy.samples.is_arm_bridged
         if self._stop_at(self._watch.arm_faults(angles, self._targets, is_bridged)):
             return
         if np.abs(self._targets - home).max() > _HOME_TOLERANCE:
-            self._motion.move(home, _HOME_SPEED)
+            self._motion.move(home, speed)
             # An arm that starts outside of the box may come in.
             if self._outside(self._motion.start.position) <= 0.0:
                 self._keep_in_box()
@@ -354,22 +366,42 @@ class Supervisor:
         """A step of the policy."""
         policy = self._policy
         measured = policy.read(measurements, (*policy.needs, "joint_angles"))
-        late = policy.steps_since(measured) - 1
+        steps = policy.steps_since(measured)
+        late = steps - 1
         if late > self._max_steps_late:
             self.stop(f"a control step came {late} steps late", "late_step")
             return
         is_bridged = policy.samples.is_arm_bridged
         if self._stop_at(self._watch.faults(measured, self._targets, is_bridged)):
             return
-        last = policy.step_number
-        policy.act(measured)
-        self._idle = self._idle + 1 if policy.step_number == last else 0
-        if self._idle:
-            self._motion.hold()
+        if self._is_new_step(steps):
+            policy.act(measured)
+        self._keep_in_box()
+
+    def _steps_since_due(self, measured: Measurements) -> int:
+        """Control steps since the last one on the way home, rounded as those of the policy."""
+        if "time" not in measured:
+            return 1
+        time = float(measured["time"][0])
+        if self._due is None:
+            self._due = time
+            return 1
+        dt = self._metadata.control_dt
+        steps = max(0, round((time - self._due) / dt))
+        self._due += steps * dt
+        return steps
+
+    def _is_new_step(self, steps: int) -> bool:
+        """Whether a call is a new control step: some steps after the last one. In a call that is
+        none the commands brake, and after too many in a row the arm stops."""
+        if steps > 0:
+            self._idle = 0
+            return True
+        self._idle += 1
+        self._motion.hold()
         if self._idle > self._max_steps_late:
             self.stop(f"{self._idle} calls in a row are no new step", "no_step")
-            return
-        self._keep_in_box()
+        return False
 
     def _keep_in_box(self) -> None:
         """Brakes if the paddle would leave the box when the commands braked from the end of this
