@@ -186,7 +186,14 @@ def test_a_command_outside_of_the_box_is_a_fault() -> None:
 
 
 SETTINGS = {
-    "box": [((0, 0, 0), (1, math.nan, 1)), ((1, 1, 1), (0, 0, 0)), ((0, 0), (1, 1))],
+    "box": [
+        ((0, 0, 0), (1, math.nan, 1)),
+        ((1, 1, 1), (0, 0, 0)),
+        ((0, 0), (1, 1)),
+        # In mm and in cm, also of one end alone.
+        ((-1000, -500, -200), (1000, 500, 600)),
+        ((-0.1, -0.5, -math.inf), (math.inf, math.inf, 60)),
+    ],
     "max_picture_age": [0.0, -0.1, 1.5, math.nan, math.inf],
     "max_steps_late": [0, -1, math.nan, math.inf],
     "rate": [125, 0, math.nan],
@@ -199,6 +206,7 @@ def test_a_wrong_setting_is_refused_at_once(name: str) -> None:
     for value in SETTINGS[name]:
         with pytest.raises(UserError, match=f"the {name} is|{name} is"):
             policy.supervise(**{"rate": 1000} | {name: value})
+    policy.supervise(1000, box=((-30, -math.inf, 0), (30, math.inf, 1)))
 
 
 def test_the_largest_age_of_a_picture_is_that_of_the_training() -> None:

@@ -275,7 +275,8 @@ class DeployedPolicy:
         an earlier one.
 
         Args:
-          settings: `box`, the lowest and the highest x, y and z of the paddle's centre, m;
+          settings: `box`, the lowest and the highest x, y and z of the paddle's centre, m (each
+            infinite, or at most 30 from the base);
             `max_picture_age`, s (at most 1; by default the file's largest latency and five of its
             longest camera intervals, at least 0.1); `max_steps_late`, control steps between two
             steps, and calls in a row without a new step (2).

@@ -27,6 +27,8 @@ _HOME_SPEED = 0.3
 _OTHER_ORDER = "the policy's joints have another order than the supervisor's; call supervise again"
 _NEWER = "the policy has a newer supervisor; call that one"
 _MOVED = "the policy was reset or stepped beside its supervisor; call the supervisor alone"
+# Of an end of a box from the base, m.
+_FARTHEST_END = 30.0
 # In which an arm comes to rest where its commands do, s.
 _SETTLING = 1.0
 
@@ -85,6 +87,12 @@ class Supervisor:
         self._max_steps_late = max_steps_late
         if self._box.shape != (2, 3) or not np.all(self._box[0] < self._box[1]):
             raise UserError(f"the box is {box}; give its lowest and its highest x, y and z, m")
+        farthest = np.max(np.abs(self._box), where=np.isfinite(self._box), initial=0.0)
+        if farthest > _FARTHEST_END:
+            raise UserError(
+                f"the box is {box}, and ends {farthest:g} from the base, but no arm reaches "
+                f"{_FARTHEST_END:g} m; give metres, or inf for an end that is not there"
+            )
         self._has_box = bool(np.any(np.isfinite(self._box)))
         self._watch = Watch(self._metadata, age)
         # A stop may come within any other call, from another thread or a signal handler: it is one
