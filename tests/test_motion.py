@@ -215,6 +215,19 @@ def test_the_largest_age_of_a_picture_is_that_of_the_training() -> None:
         assert picture_age(load_policy(name).metadata) == pytest.approx(expected)
 
 
+def test_a_missing_measurement_is_named_with_each_that_is_needed_once() -> None:
+    arm = running()
+    given = measured(arm.angles)
+    del given["ball_position"]
+    arm.supervisor.commands(given | {"time": arm.time})
+    needs = arm.supervisor._policy.needs
+    assert arm.supervisor.reason == (
+        f"the measurement ball_position is missing; this policy needs {', '.join(needs)} in every "
+        "step"
+    )
+    assert needs.count("joint_angles") == 1
+
+
 @pytest.mark.parametrize("rate", [100, 125, 1000])
 def test_a_policy_acts_at_its_own_rate(rate: int) -> None:
     policy, rng = load_policy("pretrained"), np.random.default_rng(0)

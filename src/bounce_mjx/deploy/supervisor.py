@@ -373,7 +373,9 @@ class Supervisor:
     def _follow(self, measurements: Mapping[str, Any]) -> None:
         """A step of the policy."""
         policy = self._policy
-        measured = policy.read(measurements, (*policy.needs, "joint_angles"))
+        # Of a policy that does not see them, the arm needs the angles all the same.
+        needs = dict.fromkeys((*policy.needs, "joint_angles"))
+        measured = policy.read(measurements, tuple(needs))
         steps = policy.steps_since(measured)
         late = steps - 1
         if late > self._max_steps_late:
