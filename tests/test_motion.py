@@ -190,13 +190,16 @@ SETTINGS = {
         ((0, 0, 0), (1, math.nan, 1)),
         ((1, 1, 1), (0, 0, 0)),
         ((0, 0), (1, 1)),
+        ((0, 0, 0), (1, 1)),
+        "1 m",
+        None,
         # In mm and in cm, also of one end alone.
         ((-1000, -500, -200), (1000, 500, 600)),
         ((-0.1, -0.5, -math.inf), (math.inf, math.inf, 60)),
     ],
-    "max_picture_age": [0.0, -0.1, 1.5, math.nan, math.inf],
-    "max_steps_late": [0, -1, math.nan, math.inf],
-    "rate": [125, 0, math.nan],
+    "max_picture_age": [0.0, -0.1, 1.5, math.nan, math.inf, "0.1", [0.1]],
+    "max_steps_late": [0, -1, math.nan, math.inf, None, "2"],
+    "rate": [125, 0, math.nan, "500", None, [500]],
 }
 
 
@@ -206,6 +209,8 @@ def test_a_wrong_setting_is_refused_at_once(name: str) -> None:
     for value in SETTINGS[name]:
         with pytest.raises(UserError, match=f"the {name} is|{name} is"):
             policy.supervise(**{"rate": 1000} | {name: value})
+    policy.supervise(np.float32(1000.0), max_steps_late=np.int64(2))
+    policy.reset()
     policy.supervise(1000, box=((-30, -math.inf, 0), (30, math.inf, 1)))
 
 

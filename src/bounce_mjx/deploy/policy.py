@@ -1,6 +1,7 @@
 """A trained policy on a robot: measurements in, actions out, with only NumPy and onnxruntime."""
 
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -255,7 +256,7 @@ class DeployedPolicy:
     def commands_per_step(self, rate: float) -> int:
         """Number of `commands` of a control step at a rate (Hz); UserError as there."""
         dt = self.metadata.control_dt
-        count = rate * dt
+        count = rate * dt if isinstance(rate, Real) else 0.0
         if not (0.999 < count < 10_000.5 and abs(count - round(count)) < 1e-3):
             raise UserError(
                 f"the rate is {rate!r} Hz, but must be a multiple of {1.0 / dt:g} Hz, one command "

@@ -3,6 +3,7 @@
 import math
 import traceback
 from collections.abc import Iterable, Mapping, Sequence
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -81,9 +82,12 @@ class Supervisor:
             ("max_picture_age", age, 1.0),
             ("max_steps_late", max_steps_late, 1.0 / self._metadata.control_dt),
         ):
-            if not 0.0 < value <= most:
-                raise UserError(f"{name} is {value}; give a number above 0 and at most {most:g}")
-        self._box = np.array(box, float)
+            if not (isinstance(value, Real) and 0.0 < value <= most):
+                raise UserError(f"{name} is {value!r}; give a number above 0 and at most {most:g}")
+        try:
+            self._box = np.array(box, float)
+        except (TypeError, ValueError):
+            self._box = np.zeros(0)
         self._max_steps_late = max_steps_late
         if self._box.shape != (2, 3) or not np.all(self._box[0] < self._box[1]):
             raise UserError(f"the box is {box}; give its lowest and its highest x, y and z, m")
