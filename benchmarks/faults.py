@@ -45,7 +45,7 @@ RATE = 500.0
 FAULT_AT = 1.5
 """Time of the fault after the start of the episode, s."""
 FAULT_AT_OF = {"catch": 0.7}
-"""The same of policies whose arm rests by then: a joint that is not asked to move shows no fault."""
+"""The same of policies whose arm rests by then: a joint that is not asked to move shows none."""
 SECONDS = 4.0
 """Length of a run after the start of the episode, s."""
 BOX = 0.5

@@ -34,8 +34,8 @@ _SECTIONS = (
     ("Batches of environments", "", "env.vector"),
     (
         "Tasks",
-        "All of these are names of `bounce_mjx.task`. [Write a task](tasks.md#write-a-task) shows "
-        "their use.",
+        "All but `find_task` are names of `bounce_mjx.task`. "
+        "[Write a task](tasks.md#write-a-task) shows their use.",
         "task.task world.config.WorldConfig world.config.Command world.observation.Quantity "
         "task.results task.registry.find_task",
     ),

@@ -1,6 +1,8 @@
 """PureJaxRL's loop in small, with its names: collect, advantages and update in one `scan`.
 
-`python examples/purejaxrl.py` needs only the core package. The algorithm is advantage actor-critic.
+`python examples/purejaxrl.py` needs only the core package. The algorithm is advantage actor-critic,
+with one gradient step for each rollout. It shows the form and prints a tenth of the mean
+reward of each update; in these 500 updates it does not learn to bounce.
 """
 
 from typing import Any, NamedTuple
@@ -108,7 +110,7 @@ def loss_fn(
 
 
 def main(num_envs: int = 512, rollout: int = 32, updates: int = 500) -> list[float]:
-    """Trains; the mean reward of each update.
+    """Trains; the mean scaled reward of each update.
 
     Args:
       rollout: steps of each environment in an update.

@@ -1,5 +1,6 @@
 """A hidden robot on C is identified, and each part of the fit agrees with another computation."""
 
+import html
 import re
 import runpy
 from pathlib import Path
@@ -221,6 +222,20 @@ def test_logs_of_the_longest_steps_are_joined_with_a_gap() -> None:
     joined = join([slow, slow])
     for times in (joined.times, joined.target_times):
         assert len(find_gaps(times)) == 1
+
+
+@pytest.mark.parametrize("lost", [1, 5])
+def test_a_lost_row_of_an_even_log_is_a_gap(lost: int) -> None:
+    """In 50 ms an arm moves by targets that the log lacks, and a fit would take the last one."""
+    random = np.random.default_rng(0)
+    times = 0.01 * np.arange(400.0)
+    rows = np.r_[:200, 200 + lost : 400]
+    for noise in (0.0, 3e-4):
+        stamps = times[rows] + random.uniform(-noise, noise, len(rows))
+        assert find_gaps(stamps) == [(stamps[199], stamps[200])]
+    # Of stamps that wait for a busy computer, a long step is no lost row.
+    waits = np.sort(times + random.choice([0.0, 0.008], len(times)))
+    assert find_gaps(waits) == []
 
 
 @pytest.mark.parametrize("latency, lag", [(0.0237, 0.0), (0.0082, 0.015)])
@@ -502,15 +517,22 @@ def test_the_page_begins_with_the_answer() -> None:
     """What the log leaves open comes after it, and the log itself last."""
     found, log = unseen(), flight_log()
     checkups = examine([log], NAMES)
-    page = identification_page(found, [log], checkups, NAMES, Path("world.yaml"), ["A doubt."])
+    world = Path("my world.yaml")
+    page = identification_page(found, [log], checkups, NAMES, world, ["A doubt."], None)
     parts = "<b>Found:", "<b>How sure:", "<b>What to do:", "<h2>Estimates", "<h2>What the log"
     assert sorted(parts, key=page.index) == [*parts]
     assert "do not train with this world: A doubt." in page
     inspected = inspection_page([log._replace(source="a&b.csv")], checkups)
     assert "<title>bounce_mjx: logs a&amp;b.csv</title>" in inspected
     assert "<h1>a&amp;b.csv</h1>" in inspected
-    better = identification_page(found, [log], checkups, NAMES, Path("world.yaml"), [])
-    assert "bounce-mjx identify LOG --check world.yaml" in better
+    better = html.unescape(identification_page(found, [log], checkups, NAMES, world, [], None))
+    assert "bounce-mjx identify LOG --check 'my world.yaml'" in better
+    assert "--warm-start robust_small --config finetune --world 'my world.yaml'" in better
+    # Another arm has no policy to begin from, and its logs are read with its own robot.
+    other = html.unescape(identification_page(found, [log], checkups, NAMES, world, [], "ur5e"))
+    assert "--warm-start" not in other
+    assert "bounce-mjx train --config robust_cpu --world 'my world.yaml'" in other
+    assert "bounce-mjx identify LOG --robot ur5e --check 'my world.yaml'" in other
     assert all(entry.label in page for entry in estimates(found, NAMES))
 
 
@@ -953,7 +975,7 @@ def test_what_was_chosen_for_a_follower_has_no_interval(tmp_path: Path) -> None:
     expected = [[30.0 * (2.0 - np.exp(0.2))] * 6, [30.0 * np.exp(0.2)] * 6]
     np.testing.assert_allclose(world.settings["randomization"]["servo_gain"], expected, rtol=1e-3)
     checkups = examine([flight_log()], NAMES)
-    page = identification_page(follower, [flight_log()], checkups, NAMES, path, [])
+    page = identification_page(follower, [flight_log()], checkups, NAMES, path, [], None)
     assert page.count("chosen for an arm that follows") == 19
 
 

@@ -23,6 +23,7 @@ from against_c import (
 from arms import ARM, ARM_JOINTS, arm, hinge, link, mjcf, motors, ur5e
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.commands import adopt as adopt_command
+from bounce_mjx.deploy.export import policy_metadata
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.contacts import ContactChecker
 from bounce_mjx.resources import resource_path
@@ -32,6 +33,7 @@ from bounce_mjx.robot.arm import build_arm, compile_spec, locate, naming, read_s
 from bounce_mjx.robot.config import PaddleConfig, RobotConfig
 from bounce_mjx.robot.model import data_at, find_addresses, joint_names, load_model
 from bounce_mjx.robot.pose import clearance, mounts, place_paddle
+from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.settings import read_preset
 from random_worlds import random_parameters
 
@@ -593,7 +595,9 @@ def test_no_printed_number_is_minus_0() -> None:
         config=RobotConfig(),
         action_scale=0.05,
         servos=[ServoSettings(100.0, 1.0, None)] * 2,
-        arm=SimpleNamespace(joint_names=("a", "b"), changes=()),
+        arm=SimpleNamespace(
+            joint_names=("a", "b"), changes=(), spec=mujoco.MjSpec.from_string(TWO_JOINTS)
+        ),
     )
     lines = adopt_command.describe(adoption)
     assert lines[0].startswith("paddle: level at x 0.500, y 0.000, z 0.200 m")
@@ -705,6 +709,43 @@ def test_three_joints_suffice_to_lift_and_tilt(tmp_path, capsys) -> None:
     left = (data.qfrc_actuator + data.qfrc_passive)[list(env.addresses.arm_qvel)]
     np.testing.assert_allclose(left, 0.0, atol=1e-3 * np.max(data.ctrl))
     assert model.actuator_biasprm[servos, 2].tolist()[2] == 0.0
+
+
+def test_what_is_said_of_a_slide_is_true(tmp_path) -> None:
+    """Its position is in metres, and its policy acts in JAX alone."""
+    (tmp_path / "lift.xml").write_text(mjcf(LIFT, motors("lift roll pitch", 60.0)))
+    robot = RobotConfig(site="tool")
+    pose = SimpleNamespace(
+        angles=np.array([0.2, 0.1, 0.0]),
+        paddle=np.array([0.5, 0.0, 0.2]),
+        acceleration=9.0,
+        reach=1.0,
+        manipulability=0.1,
+        inertia=(1.0, 1.0, 1.0),
+    )
+    adoption = SimpleNamespace(
+        pose=pose,
+        clearance=0.1,
+        config=robot,
+        action_scale=0.01,
+        servos=[ServoSettings(100.0, 1.0, None)] * 3,
+        arm=build_arm(tmp_path / "lift.xml", robot),
+    )
+    said = "\n".join(adopt_command.describe(adoption))
+    assert "  lift: +0.200 m, " in said and "  roll: +0.100 rad, " in said
+    assert "action scale 0.01 rad (a slide: m)" in said
+    assert "a slide (lift) runs in JAX alone" in said
+    servos = {
+        "servo_stiffness": (100.0,) * 3,
+        "servo_damping": (1.0,) * 3,
+        "servo_force_limit": (60.0,) * 3,
+    }
+    arm_config = robot.model_copy(update=servos)
+    settings = {"mjcf": tmp_path / "lift.xml", "robot": arm_config.model_dump()}
+    settings |= {"default_joint_angles": (0.2, 0.0, 0.0)}
+    with pytest.raises(UserError, match="the acting joint 'lift' is a slide") as refusal:
+        policy_metadata(TrainConfig(env=settings), 0)
+    assert "remov" not in str(refusal.value) and "Run(FOLDER).policy" in str(refusal.value)
 
 
 def test_the_config_of_the_packages_arm_has_the_defaults() -> None:

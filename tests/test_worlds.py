@@ -17,7 +17,7 @@ from bounce_mjx.robot.config import LimitsConfig, RobotConfig
 from bounce_mjx.robot.model import add_balls, scene_spec
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.settings import read_preset
-from bounce_mjx.runs.worlds import in_world
+from bounce_mjx.runs.worlds import in_world, robot_in_world
 from bounce_mjx.task.catch import Catch
 from bounce_mjx.world.config import ActionConfig
 from bounce_mjx.world.model import model_nominals
@@ -177,6 +177,19 @@ def test_a_world_brings_its_robot() -> None:
     assert command.config.env.robot.servo_stiffness[0] > 1e4
     with pytest.raises(UserError, match="is for the robot ur5e, and a robot is given too"):
         read_command(["--world", "ur5e_rtde", "--robot", "panda"])
+
+
+def test_a_world_names_a_robots_file_from_its_own_folder(tmp_path: Path, monkeypatch) -> None:
+    """As `identify --robot arm.yaml --out worlds/world.yaml` writes it, and --world reads it from
+    anywhere."""
+    monkeypatch.chdir(tmp_path)
+    Path("worlds").mkdir()
+    Path("arm.yaml").write_text(yaml.safe_dump({"env": {"action_scale": 0.013}}), encoding="utf-8")
+    robot = robot_in_world(Path("arm.yaml"), Path("worlds/world.yaml"))
+    world = written(tmp_path / "worlds", robot=robot)
+    monkeypatch.chdir("/")
+    assert read_command(["--config", "cpu", "--world", str(world)]).config.env.action_scale == 0.013
+    assert robot_in_world(Path("ur5e"), Path("worlds/world.yaml")) == "ur5e"
 
 
 def test_a_robots_own_balls_and_stiff_contact_are_taken_by_another_task(tmp_path: Path) -> None:

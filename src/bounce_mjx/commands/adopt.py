@@ -104,7 +104,12 @@ def _rounded(numbers: "np.ndarray", digits: int) -> list[float]:
 
 def describe(adoption: "Adoption") -> list[str]:
     """Lines about an adopted arm: its pose, its servos, and the changes to the user's model."""
+    import mujoco
+
     pose = adoption.pose
+    names = adoption.arm.joint_names
+    types = [adoption.arm.spec.joint(name).type for name in names]
+    is_slide = [joint_type == mujoco.mjtJoint.mjJNT_SLIDE for joint_type in types]
     x, y, z = _rounded(pose.paddle, 3)
     strength = f"{pose.acceleration:.0f} m/s^2 upward in addition to holding the arm"
     if math.isinf(pose.acceleration):
@@ -112,24 +117,35 @@ def describe(adoption: "Adoption") -> list[str]:
     clearance = f"{adoption.clearance:.3f} m between the paddle and the arm's other links"
     if adoption.clearance <= 0.0:
         clearance = "none; the paddle touches another link, so choose --paddle.position yourself"
+    scale_unit = "rad"
+    if all(is_slide):
+        scale_unit = "m"
+    elif any(is_slide):
+        scale_unit = "rad (a slide: m)"
     kind = "kept" if adoption.config.servo_stiffness is None else "made from the reflected inertia"
     lines = [
         f"paddle: level at x {x:.3f}, y {y:.3f}, z {z:.3f} m; the reach is {pose.reach:.2f} m",
         f"manipulability: {pose.manipulability:.3f} (smallest singular value, 0.25 m per radian)",
         f"strength: {strength}",
         f"clearance: {clearance}",
-        f"servos: {kind}; action scale {adoption.action_scale:g} rad",
+        f"servos: {kind}; action scale {adoption.action_scale:g} {scale_unit}",
     ]
     angles = _rounded(pose.angles, 3)
-    for name, angle, inertia, servo in zip(
-        adoption.arm.joint_names, angles, pose.inertia, adoption.servos, strict=True
+    for name, slides, angle, inertia, servo in zip(
+        names, is_slide, angles, pose.inertia, adoption.servos, strict=True
     ):
+        unit = "m" if slides else "rad"
         limit = "no force limit"
         if servo.force_limit is not None:
             limit = f"force limit {servo.force_limit:.4g}"
         lines.append(
-            f"  {name}: {angle:+.3f} rad, inertia {inertia:.3g}, kp {servo.stiffness:.4g}, "
+            f"  {name}: {angle:+.3f} {unit}, inertia {inertia:.3g}, kp {servo.stiffness:.4g}, "
             f"kv {servo.damping:.4g}, {limit}"
+        )
+    if any(is_slide):
+        slides = ", ".join(name for name, slides in zip(names, is_slide, strict=True) if slides)
+        lines.append(
+            f"export: a policy of an arm with a slide ({slides}) runs in JAX alone, not as ONNX yet"
         )
     lines.append("changes to the model:")
     lines += [f"  {change}" for change in adoption.arm.changes]

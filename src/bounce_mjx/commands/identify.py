@@ -59,6 +59,7 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.reports.identification import identification_page, inspection_page
     from bounce_mjx.robot.model import joint_names
     from bounce_mjx.runs.files import check_output, write_output
+    from bounce_mjx.runs.worlds import robot_in_world
     from bounce_mjx.training.setup import set_up_jax
     from bounce_mjx.world.model import world_model
     from bounce_mjx.world.named import read_world
@@ -116,13 +117,15 @@ def main(args: Sequence[str]) -> None:
         for line in changed or [f"the robot still matches {command.check}"]:
             print(line)
         sys.exit(1 if changed else 0)
-    write_output(page, identification_page(found, logs, checkups, names, command.out, doubts))
+    robot = command.robot and str(command.robot)
+    text = identification_page(found, logs, checkups, names, command.out, doubts, robot)
+    write_output(page, text)
     print(str(page))
     if doubts and not command.force:
         raise UserError(
             f"{command.out} is not written, because no world explains the log: {doubts[0]} "
             "Read the page, or write the world all the same with --force"
         )
-    robot = command.robot and str(command.robot)
-    write_output(command.out, to_yaml(found, log, names, robot, doubts))
+    robot_here = command.robot and robot_in_world(command.robot, command.out)
+    write_output(command.out, to_yaml(found, log, names, robot_here, doubts))
     print(str(command.out))

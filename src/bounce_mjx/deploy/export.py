@@ -287,11 +287,16 @@ def _hinges(
     links = []
     anchor = np.zeros(3)
     for joint in reversed(joints):
-        is_hinge = m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
-        if joint not in addresses.arm_joints or not is_hinge:
+        name = joint_name(m, joint)
+        if joint not in addresses.arm_joints:
             raise UserError(
-                f"the paddle hangs on the joint {joint_name(m, joint)!r}, and a policy can be "
-                "exported for hinges with servos only; remove the joint from the MJCF"
+                f"the paddle hangs on the joint {name!r}, which has no servo, and a policy can be "
+                "exported for hinges with servos only; fix the joint, by removing it from the MJCF"
+            )
+        if m.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE:
+            raise UserError(
+                f"the acting joint {name!r} is a slide, and a policy can be exported for hinges "
+                "only; use it in JAX, where bounce_mjx.Run(FOLDER).policy acts on observations"
             )
         links.append(
             Hinge(

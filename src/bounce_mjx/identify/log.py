@@ -50,6 +50,11 @@ _GROWING_AGE = 0.01
 # Time between two rows, s and in typical steps, beyond which a log has a gap.
 _GAP = 0.1
 _GAP_STEPS = 5.0
+# The same of a log whose steps are even, in typical steps, as a lost row is plain in it; and the
+# quantile of its steps that is at most so many typical ones.
+_LOST_ROWS = 1.9
+_EVEN = 0.98
+_EVEN_STEPS = 1.4
 
 
 class Log(NamedTuple):
@@ -356,9 +361,16 @@ def align_clocks(log: Log) -> Log:
 
 
 def find_gaps(times: np.ndarray) -> list[tuple[float, float]]:
-    """The last time before each gap of a measurement's times [T], and the first one after it, s."""
+    """The last time before each gap of a measurement's times [T], and the first one after it, s.
+
+    Where the steps are even, each lost row is a gap: the arm had a target in it that the log lacks.
+    """
     steps = np.diff(times)
-    longest = max(_GAP, _GAP_STEPS * float(np.median(steps)))
+    typical = float(np.median(steps))
+    if np.quantile(steps, _EVEN) <= _EVEN_STEPS * typical:
+        longest = _LOST_ROWS * typical
+    else:
+        longest = max(_GAP, _GAP_STEPS * typical)
     return [(float(times[i]), float(times[i + 1])) for i in np.flatnonzero(steps > longest)]
 
 

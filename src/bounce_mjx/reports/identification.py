@@ -2,6 +2,7 @@
 
 import html
 import math
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -72,12 +73,14 @@ def identification_page(
     joint_names: Sequence[str],
     world: Path,
     doubts: Sequence[str],
+    robot: str | None,
 ) -> str:
     """The page, self-contained.
 
     Args:
       world: the file of the identified world.
       doubts: why it does not explain the logs.
+      robot: whose logs they are, as for --robot; None for the project's own arm.
     """
     source = ", ".join(log.source for log in logs)
     listed = estimates(found, joint_names)
@@ -95,7 +98,7 @@ def identification_page(
 <p><b>Found:</b> the log shows {seen} of {len(listed)} quantities of the robot's world, each
 below with the interval that contains it with 95% probability.</p>
 <p><b>How sure:</b> {_describe_fit(found)}</p>
-<p><b>What to do:</b> {_advise(doubts, world)}</p>
+<p><b>What to do:</b> {_advise(doubts, world, robot)}</p>
 <h2>Estimates</h2>
 {table(["quantity", "estimate", "95% interval", ""], rows)}
 <h2>Errors in units of the sensors' noise</h2>
@@ -145,15 +148,25 @@ def _describe_fit(found: Identified) -> str:
     return html.escape(fit + wider)
 
 
-def _advise(doubts: Sequence[str], world: Path) -> str:
+def _advise(doubts: Sequence[str], world: Path, robot: str | None) -> str:
     """What to do with the world, as HTML."""
-    name = html.escape(str(world))
-    train = "bounce-mjx train --warm-start robust_small --config finetune --world"
     if doubts:
         return f"do not train with this world: {html.escape(doubts[0])}"
+    if robot is None:
+        verb = "adapt"
+        train = "bounce-mjx train --warm-start robust_small --config finetune"
+        robot_flag = ""
+    else:
+        # `robust_small` is a policy of the project's own arm, and a warm start refuses another one.
+        verb = "train"
+        train = "bounce-mjx train --config robust_cpu"
+        robot_flag = f" --robot {shlex.quote(robot)}"
+    name = shlex.quote(str(world))
+    train = html.escape(f"{train} --world {name}")
+    check = html.escape(f"bounce-mjx identify LOG{robot_flag} --check {name}")
     return (
-        f"adapt a policy with <code>{train} {name}</code>, and check the robot later with "
-        f"<code>bounce-mjx identify LOG --check {name}</code>."
+        f"{verb} a policy with <code>{train}</code>, and check the robot later with "
+        f"<code>{check}</code>."
     )
 
 

@@ -2,6 +2,7 @@
 
 import shlex
 import sys
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -190,8 +191,13 @@ def fields_of(
     Args:
       env: the settings of the task.
       algorithm: the settings of the algorithm.
+
+    Raises:
+      UserError: two settings have the same flag.
     """
     groups = {"env": env, "ppo": algorithm}
+    others = [name for name in TrainConfig.model_fields if name not in groups]
+    check_flags(groups, others)
     fields = {}
     for name, field in TrainConfig.model_fields.items():
         if name in groups:
@@ -199,6 +205,27 @@ def fields_of(
         else:
             fields[name] = field
     return fields
+
+
+def check_flags(groups: Mapping[str, type[pydantic.BaseModel]], other_flags: Iterable[str]) -> None:
+    """Checks that each setting of the groups, whose flag is its name alone, has a flag of its own.
+
+    Raises:
+      UserError: two settings have the same flag.
+    """
+    first_keys = {name: name for name in other_flags}
+    # A task's setting is the one to rename, so PPO's come before it.
+    for group in sorted(groups, reverse=True):
+        for name in fields_in(groups[group]):
+            # One within a further group has a flag with dots.
+            if "." in name:
+                continue
+            if name in first_keys:
+                raise UserError(
+                    f"the setting {group}.{name} has the flag of {first_keys[name]}; give it "
+                    "another name"
+                )
+            first_keys[name] = f"{group}.{name}"
 
 
 def load_run_config(

@@ -1,5 +1,6 @@
 """Robots and named worlds as layers of settings."""
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +79,19 @@ def _layer_of_world(task: type[Task], world: NamedWorld, path: Path) -> Layer:
     default = task.Config().randomization.model_dump(exclude=set(CURRICULUM))
     values = merged({"env": {"randomization": default}}, {"env": world.settings})
     return Layer(f"the world {shown_file(path)}", values, is_world=True)
+
+
+def robot_in_world(robot: Path, world: Path) -> str:
+    """How a world's file names its robot: one of the package's by its name, a file relative to the
+    world's.
+
+    Args:
+      robot: a file, or a name in configs/robots/.
+      world: the world's file.
+    """
+    if named_file(robot, ROBOTS) != robot or robot.is_absolute():
+        return str(robot)
+    return os.path.relpath(robot, world.parent)
 
 
 def _robot_of(world: NamedWorld, path: Path) -> Path:
