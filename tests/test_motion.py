@@ -186,10 +186,20 @@ def test_a_command_outside_of_the_box_is_a_fault() -> None:
 
 
 SETTINGS = {
-    "box": [((0, 0, 0), (1, math.nan, 1)), ((1, 1, 1), (0, 0, 0)), ((0, 0), (1, 1))],
-    "max_picture_age": [0.0, -0.1, 1.5, math.nan, math.inf],
-    "max_steps_late": [0, -1, math.nan, math.inf],
-    "rate": [125, 0, math.nan],
+    "box": [
+        ((0, 0, 0), (1, math.nan, 1)),
+        ((1, 1, 1), (0, 0, 0)),
+        ((0, 0), (1, 1)),
+        ((0, 0, 0), (1, 1)),
+        "1 m",
+        None,
+        # In mm and in cm, also of one end alone.
+        ((-1000, -500, -200), (1000, 500, 600)),
+        ((-0.1, -0.5, -math.inf), (math.inf, math.inf, 60)),
+    ],
+    "max_picture_age": [0.0, -0.1, 1.5, math.nan, math.inf, "0.1", [0.1]],
+    "max_steps_late": [0, -1, math.nan, math.inf, None, "2"],
+    "rate": [125, 0, math.nan, "500", None, [500]],
 }
 
 
@@ -199,12 +209,28 @@ def test_a_wrong_setting_is_refused_at_once(name: str) -> None:
     for value in SETTINGS[name]:
         with pytest.raises(UserError, match=f"the {name} is|{name} is"):
             policy.supervise(**{"rate": 1000} | {name: value})
+    policy.supervise(np.float32(1000.0), max_steps_late=np.int64(2))
+    policy.reset()
+    policy.supervise(1000, box=((-30, -math.inf, 0), (30, math.inf, 1)))
 
 
 def test_the_largest_age_of_a_picture_is_that_of_the_training() -> None:
     latency = {"ur5e": 0.075 + 5.0 / 45.0, "robust": 0.065 + 5.0 / 60.0, "pretrained": 0.1}
     for name, expected in latency.items():
         assert picture_age(load_policy(name).metadata) == pytest.approx(expected)
+
+
+def test_a_missing_measurement_is_named_with_each_that_is_needed_once() -> None:
+    arm = running()
+    given = measured(arm.angles)
+    del given["ball_position"]
+    arm.supervisor.commands(given | {"time": arm.time})
+    needs = arm.supervisor._policy.needs
+    assert arm.supervisor.reason == (
+        f"the measurement ball_position is missing; this policy needs {', '.join(needs)} in every "
+        "step"
+    )
+    assert needs.count("joint_angles") == 1
 
 
 @pytest.mark.parametrize("rate", [100, 125, 1000])
@@ -237,6 +263,45 @@ def test_a_call_without_a_new_step_goes_on_where_the_last_ended(late: float) -> 
     assert state == "stopped" and arm.supervisor.fault == "no_step"
     assert "3 calls in a row" in arm.supervisor.reason
     arm.check()
+
+
+@pytest.mark.parametrize("is_limited", [False, True], ids=["without limits", "limits"])
+@pytest.mark.parametrize("rate, fault", [(50, None), (100, None), (200, None), (500, "no_step")])
+def test_the_way_home_has_its_speed_at_any_rate_of_calls(
+    rate: int, fault: str | None, is_limited: bool
+) -> None:
+    """As of a robot that calls at its own rate, and sends the first one of the commands."""
+    policy = limited() if is_limited else load_policy("pretrained")
+    arm = policy.supervise(500)
+    start = HOME + [0.4, 0.0, 0.0, 0.0, 0.0, 0.0]
+    angles = start
+    for call in range(4 * rate):
+        commands = arm.commands(measured(angles, time=7.0 + call / rate))
+        if len(commands):
+            # A step begins up to half a step early, and goes on to its end.
+            allowed = 0.3 * (call / rate + 0.015)
+            assert np.max(np.abs(commands - start)) <= allowed + 1e-9
+            angles = angles + (commands[0] - angles) * (1.0 - np.exp(-1.0 / rate / 0.02))
+    assert (arm.state, arm.fault) == (("stopped", fault) if fault else ("ready", None))
+
+
+def test_a_clock_that_stands_at_home_is_noticed_and_may_begin_anew_after_a_restart() -> None:
+    arm = Arm(limited().supervise(1000))
+    arm.until("ready")
+    time = arm.time
+    for _ in range(2):
+        assert arm.step(time=time) == "ready"
+    # A new step ends the row.
+    arm.time = time + 0.01
+    assert arm.step() == "ready"
+    for repeats in range(1, 4):
+        assert arm.step(time=time + 0.01) == ("ready" if repeats < 3 else "stopped")
+    assert arm.supervisor.fault == "no_step" and "3 calls in a row" in arm.supervisor.reason
+    arm.supervisor.restart()
+    arm.time = 0.0
+    arm.until("ready", 20)
+    for _ in range(20):
+        assert arm.step() == "ready"
 
 
 def supervised(name: str) -> tuple[Any, np.ndarray, Any]:
@@ -416,6 +481,33 @@ def test_zeros_of_a_driver_without_data_are_no_command() -> None:
         policy = load_policy(name)
         with pytest.raises(UserError, match="all joint angles are 0"):
             policy.step(seen(np.zeros(joints), 0, 0.3))
+
+
+def test_targets_at_which_the_arm_does_not_rest_are_no_command() -> None:
+    """Neither in degrees nor as zeros of a driver without data; the measured angles are right."""
+    for name in ("robust", "ur5e", "panda"):
+        _, home, seen = supervised(name)
+        policy = load_policy(name)
+        policy.reset(home)
+        with pytest.raises(UserError, match=r"the target of .* is -?\d+, but .* \(rad\); give"):
+            policy.reset(np.degrees(home))
+        # Nothing was forgotten.
+        np.testing.assert_array_equal(policy.targets, home)
+        policy.reset(0.0 * home)
+        arm = policy.supervise(500)
+        for step in range(120):
+            assert arm.commands(seen(home + 0.05, step, 0.3)).shape == (0, len(home))
+            if step == 0:
+                assert "the commands at which the arm is said to rest" in arm.reason
+        assert (arm.state, arm.fault) == ("stopped", "joint_astray")
+        assert "check its load, its zero and the targets given to reset" in arm.reason
+        arm.restart(moved=True)
+        assert len(arm.commands(seen(home + 0.05, 120, 0.3))) == 5
+        # True targets are where the commands begin.
+        policy = load_policy(name)
+        policy.reset(home + 0.5)
+        arm = policy.supervise(500)
+        assert np.max(np.abs(arm.commands(seen(home + 0.5, 0, 0.3)) - home - 0.5)) < 4e-3
 
 
 def test_an_arm_without_lag_and_one_wrong_sample_are_no_fault() -> None:
@@ -683,6 +775,58 @@ def test_what_is_done_to_the_policy_of_a_resting_arm_moves_nothing(is_reset: boo
     arm.supervisor.restart()
     arm.until("ready")
     arm.check()
+
+
+@pytest.mark.parametrize("moment", ["homing", "ready", "start", "running", "restart"])
+def test_a_stop_that_comes_while_a_call_works_stays(moment: str) -> None:
+    """As from another thread, or from a signal handler within the call."""
+    arm = Arm(limited().supervise(1000))
+    supervisor, policy = arm.supervisor, arm.supervisor._policy
+    if moment != "homing":
+        arm.until("ready")
+    if moment == "running":
+        supervisor.start()
+        for i in range(25):
+            arm.step(**flying(i))
+    if moment == "restart":
+        supervisor.stop("the operator")
+        arm.until("stopped")
+
+    def press_stop() -> None:
+        supervisor.stop("the operator pressed stop")
+
+    class PressedWhileRead(dict):
+        def items(self) -> Any:
+            press_stop()
+            return super().items()
+
+    if moment in ("start", "restart"):
+        reset = policy.reset
+
+        def pressed_reset(*targets: Any) -> None:
+            press_stop()
+            reset(*targets)
+
+        policy.reset = pressed_reset
+        if moment == "start":
+            supervisor.start()
+        else:
+            supervisor.restart(moved=True)
+        policy.reset = reset
+    else:
+        given = measured(arm.angles, **flying(25)) | {"time": arm.time}
+        arm.rows.extend(supervisor.commands(PressedWhileRead(given)))
+        arm.angles, arm.time = arm.rows[-1], arm.time + 0.01
+    for _ in range(50):
+        assert supervisor.state in ("braking", "stopped") and supervisor.fault == "stopped"
+        assert supervisor.reason == "the operator pressed stop"
+        with pytest.raises(UserError, match="starts when it is ready"):
+            supervisor.start()
+        arm.rows.extend(supervisor.commands({}))
+    assert supervisor.state == "stopped"
+    arm.check()
+    supervisor.restart()
+    assert (supervisor.state, supervisor.fault) == ("homing", None)
 
 
 def test_steps_beside_a_supervisor_without_commands_are_no_commands() -> None:

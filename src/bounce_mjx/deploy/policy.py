@@ -1,6 +1,7 @@
 """A trained policy on a robot: measurements in, actions out, with only NumPy and onnxruntime."""
 
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -129,11 +130,13 @@ class DeployedPolicy:
             moves, wherever the arm is measured; by default, the joint angles of the next step.
 
         Raises:
-          UserError: the targets are not J finite numbers; nothing is forgotten.
+          UserError: the targets are not J finite numbers, or 0.5 rad outside the joint ranges;
+            nothing is forgotten.
         """
         count = len(self.metadata.joint_names)
         if targets is not None:
             targets = _array("the targets", targets, count, "rad", _LARGEST)
+            self.samples.check_range("target", targets)
         self._network.reset()
         self.samples.forget(targets)
         self._measured: Measurements = {}
@@ -253,7 +256,7 @@ class DeployedPolicy:
     def commands_per_step(self, rate: float) -> int:
         """Number of `commands` of a control step at a rate (Hz); UserError as there."""
         dt = self.metadata.control_dt
-        count = rate * dt
+        count = rate * dt if isinstance(rate, Real) else 0.0
         if not (0.999 < count < 10_000.5 and abs(count - round(count)) < 1e-3):
             raise UserError(
                 f"the rate is {rate!r} Hz, but must be a multiple of {1.0 / dt:g} Hz, one command "
@@ -273,7 +276,8 @@ class DeployedPolicy:
         an earlier one.
 
         Args:
-          settings: `box`, the lowest and the highest x, y and z of the paddle's centre, m;
+          settings: `box`, the lowest and the highest x, y and z of the paddle's centre, m (each
+            infinite, or at most 30 from the base);
             `max_picture_age`, s (at most 1; by default the file's largest latency and five of its
             longest camera intervals, at least 0.1); `max_steps_late`, control steps between two
             steps, and calls in a row without a new step (2).

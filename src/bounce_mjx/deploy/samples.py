@@ -93,9 +93,11 @@ class Samples:
         if near is None:
             self._place = self._start
             self._room = _NEAR + self._metadata.start_noise
+            self._place_name = "where the arm starts"
         else:
             self._place = near
             self._room = _NEAR
+            self._place_name = "the commands at which the arm is said to rest"
         self._last: Measurements = {}
         self._bridged: set[str] = set()
         self._unconfirmed: np.ndarray | None = None
@@ -191,7 +193,7 @@ class Samples:
             self._bridge(measured, _OF_ARM, "joint_jump", reason + remedy)
             return
         # Not left by a jump, so that the next sample will say the same.
-        self._check_range(angles)
+        self.check_range("angle", angles)
         velocities = measured.get("joint_velocities", self._still)
         too_fast = np.abs(velocities) - self._fastest
         if too_fast.max() > 0.0:
@@ -205,17 +207,24 @@ class Samples:
         self._believe(measured, _OF_ARM)
         self._arm_time = self._now
 
-    def _check_range(self, angles: np.ndarray) -> None:
-        """Refuses angles [J] far outside of their ranges. Whole turns are not removed: a joint that
-        counts them would be commanded a turn away, and another one is really there."""
+    def check_range(self, label: str, angles: np.ndarray) -> None:
+        """Refuses angles [J] (rad) far outside of their ranges. Whole turns are not removed: a
+        joint that counts them would be commanded a turn away, and another one is really there.
+
+        Args:
+          label: what each is of its joint, for the message.
+
+        Raises:
+          ImpossibleMeasurement: one is 0.5 rad outside.
+        """
         outside = np.maximum(self._low - angles, angles - self._high)
         if outside.max() > _OUTSIDE:
             joint = int(np.argmax(outside))
             raise ImpossibleMeasurement(
                 "joint_range",
-                f"the angle of {self._metadata.joint_names[joint]} is {angles[joint]:.3g}, but the "
-                f"training had {self._low[joint]:.3g} to {self._high[joint]:.3g} (rad); give this "
-                "unit, the policy's order, and no whole turns",
+                f"the {label} of {self._metadata.joint_names[joint]} is {angles[joint]:.3g}, but "
+                f"the training had {self._low[joint]:.3g} to {self._high[joint]:.3g} (rad); give "
+                "this unit, the policy's order, and no whole turns",
             )
 
     def _check_first(self, angles: np.ndarray) -> None:
@@ -225,13 +234,14 @@ class Samples:
             raise UnconfirmedSample(
                 "all joint angles are 0, as of a driver without data; wait for its first sample"
             )
-        self._check_range(angles)
+        self.check_range("angle", angles)
         far = float(np.max(np.abs(angles - self._place)))
         if far <= self._room:
             return
         in_order = np.max(np.abs(angles - self._start))
+        start_room = _NEAR + metadata.start_noise
         reordered = np.max(np.abs(np.sort(np.abs(angles)) - np.sort(np.abs(self._start))))
-        if reordered <= min(_SAME + metadata.start_noise, 0.5 * in_order):
+        if in_order > start_room and reordered <= min(_SAME + metadata.start_noise, 0.5 * in_order):
             raise ImpossibleMeasurement(
                 "joint_order",
                 "the joint angles fit the start pose in another order or with other signs; give "
@@ -243,7 +253,7 @@ class Samples:
         reach = self._fastest * metadata.control_dt + self._noise
         if last is None or np.any(np.abs(angles - last) > reach):
             raise UnconfirmedSample(
-                f"the first joint angles are {far:.3g} rad from where the arm starts; they count "
+                f"the first joint angles are {far:.3g} rad from {self._place_name}; they count "
                 "when the next sample confirms them"
             )
 

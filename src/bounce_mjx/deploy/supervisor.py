@@ -3,14 +3,15 @@
 import math
 import traceback
 from collections.abc import Iterable, Mapping, Sequence
+from numbers import Real
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
 from bounce_mjx.deploy.faults import Fault, Watch, picture_age
 from bounce_mjx.deploy.motion import paddle_position
-from bounce_mjx.deploy.samples import UnconfirmedSample, check_mapping
+from bounce_mjx.deploy.samples import Measurements, UnconfirmedSample, check_mapping
 from bounce_mjx.errors import UserError
 from bounce_mjx.robot.setpoints import Setpoint
 
@@ -27,8 +28,19 @@ _HOME_SPEED = 0.3
 _OTHER_ORDER = "the policy's joints have another order than the supervisor's; call supervise again"
 _NEWER = "the policy has a newer supervisor; call that one"
 _MOVED = "the policy was reset or stepped beside its supervisor; call the supervisor alone"
+# Of an end of a box from the base, m.
+_FARTHEST_END = 30.0
 # In which an arm comes to rest where its commands do, s.
 _SETTLING = 1.0
+
+
+class Stop(NamedTuple):
+    """Why an arm stops."""
+
+    fault: str
+    reason: str
+    is_at_rest: bool = False
+    """Whether the commands rest."""
 
 
 class Supervisor:
@@ -70,27 +82,63 @@ class Supervisor:
             ("max_picture_age", age, 1.0),
             ("max_steps_late", max_steps_late, 1.0 / self._metadata.control_dt),
         ):
-            if not 0.0 < value <= most:
-                raise UserError(f"{name} is {value}; give a number above 0 and at most {most:g}")
-        self._box = np.array(box, float)
+            if not (isinstance(value, Real) and 0.0 < value <= most):
+                raise UserError(f"{name} is {value!r}; give a number above 0 and at most {most:g}")
+        try:
+            self._box = np.array(box, float)
+        except (TypeError, ValueError):
+            self._box = np.zeros(0)
         self._max_steps_late = max_steps_late
         if self._box.shape != (2, 3) or not np.all(self._box[0] < self._box[1]):
             raise UserError(f"the box is {box}; give its lowest and its highest x, y and z, m")
+        farthest = np.max(np.abs(self._box), where=np.isfinite(self._box), initial=0.0)
+        if farthest > _FARTHEST_END:
+            raise UserError(
+                f"the box is {box}, and ends {farthest:g} from the base, but no arm reaches "
+                f"{_FARTHEST_END:g} m; give metres, or inf for an end that is not there"
+            )
         self._has_box = bool(np.any(np.isfinite(self._box)))
         self._watch = Watch(self._metadata, age)
-        self.state: State = "homing"
-        self.fault: str | None = None
-        """Code of the rule that was broken, such as `ball_lost`, of the tables in
-        docs/real-robot.md; `stopped` after `stop`."""
-        self.reason: str | None = None
-        """Why the arm has stopped or brakes, or what it waits for on its way home."""
+        # A stop may come within any other call, from another thread or a signal handler: it is one
+        # assignment, which `restart` alone takes back.
+        self._stop: Stop | None = None
+        self._phase: State = "homing"
+        """The state unless there is a stop."""
+        self._waits_for: str | None = None
+        """Why the arm waits on its way home."""
+        self._has_found_arm = False
+        """Whether the arm has been measured where its commands rest; nothing is sent before."""
         self._is_moving_home = False
         self._waited = 0
         """Control steps in a row in which the arm was not where its commands rest."""
+        self._idle = 0
+        """Calls in a row that are no new control step."""
+        self._due: float | None = None
+        """Time at which the last step on the way home was due, s; None before it."""
         self._resting_angles = np.array(self._metadata.default_joint_angles)
         """Measured [J] in the last step at home, rad."""
         # An arm may rest at the last commands, far from the start pose.
         policy.samples.forget(policy.targets)
+
+    @property
+    def state(self) -> State:
+        stop = self._stop
+        if stop is None:
+            return self._phase
+        return "stopped" if stop.is_at_rest else "braking"
+
+    @property
+    def fault(self) -> str | None:
+        """Code of the rule that was broken, such as `ball_lost`, of the tables in
+        docs/real-robot.md; `stopped` after `stop`."""
+        stop = self._stop
+        return None if stop is None else stop.fault
+
+    @property
+    def reason(self) -> str | None:
+        """Why the arm has stopped or brakes, or what it waits for on its way home."""
+        stop = self._stop
+        return self._waits_for if stop is None else stop.reason
 
     def start(self) -> None:
         """Starts an episode.
@@ -111,14 +159,14 @@ class Supervisor:
         self._end = self._motion.end
         self._watch.begin()
         self._idle = 0
-        self.state = "running"
+        self._phase = "running"
 
     def stop(self, reason: str, fault: str = "stopped") -> None:
-        """Brakes, from any state."""
-        if self.state not in ("braking", "stopped"):
-            self.state = "braking"
-            self.fault = fault
-            self.reason = reason
+        """Brakes, from any state. It may be called at any time, also by another thread or a signal
+        handler while `commands` works; the commands of the next control step brake, at the
+        latest."""
+        if self._stop is None:
+            self._stop = Stop(fault, reason)
 
     def restart(self, moved: bool = False) -> None:
         """Goes home after a stop, for the next `start`. The commands go on where they rest, and
@@ -135,9 +183,10 @@ class Supervisor:
         if self.state != "stopped":
             raise UserError(f"the arm is {self.state}; restart it when it has stopped")
         self._take_back()
-        self.state = "homing"
-        self.fault = None
-        self.reason = None
+        self._phase = "homing"
+        self._waits_for = None
+        # A stop from here on stays.
+        self._stop = None
         self._is_moving_home = False
         self._waited = 0
         if moved:
@@ -148,7 +197,8 @@ class Supervisor:
 
     def commands(self, measurements: Mapping[str, Any]) -> np.ndarray:
         """Commands [M, J] of a control step at the robot's rate, rad; none ([0, J]) until a first
-        sample is believed (`Samples`), so that nothing is sent.
+        sample is believed (`Samples`), and the arm is where `DeployedPolicy.reset` was told that it
+        rests, so that nothing is sent.
 
         Args:
           measurements: as for `DeployedPolicy.step`. Before `start`, only the joint angles are
@@ -161,9 +211,7 @@ class Supervisor:
             as the first joint angles are wrong. Afterwards nothing is raised, and the arm brakes.
         """
         if self._policy.supervisor is not self:
-            self.state = "stopped"
-            self.fault = "error"
-            self.reason = _NEWER
+            self._stop = Stop("error", _NEWER, is_at_rest=True)
             return self._no_commands
         try:
             if self._has_other_order:
@@ -178,19 +226,22 @@ class Supervisor:
             if not self._has_begun:
                 raise
             self.stop(*_fault_of(error))
+        stop = self._stop
         if self._targets is None:
-            if self.state == "braking":
-                self.state = "stopped"
+            if stop is not None:
+                self._stop = stop._replace(is_at_rest=True)
             return self._no_commands
-        if self.state in ("braking", "stopped"):
+        if stop is not None:
             # What this step was to send is not sent.
             if self._end is not None:
                 self._motion.end = self._end
             self._motion.hold()
-            if self.state == "braking" and self._motion.is_still:
-                self.state = "stopped"
+            if self._motion.is_still:
+                self._stop = stop._replace(is_at_rest=True)
         self._end = self._motion.end
         self._has_begun = True
+        if not self._has_found_arm:
+            return self._no_commands
         return self._motion.at(self._times)
 
     @property
@@ -227,29 +278,30 @@ class Supervisor:
         """Whether the policy's joints have another order than when the supervisor began."""
         return self._policy.motion is not self._motion
 
-    def _angles(self, measurements: Mapping[str, Any]) -> np.ndarray:
-        """The joint angles [J], whatever else is measured."""
+    def _read_arm(self, measurements: Mapping[str, Any]) -> Measurements:
+        """`joint_angles` [J] and, if it is given, `time` [1], whatever else is measured."""
         check_mapping(measurements)
         of_arm = {
             name: value for name, value in measurements.items() if name in ("joint_angles", "time")
         }
-        return self._policy.read(of_arm, ("joint_angles",))["joint_angles"]
+        return self._policy.read(of_arm, ("joint_angles",))
 
-    def _find_arm(self, measurements: Mapping[str, Any]) -> np.ndarray | None:
-        """The joint angles [J] of the arm at rest, from which it goes home; None while that is not
-        known. The first command is where the arm is; after a stop, the arm has to be where its
-        commands rest."""
+    def _find_arm(self, measurements: Mapping[str, Any]) -> Measurements | None:
+        """What is measured (`_read_arm`) of the arm at rest, from which it goes home; None while
+        that is not known. The first command is where the arm is; after a stop, the arm has to be
+        where its commands rest."""
         policy = self._policy
         try:
-            angles = self._angles(measurements)
+            measured = self._read_arm(measurements)
         except UnconfirmedSample as error:
-            self.reason = str(error)
+            self._waits_for = str(error)
             return None
+        angles = measured["joint_angles"]
         if self._targets is None:
             policy.reset(angles)
             policy.samples.rest(angles)
-            return angles
-        return angles if self._rests(angles) else None
+            return measured
+        return measured if self._rests(angles) else None
 
     def _rests(self, angles: np.ndarray) -> bool:
         """Whether the arm is where its commands rest. Else there is a reason for which it waits,
@@ -258,18 +310,18 @@ class Supervisor:
         joint = int(np.argmax(beside))
         if beside[joint] <= self._watch.offset:
             self._waited = 0
-            self.reason = None
+            self._waits_for = None
             return True
         self._waited += 1
         reason = (
             f"{self._metadata.joint_names[joint]} is {beside[joint]:.2g} rad from where its "
-            "commands rest; check its load and its zero, or, if the arm was moved with its servos "
-            "off, call restart(moved=True)"
+            "commands rest; check its load, its zero and the targets given to reset, or, if the "
+            "arm was moved with its servos off, call restart(moved=True)"
         )
         if self._waited * self._metadata.control_dt > _SETTLING:
             self.stop(reason, "joint_astray")
         else:
-            self.reason = reason
+            self._waits_for = reason
         return False
 
     def _stop_at(self, faults: Iterable[Fault]) -> bool:
@@ -286,21 +338,29 @@ class Supervisor:
         policy = self._policy
         home = np.array(self._metadata.default_joint_angles)
         if self._is_moving_home:
-            angles = self._angles(measurements)
+            measured = self._read_arm(measurements)
         else:
-            angles = self._find_arm(measurements)
-            if angles is None:
+            measured = self._find_arm(measurements)
+            if measured is None:
                 if self._targets is not None:
                     self._motion.hold()
                 return
-            self._watch.rest(angles, self._targets)
+            self._watch.rest(measured["joint_angles"], self._targets)
+            self._idle = 0
+            self._due = None
+            self._has_found_arm = True
             self._is_moving_home = True
-            self.reason = None
+            self._waits_for = None
+        # Each call moves the commands for a whole control step, so that those of one share its way.
+        speed = _HOME_SPEED / (1 + self._idle)
+        if not self._is_new_step(self._steps_since_due(measured)):
+            return
+        angles = measured["joint_angles"]
         is_bridged = policy.samples.is_arm_bridged
         if self._stop_at(self._watch.arm_faults(angles, self._targets, is_bridged)):
             return
         if np.abs(self._targets - home).max() > _HOME_TOLERANCE:
-            self._motion.move(home, _HOME_SPEED)
+            self._motion.move(home, speed)
             # An arm that starts outside of the box may come in.
             if self._outside(self._motion.start.position) <= 0.0:
                 self._keep_in_box()
@@ -310,30 +370,52 @@ class Supervisor:
         if not self._motion.is_still:
             return
         if self._rests(angles):
-            self.state = "ready"
-        elif self.state == "ready":
-            self.state = "homing"
+            self._phase = "ready"
+        else:
+            self._phase = "homing"
 
     def _follow(self, measurements: Mapping[str, Any]) -> None:
         """A step of the policy."""
         policy = self._policy
-        measured = policy.read(measurements, (*policy.needs, "joint_angles"))
-        late = policy.steps_since(measured) - 1
+        # Of a policy that does not see them, the arm needs the angles all the same.
+        needs = dict.fromkeys((*policy.needs, "joint_angles"))
+        measured = policy.read(measurements, tuple(needs))
+        steps = policy.steps_since(measured)
+        late = steps - 1
         if late > self._max_steps_late:
             self.stop(f"a control step came {late} steps late", "late_step")
             return
         is_bridged = policy.samples.is_arm_bridged
         if self._stop_at(self._watch.faults(measured, self._targets, is_bridged)):
             return
-        last = policy.step_number
-        policy.act(measured)
-        self._idle = self._idle + 1 if policy.step_number == last else 0
-        if self._idle:
-            self._motion.hold()
+        if self._is_new_step(steps):
+            policy.act(measured)
+        self._keep_in_box()
+
+    def _steps_since_due(self, measured: Measurements) -> int:
+        """Control steps since the last one on the way home, rounded as those of the policy."""
+        if "time" not in measured:
+            return 1
+        time = float(measured["time"][0])
+        if self._due is None:
+            self._due = time
+            return 1
+        dt = self._metadata.control_dt
+        steps = max(0, round((time - self._due) / dt))
+        self._due += steps * dt
+        return steps
+
+    def _is_new_step(self, steps: int) -> bool:
+        """Whether a call is a new control step: some steps after the last one. In a call that is
+        none the commands brake, and after too many in a row the arm stops."""
+        if steps > 0:
+            self._idle = 0
+            return True
+        self._idle += 1
+        self._motion.hold()
         if self._idle > self._max_steps_late:
             self.stop(f"{self._idle} calls in a row are no new step", "no_step")
-            return
-        self._keep_in_box()
+        return False
 
     def _keep_in_box(self) -> None:
         """Brakes if the paddle would leave the box when the commands braked from the end of this
