@@ -120,6 +120,10 @@ def swapped(lines: list[str]) -> list[str]:
             r"Line #6 \(got 13 columns instead of 12",
         ),
         (
+            lambda lines: [*lines[:-1], lines[-1][:9]],
+            r"\(got 1 columns instead of 12\).+ delete the last one where the recording was cut",
+        ),
+        (
             scaled("joint_angles", 57.3),
             r"is -28\.\d+ rad .+ if these are degrees, write .+ \[deg\]",
         ),

@@ -127,9 +127,12 @@ def _read_columns(path: Path) -> tuple[dict[str, tuple[str, np.ndarray]], np.nda
         options = dict(delimiter=delimiter, comments=None, ndmin=2, skip_header=1)
         cells = np.genfromtxt([header, *lines], **options) if lines else np.zeros((0, 0))
     except (OSError, ValueError) as error:
+        remedy = "give a CSV file in UTF-8, or a ROS bag"
+        # NumPy's words for lines of another length.
+        if "columns instead of" in str(error):
+            remedy = "correct these lines, or delete the last one where the recording was cut off"
         raise UserError(
-            f"the log {path} cannot be read ({shorten(reason_of(error))}); give a CSV file in "
-            "UTF-8, or a ROS bag"
+            f"the log {path} cannot be read ({shorten(reason_of(error))}); {remedy}"
         ) from error
     if cells.shape[1] != len(titles) or not cells.size:
         raise UserError(
