@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -13,9 +12,7 @@ import yaml
 
 import bounce_mjx
 from arms import ARM
-from bounce_mjx.commands.eval import EvalCommand
 from bounce_mjx.commands.main import main
-from bounce_mjx.commands.task_commands import parse_with_commands
 from bounce_mjx.config.command_line import flag_names
 from bounce_mjx.config.files import flat
 from bounce_mjx.config.settings import merged
@@ -418,26 +415,12 @@ def test_the_printed_config_is_a_config_and_says_its_sources(folder: Path) -> No
     assert again == read_command(said_by_user).config
 
 
-@pytest.mark.parametrize(
-    "setting, other",
-    [("num_envs", "ppo.num_envs"), ("seed", "seed"), ("report", "report")],
-)
-def test_no_setting_of_a_task_takes_another_ones_flag(
-    folder: Path, setting: str, other: str
-) -> None:
+def test_no_setting_of_a_task_takes_a_flag_of_the_algorithms(folder: Path) -> None:
     """`--num-envs 8` once trained with 512 environments: it was the task's."""
     text = DRIBBLE.read_text(encoding="utf-8")
     before = "    apex_range: tuple"
     assert before in text
-    own = f'    {setting}: int = 3\n    """A number of its own."""\n'
+    own = '    num_envs: int = 3\n    """A number of its own."""\n'
     (folder / "own.py").write_text(text.replace(before, own + before), encoding="utf-8")
-    sentence = f"the setting env.{setting} has the flag of {other}; give it another name"
-    with pytest.raises(UserError, match=re.escape(sentence)):
+    with pytest.raises(UserError, match="env.num_envs and ppo.num_envs have the same name; give"):
         read_command(["--config", "cpu", "--task", "own.py:Dribble", "--num-envs", "8"])
-
-
-def test_no_command_of_a_task_takes_another_ones_flag(folder: Path) -> None:
-    text = DRIBBLE.read_text(encoding="utf-8")
-    (folder / "own.py").write_text(text.replace('"apex"', '"seed"'), encoding="utf-8")
-    with pytest.raises(UserError, match="the command seed of the task own.py:Dribble has the flag"):
-        parse_with_commands(EvalCommand, ["--task", "own.py:Dribble"], prog="bounce-mjx eval")

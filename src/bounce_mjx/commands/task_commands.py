@@ -48,19 +48,10 @@ def parse_with_commands(
     """Reads a command line in which the commands of the run's task are flags too.
 
     Raises:
-      UserError: a flag has a bad value, or no task has it, or a command of the task has the flag
-        of something else.
+      UserError: a flag has a bad value, or no task has it.
     """
     task = parse(WhichPolicy, args, prog=prog, is_first=True).task
-    command_fields = fields_in(command_class)
-    task_fields = _fields_of(task)
-    for name in _of_group(task_fields):
-        if name in command_fields:
-            raise UserError(
-                f"the command {name} of the task {task} has the flag of {prog}'s own {name}; give "
-                "it another name"
-            )
-    fields = command_fields | task_fields
+    fields = fields_in(command_class) | _fields_of(task)
     given = read_flags(
         fields,
         args,

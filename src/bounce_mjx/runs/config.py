@@ -2,7 +2,6 @@
 
 import shlex
 import sys
-from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -193,11 +192,10 @@ def fields_of(
       algorithm: the settings of the algorithm.
 
     Raises:
-      UserError: two settings have the same flag.
+      UserError: a setting of the task has the name of one of the algorithm.
     """
+    check_names(env, algorithm)
     groups = {"env": env, "ppo": algorithm}
-    others = [name for name in TrainConfig.model_fields if name not in groups]
-    check_flags(groups, others)
     fields = {}
     for name, field in TrainConfig.model_fields.items():
         if name in groups:
@@ -207,25 +205,19 @@ def fields_of(
     return fields
 
 
-def check_flags(groups: Mapping[str, type[pydantic.BaseModel]], other_flags: Iterable[str]) -> None:
-    """Checks that each setting of the groups, whose flag is its name alone, has a flag of its own.
+def check_names(env: type[WorldConfig], algorithm: type[PPOConfig]) -> None:
+    """Checks that no setting of a task has the name of one of the algorithm: of both, the flag and
+    the key that stands alone would be one, as in --num-envs.
 
     Raises:
-      UserError: two settings have the same flag.
+      UserError: one has.
     """
-    first_keys = {name: name for name in other_flags}
-    # A task's setting is the one to rename, so PPO's come before it.
-    for group in sorted(groups, reverse=True):
-        for name in fields_in(groups[group]):
-            # One within a further group has a flag with dots.
-            if "." in name:
-                continue
-            if name in first_keys:
-                raise UserError(
-                    f"the setting {group}.{name} has the flag of {first_keys[name]}; give it "
-                    "another name"
-                )
-            first_keys[name] = f"{group}.{name}"
+    for name in fields_in(env):
+        if name in algorithm.model_fields:
+            raise UserError(
+                f"env.{name} and ppo.{name} have the same name; give the setting of the task, or "
+                "of the algorithm, another one"
+            )
 
 
 def load_run_config(

@@ -10,7 +10,7 @@ from pydantic.fields import FieldInfo
 from bounce_mjx.config.command_line import flag_names, parse, read_flags, typed
 from bounce_mjx.config.files import flat
 from bounce_mjx.config.settings import Count, NonNegativeInt, fields_in
-from bounce_mjx.runs.config import TrainConfig, check_flags
+from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.settings import Choice, Stack, stack
 
 PROG = "bounce-mjx train"
@@ -71,7 +71,6 @@ class TrainCommand(NamedTuple):
 def fields_of_command(layers: Stack) -> dict[str, FieldInfo]:
     """What has a flag, by dotted key: the settings of the training, then the other flags."""
     others = fields_in(TrainFlags)
-    check_flags({"env": layers.task.Config, "ppo": layers.algorithm}, others)
     return layers.fields | {key: x for key, x in others.items() if key not in layers.fields}
 
 
