@@ -14,7 +14,7 @@ import numpy as np
 
 from bounce_mjx import load_policy
 from bounce_mjx.deploy.recorder import Recorder
-from bounce_mjx.errors import exit_on_user_error
+from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.resources import resource_path
 
 MJCF = resource_path("mjcf/bounce_ball.xml")
@@ -188,6 +188,11 @@ def rendered_camera(policy, arguments: argparse.Namespace):
 def main() -> None:
     arguments = parse_arguments()
     policy = load_policy(arguments.policy)
+    if list(policy.metadata.commands) != ["target_height"] or policy.metadata.num_balls > 1:
+        raise UserError(
+            f"{arguments.policy} is of another task, and this loop bounces one ball; give a policy "
+            "of bouncing, such as robust"
+        )
     log = contextlib.nullcontext()
     if arguments.log:
         log = Recorder(arguments.log, policy.metadata.joint_names, commands={"target_height": "m"})

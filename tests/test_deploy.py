@@ -697,6 +697,13 @@ main(["eval"])
     assert re.fullmatch(f"error: bounce-mjx eval cannot be imported {reason}", done.stderr)
 
 
+@pytest.mark.parametrize("name", ["catch", "juggle"])
+def test_the_example_plays_bouncing_policies_alone(name: str, monkeypatch) -> None:
+    monkeypatch.setattr("sys.argv", ["deploy.py", name])
+    with pytest.raises(UserError, match=f"{name} is of another task, and this loop bounces one"):
+        EXAMPLE["main"]()
+
+
 @pytest.mark.slow
 def test_only_the_robust_policy_bounces_with_a_late_camera() -> None:
     """On plain MuJoCo; the defaults of the example."""
