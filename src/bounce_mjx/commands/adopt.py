@@ -108,8 +108,10 @@ def describe(adoption: "Adoption") -> list[str]:
 
     pose = adoption.pose
     names = adoption.arm.joint_names
-    types = [adoption.arm.spec.joint(name).type for name in names]
-    is_slide = [joint_type == mujoco.mjtJoint.mjJNT_SLIDE for joint_type in types]
+    slides = []
+    for name in names:
+        if adoption.arm.spec.joint(name).type == mujoco.mjtJoint.mjJNT_SLIDE:
+            slides.append(name)
     x, y, z = _rounded(pose.paddle, 3)
     strength = f"{pose.acceleration:.0f} m/s^2 upward in addition to holding the arm"
     if math.isinf(pose.acceleration):
@@ -118,9 +120,9 @@ def describe(adoption: "Adoption") -> list[str]:
     if adoption.clearance <= 0.0:
         clearance = "none; the paddle touches another link, so choose --paddle.position yourself"
     scale_unit = "rad"
-    if all(is_slide):
+    if len(slides) == len(names):
         scale_unit = "m"
-    elif any(is_slide):
+    elif slides:
         scale_unit = "rad (a slide: m)"
     kind = "kept" if adoption.config.servo_stiffness is None else "made from the reflected inertia"
     lines = [
@@ -130,22 +132,22 @@ def describe(adoption: "Adoption") -> list[str]:
         f"clearance: {clearance}",
         f"servos: {kind}; action scale {adoption.action_scale:g} {scale_unit}",
     ]
-    angles = _rounded(pose.angles, 3)
-    for name, slides, angle, inertia, servo in zip(
-        names, is_slide, angles, pose.inertia, adoption.servos, strict=True
+    positions = _rounded(pose.angles, 3)
+    for name, position, inertia, servo in zip(
+        names, positions, pose.inertia, adoption.servos, strict=True
     ):
-        unit = "m" if slides else "rad"
+        unit = "m" if name in slides else "rad"
         limit = "no force limit"
         if servo.force_limit is not None:
             limit = f"force limit {servo.force_limit:.4g}"
         lines.append(
-            f"  {name}: {angle:+.3f} {unit}, inertia {inertia:.3g}, kp {servo.stiffness:.4g}, "
+            f"  {name}: {position:+.3f} {unit}, inertia {inertia:.3g}, kp {servo.stiffness:.4g}, "
             f"kv {servo.damping:.4g}, {limit}"
         )
-    if any(is_slide):
-        slides = ", ".join(name for name, slides in zip(names, is_slide, strict=True) if slides)
+    if slides:
         lines.append(
-            f"export: a policy of an arm with a slide ({slides}) runs in JAX alone, not as ONNX yet"
+            f"export: a policy of an arm with a slide ({', '.join(slides)}) runs in JAX alone, not "
+            "as ONNX yet"
         )
     lines.append("changes to the model:")
     lines += [f"  {change}" for change in adoption.arm.changes]

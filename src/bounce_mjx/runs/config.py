@@ -194,7 +194,7 @@ def fields_of(
     Raises:
       UserError: a setting of the task has the name of one of the algorithm.
     """
-    check_names(env, algorithm)
+    _check_names(env, algorithm)
     groups = {"env": env, "ppo": algorithm}
     fields = {}
     for name, field in TrainConfig.model_fields.items():
@@ -205,7 +205,7 @@ def fields_of(
     return fields
 
 
-def check_names(env: type[WorldConfig], algorithm: type[PPOConfig]) -> None:
+def _check_names(env: type[WorldConfig], algorithm: type[PPOConfig]) -> None:
     """Checks that no setting of a task has the name of one of the algorithm: of both, the flag and
     the key that stands alone would be one, as in --num-envs.
 
