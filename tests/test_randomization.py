@@ -638,7 +638,7 @@ def test_targets_change_at_their_interval(at_rest: Run) -> None:
 @pytest.mark.parametrize(
     ("terms", "given", "words"),
     [
-        ({"ball_mass": (2.0, 2.0)}, {"ball_mass": 0.01}, "returns ball_mass, which is sampled by randomi"),
+        ({"ball_mass": (2.0, 2.0)}, {"ball_mass": 0.01}, "returns ball_mass, which is sampled"),
         # The damping of a restitution is that of the model's own stiffness.
         (
             {"restitution": (0.8, 0.9)},
