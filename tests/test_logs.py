@@ -71,6 +71,25 @@ def test_recorder_keeps_an_earlier_log(tmp_path: Path) -> None:
         recorder.step({"joint_angles": [0.1, 0.2]}, [0.3, 0.4])
 
 
+@pytest.mark.parametrize("num_balls", [None, 2])
+def test_recorder_writes_each_of_several_balls(num_balls: int | None, tmp_path: Path) -> None:
+    """As many as the first row has, or as it is told; of a picture that lacks one, the other."""
+    path = tmp_path / "log.csv"
+    balls = np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
+    with Recorder(path, JOINTS, num_balls=num_balls) as recorder:
+        first = {"time": 5.0, "joint_angles": [0.1, 0.2]}
+        recorder.step(first | ({"ball_position": balls} if num_balls is None else {}), [0.3, 0.4])
+        lost = np.where([[False], [True]], np.nan, balls + 1.0)
+        recorder.step(first | {"time": 5.01, "ball_position": lost, "ball_age": 0.0}, [0.3, 0.4])
+        recorder.picture(5.015, balls + 2.0)
+    rows = np.genfromtxt(path, delimiter=",", names=True, deletechars="")
+    x = [rows[f"ball_position.{i}.x_[m]"][-2:] for i in (1, 2)]
+    np.testing.assert_allclose(x, [[1.1, 2.1], [np.nan, 2.4]])
+    log = read_csv(path, JOINTS)
+    np.testing.assert_allclose(log.ball_positions[-2:, 0], [1.1, 2.1])
+    assert any("shows several balls" in note for note in log.notes)
+
+
 def changed(line: str, row: int, column: int, cell: str) -> str:
     cells = line.split(",")
     cells[column] = cell
