@@ -113,8 +113,7 @@ class Recorder(contextlib.AbstractContextManager):
         return {"ball_position": position, "ball_time": taken}
 
     def _write(self, values: Mapping[str, Any]) -> None:
-        """Writes a row; the cells of what is missing or not finite are empty, of several balls those
-        of each ball."""
+        """Writes a row; the cells of what is missing or not finite are empty, ball by ball."""
         if self._sizes is None:
             self._write_header(values.get("ball_position"))
         row = []

@@ -13,6 +13,7 @@ from numpy.polynomial.polynomial import polyfit
 from scipy.ndimage import uniform_filter1d
 from scipy.optimize import linear_sum_assignment
 
+from bounce_mjx.identify.flight import GRAVITY
 from bounce_mjx.identify.following import SETTLING, commanded, find_settled
 from bounce_mjx.identify.log import Log, find_gaps
 
@@ -55,7 +56,7 @@ _SATURATED = 0.02
 _REST = 3e-3
 _BEYOND = 0.02
 _EXACT = 0.9
-_GRAVITY = 9.81
+_FALLING = float(np.linalg.norm(GRAVITY))
 # Time of a piece of flight that shows the ball's acceleration, s.
 _PIECE = 0.12
 _FEWEST_PIECES = 10
@@ -563,7 +564,7 @@ def _find_ball(log: Log) -> list[Finding]:
     if len(pulls) < _FEWEST_PIECES:
         return []
     found = []
-    falls = np.linalg.norm(pulls + [0.0, 0.0, _GRAVITY], axis=1) < _NEAR_GRAVITY * _GRAVITY
+    falls = np.linalg.norm(pulls - GRAVITY, axis=1) < _NEAR_GRAVITY * _FALLING
     if np.sum(falls) >= _FEWEST_PIECES:
         # A hand may carry it in between, for most of the log.
         return []
@@ -571,10 +572,10 @@ def _find_ball(log: Log) -> list[Finding]:
     size = float(np.linalg.norm(pull))
     axis = int(np.argmax(np.abs(pull)))
     shown = "(" + ", ".join(f"{x:.1f}" for x in pull) + ") m/s^2"
-    if not 0.5 * _GRAVITY < size < 2.0 * _GRAVITY:
+    if not 0.5 * _FALLING < size < 2.0 * _FALLING:
         text = (
-            f"in flight it accelerates by {shown}, and {_GRAVITY} m/s^2 is expected; look at the "
-            "units of its position and of ball_time"
+            f"in flight it accelerates by {shown}, and {_FALLING:.2f} m/s^2 is expected; look at "
+            "the units of its position and of ball_time"
         )
         found.append(Finding("ball unit", "the ball", text))
     elif axis != 2:
