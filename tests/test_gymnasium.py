@@ -306,6 +306,22 @@ def test_the_first_picture_opens_opengl(monkeypatch) -> None:
         env.close()
 
 
+def test_a_program_that_closes_no_environment_ends_in_silence(opengl) -> None:
+    """Also where a library has asked for its own ends before OpenGL is opened."""
+    script = f"""
+import weakref
+class Library: pass
+library = Library()
+weakref.finalize(library, print, "end")
+import gymnasium, bounce_mjx.adapters.gymnasium
+env = gymnasium.make({ENV_ID!r}, render_mode="rgb_array", width=64, height=48)
+env.reset()
+print(env.render().shape)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "(48, 64, 3)\nend\n", "")
+
+
 def test_use_before_reset_or_with_a_wrong_action_gives_one_sentence(vectorised):
     single, vector = environments.TaskEnv(episode_seconds=0.01), make_vec()
     for env in (single, vector):

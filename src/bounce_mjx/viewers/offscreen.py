@@ -1,5 +1,6 @@
 """Rendering without a screen."""
 
+import atexit
 import contextlib
 import functools
 import importlib
@@ -127,6 +128,8 @@ class Renderer(contextlib.AbstractContextManager):
         # Otherwise this would free objects of the renderer that drew last.
         self._opened._gl_context.make_current()
         self._opened.close()
+        self._opened = None
+        atexit.unregister(self.close)
 
     def render(
         self,
@@ -157,6 +160,8 @@ class Renderer(contextlib.AbstractContextManager):
             choose_opengl()
             self._opened = mujoco.Renderer(self._display.model, *self._size)
             self._opened.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self._has_shadows
+            # Before MuJoCo ends OpenGL, which it has asked of `atexit` when it was loaded.
+            atexit.register(self.close)
         return self._opened
 
 

@@ -54,8 +54,9 @@ class Pictures:
     def _renderer(self) -> Renderer:
         task = self._batch.programs.task
         renderer = Renderer(task, self._width, self._height, self._camera, plain=True)
-        # Also closed at exit, where OpenGL would be unloaded before the renderer.
         self._close_renderer = weakref.finalize(self, renderer.close)
+        # The renderer closes itself.
+        self._close_renderer.atexit = False
         return renderer
 
     def __getstate__(self) -> dict[str, Any]:
