@@ -331,16 +331,38 @@ def test_an_attribute_of_another_type_is_refused(
 
 
 @pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"low": 0.5, "high": 0.4}, "is sampled from 0.5 to 0.4; give two finite numbers, the low"),
+        ({"low": np.nan, "high": 0.4}, "is sampled from nan to 0.4; give two finite numbers"),
+        ({"low": 0.4, "high": np.inf}, "is sampled from 0.4 to inf; give two finite numbers"),
+        ({"low": "0.4", "high": 0.5}, "is sampled from '0.4' to 0.5; give two finite numbers"),
+        ({"low": True, "high": 1.5}, "is sampled from True to 1.5; give two finite numbers"),
+        (
+            {"low": 0.1, "high": 2.0, "greatest": 1.0, "unit": "m", "reason": "as it ends there"},
+            r"is sampled from 0.1 to 2, but must be <= 1 \(m\), as it ends there",
+        ),
+        ({"low": 0.1, "high": 2.0, "least": 0.2}, "is sampled from 0.1 to 2, but must be >= 0.2"),
+        ({"low": 0.0, "high": 1.0, "span": (1.0, 0.0)}, r"is offered as \(1.0, 0.0\); give two"),
+        ({"low": 0.0, "high": 1.0, "step": 0.0}, "has the step 0.0; give a number above 0"),
+        ({"low": 0.0, "high": 1.0, "names": "ab"}, "has the names 'ab'; give a tuple of names"),
+        ({"low": 0.0, "high": 1.0, "names": ("1",)}, "the names .'1',.; give a tuple of names, of"),
+    ],
+)
+def test_a_command_from_which_nothing_can_be_sampled_is_refused(settings: dict, words: str) -> None:
+    """Where it is written, with its line."""
+    with pytest.raises(UserError, match=rf"a command( \(test_tasks.py, line \d+\))?:? .*{words}"):
+        task.Command(**settings)
+
+
+@pytest.mark.parametrize(
     ("commands", "words"),
     [
-        ({"height": task.Command(0.5, 0.4)}, "the command height .* sampled from 0.5 to 0.4; give"),
-        ({"height": task.Command(np.nan, 0.4)}, "the command height .* sampled from nan to 0.4"),
-        ({"height": task.Command(0.4, np.inf)}, "the command height .* two finite numbers"),
         ({"height": (0.4, 0.5)}, r"the command height .* is \(0.4, 0.5\); give a task.Command"),
         ([task.Command(0.4, 0.5)], "the commands of .* _Wrong are .*; return a dictionary of a"),
     ],
 )
-def test_a_command_from_which_nothing_can_be_sampled_is_refused(
+def test_commands_of_another_type_are_refused(
     commands: object, words: str, wrong: Env, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(_Wrong.Config, "commands", commands)
@@ -349,25 +371,45 @@ def test_a_command_from_which_nothing_can_be_sampled_is_refused(
 
 
 @pytest.mark.parametrize(
-    ("quantity", "words"),
+    ("settings", "words"),
     [
-        (
-            task.Quantity(2, "m", "command"),
-            r"height as Quantity\(size=2, .* number; give it task.Quantity\(1, 'm', ",
-        ),
-        (task.Quantity(None, "", "command"), "shows the command height as .* is one number"),
-        (task.Quantity(1, "m", "command", per_ball=True), "shows the command height as .* is one"),
-        (task.Quantity(1, "m", "commands"), "the quantity height of Seen has the group 'commands'"),
+        ((2, "m", "command"), r"shows a command, which is one number; give task.Quantity\(1, 'm'"),
+        ((None, "", "command"), "shows a command, which is one number"),
+        ((1, "m", "command", True), "shows a command, which is one number"),
+        ((1, "m", "commands"), "has the group 'commands'; choose from state, command, past, task"),
+        ((0, "m"), "has the size 0; give a number of entries, or None for one of each joint"),
+        ((1.5, "m"), "has the size 1.5; give a number of entries"),
     ],
 )
-def test_a_command_is_shown_as_one_number(quantity: task.Quantity, words: str, wrong: Env) -> None:
-    """Of a larger size, the observation would repeat it."""
+def test_a_quantity_that_cannot_be_is_refused(settings: tuple, words: str) -> None:
+    """Where it is written. Of a larger size, the observation would repeat a command."""
+    with pytest.raises(
+        UserError, match=rf"Quantity\(size=.*\) \(test_tasks.py, line \d+\) {words}"
+    ):
+        task.Quantity(*settings)
 
+
+def test_a_command_is_not_shown_by_a_quantity_of_another_group(wrong: Env) -> None:
     class Seen(task.ObservationConfig):
-        height: Annotated[int, quantity] = 1
+        height: Annotated[int, task.Quantity(1, "m")] = 1
 
-    with pytest.raises(UserError, match=words):
+    with pytest.raises(UserError, match="height has the name of a quantity of the task; .* group"):
         Env(wrong.config.model_copy(update={"observation": Seen()}))
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (("", "error"), "the tag of a task.Curve .* is ''; give a name"),
+        (("task/error", None), "the metric of a task.Curve .* is None; give a name"),
+        (("task/error", "error", 3), "the over of a task.Curve .* is 3; give a name"),
+        (("a", "b", "steps", 100.0), "the title of the curve a .* is 100.0; give words"),
+        (("a", "b", "steps", "", "cm"), "the scale of the curve a .* is 'cm'; give a finite num"),
+    ],
+)
+def test_a_curve_that_cannot_be_is_refused(settings: tuple, words: str) -> None:
+    with pytest.raises(UserError, match=words):
+        task.Curve(*settings)
 
 
 def test_a_command_that_is_shown_but_not_there_is_refused(wrong: Env) -> None:
@@ -504,6 +546,37 @@ def test_tasks_have_the_geometry_of_the_model(large: Path) -> None:
         Env(find_task("bounce").Config(mjcf=large, ball_init_pos=(0.59, 0.0, 0.07)))
 
 
+@pytest.mark.parametrize(
+    ("task_name", "settings", "words"),
+    [
+        (
+            "catch",
+            {"randomization": {"command_interval": (1.0, 2.0)}},
+            "randomization.command_interval is given, but the task Catch has no commands; leave",
+        ),
+        (
+            "catch",
+            {"randomization": {"first_command_range": 0.5, "warmup_steps": 10}},
+            "randomization.first_command_range is given, but the task Catch has no commands",
+        ),
+        ("bounce", {"target_height_range": 0.5}, "0.5 is not a range; give two numbers"),
+        ("track", {"speed_range": (0.1,)}, r"\(0.1,\) is not a range; give two numbers"),
+        ("juggle", {"height_range": (0.5, 0.4)}, r"\(0.5, 0.4\) is not a range; give the lower"),
+        ("bounce", {"randomization": {"restitution": 0.9}}, "0.9 is not a range; give two numbers"),
+        (
+            "bounce",
+            {"max_height_above_target": 0.01},
+            "max_height_above_target is 0.01 m, so an episode ends where it starts, at the ball_in",
+        ),
+    ],
+)
+def test_a_setting_that_a_task_cannot_have_is_refused(
+    task_name: str, settings: dict, words: str
+) -> None:
+    with pytest.raises(ValueError, match=words):
+        find_task(task_name).Config.model_validate(settings)
+
+
 @pytest.mark.parametrize("name", ["juggle", "track"])
 def test_no_height_that_may_be_commanded_ends_the_episode_at_a_hit(name: str) -> None:
     """A ball exactly in its column or under its point is not lost where the paddle hits it, at the
@@ -530,12 +603,12 @@ def test_no_height_that_may_be_commanded_ends_the_episode_at_a_hit(name: str) ->
         return bool(flown.step(state, task.Step(truth, commands, rest, rest)).ended)
 
     assert not is_ended(command.greatest + rise) and is_ended(command.greatest + rise + 0.05)
-    lowest, highest = command.span or (command.low, command.high)
+    lowest, highest = command.offered
     assert command.least <= lowest and highest <= command.greatest
     for height in (command.least - 1e-3, command.greatest + 1e-3):
         with pytest.raises(UserError, match="target_height is .* but must be a finite number >= "):
             command.checked(height, "target_height")
-    with pytest.raises(ValueError, match="height_range goes up to 0.75 m over home, but max_dist"):
+    with pytest.raises(ValueError, match="height_range: a command .* farther than max_distance"):
         kind.Config(height_range=(0.72, 0.75))
 
 

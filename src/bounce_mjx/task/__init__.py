@@ -67,5 +67,6 @@ from bounce_mjx.world.config import (
     ResetConfig,
     WorldConfig,
 )
+from bounce_mjx.world.limits import Limit, Limits, check_within, is_beyond, target_heights
 from bounce_mjx.world.observation import History, Kinematics, ObservationConfig, Quantity
 from bounce_mjx.world.randomization import RandomizationConfig

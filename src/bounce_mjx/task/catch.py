@@ -114,6 +114,11 @@ class Config(task.WorldConfig):
         x, y, z = paddle
         return {"ball_init_pos": [x, y, round(z + REST_HEIGHT, 4)]}
 
+    @property
+    def limits(self) -> task.Limits:
+        """Relative to the paddle's centre."""
+        return (task.Limit("LOST_DEPTH", "below", LOST_DEPTH),)
+
 
 class CatchState(NamedTuple):
     """What the task keeps of an episode."""
@@ -196,7 +201,7 @@ class Catch(task.Task):
         in_time = contact < CATCH_SECONDS + 0.5 * dt
         caught = state.caught | (in_time & (rest_seconds > REST_SECONDS - 0.5 * dt))
 
-        is_low = offset[2] < -LOST_DEPTH
+        is_lost = task.is_beyond(self.config.limits, truth.ball_position, truth.paddle_position)
         hits_floor = truth.paddle_position[2] < FLOOR
         return task.TaskStep(
             state=CatchState(
@@ -213,7 +218,7 @@ class Catch(task.Task):
                 rest=(resting, speed),
                 action_rate=jnp.mean(jnp.square(step.action - step.last_action)),
             ),
-            ended=is_low | hits_floor,
+            ended=is_lost | hits_floor,
             metrics={"caught": caught},
         )
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-import pydantic
 from pydantic import Field
 
 from bounce_mjx import task
-from bounce_mjx.config.settings import Ascending, Coordinate, Finite, Length, Positive
+from bounce_mjx.config.settings import Coordinate, Finite, Length, Positive, Range
 from bounce_mjx.lazy import jax, jnp
 
 FLOWN = 0.125
@@ -75,7 +74,7 @@ class Config(task.WorldConfig):
     """Home of the paddle, m; the columns stand side by side over it."""
     spacing: Annotated[Positive, Field(le=1.0)] = 0.065
     """Distance between columns, m."""
-    height_range: Annotated[tuple[Height, Height], Ascending] = (0.35, 0.55)
+    height_range: Range[Height] = (0.35, 0.55)
     """Range of the target height over home, m."""
     max_distance: Length = 0.7
     """The episode ends when a ball is this far from the top of its column, m; or when it is lower
@@ -87,17 +86,6 @@ class Config(task.WorldConfig):
     reward: Rewards = Rewards()
     """The reward terms."""
 
-    @pydantic.model_validator(mode="after")
-    def _check_heights(self):
-        """A ball that is hit is not yet lost."""
-        if self.height_range[1] > self.max_distance:
-            raise ValueError(
-                f"height_range goes up to {self.height_range[1]:g} m over home, but max_distance "
-                f"is {self.max_distance:g} m, so that a ball which is hit there ends the episode; "
-                "change one of the two"
-            )
-        return self
-
     @classmethod
     def settings_at(cls, paddle: tuple[float, float, float]) -> dict[str, Any]:
         return super().settings_at(paddle) | {"home": paddle}
@@ -108,17 +96,27 @@ class Config(task.WorldConfig):
         return {"height_range": self.home[2] + self.height_range[0]}
 
     @property
+    def limits(self) -> task.Limits:
+        return (
+            task.Limit("home", "lowest", self.home[2]),
+            task.Limit("max_distance", "distance", self.max_distance),
+        )
+
+    @property
     def commands(self) -> dict[str, task.Command]:
         """The height of the apexes."""
         home_height = self.home[2]
         lowest, highest = self.height_range
+        heights = task.target_heights(self.limits, min_flight=MIN_TARGET_HEIGHT)
         return {
             "target_height": task.Command(
                 home_height + lowest,
                 home_height + highest,
                 "m",
-                least=home_height + MIN_TARGET_HEIGHT,
-                greatest=home_height + self.max_distance,
+                least=heights.least,
+                greatest=heights.greatest,
+                setting="height_range",
+                reason=heights.reason,
             )
         }
 
@@ -199,8 +197,7 @@ class Juggle(task.Task):
         flies = balls[:, 2] > self.config.home[2] + MIN_APEX_HEIGHT
         apexes = rose & ~rising & flies
 
-        is_far = jnp.sum(jnp.square(balls - columns), axis=1) > self.config.max_distance**2
-        is_low = balls[:, 2] < self.config.home[2]
+        is_lost = task.is_beyond(self.config.limits, balls, columns)
         touched = self._touched(step)
 
         ball_numbers = jnp.arange(self.config.num_balls)
@@ -220,7 +217,7 @@ class Juggle(task.Task):
                 home=truth.paddle_position - jnp.array(self.config.home),
                 calm=self._calm_error(step),
             ),
-            ended=jnp.any(is_far | is_low) | touched,
+            ended=jnp.any(is_lost) | touched,
             metrics={
                 "hits": jnp.sum(hits),
                 "in_turn": jnp.sum(hits & (ball_numbers == next_in_turn)),

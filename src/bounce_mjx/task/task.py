@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
+from bounce_mjx.config.settings import is_finite
+from bounce_mjx.config.user_code import where_made
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.lazy import jax, jnp, np
 from bounce_mjx.task.results import Episodes, Figure, Result
@@ -125,8 +128,13 @@ class Recording(NamedTuple):
     """Metrics of the step [T, K]."""
 
 
-class Curve(NamedTuple):
-    """A number that the training logs: how a metric adds up over a rollout."""
+@dataclasses.dataclass(frozen=True)
+class Curve:
+    """A number that the training logs: how a metric adds up over a rollout.
+
+    Raises:
+      UserError: it has no tag or metric, or its scale is no number.
+    """
 
     tag: str
     """Name in the log."""
@@ -140,6 +148,25 @@ class Curve(NamedTuple):
     """Title in the report; "" leaves it out there."""
     scale: float = 1.0
     """Factor from the metric's unit to the title's, in the report alone."""
+
+    def __post_init__(self) -> None:
+        for name in ("tag", "metric", "over"):
+            value = getattr(self, name)
+            if not (isinstance(value, str) and value):
+                raise UserError(
+                    f"the {name} of a task.Curve{where_made()} is {shorten(repr(value))}; give a "
+                    "name"
+                )
+        if not isinstance(self.title, str):
+            raise UserError(
+                f"the title of the curve {self.tag}{where_made()} is {shorten(repr(self.title))}; "
+                "give words"
+            )
+        if not is_finite(self.scale):
+            raise UserError(
+                f"the scale of the curve {self.tag}{where_made()} is {shorten(repr(self.scale))}; "
+                "give a finite number"
+            )
 
 
 class Histogram(NamedTuple):

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Annotated, Any, NamedTuple
 
-import pydantic
 from pydantic import Field
 
 from bounce_mjx import task
-from bounce_mjx.config.settings import Ascending, Coordinate, Finite, Length, Positive
+from bounce_mjx.config.settings import Coordinate, Finite, Length, Positive, Range
 from bounce_mjx.lazy import jax, jnp
 from bounce_mjx.task import paths
 
@@ -90,9 +89,9 @@ class Config(task.WorldConfig):
     # Not `task.PADDLE_HOME`: the shipped policy was trained here. Move it with the next one.
     home: tuple[Coordinate, Coordinate, Coordinate] = (0.58856, 0.0, 0.05)
     """Home of the paddle, m."""
-    height_range: Annotated[tuple[Height, Height], Ascending] = (0.4, 0.5)
+    height_range: Range[Height] = (0.4, 0.5)
     """Range of the target height over home, around which it sways, m."""
-    speed_range: Annotated[tuple[PointSpeed, PointSpeed], Ascending] = (0.05, 0.3)
+    speed_range: Range[PointSpeed] = (0.05, 0.3)
     """Range of the point's greatest speed, m/s."""
     path_size: Annotated[Positive, Field(le=1.0)] = 0.12
     """Radius of the circle, half the length of the line and of the figure of eight, m."""
@@ -104,24 +103,6 @@ class Config(task.WorldConfig):
     reward: Rewards = Rewards()
     """The reward terms."""
 
-    @pydantic.model_validator(mode="after")
-    def _check_heights(self):
-        """A ball that is hit under the point is not yet lost."""
-        if self.height_range[1] > self.max_height:
-            raise ValueError(
-                f"height_range goes up to {self.height_range[1]:g} m over home, but max_distance "
-                f"is {self.max_distance:g} m and the point sways, so that a ball which is hit "
-                f"under it ends the episode; give at most {self.max_height:g} m, or change "
-                "max_distance"
-            )
-        return self
-
-    @property
-    def max_height(self) -> float:
-        """Greatest height of the point over home, m: set at the lowest place of its sway, it rises
-        by both amplitudes, and the ball under it may fall to home."""
-        return round(self.max_distance - 2.0 * paths.SWAY, 9)
-
     @classmethod
     def settings_at(cls, paddle: tuple[float, float, float]) -> dict[str, Any]:
         return super().settings_at(paddle) | {"home": paddle}
@@ -131,12 +112,26 @@ class Config(task.WorldConfig):
         return super().heights | {"height_range": self.home[2] + self.height_range[0]}
 
     @property
+    def limits(self) -> task.Limits:
+        return (
+            task.Limit("home", "lowest", self.home[2]),
+            task.Limit("max_distance", "distance", self.max_distance),
+        )
+
+    @property
+    def targets(self) -> tuple[tuple[float, float, float], ...]:
+        x, y, z = self.home
+        lowest, highest = self.height_range
+        return (x, y, z + lowest), (x, y, z + highest)
+
+    @property
     def commands(self) -> dict[str, task.Command]:
         """The point, its speed and its path. The ranges of the point are those of the middle of the
         path, which is sampled; the point itself leaves them (`first_command`)."""
         x, y, z = self.home
         lowest, highest = self.height_range
         slowest, fastest = self.speed_range
+        heights = task.target_heights(self.limits, min_flight=MIN_TARGET_HEIGHT, sway=paths.SWAY)
         commands = {
             "target_x": task.Command(x - 0.02, x + 0.02, "m", span=(x - 0.15, x + 0.15), step=0.01),
             "target_y": task.Command(y - 0.02, y + 0.02, "m", span=(y - 0.15, y + 0.15), step=0.01),
@@ -144,9 +139,11 @@ class Config(task.WorldConfig):
                 z + lowest,
                 z + highest,
                 "m",
-                least=z + MIN_TARGET_HEIGHT,
-                greatest=z + self.max_height,
-                span=(z + min(0.3, self.max_height), z + min(0.7, self.max_height)),
+                least=heights.least,
+                greatest=heights.greatest,
+                span=(z + 0.3, z + 0.7),
+                setting="height_range",
+                reason=heights.reason,
             ),
             "point_speed": task.Command(
                 slowest, fastest, "m/s", least=0.0, span=(0.0, 0.3), hidden=True
@@ -210,9 +207,8 @@ class Track(task.Task):
 
         flies = ball[2] > home_height + MIN_APEX_HEIGHT
         is_apex = rose & (vertical_velocity <= 0.0) & flies
-        x_square, y_square, z_square = jnp.square(ball - paths.point(step.command))
-        is_far = x_square + y_square + z_square > self.config.max_distance**2
-        is_low = ball[2] < home_height
+        point = paths.point(step.command)
+        x_square, y_square, z_square = jnp.square(ball - point)
         return task.TaskStep(
             state=vertical_velocity > 0.0,
             reward=task.weighted_terms(
@@ -223,7 +219,7 @@ class Track(task.Task):
                 home=truth.paddle_position[2] - home_height,
                 calm=self._calm_error(step),
             ),
-            ended=is_low | is_far,
+            ended=task.is_beyond(self.config.limits, ball, point),
             metrics={
                 "apexes": is_apex,
                 "error": jnp.where(is_apex, task.safe_sqrt(x_square + y_square), 0.0),
