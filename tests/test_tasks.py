@@ -566,7 +566,17 @@ def test_tasks_have_the_geometry_of_the_model(large: Path) -> None:
         (
             "bounce",
             {"max_height_above_target": 0.01},
-            "max_height_above_target is 0.01 m, so an episode ends where it starts, at the ball_in",
+            "target_height_range: .* >= 0.44 .*max_height_above_target .* a ball starts at 0.45 m",
+        ),
+        (
+            "bounce",
+            {"min_ball_height": 0.5},
+            "target_height_range: .* >= 0.5 .* with a ball lower than min_ball_height .0.5 m.",
+        ),
+        (
+            "bounce",
+            {"max_horizontal_distance": 0.5},
+            "max_horizontal_distance is 0.5 m, so an episode ends where it starts, at the ball_in",
         ),
     ],
 )

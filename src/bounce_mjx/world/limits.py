@@ -89,18 +89,21 @@ def target_heights(
         any place of its sway.
     """
     lowest = max((limit for limit in limits if limit.kind == "lowest"), key=lambda x: x.value)
-    least = lowest.value + min_flight
-    greatest = float("inf")
-    binding = {lowest}
+    least, least_by = lowest.value + min_flight, lowest
+    greatest, greatest_by = float("inf"), lowest
     for limit in limits:
         if limit.kind == "distance" and lowest.value + limit.value - 2.0 * sway < greatest:
-            greatest = lowest.value + limit.value - 2.0 * sway
-            binding.add(limit)
+            greatest, greatest_by = lowest.value + limit.value - 2.0 * sway, limit
         if limit.kind == "above" and start is not None and start - limit.value > least:
-            least = start - limit.value
-            binding.add(limit)
-    words = [_WORDS[limit.kind].format(**limit._asdict()) for limit in limits if limit in binding]
-    return HeightLimits(least, greatest, f"as an episode ends with a ball {' or '.join(words)}")
+            least, least_by = start - limit.value, limit
+    words = []
+    for limit in limits:
+        if limit in (least_by, greatest_by):
+            words.append(_WORDS[limit.kind].format(**limit._asdict()))
+    reason = f"as an episode ends with a ball {' or '.join(words)}"
+    if least_by.kind == "above":
+        reason += f", and a ball starts at {start:.4g} m"
+    return HeightLimits(least, greatest, reason)
 
 
 def check_within(limits: Limits, starts: Any, targets: Any, setting: str) -> None:
