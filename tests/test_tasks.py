@@ -22,10 +22,10 @@ from bounce_mjx.commands.main import main
 from bounce_mjx.commands.play import PlayCommand
 from bounce_mjx.commands.task_commands import parse_with_commands
 from bounce_mjx.config.files import dump_config
+from bounce_mjx.config.validation import validate
 from bounce_mjx.env.env import Env, EnvState
 from bounce_mjx.env.vector import VectorStep
 from bounce_mjx.errors import UserError
-from bounce_mjx.evaluation.statistics import empty_statistics
 from bounce_mjx.learning.metrics import rollout_metrics, step_metrics
 from bounce_mjx.runs import checkpoints
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
@@ -195,14 +195,16 @@ TWO_BOOLS = jnp.zeros(2, bool)
     [
         (
             {"reward": {"still": jnp.ones(3)}},
-            r"reward term still .* _Wrong is float32 of .* \(3,\)",
+            r"step of the task _Wrong \(test_tasks.py, line \d+\) returns float32 of the shape "
+            r"\(3,\) for reward\['still'\]; return one number",
         ),
-        ({"reward": {"still": None}}, "reward term still .* _Wrong is None; return one number"),
-        ({"reward": jnp.ones(())}, "the reward of .* _Wrong is float32 of .*; return a dictionary"),
-        ({"metrics": {"drop": jnp.ones((1,))}}, r"the metric drop .* is float32 of .* \(1,\)"),
-        ({"ended": jnp.zeros(())}, "ended of .* _Wrong is float32 of .*; return one bool"),
-        ({"ended": TWO_BOOLS}, r"ended of .* _Wrong is bool of the shape \(2,\); return one bool"),
-        ({"state": jnp.zeros(())}, r"state of .* is a tuple at a reset and float32 .* structure"),
+        ({"reward": {"still": None}}, r"returns None for reward\['still'\]; return one number"),
+        ({"reward": jnp.ones(())}, "returns float32 of .* for reward; return a dictionary"),
+        ({"metrics": {"drop": jnp.ones((1,))}}, r"float32 of .* \(1,\) for metrics\['drop'\]"),
+        ({"ended": jnp.zeros(())}, "_Wrong .* returns float32 of .* for ended; return one bool"),
+        ({"ended": TWO_BOOLS}, r"returns bool of the shape \(2,\) for ended; return one bool"),
+        ({"state": jnp.zeros(())}, r"float32 of .* for state; return a tuple of the same struct"),
+        ({"metrics": {"drop": "low"}}, "returns something that is no array .*; return arrays and"),
     ],
 )
 def test_a_step_that_returns_something_else_is_refused(
@@ -218,20 +220,20 @@ def test_a_step_that_returns_something_else_is_refused(
         jax.eval_shape(lambda key: wrong.reset(key), jax.random.key(0))
 
 
-COMMAND = "of the task _Wrong returns"
+COMMAND = r"of the task _Wrong \(test_tasks.py, line \d+\) returns"
 
 
 @pytest.mark.parametrize(
     ("method", "returned", "words"),
     [
-        ("step", None, "step of the task _Wrong returns None; return a task.TaskStep"),
-        ("reset", {"rose": False}, "state of the task _Wrong is a dict at a reset and a tuple"),
+        ("step", None, "step of the task _Wrong .* returns None; return a task.TaskStep"),
+        ("reset", {"rose": False}, "returns a tuple for state; return a dict of the same struct"),
         ("first_command", None, f"first_command {COMMAND} None; return a dictionary"),
-        ("first_command", {"height": jnp.ones(1)}, r"float32 of the shape \(1,\) for the command"),
-        ("next_command", {"height": jnp.ones(1)}, rf"next_command {COMMAND} .* command height;"),
-        ("next_command", {"height": 1}, f"next_command {COMMAND} a int for the command height"),
+        ("first_command", {"height": jnp.ones(1)}, r"float32 of the shape \(1,\) for \['height'\]"),
+        ("next_command", {"height": jnp.ones(1)}, rf"next_command {COMMAND} .* for \['height'\];"),
+        ("next_command", {"height": 1}, rf"next_command {COMMAND} a int for \['height'\]; return"),
         ("next_command", {"height": jnp.int32(1)}, f"{COMMAND} int32 .* of a floating-point type"),
-        ("throw", np.zeros(3), r"throw of the task _Wrong returns float64 of the shape \(3,\)"),
+        ("throw", np.zeros(3), rf"throw {COMMAND} float64 of the shape \(3,\); return the pos"),
         ("throw", (np.zeros(2), np.zeros(3)), r"a tuple of the shapes \(2,\), \(3,\); return"),
     ],
 )
@@ -253,26 +255,157 @@ def test_a_state_that_changes_its_type_is_refused(
 
     monkeypatch.setattr(_Wrong, "step", step)
     monkeypatch.setattr(_Wrong, "reset", lambda *_: {"rose": False})
-    with pytest.raises(UserError, match=r"state\['rose'\] of .* is bool .* reset and float32 of"):
+    words = r"returns float32 .* for state\['rose'\]; return bool of the shape \(\), as at a reset"
+    with pytest.raises(UserError, match=words):
         jax.eval_shape(lambda key: wrong.reset(key), jax.random.key(0))
 
 
 @pytest.mark.parametrize(
     ("tally", "words"),
     [
-        ({"speed": 1.0}, "tally of the task _Wrong returns a dict; return a task.Tally"),
-        (task.Tally({"p": jnp.ones(3)}), r"the sum p in .* _Wrong is float32 of the shape \(3,\)"),
-        (task.Tally({}, {"p": jnp.ones(3)}), "the maximum p in the maxima of the tally of .* _Wr"),
+        ({"speed": 1.0}, "tally of the task _Wrong .* returns a dict; return a task.Tally"),
+        (task.Tally({"p": jnp.ones(3)}), r"returns float32 of the shape \(3,\) for sums\['p'\]"),
+        (task.Tally({}, {"p": jnp.ones(3)}), r"returns float32 of .* for maxima\['p'\]; return o"),
     ],
 )
 def test_a_tally_that_is_not_numbers_is_refused(
     tally: object, words: str, wrong: Env, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """At the first reset, as everything that a task returns."""
     monkeypatch.setattr(_Wrong, "tally", lambda *_: tally)
-    keys = jax.random.split(jax.random.key(0), 2)
-    states = jax.eval_shape(jax.vmap(wrong.reset, out_axes=-1), keys)
     with pytest.raises(UserError, match=words):
-        jax.eval_shape(lambda states: empty_statistics(wrong, states), states)
+        jax.eval_shape(lambda key: wrong.reset(key), jax.random.key(0))
+
+
+@pytest.mark.parametrize(
+    ("method", "body", "words"),
+    [
+        (
+            "step",
+            lambda task, state, step: step.comand,
+            r"ends in AttributeError: .*comand.* mean",
+        ),
+        (
+            "step",
+            lambda task, state, step: step.command["hieght"],
+            r"_Wrong \(test_tasks.py, line \d+\) ends in KeyError: 'hieght' \(did you mean",
+        ),
+        (
+            "step",
+            lambda task, state, step: 1 if step.truth.ball_position[2] > 0 else 0,
+            "ends in TracerBoolConversionError, as Python's if, .*; write jnp.where",
+        ),
+        (
+            "step",
+            lambda task, state, step: step.action + step.truth.ball_position,
+            "ends in TypeError: add got incompatible shapes",
+        ),
+        ("results", lambda task, episodes: episodes.sums["rest"], "results of .* KeyError: 'rest'"),
+        (
+            "results",
+            lambda task, episodes: None,
+            "results .* returns None; return a tuple of task.R",
+        ),
+        (
+            "results",
+            lambda task, episodes: 1.0 / len(episodes.maxima),
+            "ends in ZeroDivisionError: ",
+        ),
+    ],
+)
+def test_an_error_in_a_task_is_one_sentence_with_its_line(
+    method: str, body: object, words: str, wrong: Env, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before anything is compiled, also of the results of an evaluation."""
+    monkeypatch.setattr(_Wrong, method, body)
+    with pytest.raises(UserError, match=words):
+        jax.eval_shape(lambda key: wrong.reset(key), jax.random.key(0))
+
+
+COMMON_MISTAKES = {
+    "a field": (
+        "step.truth.ball_velocity[2]",
+        "step.truth.ball_velocty[2]",
+        "AttributeError: .* mean ball_velocity",
+    ),
+    "a name": ('step.command["apex"]', 'step.command["apx"]', "KeyError: 'apx' .did you mean apex"),
+    "an if": (
+        "is_low = ",
+        "low = 1 if height > 0 else 0\n        is_low = ",
+        "Python's if, .*where",
+    ),
+    "no return": ("return task.TaskStep(", "task.TaskStep(", "step .*None; return a task.TaskStep"),
+    "a vector": ("height < -0.03", "ball_position < -0.03", "bool of the shape .3,. for ended"),
+    "an end": ("ended=is_lost", "ended=height", "float32 of the shape .. for ended; return one b"),
+    "a state": (
+        "state=velocity_z > 0.0",
+        "state=velocity_z",
+        "returns float32 of the shape .. for state; return bool of the shape .., as at a reset",
+    ),
+    "a shape": (
+        "reach = height + ",
+        "reach = step.action + ball_position + ",
+        "TypeError: add got",
+    ),
+    "a curve": ('"apex_error", "apexes"', '"apex_eror", "apexes"', "a metric that .* apex_eror"),
+    "an order": ("Command(low, high", "Command(high, low", "from 0.085 to 0.065; give two finite"),
+    "a group": (
+        ', "command")] = 1',
+        ")] = 1",
+        "the name of a quantity of the task; .* the group com",
+    ),
+    "an unseen": (
+        "apex: Annotated[",
+        "apx: Annotated[",
+        "policy does not see the command apex, wh",
+    ),
+    "a tally": ("return task.Tally(sums)", "return sums", "tally .* a dict; return a task.Tally"),
+    "a sum": (
+        'sums["apexes"]',
+        'sums["apexs"]',
+        "results .*KeyError: 'apexs' .did you mean apexes",
+    ),
+    "a share": (
+        "low_apexes, apexes, 0.95",
+        "low_apexes, apexes, 95",
+        "least share 95; give one fro",
+    ),
+    "a class": (
+        "class Dribble(task.Task):",
+        "class Drible(task.Task):",
+        "no subclass 'Dribble' of",
+    ),
+    "a config": ("    Config = Config\n", "", "Dribble has no Config of its own"),
+    "an import": (
+        "import jax.numpy as jnp",
+        "import jax.numpi as jnp",
+        "ModuleNotFoundError in line 7",
+    ),
+    "a weight": (
+        "weight: float = 4.0",
+        'weight: float = "high"',
+        "in line 53: weight is high, but must be a valid number",
+    ),
+}
+
+
+@pytest.mark.parametrize("mistake", COMMON_MISTAKES)
+def test_a_common_mistake_in_a_task_is_one_sentence(mistake: str, tmp_path: Path) -> None:
+    """In a file like the page's: before anything is compiled, with its line where it has one."""
+    right, wrong, words = COMMON_MISTAKES[mistake]
+    text = Path(DRIBBLE.rpartition(":")[0]).read_text(encoding="utf-8")
+    assert right in text
+    path = tmp_path / "mine.py"
+    path.write_text(text.replace(right, wrong, 1), encoding="utf-8")
+
+    def trace() -> None:
+        env = Env(validate(find_task(f"{path}:Dribble").Config, {}, "mine.yaml"))
+        jax.eval_shape(lambda key: env.step(env.reset(key), jnp.zeros(6)), jax.random.key(0))
+
+    with pytest.raises(UserError, match=words) as refused:
+        trace()
+    about_a_value = ("a curve", "a group", "an unseen", "a class", "a config")
+    assert ("line " in str(refused.value)) == (mistake not in about_a_value)
 
 
 @pytest.mark.parametrize("method", ["reset", "step", "results"])

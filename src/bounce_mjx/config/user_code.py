@@ -13,6 +13,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
+import pydantic
+
+from bounce_mjx.config.validation import describe
 from bounce_mjx.errors import UserError, reason_of, shorten
 
 Kind = TypeVar("Kind")
@@ -144,9 +147,12 @@ def _run(source: bytes, path: Path) -> types.ModuleType:
                 line = frame.lineno
         # A SyntaxError has its own.
         line = getattr(error, "lineno", None) or line
+        reason = reason_of(error)
+        if isinstance(error, pydantic.ValidationError):
+            reason = describe(error, {})
         raise UserError(
             f"{path} cannot be imported ({type(error).__name__} in line {line}: "
-            f"{shorten(str(error), 300)}); correct it"
+            f"{shorten(reason, 300)}); correct it"
         ) from error
     return module
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Annotated, Any
 
 from pydantic import Field
 
 from bounce_mjx import task
 from bounce_mjx.config.settings import Coordinate, Finite, Length, Positive, Range
+from bounce_mjx.errors import UserError
 from bounce_mjx.lazy import jax, jnp
 
 FLOWN = 0.125
@@ -162,6 +164,18 @@ class Juggle(task.Task):
 
     # The start.
 
+    def check(self) -> None:
+        """Refuses columns in which the balls touch as they pass each other."""
+        _, largest = self.config.randomization.ball_radius or (1.0, 1.0)
+        radii = [radius * largest for radius in self.geometry.ball_radii]
+        for i, j in itertools.combinations(range(len(radii)), 2):
+            apart = (j - i) * self.config.spacing
+            if apart <= radii[i] + radii[j]:
+                raise UserError(
+                    f"spacing is {self.config.spacing:g} m, but balls of the radii {radii[i]:.4g} "
+                    f"and {radii[j]:.4g} m touch in columns that are {apart:g} m apart; give more"
+                )
+
     def throw(self, draws: jax.Array, command: task.Values) -> tuple[jax.Array, jax.Array]:
         """The balls are in their columns and land alternately, in the order of their numbers."""
         height = command["target_height"]
@@ -233,11 +247,13 @@ class Juggle(task.Task):
 
     def _touched(self, step: task.Step) -> jax.Array:
         """Whether two balls touched during the step [], bool."""
-        radius = self.geometry.ball_radius if step.ball_radius is None else step.ball_radius
+        geometry = self.geometry
+        first = geometry.ball_radius if step.ball_radius is None else step.ball_radius
+        radii = [first * (radius / geometry.ball_radius) for radius in geometry.ball_radii]
         distance = task.closest(
-            step.truth.ball_position, step.truth.ball_velocity, self.config.control_dt
+            step.truth.ball_position, step.truth.ball_velocity, self.config.control_dt, radii
         )
-        return distance < 2.0 * radius
+        return distance < 0.0
 
     # The reward: the error of each term, of the balls with a row for each.
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 import typing
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
 from bounce_mjx.config.settings import Finite, Positive, StrictModel
@@ -227,13 +227,20 @@ def _position_after(seconds: jax.Array, ball: jax.Array, velocity: jax.Array) ->
     return ball + seconds[..., None] * velocity - drops
 
 
-def closest(balls: jax.Array, velocities: jax.Array, seconds: float) -> jax.Array:
+def closest(
+    balls: jax.Array,
+    velocities: jax.Array,
+    seconds: float,
+    radii: Sequence[jax.Array | float] | None = None,
+) -> jax.Array:
     """Smallest distance of two balls in the last `seconds` [], m. Balls in free flight see each
     other move straight on; they can pass within a control step.
 
     Args:
       balls: present positions [B, 3], m.
       velocities: present velocities [B, 3], m/s.
+      radii: of each ball, m, for the distance of their surfaces, negative where they overlap; None
+        for that of their centres.
     """
     distances = []
     for i, j in itertools.combinations(range(len(balls)), 2):
@@ -241,5 +248,8 @@ def closest(balls: jax.Array, velocities: jax.Array, seconds: float) -> jax.Arra
         velocity = velocities[i] - velocities[j]
         # Where the distance |offset - ago velocity| is smallest; 1e-6 for balls that move alike.
         ago = jnp.sum(offset * velocity) / jnp.maximum(jnp.sum(jnp.square(velocity)), 1e-6)
-        distances.append(length(offset - jnp.clip(ago, 0.0, seconds) * velocity))
+        distance = length(offset - jnp.clip(ago, 0.0, seconds) * velocity)
+        if radii is not None:
+            distance -= radii[i] + radii[j]
+        distances.append(distance)
     return jnp.min(jnp.stack(distances))

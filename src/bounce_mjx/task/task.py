@@ -48,7 +48,8 @@ class Step(NamedTuple):
     last_action: jax.Array
     """Clipped action of the previous step [n]."""
     ball_radius: jax.Array | float | None = None
-    """Radius [] of the balls in this episode, m; None for that of the task's `geometry`."""
+    """Radius [] of the first ball in this episode, m, to which the others stay in proportion; None
+    for that of the task's `geometry`."""
 
 
 class TaskStep(NamedTuple):
@@ -249,6 +250,14 @@ class Task:
 
         model = world_model(self.config, visual=False)
         return read_geometry(model, find_addresses(model), self.config.default_joint_angles)
+
+    def check(self) -> None:
+        """Refuses settings that the task cannot have with this `geometry`; called once, before the
+        first episode.
+
+        Raises:
+          UserError: it cannot.
+        """
 
     def throw(self, draws: jax.Array, command: Values) -> tuple[jax.Array, jax.Array] | None:
         """Position [3] (m) and velocity [3] (m/s) of the ball at a reset, before the noise and the

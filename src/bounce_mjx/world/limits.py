@@ -82,20 +82,24 @@ def target_heights(
     should: it starts at its start, and flies between the lowest place and the target.
 
     Args:
-      limits: the ball's; one of the kind lowest among them.
+      limits: the ball's; one of the kind lowest among them, and at most one of each other kind.
       min_flight: least height of the target over the lowest place, m.
       start: height at which the ball starts, m; None for a start that follows from the target.
       sway: how far the target moves up and down by itself, to each side, m: a user may set it at
         any place of its sway.
     """
     lowest = max((limit for limit in limits if limit.kind == "lowest"), key=lambda x: x.value)
-    least, least_by = lowest.value + min_flight, lowest
-    greatest, greatest_by = float("inf"), lowest
+    least = lowest.value + min_flight
+    greatest = float("inf")
+    least_by = lowest
+    greatest_by = None
     for limit in limits:
-        if limit.kind == "distance" and lowest.value + limit.value - 2.0 * sway < greatest:
-            greatest, greatest_by = lowest.value + limit.value - 2.0 * sway, limit
-        if limit.kind == "above" and start is not None and start - limit.value > least:
-            least, least_by = start - limit.value, limit
+        if limit.kind == "distance":
+            greatest = lowest.value + limit.value - 2.0 * sway
+            greatest_by = limit
+        elif limit.kind == "above" and start is not None and start - limit.value > least:
+            least = start - limit.value
+            least_by = limit
     words = []
     for limit in limits:
         if limit in (least_by, greatest_by):

@@ -1,7 +1,7 @@
 """From the ranges of the randomisation to an episode's world, and from that to its physics."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -50,20 +50,25 @@ def check_overlap(
     mj_model: mujoco.MjModel,
     addresses: Addresses,
     terms: Iterable[str],
-    randomized: PhysicsParameters,
+    randomize: Callable[[jax.Array], PhysicsParameters],
 ) -> None:
-    """Refuses parameters of a `randomize` that change what a term changes: the world would say one
+    """Refuses a `randomize` whose parameters change what a term changes: the world would say one
     value, and the physics have the other.
 
     Args:
       mj_model: the model.
       addresses: of its parts.
       terms: names of the active terms.
-      randomized: what `randomize` returns; of its arrays, none is read.
+      randomize: key -> parameters; it is traced, and computes nothing.
 
     Raises:
-      UserError: a term and `randomize` change the same number of the model.
+      UserError: a term and `randomize` change the same number of the model, or it returns something
+        else than parameters.
     """
+    randomized = jax.eval_shape(randomize, jax.random.PRNGKey(0))
+    if not isinstance(randomized, PhysicsParameters):
+        returned = "None" if randomized is None else f"a {type(randomized).__name__}"
+        raise UserError(f"randomize returns {returned}; return a physics.PhysicsParameters")
     given = {name: value for name, value in randomized._asdict().items() if value is not None}
     places: dict[tuple[str, int], str] = {}
     for name in given:
