@@ -674,7 +674,7 @@ def test_tasks_have_the_geometry_of_the_model(large: Path) -> None:
     assert touched(0.039, 0.02) and not touched(0.041, 0.02)
     for flown in (juggle, track):
         height = flown.config.home[2] + RADIUS + HALF_HEIGHT
-        assert flown._ground() == pytest.approx(height)
+        assert flown.ground == pytest.approx(height)
     with pytest.raises(UserError, match=r"a ball of the radius 0.03 m rests on .* 0.0898 m"):
         Env(find_task("bounce").Config(mjcf=large, ball_init_pos=(0.59, 0.0, 0.07)))
 
@@ -735,7 +735,7 @@ def test_no_height_that_may_be_commanded_ends_the_episode_at_a_hit(name: str) ->
         tops = jnp.array([flown.config.home])
         if name == "juggle":
             tops = jnp.array(flown.config.columns(height))
-        balls = tops.at[:, 2].set(flown._ground())
+        balls = tops.at[:, 2].set(flown.ground)
         if name == "track":
             balls = balls[0]
         truth = task.Kinematics(rest, balls, None, rest, 0.0 * balls, None, jnp.array(tops[0]))
@@ -1049,3 +1049,34 @@ def test_a_task_moves_its_commands() -> None:
     for count in range(3):
         np.testing.assert_allclose(state.pipeline_state.command["height"], 0.41 + 0.01 * count)
         state = step(state, jnp.zeros(6))
+
+
+class _Timed(rest_task.Rest):
+    """It ends after 25 ms, and tells the time."""
+
+    class Config(rest_task.Rest.Config):
+        pass
+
+    def step(self, state: tuple, step: task.Step) -> task.TaskStep:
+        result = super().step(state, step)
+        metrics = result.metrics | {"time": step.seconds}
+        return result._replace(ended=step.seconds > 0.025, metrics=metrics)
+
+
+def test_a_step_has_its_time() -> None:
+    """The environment counts its steps only for a task that reads it: the state of the others is
+    what it was."""
+    env = Env(_Timed.Config())
+    reset, step = jax.jit(env.reset), jax.jit(env.step)
+    state = reset(jax.random.key(0))
+    times = []
+    ends = []
+    for _ in range(4):
+        state = step(state, jnp.zeros(6))
+        times.append(float(state.metrics["time"]))
+        ends.append(bool(state.done))
+    np.testing.assert_allclose(times, [0.01, 0.02, 0.03, 0.04], rtol=1e-6)
+    assert ends == [False, False, True, True]
+    assert float(reset(jax.random.key(1)).pipeline_state.steps) == 0
+    untimed = jax.eval_shape(Env(rest_task.Config()).reset, jax.random.key(0))
+    assert untimed.pipeline_state.steps is None

@@ -5,7 +5,7 @@ program: names, shapes and types alone are read."""
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -153,6 +153,15 @@ def unnamed_metrics(metrics: Iterable[str], curves: Sequence[Curve]) -> list[str
     return [name for name in metrics if name not in known and not name.startswith(METRIC_PREFIXES)]
 
 
+class Outline(NamedTuple):
+    """What an environment has to know of a task's step before the first one."""
+
+    metrics: list[str]
+    """Names of the metrics that it adds: its weighted terms and its own."""
+    reads_time: bool
+    """Whether it reads `Step.seconds`."""
+
+
 class CheckedTask:
     """A task, with what its methods return compared with what an environment expects of them.
 
@@ -248,27 +257,30 @@ class CheckedTask:
         code.compare(next_memory, Like(memory, "what it remembered before"), "what it remembers")
         return next_memory, following
 
-    def outline(self, state: Any, step: Step, metrics: Mapping[str, Any]) -> TaskStep:
-        """The names, shapes and types that a step of the task returns, compared, with its curves,
-        its tally and its results; nothing of them is computed.
+    def outline(self, state: Any, step: Step, own_metrics: Sequence[str]) -> Outline:
+        """What a step of the task returns, compared, with its curves, its tally and its results;
+        nothing of them is computed.
 
         Args:
           state: the task's at a reset.
           step: a first step; its values are not read.
-          metrics: the environment's own metrics, by name.
+          own_metrics: names of the environment's own metrics.
         """
-        result = self._check_step(state, step)
-        all_metrics = dict(metrics)
-        all_metrics |= {f"reward/{name}": value for name, value in result.reward.items()}
-        all_metrics |= result.metrics
-        self._check_curves(all_metrics, result.metrics)
-        tally = self._check_tally(result, step, all_metrics)
+        result, reads_time = self._check_step(state, step)
+        rewards = [f"reward/{name}" for name in result.reward]
+        metrics = [*rewards, *result.metrics]
+        self._check_curves([*metrics, *own_metrics], result.metrics)
+        tally = self._check_tally(result, step, [*metrics, *own_metrics])
         self._check_results(tally)
-        return result
+        return Outline(metrics, reads_time)
 
-    def _check_step(self, state: Any, step: Step) -> TaskStep:
+    def _check_step(self, state: Any, step: Step) -> tuple[TaskStep, bool]:
+        """What a step returns, as shapes and types, and whether it reads the time."""
         code = self._code("step")
-        result = code.shapes(state, step)
+        zero = jnp.zeros_like(step.truth.joint_angles[0])
+        result, reads_time = code.traced(
+            lambda seconds: (state, step._replace(seconds=seconds)), zero
+        )
         state_before = jax.eval_shape(lambda: state)
         code.compare(
             result,
@@ -286,9 +298,9 @@ class CheckedTask:
                     f"environment's own ({', '.join(_TAKEN_METRICS)}, or one that begins with "
                     f"{', '.join(METRIC_PREFIXES)}); choose another name"
                 )
-        return result
+        return result, reads_time
 
-    def _check_curves(self, metrics: Mapping[str, Any], of_task: Mapping[str, Any]) -> None:
+    def _check_curves(self, metrics: Sequence[str], of_task: Mapping[str, Any]) -> None:
         """Refuses a curve of a metric that there is not, and one in whose place the log would have
         another one, or the reverse.
 
@@ -301,7 +313,7 @@ class CheckedTask:
             if curve.over not in ("steps", "episodes"):
                 named.add(curve.over)
             # A curve may not name an unknown metric, and need not name them all.
-            check_names(f"the curve {curve.tag}", "metric", metrics.keys() | named, metrics)
+            check_names(f"the curve {curve.tag}", "metric", {*metrics, *named}, metrics)
         # After the names, as a mistyped metric leaves another one without its curve.
         taken = {*_TAKEN_TAGS}
         taken.update(f"task/{name}" for name in unnamed_metrics(of_task, self._task.curves))
@@ -313,7 +325,7 @@ class CheckedTask:
                 )
             taken.add(curve.tag)
 
-    def _check_tally(self, result: TaskStep, step: Step, metrics: Mapping[str, Any]) -> Tally:
+    def _check_tally(self, result: TaskStep, step: Step, metrics: Sequence[str]) -> Tally:
         code = self._code("tally")
         zero = jnp.zeros(())
         moment = Moment(

@@ -9,7 +9,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from bounce_mjx.env.contract import ENDS, CheckedTask, check_declared, check_has_task
+from bounce_mjx.env.contract import (
+    ENDS,
+    CheckedTask,
+    Outline,
+    check_declared,
+    check_has_task,
+)
 from bounce_mjx.env.ranges import check_ranges, within_queues
 from bounce_mjx.env.starts import check_joint_angles, check_start, check_starts
 from bounce_mjx.errors import UserError
@@ -91,6 +97,8 @@ class EnvState(NamedTuple):
     redraw: Redraw | None = None
     """For commands that are sampled again within an episode."""
     actuation: Actuation = Actuation()
+    steps: jax.Array | None = None
+    """Control steps since the reset [], int32, for a task whose step reads the time."""
     sensing: Sensing | None = None
     """For an observation that differs from the true state of one instant."""
 
@@ -258,12 +266,15 @@ class Env:
         )
         if self._sensors.are_needed:
             state = state._replace(sensing=self._sensors.first(_instant(state, truth)))
+        outline = self._outline(state, truth)
+        if outline.reads_time:
+            state = state._replace(steps=jnp.zeros((), jnp.int32))
         return State(
             pipeline_state=state,
             obs=self.observe(state, truth),
             reward=jnp.zeros((), physics.qpos.dtype),
             done=jnp.zeros((), physics.qpos.dtype),
-            metrics=self._first_metrics(state, truth),
+            metrics=self._first_metrics(state, truth, outline),
         )
 
     def step(self, state: State, action: jax.Array) -> State:
@@ -320,12 +331,15 @@ class Env:
         after = before._replace(physics=physics, last_action=action, actuation=actuation)
         truth = self.kinematics(after)
 
+        if before.steps is not None:
+            after = after._replace(steps=before.steps + 1)
         task_step = Step(
             truth=truth,
             command=before.command,
             action=action,
             last_action=before.last_action,
             ball_radius=before.parameters.ball_radius,
+            seconds=0.0 if after.steps is None else after.steps * self.dt,
         )
         result = self.task.step(before.task, task_step)
         ends = {
@@ -480,21 +494,24 @@ class Env:
         redraw = Redraw(age=jnp.where(is_due, 0.0, age + self.dt), ranges=ranges)
         return state._replace(command=command, redraw=redraw)
 
-    def _first_metrics(self, state: EnvState, truth: Kinematics) -> dict[str, jax.Array]:
-        """The metrics of a reset, which are zero except for the privileged ones."""
-        zero = jnp.zeros((), truth.joint_angles.dtype)
+    def _outline(self, state: EnvState, truth: Kinematics) -> Outline:
+        """What the task's step returns, traced from the state of a reset."""
         step = Step(
             truth=truth,
             command=state.command,
             action=state.last_action,
             last_action=state.last_action,
         )
-        metrics = dict.fromkeys(ENDS, zero)
-        metrics |= self._privileged_metrics(state.world, truth)
-        result = self._checked_task.outline(state.task, step, metrics)
-        rewards = [f"reward/{name}" for name in result.reward]
-        of_task = dict.fromkeys([*rewards, *result.metrics], zero)
-        return of_task | metrics
+        own = [*ENDS, *self._privileged_metrics(state.world, truth)]
+        return self._checked_task.outline(state.task, step, own)
+
+    def _first_metrics(
+        self, state: EnvState, truth: Kinematics, outline: Outline
+    ) -> dict[str, jax.Array]:
+        """The metrics of a reset, which are zero except for the privileged ones."""
+        zero = jnp.zeros((), truth.joint_angles.dtype)
+        metrics = dict.fromkeys([*outline.metrics, *ENDS], zero)
+        return metrics | self._privileged_metrics(state.world, truth)
 
     def kinematics(self, state: EnvState) -> Kinematics:
         """True positions and velocities of one environment's state, read from its physics."""

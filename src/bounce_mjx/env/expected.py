@@ -95,10 +95,34 @@ class Code:
         try:
             return jax.eval_shape(lambda: self(*args))
         except TypeError as error:
-            raise UserError(
-                f"{self._name}{where_defined(self._function)} returns something that is no array "
-                f"({shorten(reason_of(error), 200)}); return arrays and numbers"
-            ) from error
+            raise self._no_array(error) from error
+
+    def traced(
+        self, arguments: Callable[[jax.Array], tuple[Any, ...]], number: jax.Array
+    ) -> tuple[Any, bool]:
+        """What it returns, as the shapes and types of its arrays, and whether it reads a number.
+
+        Args:
+          arguments: the number [] -> its arguments.
+          number: the number; its value is not read.
+        """
+        trace = jax.make_jaxpr(lambda number: self(*arguments(number)), return_shape=True)
+        try:
+            program, shapes = trace(number)
+        except TypeError as error:
+            raise self._no_array(error) from error
+        (variable,) = program.jaxpr.invars
+        read = [*program.jaxpr.outvars]
+        for equation in program.jaxpr.eqns:
+            read += equation.invars
+        return shapes, any(variable is other for other in read)
+
+    def _no_array(self, error: TypeError) -> UserError:
+        """The error of code that returns something else than arrays."""
+        reason = shorten(reason_of(error), 200)
+        return UserError(
+            f"{self.named} returns something that is no array ({reason}); return arrays and numbers"
+        )
 
     def pair(self, wanted: str, *args: Any) -> tuple[Any, Any]:
         """The two things that it returns for its arguments.

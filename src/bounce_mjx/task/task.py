@@ -50,6 +50,9 @@ class Step(NamedTuple):
     ball_radius: jax.Array | float | None = None
     """Radius [] of the first ball in this episode, m, to which the others stay in proportion; None
     for that of the task's `geometry`."""
+    seconds: jax.Array | float = 0.0
+    """Time since the reset [], s, as `Moment.seconds`. An environment counts its steps only for a
+    task whose step reads it."""
 
 
 class TaskStep(NamedTuple):
@@ -204,8 +207,8 @@ class Task:
     folder: ClassVar[str] = ""
     """Name of the folder of its runs in runs/; by default, the class's name in lower case."""
     curves: ClassVar[tuple[Curve, ...]] = ()
-    """What a training logs and a report draws of the metrics; the first is the progress line's. A
-    metric that no curve shows or is over is logged as its mean over the steps."""
+    """What a training logs and prints, and a report draws, of the metrics. A metric that no curve
+    shows or is over is logged as its mean over the steps."""
     num_balls: ClassVar[tuple[int, ...]] = (1,)
     """Numbers of balls (`WorldConfig.num_balls`) that it takes."""
     num_draws: ClassVar[int] = 0
