@@ -15,7 +15,7 @@ from bounce_mjx import task
 from bounce_mjx.config import settings
 from bounce_mjx.errors import UserError
 from bounce_mjx.lazy import jax, jnp, np
-from bounce_mjx.task.bounce_rewards import BounceReward, RewardInputs
+from bounce_mjx.task.bounce_rewards import RewardInputs, Rewards
 
 SETTLING_SECONDS = 2.0
 """Time at the start of an episode that does not count for the horizontal position and the height,
@@ -53,7 +53,7 @@ HOME_HEIGHT = 0.05
 """Home height of the original specification, m."""
 
 
-class BounceObservation(task.ObservationConfig):
+class Observation(task.ObservationConfig):
     """The quantities that the policy sees, and how many values of each: 0 for none, 1 for the
     newest, N for the last N, the newest first."""
 
@@ -72,7 +72,7 @@ class BounceObservation(task.ObservationConfig):
     """Measured joint velocities at the lowest points of the last bounces."""
 
 
-class BounceConfig(task.WorldConfig):
+class Config(task.WorldConfig):
     """The world, and the task of bouncing: target heights, bounces, ends and reward."""
 
     target_height_range: settings.Range[settings.Length] = (0.4, 0.6)
@@ -89,9 +89,9 @@ class BounceConfig(task.WorldConfig):
     """The episode ends when the ball is higher than this above the target height, m."""
     max_horizontal_distance: Annotated[settings.Positive, Field(le=20.0)] = 1.5
     """The episode ends when |x| or |y| of the ball exceeds this, m."""
-    observation: BounceObservation = BounceObservation()
+    observation: Observation = Observation()
     """The quantities that the policy sees."""
-    reward: BounceReward = BounceReward()
+    reward: Rewards = Rewards()
     """The reward terms."""
 
     @pydantic.model_validator(mode="after")
@@ -183,7 +183,7 @@ class BounceConfig(task.WorldConfig):
         return self.reward.paddle_home_height - HOME_HEIGHT
 
 
-class BounceState(NamedTuple):
+class State(NamedTuple):
     """What the task keeps of an episode."""
 
     rising: jax.Array
@@ -210,8 +210,8 @@ class MeasuredFlight(NamedTuple):
 class Bounce(task.Task):
     """The ball bounces on the paddle at the commanded height."""
 
-    Config = BounceConfig
-    config: BounceConfig
+    Config = Config
+    config: Config
     folder = "bounce_ball"
     curves = (
         task.Curve(
@@ -225,16 +225,16 @@ class Bounce(task.Task):
 
     # The start, and a control step: bounce, reward, ends, metrics.
 
-    def reset(self, start: task.Start) -> BounceState:
+    def reset(self, start: task.Start) -> State:
         """No bounce yet; the first apex is the height at which the ball starts."""
         height = start.truth.ball_position[2]
-        return BounceState(
+        return State(
             rising=jnp.zeros((), bool),
             n_bounces=jnp.zeros_like(height),
             apex=height,
         )
 
-    def step(self, state: BounceState, step: task.Step) -> task.TaskStep:
+    def step(self, state: State, step: task.Step) -> task.TaskStep:
         """A bounce or none, the specification's reward, and whether the ball fell, flew too high or
         too far."""
         config = self.config
@@ -270,7 +270,7 @@ class Bounce(task.Task):
             },
         )
 
-    def detect(self, state: BounceState, step: task.Step) -> tuple[BounceState, jax.Array]:
+    def detect(self, state: State, step: task.Step) -> tuple[State, jax.Array]:
         """Detects a bounce and counts it.
 
         A bounce is the first step on which the ball rises, near the paddle. It adds to the count if
@@ -288,7 +288,7 @@ class Bounce(task.Task):
         bounced = rising & ~state.rising & near
         continues = state.apex > step.command["target_height"] - config.apex_tolerance
         counted = jnp.where(continues, state.n_bounces + 1.0, 1.0)
-        after = BounceState(
+        after = State(
             rising=rising,
             n_bounces=jnp.where(bounced, counted, state.n_bounces),
             apex=jnp.where(bounced, height, jnp.maximum(state.apex, height)),

@@ -120,7 +120,7 @@ class Config(task.WorldConfig):
         return (task.Limit("LOST_DEPTH", "below", LOST_DEPTH),)
 
 
-class CatchState(NamedTuple):
+class State(NamedTuple):
     """What the task keeps of an episode."""
 
     fall: jax.Array
@@ -172,10 +172,10 @@ class Catch(task.Task):
         position = home + aim_offset - seconds * horizontal_velocity
         return position, horizontal_velocity + upward_velocity
 
-    def reset(self, start: task.Start) -> CatchState:
+    def reset(self, start: task.Start) -> State:
         truth = start.truth
         zero = jnp.zeros(())
-        return CatchState(
+        return State(
             fall=truth.ball_velocity[2],
             offset=truth.ball_position - truth.paddle_position,
             contact=zero,
@@ -185,7 +185,7 @@ class Catch(task.Task):
 
     # A control step: contact, rest, reward, end.
 
-    def step(self, state: CatchState, step: task.Step) -> task.TaskStep:
+    def step(self, state: State, step: task.Step) -> task.TaskStep:
         truth = step.truth
         dt = self.config.control_dt
         offset = truth.ball_position - truth.paddle_position
@@ -204,7 +204,7 @@ class Catch(task.Task):
         is_lost = task.is_beyond(self.config.limits, truth.ball_position, truth.paddle_position)
         hits_floor = truth.paddle_position[2] < FLOOR
         return task.TaskStep(
-            state=CatchState(
+            state=State(
                 fall=truth.ball_velocity[2],
                 offset=offset,
                 contact=contact,
