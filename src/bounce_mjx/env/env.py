@@ -25,7 +25,7 @@ from bounce_mjx.physics.parameters import MODEL_PARAMETERS
 from bounce_mjx.robot import model as robot_model
 from bounce_mjx.task.task import Start, Step, Task, TaskStep
 from bounce_mjx.world import noise
-from bounce_mjx.world.actuation import Actuation, Actuators
+from bounce_mjx.world.actuation import ActuationMemory, Actuators
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.model import world_model
 from bounce_mjx.world.noise import Clock
@@ -96,7 +96,7 @@ class EnvState(NamedTuple):
     """For a randomised world, or where there is `sensing`."""
     redraw: Redraw | None = None
     """For commands that are sampled again within an episode."""
-    actuation: Actuation = Actuation()
+    actuation: ActuationMemory = ActuationMemory()
     steps: jax.Array | None = None
     """Control steps since the reset [], int32, for a task whose step reads the time."""
     sensing: Sensing | None = None
@@ -300,7 +300,7 @@ class Env:
         physics = self.engine.step(before.parameters, before.physics, control, num_substeps)
         return self.finish_step(state, action, actuation, physics)
 
-    def control(self, before: EnvState, action: jax.Array) -> tuple[Control, Actuation]:
+    def control(self, before: EnvState, action: jax.Array) -> tuple[Control, ActuationMemory]:
         """The part of a step before the physics: the inputs of the physics under the action [n] of
         `step`, late by the world's latency and lag, and the memory of the actuation after the
         step."""
@@ -310,7 +310,7 @@ class Env:
         )
 
     def finish_step(
-        self, state: State, action: jax.Array, actuation: Actuation, physics: PhysicsState
+        self, state: State, action: jax.Array, actuation: ActuationMemory, physics: PhysicsState
     ) -> State:
         """The part of a step after the physics: the task's, and the observation.
 

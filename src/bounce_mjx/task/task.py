@@ -156,7 +156,9 @@ class Curve:
     def __post_init__(self) -> None:
         for name in ("tag", "metric", "over"):
             value = getattr(self, name)
-            if not (isinstance(value, str) and value):
+            # A report has curves of no metric.
+            is_name = isinstance(value, str) and (value or name == "metric")
+            if not is_name:
                 raise UserError(
                     f"the {name} of a task.Curve{where_made()} is {shorten(repr(value))}; give a "
                     "name"

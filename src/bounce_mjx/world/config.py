@@ -171,7 +171,7 @@ class ResetConfig(settings.StrictModel):
     """Half-width of the uniform noise of each ball coordinate, m."""
 
 
-class RobotSettings(settings.StrictModel):
+class WorldSettings(settings.StrictModel):
     """The settings that a named world may have (`world.named`): those of a robot, its sensors and
     its ball."""
 
@@ -193,7 +193,7 @@ class RobotSettings(settings.StrictModel):
     """The world that each episode samples."""
 
 
-class WorldConfig(RobotSettings):
+class WorldConfig(WorldSettings):
     """The world of an environment: the robot, the ball, the time steps, the resets, the sensors
     and the randomisation. The config of a task extends it."""
 

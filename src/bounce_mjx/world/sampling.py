@@ -132,26 +132,26 @@ def nominal_values(
       terms: names of the terms.
       addresses: of the model's parts, if they are known.
     """
-    model = own_parameters(mj_model, addresses)
-    num_joints = len(model.armature)
+    own = own_parameters(mj_model, addresses)
+    num_joints = len(own.armature)
     nominals = {}
     for name in terms:
         term = TERMS[name]
         value = term.nominal
         if value == MODEL:
-            value = _model_nominal(model, term)
+            value = _own_nominal(own, term)
         if value is not None:
             nominals[name] = np.broadcast_to(np.float64(value), term.shape(num_joints))
     return nominals
 
 
-def _model_nominal(model: PhysicsParameters, term: Term) -> Any:
+def _own_nominal(own: PhysicsParameters, term: Term) -> Any:
     """The model's own value of a term; None if the model lacks the parameter."""
     if term.operation != "restitution":
-        return getattr(model, term.parameter)
-    if model.contact_damping is None:
+        return getattr(own, term.parameter)
+    if own.contact_damping is None:
         return None
-    return restitution_of_damping(model.contact_damping, model.contact_stiffness)
+    return restitution_of_damping(own.contact_damping, own.contact_stiffness)
 
 
 def sample_world(
@@ -200,23 +200,23 @@ def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParamet
     physical_terms = [name for name in TERMS if name in world and TERMS[name].parameter]
     if not physical_terms:
         return PhysicsParameters()
-    model = own_parameters(mj_model)
+    own = own_parameters(mj_model)
     parameters = {}
     for name in physical_terms:
         term = TERMS[name]
-        parameters[term.parameter] = apply(term.operation, model, term.parameter, world[name])
+        parameters[term.parameter] = apply(term.operation, own, term.parameter, world[name])
     return PhysicsParameters(**parameters)
 
 
 def apply(
-    operation: Operation, model: PhysicsParameters, parameter: str, sampled: jax.Array
+    operation: Operation, own: PhysicsParameters, parameter: str, sampled: jax.Array
 ) -> jax.Array:
     """A physical parameter of an episode.
 
     Args:
       operation: how the sampled value changes the model's own; with "restitution", the sampled
         value is a restitution and the parameter is the contact's damping.
-      model: the model's own parameters.
+      own: the model's own parameters.
       parameter: name of the field of `PhysicsParameters`.
       sampled: the term's value, of its shape.
 
@@ -227,10 +227,10 @@ def apply(
         # `physics.edited` keeps the model's own limit where that is lower.
         return sampled
     if operation == "restitution":
-        if model.contact_stiffness is None:
+        if own.contact_stiffness is None:
             raise UserError(NO_PAIR)
-        return damping_of_restitution(sampled, model.contact_stiffness)
-    value = jnp.asarray(getattr(model, parameter), sampled.dtype)
+        return damping_of_restitution(sampled, own.contact_stiffness)
+    value = jnp.asarray(getattr(own, parameter), sampled.dtype)
     if operation == "scale":
         return value * sampled
     if operation == "add":

@@ -79,7 +79,7 @@ class Instant(NamedTuple):
     last_action: jax.Array
     """Clipped action of the control step [n]."""
     setpoint: Setpoint | None
-    """Memory of the servo targets (`Actuation.setpoint`)."""
+    """Memory of the servo targets (`ActuationMemory.setpoint`)."""
     world: World
     """The values that the episode sampled."""
     clock: Clock
