@@ -740,6 +740,13 @@ def test_a_start_that_no_arm_or_ball_can_have_is_refused(
         Env(find_task(task).Config(randomization=terms))
 
 
+def test_a_noise_that_no_ball_can_have_is_refused() -> None:
+    with pytest.raises(UserError, match="env.reset.ball_position 0.5 starts a ball up to 0.71. m"):
+        Env(EnvConfig(reset={"ball_position": 0.5}))
+    with pytest.raises(UserError, match="min_ball_height is .* with env.reset.ball_position 0.1"):
+        Env(EnvConfig(reset={"ball_position": 0.1}, ball_init_pos=(0.59, 0.0, 0.12)))
+
+
 def test_displaced_throws_are_taken() -> None:
     for task in ("catch", "juggle"):
         Env(find_task(task).Config(randomization={"ball_start": (-0.03, 0.03)}))

@@ -80,13 +80,22 @@ def check_start(config: WorldConfig, task: Task) -> None:
 def check_starts(
     config: WorldConfig, mj_model: mujoco.MjModel, addresses: Addresses, task: Task
 ) -> None:
-    """Refuses displacements of the start (`joint_start`, `ball_start`) with which the arm starts
-    outside of its joints' ranges, or a ball within, under or far beside the paddle, or under the
-    floor. It needs `task.geometry`."""
+    """Refuses displacements of the start (`joint_start`, `ball_start`, the noise of the ball) with
+    which the arm starts outside of its joints' ranges, or a ball within, under or far beside the
+    paddle, under the floor, or where the episode ends. It needs `task.geometry`."""
     if config.randomization.joint_start is not None:
         _check_joint_start(config, mj_model, addresses)
     if config.randomization.ball_start is not None:
-        _check_ball_start(config, task)
+        low, high = _entrywise(config.randomization.ball_start, 3)
+        term = f"randomization.ball_start {config.randomization.ball_start}"
+    elif not _throws(task):
+        low, high = np.zeros((2, 3))
+        term = f"env.reset.ball_position {config.reset.ball_position:g}"
+    else:
+        return
+    noise = config.reset.ball_position
+    for start in _ball_starts(config, task):
+        _check_ball_box(config, task, start + low - noise, start + high + noise, term)
 
 
 def _check_joint_start(config: WorldConfig, mj_model: mujoco.MjModel, addresses: Addresses) -> None:
@@ -107,38 +116,36 @@ def _check_joint_start(config: WorldConfig, mj_model: mujoco.MjModel, addresses:
             )
 
 
-def _check_ball_start(config: WorldConfig, task: Task) -> None:
-    """Refuses a displacement of the ball with which it starts within or under the paddle, under the
-    floor, or, if it is not thrown, far beside the paddle."""
+def _check_ball_box(
+    config: WorldConfig, task: Task, lowest: np.ndarray, highest: np.ndarray, term: str
+) -> None:
+    """Refuses a box of starts of the ball, between two corners [3], that is in part within or under
+    the paddle, under the floor, where the episode ends or, if the ball is not thrown, far beside
+    the paddle.
+
+    Args:
+      term: what displaces the ball, for the error.
+    """
     geometry = task.geometry
-    paddle_x, paddle_y, paddle_height = geometry.paddle_home
-    low, high = _entrywise(config.randomization.ball_start, 3)
-    noise = config.reset.ball_position
-    term = f"randomization.ball_start {config.randomization.ball_start}"
-    for start in _ball_starts(config, task):
-        lowest = start + low - noise
-        highest = start + high + noise
-        corners = np.array([lowest, highest]) - geometry.paddle_home
-        farthest = np.hypot(*np.max(np.abs(corners), axis=0)[:2])
-        nearest_x = np.clip(paddle_x, lowest[0], highest[0]) - paddle_x
-        nearest_y = np.clip(paddle_y, lowest[1], highest[1]) - paddle_y
-        if farthest > _FARTHEST_BESIDE and not _throws(task):
-            raise UserError(
-                f"{term} starts a ball up to {farthest:.3g} m beside the paddle, where none is "
-                "reached; give a narrower one"
-            )
-        displaced = "ball_init_pos with randomization.ball_start"
-        check_within(config.limits, [lowest, highest], config.targets, displaced)
-        rests_on = "floor"
-        rest_height = geometry.ball_radius
-        if np.hypot(nearest_x, nearest_y) <= _FARTHEST_BESIDE:
-            rests_on = "paddle"
-            rest_height = paddle_height + geometry.rest_height
-        if lowest[2] < rest_height - _ROUNDING:
-            raise UserError(
-                f"{term} starts a ball at the height {lowest[2]:.4g} m, but it rests on the "
-                f"{rests_on} at {rest_height:.4g} m; give a higher one"
-            )
+    corners = np.array([lowest, highest])
+    farthest = np.hypot(*np.max(np.abs(corners - geometry.paddle_home), axis=0)[:2])
+    if farthest > _FARTHEST_BESIDE and not _throws(task):
+        raise UserError(
+            f"{term} starts a ball up to {farthest:.3g} m beside the paddle, where none is "
+            "reached; give less"
+        )
+    check_within(config.limits, corners, config.targets, f"ball_init_pos with {term}")
+    nearest = np.clip(geometry.paddle_home, lowest, highest) - geometry.paddle_home
+    rests_on = "floor"
+    rest_height = geometry.ball_radius
+    if np.hypot(*nearest[:2]) <= _FARTHEST_BESIDE:
+        rests_on = "paddle"
+        rest_height = geometry.paddle_home[2] + geometry.rest_height
+    if lowest[2] < rest_height - _ROUNDING:
+        raise UserError(
+            f"{term} starts a ball at the height {lowest[2]:.4g} m, but it rests on the "
+            f"{rests_on} at {rest_height:.4g} m; give a higher start"
+        )
 
 
 def _throws(task: Task) -> bool:
