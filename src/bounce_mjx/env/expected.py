@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from bounce_mjx.config.user_code import where_defined, where_raised
+from bounce_mjx.config.places import where_defined, where_raised
 from bounce_mjx.errors import UserError, reason_of, shorten, suggest
 from bounce_mjx.task.rewards import check_names
 

@@ -7,8 +7,8 @@ import functools
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
+from bounce_mjx.config.places import where_made
 from bounce_mjx.config.settings import is_finite
-from bounce_mjx.config.user_code import where_made
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.lazy import jax, jnp, np
 from bounce_mjx.task.results import Episodes, Figure, Result

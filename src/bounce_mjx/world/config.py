@@ -11,8 +11,8 @@ import pydantic
 from pydantic import Field
 
 from bounce_mjx.config import settings
+from bounce_mjx.config.places import where_made
 from bounce_mjx.config.settings import is_finite
-from bounce_mjx.config.user_code import where_made
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.robot.config import NEED_SITE, RobotConfig, Vector, is_packaged
 from bounce_mjx.world.limits import Limits

@@ -7,8 +7,8 @@ from typing import Annotated, Literal, NamedTuple, get_args
 
 from pydantic import Field
 
+from bounce_mjx.config.places import where_made
 from bounce_mjx.config.settings import StrictModel
-from bounce_mjx.config.user_code import where_made
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.lazy import jax, jnp
 
