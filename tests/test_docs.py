@@ -310,21 +310,49 @@ def test_troubleshooting_quotes_the_reason_for_mjx(tmp_path: Path) -> None:
     assert f"    physics: {engine.name} ({engine.reason})\n" in page
 
 
+def imported_modules(path: Path) -> set[str]:
+    """The modules that a file imports, also within its functions; of `from bounce_mjx import name`,
+    `bounce_mjx.name`."""
+    modules = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            modules |= {name.name for name in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            is_root = node.module == "bounce_mjx"
+            modules |= {f"bounce_mjx.{x.name}" for x in node.names} if is_root else {node.module}
+    return modules
+
+
 def test_packages_import_in_the_order_of_the_map():
-    """The map's promise: each folder of the package imports only from the rows above it."""
+    """The map's promise: each folder of the package imports only from the rows above it and from
+    the modules below them all, never the public names of the package itself."""
     text = (CHECKOUT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     section = text.split("## Where things are\n")[1]
     order = re.findall(r"^\| `src/bounce_mjx/(\w+)/`", section, re.MULTILINE)
+    (below,) = re.findall(r"from the modules `(.+?)`;", " ".join(section.split()))
+    below = below.replace("`", "").replace(" and ", ", ").split(", ")
     package = CHECKOUT / "src" / "bounce_mjx"
-    against = []
+    files = [(path, below) for path in package.glob("*.py") if path.stem in below]
     for i, folder in enumerate(order):
-        for path in (package / folder).rglob("*.py"):
-            tree = ast.parse(path.read_text(encoding="utf-8"))
-            modules = [n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)]
-            imported = {m.split(".")[1] for m in modules if m and m.startswith("bounce_mjx.")}
-            if wrong := imported & set(order[i + 1 :]):
-                against.append(f"{path.relative_to(package)} imports {wrong}")
-    assert order and not against
+        known = [*below, *order[: i + 1]]
+        files += [(path, known) for path in (package / folder).rglob("*.py")]
+    against = []
+    for path, known in files:
+        for module in imported_modules(path):
+            root, _, rest = module.partition(".")
+            if root == "bounce_mjx" and rest.split(".")[0] not in known:
+                against.append(f"{path.relative_to(package)} imports {module}")
+    assert len(files) > len(order) and not against
+
+
+def test_benchmarks_do_not_import_in_a_circle() -> None:
+    folder = CHECKOUT / "benchmarks"
+    left = {path.stem: imported_modules(path) for path in folder.glob("*.py")}
+    while left:
+        free = [name for name, modules in left.items() if not modules & left.keys() - {name}]
+        assert free, f"these import one another: {', '.join(sorted(left))}"
+        for name in free:
+            del left[name]
 
 
 def test_the_site_has_the_files_that_its_pages_link_to(need) -> None:
