@@ -45,6 +45,7 @@ from tiny_runs import shared_run
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 REFERENCE = runpy.run_path(str(CHECKOUT / "docs/config_reference.py"))["reference"]()
+API = CHECKOUT / "docs/api_reference.py"
 PAGES = [
     CHECKOUT / "README.md",
     CHECKOUT / "CONTRIBUTING.md",
@@ -202,9 +203,9 @@ def test_config_reference_is_fresh() -> None:
     assert page == REFERENCE, "docs/config.md is stale; it names the command that prints it"
 
 
-def test_api_reference_is_fresh() -> None:
+def test_api_index_is_fresh() -> None:
     pytest.importorskip("griffe")
-    written = runpy.run_path(str(CHECKOUT / "docs/api_reference.py"))["reference"]()
+    written = runpy.run_path(str(API))["index"]()
     assert content("api.md") == written, "docs/api.md is stale; it names the command that prints it"
 
 
@@ -223,7 +224,7 @@ IMPORTS = sorted(
 def test_what_a_page_imports_is_in_a_reference(imported: tuple[str, str]) -> None:
     """In the API; settings are in the config reference, and the tasks have a page."""
     module, name = imported
-    documented = set(re.findall(r"^### (\w+)$", content("api.md"), re.MULTILINE))
+    documented = set(re.findall(r"^\| \[`\S+\.(\w+)`\]", content("api.md"), re.MULTILINE))
     try:
         member = getattr(importlib.import_module(module), name, None)
     except MissingPackage as missing:
@@ -234,8 +235,17 @@ def test_what_a_page_imports_is_in_a_reference(imported: tuple[str, str]) -> Non
     assert is_elsewhere or name in documented
 
 
-def test_api_reference_has_arguments_shapes_and_errors() -> None:
-    page = content("api.md")
+def test_the_site_has_the_arguments_shapes_and_errors_of_the_api(need) -> None:
+    """Its page has the headings of the index, to which pages link, and the whole docstrings."""
+    need("griffe")
+    hooks = runpy.run_path(str(CHECKOUT / "docs/site_hooks.py"))
+    config = need("mkdocs.config").load_config(str(CHECKOUT / "mkdocs.yml"))
+    files = need("mkdocs.structure.files")
+    file = files.File("api.md", config.docs_dir, config.site_dir, use_directory_urls=False)
+    site_page = need("mkdocs.structure.pages").Page(None, file, config)
+    page = hooks["on_page_markdown"](content("api.md"), site_page, config, files.Files([file]))
+    heads = re.compile(r"^## .+$", re.MULTILINE)
+    assert heads.findall(page) == heads.findall(content("api.md"))
     entry = page.split("\n### Env\n")[1].split("\n### ")[0]
     assert "`from bounce_mjx.env.env import Env`" in entry
     assert "Env.step(state: State, action: jax.Array) -> State" in entry
