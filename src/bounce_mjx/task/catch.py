@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import pydantic
 
 from bounce_mjx import task
-from bounce_mjx.config.settings import Coordinate, Duration, Finite, Friction
+from bounce_mjx.config.settings import HOLLOW, BallInertia, Coordinate, Duration, Finite, Friction
 from bounce_mjx.lazy import jax, jnp
 
 SPEEDS = (1.0, 2.0)
@@ -87,6 +87,9 @@ class Config(task.WorldConfig):
     """The noise of a reset."""
     friction: Friction | None = 0.3
     """Coefficient of sliding friction between ball and paddle; null for the MJCF's."""
+    ball_inertia: BallInertia | None = HOLLOW
+    """Moment of inertia of the ball per mass and squared radius: 0.667 of a hollow ball, 0.4 of a
+    solid one; null for the MJCF's."""
     action: task.ActionConfig = task.ActionConfig(base="target")
     """What an action adds to."""
     observation: task.ObservationConfig = task.ObservationConfig(

@@ -14,13 +14,19 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.physics import PhysicsParameters
 from bounce_mjx.physics.edited import NO_PAIR, own_parameters
 from bounce_mjx.physics.scalars import Quaternion, quaternion_matrix, quaternion_product
-from bounce_mjx.robot.contact import damping_of_restitution, restitution_of_damping
+from bounce_mjx.robot.contact import (
+    damping_of_restitution,
+    duration_of_stiffness,
+    restitution_of_damping,
+    stiffness_of_duration,
+)
 from bounce_mjx.robot.model import Addresses, contact_pairs
 from bounce_mjx.world.randomization import MODEL, TERMS, Operation, Ranges, Term, World
 
 # The fields that the terms of the contact change.
 _CONTACT_FIELDS = {
     "restitution": ("pair_solref",),
+    "contact_duration": ("pair_solref",),
     "contact_friction": ("pair_friction", "pair_dim"),
 }
 
@@ -73,10 +79,12 @@ def nominal_values(
 
 def _model_nominal(model: PhysicsParameters, term: Term) -> Any:
     """The model's own value of a term; None if the model lacks the parameter."""
-    if term.operation != "restitution":
+    if term.operation not in ("restitution", "duration"):
         return getattr(model, term.parameter)
     if model.contact_damping is None:
         return None
+    if term.operation == "duration":
+        return duration_of_stiffness(model.contact_stiffness)
     return restitution_of_damping(model.contact_damping, model.contact_stiffness)
 
 
@@ -128,10 +136,26 @@ def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParamet
         return PhysicsParameters()
     model = own_parameters(mj_model)
     parameters = {}
+    if "contact_duration" in world:
+        model = _with_duration(model, world["contact_duration"])
+        # Without a term of its own, it follows the stiffness.
+        parameters["contact_damping"] = model.contact_damping
     for name in physical_terms:
         term = TERMS[name]
         parameters[term.parameter] = apply(term.operation, model, term.parameter, world[name])
     return PhysicsParameters(**parameters)
+
+
+def _with_duration(model: PhysicsParameters, duration: jax.Array) -> PhysicsParameters:
+    """The model's own parameters with a contact that lasts as long (s) and has the same
+    restitution."""
+    if model.contact_stiffness is None:
+        raise UserError(NO_PAIR)
+    stiffness = stiffness_of_duration(duration)
+    faster = jnp.sqrt(stiffness / model.contact_stiffness)
+    return model._replace(
+        contact_stiffness=stiffness, contact_damping=model.contact_damping * faster
+    )
 
 
 def apply(
@@ -149,6 +173,8 @@ def apply(
     Raises:
       UserError: the term is a restitution, and the model has no contact pair of ball and paddle.
     """
+    if operation == "duration":
+        return stiffness_of_duration(sampled)
     if operation in ("replace", "limit"):
         # `physics.edited` keeps the model's own limit where that is lower.
         return sampled
