@@ -1,5 +1,5 @@
-"""Evaluation on MuJoCo's C engine: the same task and policy. The physics is in threads, except where
-a ball has friction: there each step of each episode is one of `physics.CEngine`."""
+"""Evaluation on MuJoCo's C engine: the same task and policy. The physics is in threads, except
+where a ball has friction: there each step of each episode is one of `physics.CEngine`."""
 
 import copy
 import os

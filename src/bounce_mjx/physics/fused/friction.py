@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from bounce_mjx.physics.friction import impulse_per_slip
 from bounce_mjx.physics.fused import chain
 from bounce_mjx.physics.fused.ball import Ball
-from bounce_mjx.physics.fused.contact import Contact, ContactModel
+from bounce_mjx.physics.fused.contact import Contact
 from bounce_mjx.physics.fused.model import BallModel, FusedModel
 from bounce_mjx.physics.scalars import Scalar, Vec, add, cross, dot, mul
 
