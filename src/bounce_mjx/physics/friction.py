@@ -28,9 +28,9 @@ import numpy as np
 from bounce_mjx.physics.scalars import Scalar, inverse_root, minimum, mul, select
 from bounce_mjx.robot.model import Addresses, contact_pairs
 
-# Square of a slip that counts as none, m^2/s^2: in float32 its power -3/2, which a derivative has,
-# is still a number.
-_NO_SLIP = 1e-24
+# Square of a slip that counts as none, m^2/s^2: that of 10 nm/s. The derivative of the impulse has
+# the inverse square of the compliance, which float32 must hold.
+_NO_SLIP = 1e-16
 
 Array = Any
 """An array of NumPy or of JAX."""
