@@ -42,6 +42,7 @@ from bounce_mjx.physics import (
     edited_model,
     make_engine,
 )
+from bounce_mjx.physics.friction import after_friction
 from bounce_mjx.robot.model import find_addresses
 from random_worlds import random_parameters
 
@@ -374,6 +375,148 @@ def test_a_plain_mj_step_has_another_friction():
         while data.qvel[8] < 0.0 or data.ncon:
             mujoco.mj_step(plain, data)
         assert 0.05 < 1.0 - data.qvel[6] < 0.15
+
+
+# What the physics lacks
+
+
+def touching_by_type(model_text: str) -> mujoco.MjModel:
+    """Ball and paddle that touch by their types, in place of the pair."""
+    spec = mujoco.MjSpec.from_string(model_text)
+    for pair in spec.pairs:
+        spec.delete(pair)
+    for name in ("ball", "blocker"):
+        geom = spec.geom(name)
+        geom.contype, geom.conaffinity, geom.condim = 1, 1, 3
+    return spec.compile()
+
+
+REFUSED = {
+    "condim 4": (lambda: frictional('condim="3"', 'condim="4"'), "friction of the ball .condim 4;"),
+    "condim 6": (lambda: frictional('condim="3"', 'condim="6"'), "friction of the ball .condim 6;"),
+    "unequal": (
+        lambda: frictional('friction="0.3 0.3"', 'friction="0.3 0.4"'),
+        r"two coefficients of friction between ball and paddle \(friction 0.3 0.4; only equal",
+    ),
+    "RK4": (
+        lambda: frictional("implicitfast", "RK4"),
+        "friction of a ball with the integrator RK4",
+    ),
+    "no pair": (lambda: touching_by_type(XML), r"touch without a <pair> in <contact> \(condim 3"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_friction_that_the_law_lacks_is_refused_by_every_engine(name):
+    make, words = REFUSED[name]
+    model = make()
+    for build in (CEngine, partial(make_engine, choice="auto"), partial(make_engine, choice="mjx")):
+        with pytest.raises(UserError, match=words) as error:
+            build(model)
+        assert str(error.value).endswith("; change the MJCF") and "\n" not in str(error.value)
+    with pytest.raises(UserError):
+        make_engine(model, "fused")
+
+
+def test_friction_that_a_frictionless_model_only_names_is_allowed():
+    """Unequal coefficients of a pair of condim 1, and RK4 in MJX and C."""
+    model = edited('condim="1"', 'condim="1" friction="0.3 0.4"')
+    assert make_engine(model, "auto").name == "fused" and not CEngine(model).has_friction
+    model = edited("implicitfast", "RK4")
+    assert make_engine(model, "auto").name == "mjx" and not CEngine(model).has_friction
+
+
+# Gradients
+
+
+def test_the_gradient_of_friction_is_that_of_finite_differences(float64):
+    """From states that stick and slip, with respect to the state, the coefficient and the ball's
+    inertia, away from the limit between the two."""
+    model = frictional()
+    states = touching_states(model, 240, seed=4)
+    _, force = c_steps(model, states)
+    friction, limit = np.hypot(*force[:, 1:].T), 0.3 * force[:, 0]
+    ratio = friction / np.where(limit > 0.0, limit, np.inf)
+    sticking = np.flatnonzero((ratio > 0.01) & (ratio < 0.9))[:12]
+    slipping = np.flatnonzero(ratio > 1.0 - 1e-9)[:12]
+    assert len(sticking) == len(slipping) == 12
+    some = np.concatenate([sticking, slipping])
+    step = make_engine(model, "fused").step
+    weights = jnp.asarray(np.random.default_rng(0).normal(size=model.nv))
+    weights = weights.at[9:].multiply(RADIUS)
+
+    def outcome(numbers: jax.Array, state: jax.Array, ctrl: jax.Array) -> jax.Array:
+        given = PhysicsParameters(contact_friction=numbers[0], ball_inertia=numbers[1])
+        after = step(given, PhysicsState(state[:13], state[13:]), Control(ctrl), 1)
+        return weights @ after.qvel
+
+    numbers = jnp.tile(jnp.array([0.3, SOLID]), (24, 1))
+    state = jnp.asarray(np.concatenate([states.qpos[some], states.qvel[some]], axis=1))
+    ctrl = jnp.asarray(states.ctrl[some])
+    # The argument, the index in it, and the step of the difference.
+    directions = [*((0, i, 1e-6) for i in range(2)), *((1, i, 1e-8) for i in (0, 3, 6, 8))]
+    directions += [(1, i, 1e-6) for i in (13, 16, 19, 20, 22, 24)]
+    moved = []
+    for which, i, size in directions:
+        for sign in (1.0, -1.0):
+            point = [numbers, state]
+            point[which] = point[which].at[:, i].add(sign * size)
+            moved.append((*point, ctrl))
+    with jax.disable_jit():
+        gradient = jax.vmap(jax.grad(outcome, argnums=(0, 1)))(numbers, state, ctrl)
+        values = jax.vmap(outcome)(*map(jnp.concatenate, zip(*moved, strict=True)))
+    up, down = np.moveaxis(np.reshape(values, (len(directions), 2, 24)), 1, 0)
+    sizes = np.array([size for *_, size in directions])[:, None]
+    expected = (up - down) / (2.0 * sizes)
+    found = np.array([gradient[which][:, i] for which, i, _ in directions])
+    error = np.abs(found - expected) / (np.abs(expected).max(axis=1, keepdims=True) + 1e-9)
+    assert error.max() < 1e-4
+    # The coefficient acts on what slips alone, the inertia on what sticks.
+    assert np.all(found[0, :12] == 0.0) and np.all(np.abs(found[0, 12:]) > 1e-6)
+    assert np.all(np.abs(found[1, :12]) > 1e-6)
+
+
+def test_gradients_are_finite_at_the_edges_of_friction():
+    """Without slip, with hardly any, without contact, without friction; in float32 as shipped."""
+    step = make_engine(frictional(), "fused").step
+    centre, axes = paddle_frame(frictional(), HOME)
+
+    def outcome(mu: jax.Array, gap: jax.Array, velocity: jax.Array, spin: jax.Array) -> jax.Array:
+        at = jnp.asarray(centre + HALF_SIZE[2] * axes[:, 2]) + (RADIUS + gap) * axes[:, 2]
+        qpos = jnp.concatenate([jnp.asarray(HOME), at, jnp.array([1.0, 0.0, 0.0, 0.0])])
+        qvel = jnp.concatenate([jnp.zeros(6), velocity, spin])
+        given = PhysicsParameters(contact_friction=mu)
+        after = step(given, PhysicsState(qpos, qvel), Control(jnp.asarray(HOME)), 2)
+        return jnp.sum(after.qvel) + jnp.sum(after.qpos)
+
+    still, down = np.zeros(3), np.array([0.0, 0.0, -1.0])
+    along = np.array([1.0, 0.0, 0.0])
+    cases = [(0.3, gap, velocity, still) for gap in (-1e-3, 0.1) for velocity in (still, down)]
+    cases += [(0.3, -1e-3, down + size * along, still) for size in (1e-3, 1e-9, 1e-12, 1e-30)]
+    cases += [(mu, gap, down + along, still) for mu in (0.0, 1e-30) for gap in (-1e-3, 0.1)]
+    # It rolls: the velocity of the centre cancels that of the spin.
+    cases.append((0.3, -1e-3, down + 10.0 * RADIUS * along, np.array([0.0, 10.0, 0.0])))
+    columns = [jnp.asarray(np.array(column), jnp.float32) for column in zip(*cases, strict=True)]
+    with jax.disable_jit():
+        gradients = jax.vmap(jax.grad(outcome, argnums=(0, 1, 2, 3)))(*columns)
+    for array in gradients:
+        assert np.all(np.isfinite(array)) and np.abs(array).max() > 0.0
+
+
+def test_the_law_has_a_gradient_at_every_slip():
+    """Also at none, and at one whose square float32 cannot hold."""
+
+    def speed(slip: jax.Array, largest: jax.Array) -> jax.Array:
+        jacobian = jnp.concatenate([jnp.eye(3), jnp.eye(3)], axis=1)
+        qvel = jnp.zeros(6).at[0].set(slip)
+        return after_friction(qvel, jacobian, UP, largest, lambda force: force)[0]
+
+    slips = jnp.asarray([0.0, *10.0 ** np.arange(-30.0, 1.0, 0.5)], jnp.float32)
+    for largest in (0.0, 1e-30, 1e-3, 10.0):
+        by_slip, by_largest = jax.vmap(jax.grad(speed, argnums=(0, 1)), (0, None))(slips, largest)
+        assert np.all(np.isfinite(by_slip)) and np.all(np.isfinite(by_largest))
+    # Two free masses that stick share their speed.
+    np.testing.assert_allclose(by_slip[slips > 1e-7], 0.5, rtol=1e-6)
 
 
 # Dry friction of the joints
