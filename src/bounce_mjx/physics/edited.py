@@ -275,8 +275,8 @@ def _set_flags(model: EditedModel) -> None:
     for name in model.edited_beside([("pair_friction", (slice(None), 0))]):
         if name.startswith("pair_friction["):
             raise UserError(
-                f"{name} would be another friction along one tangent, and a pair has one for both; "
-                "give the entry with the index 0"
+                f"{name} would be another friction than the one of its pair, which has one along "
+                "both tangents; give the entry with the index 0"
             )
     for servo in model.rows("actuator_forcerange"):
         model.follow("actuator_forcelimited", servo, [True])
