@@ -16,6 +16,7 @@ from against_c import (
     balls_model,
     c_models,
     c_steps,
+    differences,
     free_run,
     hostile_states,
     num_pressed,
@@ -166,7 +167,13 @@ def test_mjx_agrees_on_several_balls(float64):
     states = States(*(x[some] for x in states))
     expected, _ = c_steps(model, states)
     step = jax.jit(jax.vmap(lambda s, u: make_engine(model, "mjx").step(MODEL, s, Control(u), 1)))
-    assert_same_step(step(PhysicsState(*states[:2]), states.ctrl), expected)
+    after = step(PhysicsState(*states[:2]), states.ctrl)
+    error = differences(PhysicsState(*map(np.asarray, after[:2])), expected)
+    error /= np.max(np.abs(expected.qvel), axis=1)
+    assert np.sum(error < 1e-11) >= 6
+    # From some states of three contacts MJX's solver stops at errors up to 2e-5, without friction
+    # too, and the small inertia of a ball magnifies them.
+    assert np.max(error) < 1e-2
 
 
 class Two(Rest):

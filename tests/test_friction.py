@@ -124,11 +124,13 @@ def c_engine_steps(model: mujoco.MjModel, states: States) -> PhysicsState:
 def test_mjx_has_the_same_friction(float64):
     """From states that stick, slip and separate; given as parameters of each environment too."""
     model = frictional()
-    states = States(*(x[::5] for x in touching_states(model, 120, seed=0)))
-    count = len(states.qpos)
+    states = touching_states(model, 120, seed=0)
     _, force = c_steps(model, states)
     sticking, slipping = sticks(model, force)
-    assert sticking.sum() >= 5 and slipping.sum() >= 5
+    some = [np.flatnonzero(which)[:8] for which in (sticking, slipping, force[:, 0] == 0.0)]
+    states = States(*(x[np.concatenate(some)] for x in states))
+    count = len(states.qpos)
+    assert count == 24
     given = PhysicsParameters(
         contact_friction=np.linspace(0.0, 0.6, count), ball_inertia=np.linspace(0.3, 0.667, count)
     )
