@@ -12,6 +12,7 @@ import pytest
 from mujoco import rollout
 
 from against_c import (
+    Coulomb,
     States,
     assert_same_step,
     bouncing_states,
@@ -85,8 +86,8 @@ def test_mjx_carries_worlds(mj_model, float64):
     )
     data = []
     for i in range(count):
-        c_model = edited_model(mj_model, world(parameters, i))
-        data.append((c_model, mujoco.MjData(c_model)))
+        law = Coulomb(edited_model(mj_model, world(parameters, i)))
+        data.append((law, mujoco.MjData(law.model)))
         data[i][1].qpos[:], data[i][1].qvel[:] = (x[i] for x in state)
     engine = make_engine(mj_model, "mjx")
     control = partial(Control, air_drag=air_drag)
@@ -95,11 +96,11 @@ def test_mjx_carries_worlds(mj_model, float64):
     for i in range(6):
         ctrl = np.asarray(state.qpos[:, :6]) + 0.02 * (-1.0) ** i
         state = step(parameters, state, jnp.asarray(ctrl))
-        for j, (c_model, d) in enumerate(data):
+        for j, (law, d) in enumerate(data):
             d.ctrl[:] = ctrl[j]
             for _ in range(num_substeps):
-                push_by_air(c_model, d, air_drag)
-                mujoco.mj_step(c_model, d)
+                push_by_air(law.model, d, air_drag)
+                law.step(d)
                 contacts += d.ncon
                 touched |= {j} if d.ncon else set()
             if j not in touched:
