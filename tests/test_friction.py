@@ -33,7 +33,9 @@ from against_c import (
     paddle_frame,
     touching_states,
 )
+from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation import c_episodes
 from bounce_mjx.physics import (
     CEngine,
     Control,
@@ -41,6 +43,7 @@ from bounce_mjx.physics import (
     PhysicsState,
     edited_model,
     make_engine,
+    servo_targets,
 )
 from bounce_mjx.physics.friction import after_friction
 from bounce_mjx.robot.model import find_addresses
@@ -379,6 +382,76 @@ def test_a_plain_mj_step_has_another_friction():
         while data.qvel[8] < 0.0 or data.ncon:
             mujoco.mj_step(plain, data)
         assert 0.05 < 1.0 - data.qvel[6] < 0.15
+
+
+# Evaluation on C
+
+
+@pytest.mark.parametrize("drawn", [False, True], ids=["one world", "a world each"])
+def test_the_evaluation_on_c_has_the_friction_of_the_engine(drawn):
+    """Over control steps with a bounce, the drag of the air and pushes, each up to the rounding of
+    float32; with one model for all episodes, and with one for each."""
+    terms = {"air_drag": (0.5, 0.5), "push_speed": (0.5, 0.5)}
+    terms |= {"contact_friction": (0.1, 0.5), "ball_inertia": (0.4, 0.6)} if drawn else {}
+    env = BounceBall(EnvConfig(friction=0.3, ball_inertia=HOLLOW, randomization=terms))
+    count, num_steps = 4, env.config.num_substeps
+    now = jax.vmap(env.reset, out_axes=-1)(jax.random.split(jax.random.key(0), count))
+    now = now.pipeline_state
+    assert (not jax.tree.leaves(now.parameters)) != drawn
+    qpos, qvel = (np.array(x) for x in now.physics[:2])
+    for i in range(count):
+        centre, axes = paddle_frame(env.mj_model, qpos[:6, i])
+        qpos[6:9, i] = centre + (HALF_SIZE[2] + RADIUS + 0.003) * axes[:, 2]
+        qvel[6:9, i], qvel[9:, i] = (0.4, 0.1 * i, -1.0), (5.0, 40.0 - 30.0 * i, 20.0)
+    physics = PhysicsState(jnp.asarray(qpos), jnp.asarray(qvel))
+    control = Control(
+        physics.qpos[:6] + 0.01,
+        air_drag=jnp.full(count, 0.5),
+        ball_push=0.1 * jnp.arange(3.0)[:, None] * jnp.ones(count),
+    )
+    targets = jax.vmap(servo_targets, in_axes=(-1, None))(control, num_steps)
+    step = jax.jit(
+        jax.vmap(lambda p, s, c: env.engine.step(p, s, c, num_steps), in_axes=-1, out_axes=-1)
+    )
+    with mujoco.rollout.Rollout(nthread=2) as pool:
+        on_c = c_episodes._Physics(env, now._replace(physics=physics), pool)
+        for _ in range(3):
+            expected = on_c.step(control, targets)
+            physics = step(now.parameters, physics, control)
+    np.testing.assert_allclose(physics.qpos, expected.qpos, atol=1e-5)
+    np.testing.assert_allclose(physics.qvel[:9], expected.qvel[:9], atol=1e-3)
+    np.testing.assert_allclose(physics.qvel[9:], expected.qvel[9:], atol=0.05)
+    # It has bounced, and friction has turned it.
+    turned = np.abs(expected.qvel[9:] - qvel[9:]).max(axis=0)
+    assert np.all(expected.qvel[8] > 0.1) and np.all(turned > 3.0)
+
+
+def test_a_frictionless_world_is_stepped_in_threads():
+    """By `mj_step` alone, as before, of which `CEngine` is no copy."""
+    env = BounceBall(EnvConfig())
+    now = jax.vmap(env.reset, out_axes=-1)(jax.random.split(jax.random.key(0), 2)).pipeline_state
+    with mujoco.rollout.Rollout(nthread=1) as pool:
+        assert not c_episodes._Physics(env, now, pool)._has_friction
+    model = frictionless(frictional())
+    engine, states = CEngine(model), touching_states(model, 12, seed=0)
+    expected, _ = c_steps(model, states)
+    assert not engine.has_friction
+    np.testing.assert_array_equal(c_engine_steps(model, states).qvel, expected.qvel)
+
+
+def test_c_engine_is_one_step_after_another():
+    """`num_steps` at once, and its model is a copy: the caller's keeps its friction."""
+    model = frictional()
+    engine, states = CEngine(model), touching_states(model, 3, seed=0)
+    assert model.pair_dim[0] == 3 and engine.model.pair_dim[0] == 1 and engine.has_friction
+    once, often = mujoco.MjData(engine.model), mujoco.MjData(engine.model)
+    for data in (once, often):
+        data.qpos[:], data.qvel[:], data.ctrl[:] = (x[0] for x in states)
+    engine.step(once, 20)
+    for _ in range(20):
+        engine.step(often)
+    np.testing.assert_array_equal(once.qvel, often.qvel)
+    assert once.time == pytest.approx(0.02)
 
 
 # What the physics lacks
