@@ -7,7 +7,7 @@ trainer brax's. The differences of the hyperparameters from ours:
 |--------------------------------------|----------------------------------------------------------|
 | settings not listed below            | the same                                                 |
 | compute_dtype                        | float32 (configs/default.yaml: bfloat16)                 |
-| min_noise_std                        | none (configs/default.yaml: 0.1)                         |
+| mean_noise_bound                     | none (configs/default.yaml: 0.1)                         |
 | value_cost                           | the same; passed doubled, as brax halves it              |
 | learning_rate, its limits, target_kl | the same; adapted by a factor of 1.5 (ours 1.1)          |
 | final_max_learning_rate, decay_steps | none: max_learning_rate stays                            |

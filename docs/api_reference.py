@@ -27,7 +27,7 @@ Look up any public name: its arguments, fields, shapes, units and errors. {share
 """
 _SHARED = """Arrays have the
 shapes in square brackets: `[B, 29]` is a batch of B observations. The settings are in the [config
-reference](config.md). `BounceBall`, `EnvConfig` (`BounceConfig`), `train`, `Run` and `load_policy`
+reference](config.md). `BounceBall`, `EnvConfig` (`Bounce.Config`), `train`, `Run` and `load_policy`
 are also names of `bounce_mjx` itself."""
 
 # The title of a section, a sentence about it, and its names; of a module, all public ones.
@@ -35,9 +35,9 @@ _SECTIONS = (
     (
         "The environment",
         "",
-        "env.env.Env env.bounce_ball.BounceBall task.bounce.BounceConfig env.env.State "
+        "env.env.Env env.bounce_ball.BounceBall task.bounce.Config env.env.State "
         "world.observation.ObservationLayout world.observation.Kinematics "
-        "physics.parameters.PhysicsParameters",
+        "physics.parameters.PhysicsParameters physics.c_engine.CEngine",
     ),
     ("Batches of environments", "", "env.vector"),
     (
@@ -45,7 +45,7 @@ _SECTIONS = (
         "All but `find_task` are names of `bounce_mjx.task`. "
         "[Write a task](tasks.md#write-a-task) shows their use.",
         "task.task world.config.WorldConfig world.config.Command world.observation.Quantity "
-        "task.results task.registry.find_task",
+        "world.limits task.results task.registry.find_task",
     ),
     (
         "Policies on a robot",
@@ -61,7 +61,7 @@ _SECTIONS = (
         "learning.policy.make_networks learning.policy.networks_of learning.policy.Networks "
         "baselines.mirror.MirrorLaw",
     ),
-    ("Rewards", "", "task.rewards task.bounce_rewards.RewardInputs"),
+    ("Rewards", "", "task.rewards task.flights task.bounce_rewards.RewardInputs"),
     ("Robots", "", "robot.config.RobotConfig robot.adopt.adopt"),
     (
         "Evaluation",

@@ -35,7 +35,7 @@ from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.settings import Choice, read_preset, stack
 from bounce_mjx.task import registry, term_names, weighted_terms
 from bounce_mjx.task.bounce import Bounce
-from bounce_mjx.task.bounce_rewards import BounceReward, RewardInputs
+from bounce_mjx.task.bounce_rewards import RewardInputs, Rewards
 from bounce_mjx.task.registry import find_task
 from bounce_mjx.training import hosts
 from bounce_mjx.training.command import fields_of_command
@@ -418,7 +418,7 @@ def test_new_term_of_the_rewards_page_is_a_term(tmp_path: Path) -> None:
         inputs["ball_position"] = np.array([0.0, 0.0, height])
         terms = weighted_terms(config, RewardInputs(**inputs, reward=config))
         assert float(terms["sideways_velocity"]) == pytest.approx(expected)
-    assert terms.keys() == {*term_names(BounceReward), "sideways_velocity"}
+    assert terms.keys() == {*term_names(Rewards), "sideways_velocity"}
 
 
 def short_training(folder: Path) -> Callable:
