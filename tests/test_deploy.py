@@ -2,6 +2,7 @@
 
 import inspect
 import math
+import os
 import re
 import runpy
 import subprocess
@@ -683,7 +684,11 @@ main(["doctor"])
 main(["eval"])
 """
     done = subprocess.run(
-        [sys.executable, "-c", script, str(tmp_path)], capture_output=True, text=True
+        [sys.executable, "-c", script, str(tmp_path)],
+        # Which a command would give to MuJoCo.
+        env=os.environ | {"MUJOCO_GL": "egl"},
+        capture_output=True,
+        text=True,
     )
     shapes, refusal, *doctor = done.stdout.splitlines()
     assert shapes == "(6,) (6,) True"
