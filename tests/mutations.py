@@ -26,6 +26,7 @@ SENSING, CONTACT = "world/sensing.py", "robot/contact.py"
 PPO, STATISTICS = "learning/ppo.py", "learning/statistics.py"
 CONTROL = "physics/control.py"
 BALL, NORMALS = "physics/fused/ball.py", "physics/fused/normals.py"
+FRICTION, RUB = "physics/friction.py", "physics/fused/friction.py"
 EXPORT, POLICY = "deploy/export.py", "deploy/policy.py"
 
 # What is wrong, the file, its text, the faulty text, and the test that catches it.
@@ -104,6 +105,14 @@ FAULTS = [
     ("the ball moves with the velocity before the step", BALL,
      "position = ball.position + velocity * dt", "position = ball.position + ball.velocity * dt", "test_physics.py -k random_states"),
     ("a contact pulls", NORMALS, "return [jnp.maximum(first_linear / pivot, 0.0)]", "return [first_linear / pivot]", "test_physics.py -k random_states"),
+    ("friction turns the slip round", FRICTION, "minimum(to_stop, to_slide)", "to_slide", "test_friction.py -k never_adds"),
+    ("friction ignores the coefficient", FRICTION, "minimum(to_stop, to_slide)", "to_stop", "test_friction.py -k rigid_formula"),
+    ("the paddle does not feel friction", RUB, "half_generalised)) * scale", "half_generalised)) * 0.0", "test_friction.py -k given_friction"),
+    ("friction of two balls turns one of them alone", RUB,
+     "_after_impulse(first_model, first, first_lever, -impulse)", "_after_impulse(first_model, first, first_lever * 0.0, -impulse)", "test_friction.py -k of_two_balls"),
+    ("the gradient of friction is not finite at a small slip", FRICTION, "_NO_SLIP = 1e-16", "_NO_SLIP = 1e-24", "test_friction.py -k at_every_slip"),
+    ("a contact lasts a whole period of its spring", CONTACT,
+     "return (math.pi / duration) ** 2", "return (2.0 * math.pi / duration) ** 2", "test_randomization.py -k lasts_as"),
     ("an exported policy has a wrong normaliser", EXPORT,
      "networks.act(policy, jnp",
      "networks.act(policy._replace(normalizer=policy.normalizer._replace(mean=0.0 * policy.normalizer.mean)), jnp", "test_deploy.py -k onnx_equals"),
