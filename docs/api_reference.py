@@ -80,6 +80,7 @@ _SECTIONS = (
     (
         "Adapters",
         "",
+        "deploy.environments.environment "
         "adapters.gymnasium.environments.TaskEnv adapters.gymnasium.environments.TaskVectorEnv "
         "adapters.sb3.Sb3VecEnv adapters.torch.vector_env.TorchVectorEnv "
         "adapters.torch.vector_env.StepResult adapters.torch.rsl_rl_env.RslRlVecEnv "

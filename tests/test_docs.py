@@ -349,7 +349,9 @@ def test_other_blocks_of_pages_are_what_they_say() -> None:
     assert tomllib.loads(package)["project"]["entry-points"].keys() == {registry.GROUP}
     for program in examples("libraries.md", "py"):
         for line in ast.walk(ast.parse(program)):
-            if isinstance(line, ast.ImportFrom) and line.module.startswith("bounce_mjx"):
+            if isinstance(line, ast.ImportFrom) and line.module == "bounce_mjx":
+                assert {name.name for name in line.names} <= set(bounce_mjx.__all__)
+            elif isinstance(line, ast.ImportFrom) and line.module.startswith("bounce_mjx."):
                 source = CHECKOUT / "src" / f"{line.module.replace('.', '/')}.py"
                 defined = {
                     getattr(x, "name", "") for x in ast.parse(source.read_text("utf-8")).body

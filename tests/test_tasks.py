@@ -518,12 +518,13 @@ def test_libraries_take_another_task() -> None:
     import brax.envs
 
     import bounce_mjx.adapters.brax  # noqa: F401
+    from bounce_mjx import environment
     from bounce_mjx.adapters.gymnax_env import GymnaxBounceBall
 
     key, size = jax.random.PRNGKey(0), find_task(DRIBBLE).Config().layout.size
     env = brax.envs.get_environment("bounce_ball", task=DRIBBLE)
     assert jax.eval_shape(env.reset, key).obs.shape == (size,)
-    env = GymnaxBounceBall(task=DRIBBLE)
+    env = GymnaxBounceBall(environment(DRIBBLE))
     assert jax.eval_shape(env.reset, key, env.default_params)[0].shape == (size,)
 
 

@@ -14,7 +14,6 @@ from bounce_mjx.commands.which_policy import (
     WhichPolicy,
     check_one_world,
     film_command,
-    in_what_if_world,
 )
 from bounce_mjx.config.command_line import Flag, stdout
 from bounce_mjx.config.settings import Count, NonNegativeInt
@@ -78,8 +77,7 @@ def main(args: Sequence[str]) -> None:
     check_one_world(command.nominal, command.world, command.randomization)
     command.check_log_dir(command.checkpoint)
     checkpoint = command.choose(command.checkpoint, command.robot)
-    config = command.config_of(checkpoint, command.robot, command.world)
-    config = in_what_if_world(config, command.randomization)
+    config = command.config_of(checkpoint, command.robot, command.world, command.randomization)
     if command.limits and config.env.robot.limits.velocity is None:
         raise UserError("the policy's arm has no command limits (env.robot.limits); omit --limits")
     task_commands = given_commands.checked(config.env)

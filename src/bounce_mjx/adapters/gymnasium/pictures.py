@@ -48,8 +48,7 @@ class Pictures:
 
     @functools.cached_property
     def _renderer(self) -> Renderer:
-        task = self._batch.programs.task
-        renderer = Renderer(task, self._width, self._height, self._camera, plain=True)
+        renderer = Renderer(self._batch.env, self._width, self._height, self._camera, plain=True)
         # Also closed at exit, where OpenGL would be unloaded before the renderer.
         self._close_renderer = weakref.finalize(self, renderer.close)
         return renderer
