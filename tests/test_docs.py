@@ -29,6 +29,7 @@ from bounce_mjx.commands import main as console_script
 from bounce_mjx.config import command_line as cli
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.config.settings import StrictModel, fields_in
+from bounce_mjx.config.user_code import import_code
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.settings import Choice, read_preset, stack
@@ -139,7 +140,7 @@ def test_shown_commands_are_understood(command, monkeypatch: pytest.MonkeyPatch)
     # Playground's own program reads its flags.
     if not args or args == ["--help"] or name == "bounce_mjx.adapters.playground":
         return
-    for flag in {"--resume", "--robot", "--world"} & set(args):  # their files would have to exist
+    for flag in {"--import", "--robot", "--world"} & set(args):  # their files would have to exist
         at = args.index(flag)
         args = args[:at] + args[at + 2 :]
     # A module that the command imports below would keep the changed function.
@@ -177,7 +178,7 @@ def test_shown_commands_are_understood(command, monkeypatch: pytest.MonkeyPatch)
 def known_flags() -> set[str]:
     """The flags of every command of the package, and of the maintainers' one."""
     ship = runpy.run_path(str(CHECKOUT / "benchmarks/ship.py"))
-    flags = {"--help", "--help-all", *cli.flags_of(fields_in(ship["ShipCommand"]))}
+    flags = {"--help", "--help-all", "--import", *cli.flags_of(fields_in(ship["ShipCommand"]))}
     flags |= set(cli.flags_of(fields_of_command(stack(Choice()))))
     for info in pkgutil.iter_modules(commands_package.__path__):
         module = importlib.import_module(f"bounce_mjx.commands.{info.name}")
@@ -185,7 +186,8 @@ def known_flags() -> set[str]:
             is_command = inspect.isclass(member) and issubclass(member, StrictModel)
             if is_command and name.endswith("Command"):
                 flags |= set(cli.flags_of(fields_in(member)))
-    for task in (Bounce, find_task("examples/dribble_task.py:Dribble")):
+    import_code(CHECKOUT / "examples/dribble_task.py")
+    for task in (Bounce, find_task("dribble")):
         flags |= {f"--{name}".replace("_", "-") for name in task.Config().commands}
     return flags
 
@@ -363,7 +365,8 @@ def test_new_term_of_the_rewards_page_is_a_term(tmp_path: Path) -> None:
     """The page's code, as a file of the user's."""
     (example,) = examples("task.md", "python")
     (tmp_path / "straight.py").write_text(example)
-    task = find_task(f"{tmp_path}/straight.py:Straight")
+    import_code(tmp_path / "straight.py")
+    task = find_task("straight")
     config = task.Config(reward={"sideways_velocity": {"weight": 2.0}}).reward
     names = [field.name for field in dataclasses.fields(RewardInputs) if field.name != "reward"]
     inputs = {name: np.zeros(3) for name in names}

@@ -293,7 +293,7 @@ def test_a_training_stops_once_its_results_have_a_margin(tmp_path: Path) -> None
     assert f"{run} has met all results, 192 steps; add --total-steps N" in shown.getvalue()
     # Results are not needed to resume.
     (run / "results.json").write_text("damaged")
-    layers = stack(Choice(resume=run))
+    layers = stack(Choice(start=str(run)))
     going_on = layers.config({"total_steps": 10**6})
     assert not going_on.stop_when_solved
     assert going_on.sources["stop_when_solved"] == going_on.sources["total_steps"] == "train"
@@ -347,7 +347,7 @@ def test_a_callback_sees_blocks_and_evaluations_and_ends_the_training(tmp_path: 
 
     said = io.StringIO()
     run = train(tmp_path, {1: 5.0, 2: 9.0, 3: 7.0}, callbacks=[Tracker()], said=said)
-    ends = "a callback ended the training after 128 steps; continue with: bounce-mjx train --resume"
+    ends = "a callback ended the training after 128 steps; continue with: bounce-mjx train "
     assert ends in said.getvalue()
     # The first block, during which other programs are compiled, says nothing about those to come.
     blocks = [line for line in said.getvalue().splitlines() if "steps/s" in line]
@@ -412,7 +412,7 @@ def test_a_signal_saves_and_says_how_to_resume(tmp_path: Path, number: signal.Si
     # None is begun whose end nobody waits for.
     assert num_evaluations == 1
     (run,) = tmp_path.iterdir()
-    continues = f"stopped after 128 steps; continue with: bounce-mjx train --resume {run}"
+    continues = f"stopped after 128 steps; continue with: bounce-mjx train {run}"
     assert continues in str(stopped.value)
     assert latest_checkpoint(run).steps == 2 * BLOCK
     train(tmp_path, RETURNS, run)
@@ -588,7 +588,7 @@ def test_a_training_that_ends_without_room_says_so(tmp_path: Path, monkeypatch) 
         sentence = (
             r"\(No space left on device\), so the end of the training is lost; make room, and"
         )
-        with pytest.raises(UserError, match=f"{sentence} continue with: bounce-mjx train --resume"):
+        with pytest.raises(UserError, match=f"{sentence} continue with: bounce-mjx train "):
             train(tmp_path, {1: 5.0, 2: 9.0, 3: 7.0})
     (run,) = tmp_path.iterdir()
     assert iterations_of(latest_checkpoint(run)) == 1
@@ -757,7 +757,7 @@ def test_a_device_that_fails_is_told_with_the_last_checkpoint(tmp_path: Path) ->
     (run,) = tmp_path.iterdir()
     assert str(failed.value) == (
         "cpu failed after 128 steps (INTERNAL: CUDA_ERROR_UNKNOWN in a graph); continue with: "
-        f"bounce-mjx train --resume {run} (the last checkpoint is {run}/checkpoints/128)"
+        f"bounce-mjx train {run} (the last checkpoint is {run}/checkpoints/128)"
     )
 
 
@@ -823,4 +823,4 @@ def test_a_solved_run_goes_on_with_more_steps_also_beside_a_seed_that_diverged(
     settings = {"num_seeds": SEEDS, "stop_when_solved": True, "margins": {1: 1.0}}
     run = train(tmp_path, RETURNS, trainer=DivergingAtOnce, **settings)
     assert evaluated_steps(run / "seed_000") == [64]
-    assert not stack(Choice(resume=run)).config({"total_steps": 10**6}).stop_when_solved
+    assert not stack(Choice(start=str(run))).config({"total_steps": 10**6}).stop_when_solved

@@ -203,7 +203,7 @@ def test_a_robots_own_balls_and_stiff_contact_are_taken_by_another_task(tmp_path
     env = {"mjcf": str(scene), "physics_dt": 0.0005, "num_balls": 2}
     robot = tmp_path / "robot.yaml"
     robot.write_text(yaml.safe_dump({"task": "juggle", "env": env}))
-    config = read_command(["--task", "catch", "--robot", str(robot)]).config.env
+    config = read_command(["catch", "--robot", str(robot)]).config.env
     assert config.physics_dt == 0.0005
     assert config.ball_init_pos == pytest.approx(Catch.Config().ball_init_pos, abs=1e-3)
     assert policy_metadata(TrainConfig(task="juggle", env=env), 1).num_balls == 2

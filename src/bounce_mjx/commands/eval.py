@@ -17,6 +17,7 @@ from bounce_mjx.commands.which_policy import (
 )
 from bounce_mjx.config.command_line import Flag, stdout
 from bounce_mjx.config.settings import Count, NonNegativeInt
+from bounce_mjx.config.user_code import import_flags
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import config as evaluation
 from bounce_mjx.world.randomization import RandomizationConfig
@@ -146,6 +147,11 @@ def main(args: Sequence[str]) -> None:
         # A film is on the config's engine.
         if failures and command.physics == "config":
             first_to_end = min(failures, key=lambda failure: failure.seconds)
-            shown = film_command(args, _NOT_OF_PLAY, "--episode", str(first_to_end.episode))
+            shown = film_command(
+                args,
+                _NOT_OF_PLAY,
+                *("--episode", str(first_to_end.episode)),
+                imports=import_flags(config.env.task),
+            )
             print(f"film of one: {shown}")
     sys.exit(0 if report.passed else 1)

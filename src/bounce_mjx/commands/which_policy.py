@@ -99,13 +99,16 @@ def suite_conditions(
     return path, load_suite(path, config.env, there, assumed), len(assumed)
 
 
-def film_command(args: Sequence[str], omitted: Sequence[str], *film: str) -> str:
+def film_command(
+    args: Sequence[str], omitted: Sequence[str], *film: str, imports: Sequence[str] = ()
+) -> str:
     """The command that shows an episode of the evaluation that a command line started.
 
     Args:
       args: the words of the command line.
       omitted: its flags that `play` lacks; a name that ends with = has a value.
       film: the flags of the episode.
+      imports: those of the user's own task.
     """
     without_value = {flag for flag in omitted if not flag.endswith("=")}
     without_value |= {flag.replace("--", "--no-", 1) for flag in without_value}
@@ -116,7 +119,7 @@ def film_command(args: Sequence[str], omitted: Sequence[str], *film: str) -> str
             next(words, None)
         elif word not in without_value and f"{word.partition('=')[0]}=" not in omitted:
             kept.append(word)
-    return shlex.join(["bounce-mjx", "play", *kept, *film])
+    return shlex.join(["bounce-mjx", "play", *kept, *film, *imports])
 
 
 class WhichPolicy(StrictModel):
@@ -124,7 +127,7 @@ class WhichPolicy(StrictModel):
     for its paths, and for the robot and the world if it simulates."""
 
     task: str | None = None
-    """Task of the run. A run of a task in a file, FILE.py:CLASS, needs it, as the file is code."""
+    """Task whose newest run it is, by default bounce."""
     log_dir: Path | None = None
     """Folder in which to look for the newest run; by default, that of the task's runs."""
 
@@ -190,7 +193,7 @@ class WhichPolicy(StrictModel):
         Raises:
           UserError: as `load_run_config`.
         """
-        return run_configs.load_run_config(run, self.task)
+        return run_configs.load_run_config(run)
 
     def config_of(
         self,

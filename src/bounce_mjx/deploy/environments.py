@@ -9,7 +9,7 @@ from typing import Any
 import pydantic
 
 from bounce_mjx.config.settings import merged
-from bounce_mjx.config.user_code import is_file, is_same_code
+from bounce_mjx.config.user_code import not_imported, plain_name
 from bounce_mjx.config.validation import validate
 from bounce_mjx.deploy.interface import check_interface, interface_of
 from bounce_mjx.env.env import Env
@@ -19,7 +19,14 @@ from bounce_mjx.robot.config import is_packaged
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import find_run
 from bounce_mjx.runs.worlds import NOMINAL, env_of_task, trained_in
-from bounce_mjx.task.registry import DEFAULT, find_task, registered_tasks, task_config, task_name
+from bounce_mjx.task.registry import (
+    DEFAULT,
+    find_task,
+    is_task,
+    registered_tasks,
+    task_config,
+    task_name,
+)
 from bounce_mjx.task.task import Task
 from bounce_mjx.world.config import WorldConfig
 
@@ -139,7 +146,7 @@ def _is_task_or_config(start: Any) -> bool:
         return True
     if isinstance(start, type):
         return issubclass(start, Task)
-    return str(start) in registered_tasks() or is_file(str(start))
+    return is_task(str(start))
 
 
 def _path(robot: str | os.PathLike | None) -> Path | None:
@@ -155,8 +162,7 @@ def _of_policy(
     """The settings of the environment of a policy's training, in a world, with settings on top.
 
     Args:
-      task: its class, or as the user names it: a policy of a task in a file, which is code, needs
-        it.
+      task: its class or its name, if the user has named it.
 
     Raises:
       UserError: there is no such policy, it is of another task, its file is not enough, or it would
@@ -168,16 +174,13 @@ def _of_policy(
         advice = suggest(str(policy), known)
         advice = advice or f"give {', '.join(POLICIES)}, a run's folder or an .onnx file"
         raise UserError(f"there is no policy {shorten(str(policy))}; {advice}")
-    name = task
-    if task is not None and not isinstance(task, str):
-        name = task_name(task)
-    its_file = name if name is not None and is_file(name) else None
     if path.suffix == ONNX:
-        trained = _environment_in_file(path, its_file, settings.get("mjcf"))
+        trained = _environment_in_file(path, settings.get("mjcf"))
     else:
-        trained = load_run_config(find_run(path), its_file).env
+        trained = load_run_config(find_run(path)).env
+    name = task_name(task) if isinstance(task, type) else task
     name_of_policy = task_name(trained.task)
-    if name is not None and not is_same_code(name, name_of_policy):
+    if name is not None and name != name_of_policy:
         raise UserError(
             f"the policy {policy} is of the task {name_of_policy}, and the environment of the task "
             f"{name}; leave one of them out"
@@ -192,7 +195,7 @@ def _of_policy(
     return config
 
 
-def _environment_in_file(path: Path, task: str | None, mjcf: Any) -> WorldConfig:
+def _environment_in_file(path: Path, mjcf: Any) -> WorldConfig:
     """The environment in a policy's ONNX file.
 
     Raises:
@@ -208,12 +211,9 @@ def _environment_in_file(path: Path, task: str | None, mjcf: Any) -> WorldConfig
             f"{path} says nothing of its environment, as an earlier version exported it; give the "
             "run's folder or the name of the policy, or export it again"
         )
-    name = task or metadata.task
-    if task is None and is_file(name):
-        raise UserError(
-            f"{path} has its task in a file, which is code; name it to run it: "
-            f"task='FILE.py:{name.rpartition(':')[2]}'"
-        )
+    name = plain_name(metadata.task)
+    if not is_task(name):
+        raise not_imported(str(path), "task", name, None)
     if values["mjcf"] is not None and not is_packaged(values["mjcf"]):
         if mjcf is None:
             raise UserError(

@@ -25,12 +25,13 @@ import numpy as np
 from rich.console import Console
 
 import bounce_mjx
-from bounce_mjx.config.user_code import is_file
+from bounce_mjx.config.user_code import import_flags
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.interrupt import Interrupted, StopRequest
 from bounce_mjx.learning.policy import Policy
+from bounce_mjx.learning.registry import own_algorithm
 from bounce_mjx.physics.convergence import solver_warning
 from bounce_mjx.runs import checkpoints, folders
 from bounce_mjx.runs.config import TrainConfig
@@ -153,9 +154,9 @@ def open_job(
     return job
 
 
-def named_task(config: TrainConfig) -> list[str]:
-    """The flag with which a later command has to name a task's file again."""
-    return ["--task", config.task] if is_file(config.task) else []
+def imports_of(config: TrainConfig) -> list[str]:
+    """The flags with which a later command imports the user's own task again."""
+    return import_flags(config.env.task)
 
 
 @dataclasses.dataclass
@@ -577,9 +578,9 @@ class Job:
     @property
     def go_on(self) -> str:
         """How to continue the run."""
-        name = self.config.algorithm
-        algorithm = ["--algorithm", name] if is_file(name) else []
-        flags = [*named_task(self.config), *algorithm, "--resume", str(self.run)]
+        algorithm = own_algorithm(self.config.algorithm)
+        own = [self.config.env.task] if algorithm is None else [self.config.env.task, algorithm]
+        flags = [str(self.run), *import_flags(*own)]
         return f"continue with: bounce-mjx train {shlex.join(flags)}"
 
     # Signals and faults
