@@ -7,6 +7,7 @@ that it was trained with; code is compared by its content.
 
 import importlib
 import inspect
+import itertools
 import os
 import shlex
 import sys
@@ -36,6 +37,7 @@ class Source(NamedTuple):
 
 # Of the imported files, by the name of their module.
 _sources: dict[str, Source] = {}
+_numbers = itertools.count()
 # The words of the command that runs here, for the command that has an import in addition.
 _command: list[str] = []
 
@@ -178,7 +180,7 @@ def _run(source: Source) -> None:
     Raises:
       UserError: it raises an error.
     """
-    module = types.ModuleType(f"{_PREFIX}{source.path.stem}_{len(_sources)}")
+    module = types.ModuleType(f"{_PREFIX}{source.path.stem}_{next(_numbers)}")
     module.__file__ = str(source.path)
     # Dataclasses and pickles look for their module there.
     sys.modules[module.__name__] = module
