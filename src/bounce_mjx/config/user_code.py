@@ -202,10 +202,13 @@ def _run(source: Source) -> None:
 
 
 def _subclasses(base: type[Kind]) -> Iterator[type[Kind]]:
-    """The user's subclasses of a class of the package, in the order of their definition."""
+    """The user's subclasses of a class of the package, as their modules have them: not one that a
+    module has defined anew since, nor one within a function."""
     for kind in base.__subclasses__():
+        module = sys.modules.get(kind.__module__)
         is_forgotten = kind.__module__.startswith(_PREFIX) and kind.__module__ not in _sources
-        if not kind.__module__.startswith(_PACKAGE) and not is_forgotten:
+        is_own = not kind.__module__.startswith(_PACKAGE) and not is_forgotten
+        if is_own and getattr(module, kind.__qualname__, None) is kind:
             yield kind
         yield from _subclasses(kind)
 
