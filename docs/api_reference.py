@@ -73,7 +73,8 @@ _SECTIONS = (
         "",
         "training.run.train training.run.Run training.events.Event training.events.Callback "
         "training.video.EvaluationVideo training.job.train training.ppo_trainer.PPOTrainer "
-        "training.trainer.Trainer training.trainer.Snapshot learning.ppo.PPO learning.ppo.Samples "
+        "training.trainer.Trainer training.trainer.Snapshot learning.algorithm.Algorithm "
+        "learning.ppo.PPO learning.ppo.Samples "
         "learning.policy.ActionDistribution learning.policy.NetworkFunctions "
         "learning.statistics.normalize",
     ),

@@ -9,6 +9,7 @@ import json
 import os
 import shutil
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -19,10 +20,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from bounce_mjx.config.user_code import import_code
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.interrupt import Interrupted
 from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.ppo import PPO
 from bounce_mjx.runs import checkpoints
 from bounce_mjx.runs.checkpoints import policy_shapes, read_networks, read_policy, read_record
 from bounce_mjx.runs.config import TrainConfig, load_run_config
@@ -143,13 +146,18 @@ def train(
     given = {"block_steps": BLOCK, "eval_every": BLOCK, "total_steps": BLOCK * max(returns)}
     given |= {"stop_when_solved": False} | settings
     config = TrainConfig(ppo=ppo, **given).model_copy(update={"log_dir": log_dir})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PPO, "make_trainer", staticmethod(trainer))
+        return _run_of(config, resume, callbacks, said, scores(returns, margins or {}, screening))
+
+
+def _run_of(config: TrainConfig, resume, callbacks, said, evaluators) -> Path:
     members = job.train(
         config,
         Console(file=said or io.StringIO()),
         resume=resume,
         callbacks=callbacks,
-        make_trainer=trainer,
-        make_evaluators=scores(returns, margins or {}, screening),
+        make_evaluators=evaluators,
     )
     return members[0].run if len(members) == 1 else members[0].run.parent
 
@@ -229,6 +237,51 @@ def test_a_state_is_saved_between_evaluations_where_save_every_asks_for_it(
     run = train(tmp_path, returns, eval_every=3 * BLOCK, save_every=2 * BLOCK)
     assert saved == [2, 3, 4, 6]
     assert evaluated_steps(run) == [3 * BLOCK, 6 * BLOCK]
+
+
+OWN_TRAINER = """
+from bounce_mjx.learning.algorithm import Algorithm
+from bounce_mjx.learning.config import PPOConfig
+from test_job import CountingTrainer
+
+class Counting(Algorithm):
+    class Config(PPOConfig):
+        start_steps: int = 8
+        "Steps of random actions."
+
+        @property
+        def batch_steps(self):
+            return 32
+
+    @classmethod
+    def make_trainer(cls, config, env):
+        assert config.ppo.start_steps == 8
+        return CountingTrainer(config, env)
+"""
+
+
+def test_an_algorithm_brings_its_own_trainer(tmp_path: Path, monkeypatch) -> None:
+    """By its name, with its own settings and steps, and it is resumed as PPO is."""
+    (tmp_path / "counting.py").write_text(OWN_TRAINER)
+    import_code(tmp_path / "counting.py")
+    monkeypatch.setitem(sys.modules, "test_job", sys.modules[__name__])
+    choice = Choice(algorithm="counting", config=())
+    said = {"num_envs": 8, "rollout_length": 8, "num_minibatches": 2, "hidden_layers": (4,)}
+    said |= {"block_steps": 64, "eval_every": 64, "total_steps": 128, "log_dir": tmp_path / "runs"}
+    config = stack(choice).config(said | {"stop_when_solved": False})
+    scores = Scores({1: 5.0, 2: 9.0, 3: 7.0}, {}, False)
+    run = _run_of(config, None, (), io.StringIO(), scores)
+    assert (config.ppo.start_steps, config.iterations_per_block) == (8, 2)
+    assert results_of(run)["best_steps"] == 128 and (run / "algorithm/counting.py").exists()
+    longer = stack(Choice(start=str(run))).config({"total_steps": 192})
+    _run_of(longer, run, (), io.StringIO(), scores)
+    assert evaluated_steps(run) == [64, 128, 192]
+    (tmp_path / "without.py").write_text(
+        "from bounce_mjx.learning.algorithm import Algorithm\nclass Without(Algorithm):\n    pass"
+    )
+    import_code(tmp_path / "without.py")
+    with pytest.raises(UserError, match="the algorithm Without has no make_trainer"):
+        _run_of(stack(Choice(algorithm="without")).config(said), None, (), io.StringIO(), scores)
 
 
 def test_a_history_of_checkpoints_stays_where_it_is_asked_for(tmp_path: Path) -> None:

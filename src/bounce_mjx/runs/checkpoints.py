@@ -31,7 +31,7 @@ from bounce_mjx.config.files import differing_keys
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.evaluation.results import Report
-from bounce_mjx.learning.config import PPO_NAME
+from bounce_mjx.learning.config import PPO_NAME, PPOConfig
 from bounce_mjx.learning.policy import Actor, Policy, make_networks, networks_of, untrained_policy
 from bounce_mjx.learning.ppo import PPO, Params, names_of_critic_metrics
 from bounce_mjx.learning.registry import find_algorithm
@@ -183,7 +183,7 @@ def read_start(config: TrainConfig, env: Env) -> tuple[Params, RunningStatistics
         or hidden layers are not those of the training, or one of the two makes other networks.
     """
     algorithm = find_algorithm(config.algorithm)
-    if algorithm.make_networks is not PPO.make_networks:
+    if getattr(algorithm, "make_networks", None) is not PPO.make_networks:
         raise UserError(
             f"{algorithm.__name__} makes networks of its own, which --warm-start cannot fill; "
             "leave one of them out"
@@ -231,7 +231,7 @@ def read_record(checkpoint: Checkpoint) -> Record:
     run_config = load_run_config(checkpoint.run)
     record = verify(checkpoint)
     try:
-        stored = without_own_settings(earlier.present_settings(record.config))
+        stored = earlier.present_settings(record.config)
         differing = _differing_keys(run_config, stored)
     # Pydantic's own is one.
     except ValueError as error:
@@ -256,7 +256,11 @@ def _differing_keys(run_config: TrainConfig, stored: dict[str, Any]) -> set[str]
     if others:
         return others
     env = type(run_config.env).model_validate(stored.get("env", {}))
-    config = TrainConfig.model_validate(stored | names | {"env": env})
+    algorithm = type(run_config.ppo)
+    if algorithm is PPOConfig:
+        stored = without_own_settings(stored)
+    ppo = algorithm.model_validate(stored.get("ppo", {}))
+    config = TrainConfig.model_validate(stored | names | {"env": env, "ppo": ppo})
     # The record has the path of the original MJCF file, and the run's config that of its copy.
     return differing_keys(run_config, config) - RESUMABLE_KEYS - {"env.mjcf"}
 

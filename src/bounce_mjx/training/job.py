@@ -31,7 +31,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.interrupt import Interrupted, StopRequest
 from bounce_mjx.learning.policy import Policy
-from bounce_mjx.learning.registry import own_algorithm
+from bounce_mjx.learning.registry import find_algorithm, own_algorithm
 from bounce_mjx.physics.convergence import solver_warning
 from bounce_mjx.runs import checkpoints, folders
 from bounce_mjx.runs.config import TrainConfig
@@ -47,7 +47,6 @@ from bounce_mjx.training.seeds import SeedRun
 from bounce_mjx.training.trainer import BlockMetrics, Snapshot, Trainer
 
 Result = TypeVar("Result")
-MakeTrainer = Callable[[TrainConfig, Env], Trainer]
 MakeEvaluators = Callable[..., Evaluators]
 
 # Imported during the compilation, because these imports take half a second each.
@@ -64,7 +63,6 @@ def train(
     *,
     resume: Path | None = None,
     callbacks: Sequence[events.Callback] = (),
-    make_trainer: MakeTrainer = PPOTrainer,
     make_evaluators: MakeEvaluators = Evaluators,
 ) -> list[SeedRun]:
     """Trains with a config, and returns its seeds.
@@ -72,7 +70,6 @@ def train(
     Args:
       resume: the run to continue, whose config is `config`: its folder, or a checkpoint in it.
       callbacks: see `Callback`.
-      make_trainer: builds the trainer; raises UserError where the config does not fit it.
       make_evaluators: builds what evaluates the policies, with the arguments of `Evaluators`.
 
     Raises:
@@ -85,7 +82,7 @@ def train(
     """
     hosts.agree(config, resume)
     with contextlib.ExitStack() as stack:
-        job = open_job(config, console, stack, resume, callbacks, make_trainer)
+        job = open_job(config, console, stack, resume, callbacks)
         try:
             job.compile(make_evaluators)
             while True:
@@ -109,7 +106,6 @@ def open_job(
     stack: contextlib.ExitStack,
     resume: Path | None = None,
     callbacks: Sequence[events.Callback] = (),
-    make_trainer: MakeTrainer = PPOTrainer,
 ) -> "Job":
     """Builds what may refuse the config, then makes the folder of a new run, or reads the resumed
     one, and says what is trained.
@@ -152,6 +148,16 @@ def open_job(
     job.write_configs()
     job.introduce()
     return job
+
+
+def make_trainer(config: TrainConfig, env: Env) -> Trainer:
+    """What trains with the algorithm of a config: the algorithm's own trainer, or that of PPO.
+
+    Raises:
+      UserError: the config does not fit it.
+    """
+    own_trainer = find_algorithm(config.algorithm).make_trainer(config, env)
+    return PPOTrainer(config, env) if own_trainer is None else own_trainer
 
 
 def imports_of(config: TrainConfig) -> list[str]:
