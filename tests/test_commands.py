@@ -51,7 +51,7 @@ MISTAKES = (
         "shorter rollout",
     ),
     ("train --action-scale nan", "--action-scale is nan", "a finite number"),
-    ("train latest --config a.yaml", "the run latest has its config, with which it is resumed"),
+    ("train {run} --config a.yaml", "has its config, with which it is resumed"),
     ("train --resume b", "the run to resume is the first word: bounce-mjx train b"),
     ("train --task=catch", "the task is the first word: bounce-mjx train catch"),
     ("train --seed 3 catch", "catch is what the training begins with; give it first"),

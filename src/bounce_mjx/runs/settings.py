@@ -1,6 +1,6 @@
 """The settings of a training, from wherever they come.
 
-One word fixes the classes: `find_start` says which task, which algorithm and which policy or run a
+One word fixes the classes (`start.py`): which task, which algorithm and which policy or run a
 training begins with. Everything else is values. They are layers, and a later one wins:
 
     1. the defaults of the task and of the algorithm
@@ -25,7 +25,7 @@ import itertools
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import pydantic
 from pydantic.fields import FieldInfo
@@ -33,26 +33,18 @@ from pydantic.fields import FieldInfo
 from bounce_mjx.config.command_line import Flag
 from bounce_mjx.config.files import differing_keys, flat
 from bounce_mjx.config.settings import Layer, StrictModel, default_of, has_default, merged, nested
-from bounce_mjx.config.user_code import not_imported, own_name
 from bounce_mjx.config.validation import describe, groups_of, path_of
-from bounce_mjx.errors import UserError, shorten, suggest
-from bounce_mjx.learning.config import PPO_NAME, PPOConfig
-from bounce_mjx.learning.registry import find_algorithm, own_algorithm
-from bounce_mjx.resources import POLICIES, policy_folder
+from bounce_mjx.errors import UserError, shorten
+from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.runs.config import (
     DEFAULT_SOURCE,
     RESUMABLE_KEYS,
     TrainConfig,
-    code_of,
     fields_of,
-    is_code_of,
-    load_run_config,
-    runs_folder,
 )
 from bounce_mjx.runs.presets import BASE, SOURCES, preset_files, read_config_file, shown_file
+from bounce_mjx.runs.start import Start, beside_run, find_start
 from bounce_mjx.runs.worlds import robot_and_world
-from bounce_mjx.task.registry import DEFAULT, find_task, is_task, registered_tasks, task_name
-from bounce_mjx.task.task import Task
 from bounce_mjx.world.named import without_idle_curriculum
 
 FLAGS = "flags"
@@ -93,198 +85,6 @@ class Choice(ChoiceFlags):
     screening-episodes, eval-seed, stop-when-solved and num-devices."""
 
 
-class Start(NamedTuple):
-    """What a training begins with, which fixes the classes of its settings."""
-
-    task: type[Task]
-    task_name: str
-    algorithm: type[PPOConfig]
-    """The settings of the algorithm."""
-    algorithm_name: str
-    said: dict[str, Any]
-    """What the user says by it, by keys of the config."""
-    policy: TrainConfig | None = None
-    """Config of the policy of a warm start."""
-    warm_start: Path | None = None
-    """Name of that policy, or its checkpoint's folder."""
-    run: Path | None = None
-    """Folder of the run that is resumed, or a checkpoint in it."""
-    resumed: TrainConfig | None = None
-    """Config of that run."""
-    notes: tuple[str, ...] = ()
-    """Which run latest stands for."""
-
-
-# The start: classes ------------------------------------------------------------------------------
-
-
-def find_start(choice: Choice, whole_config: TrainConfig | None = None) -> Start:
-    """What the word of a choice means: a task, a policy or a run.
-
-    Args:
-      whole_config: whose task and algorithm these are, in place of a word.
-
-    Raises:
-      UserError: there is no such thing, or two parts of the choice exclude each other.
-    """
-    from bounce_mjx.runs.folders import LATEST, is_newest
-
-    word = choice.start
-    warm_start = choice.warm_start
-    if word is not None and not is_task(word):
-        if policy_folder(word):
-            if warm_start is not None:
-                raise UserError(
-                    f"{word} and the warm start {warm_start} are two policies; leave one out"
-                )
-            warm_start, word = Path(word), None
-        elif is_newest(Path(word)) or os.path.isdir(word):
-            return _start_of_run(choice, whole_config)
-        else:
-            known = list(dict.fromkeys((*registered_tasks(), *POLICIES)))
-            own = "a run's folder, or --import FILE.py for a task of your own"
-            advice = suggest(word, [*known, LATEST]) or f"give {', '.join(known)}, {own}"
-            raise UserError(f"there is no task, policy or run {shorten(word)}; {advice}")
-    policy, notes = None, ()
-    if warm_start is not None:
-        if choice.robot:
-            raise UserError(
-                "a warm start and a robot cannot be combined, as the policy brings its arm; leave "
-                "the robot out"
-            )
-        log_dir = _folder_of_runs(choice.log_dir, word, whole_config)
-        warm_start, policy, notes = _policy_of(warm_start, log_dir)
-    said: dict[str, Any] = {}
-    if word is not None:
-        task = find_task(word)
-        said["task"] = task_name(task)
-    elif whole_config is not None:
-        task = whole_config.env.task
-    elif policy is not None:
-        task = policy.env.task
-    else:
-        task = find_task(DEFAULT)
-    if whole_config is not None and whole_config.env.task is not task:
-        raise UserError(
-            f"the config is of the task {whole_config.task}, and the first argument is {word}; "
-            "leave it out"
-        )
-    if warm_start is not None:
-        said["warm_start"] = warm_start
-    algorithm_name, algorithm = _algorithm(choice, whole_config)
-    if choice.algorithm is not None:
-        said["algorithm"] = algorithm_name
-    return Start(
-        task=task,
-        task_name=task_name(task),
-        algorithm=algorithm,
-        algorithm_name=algorithm_name,
-        said=said,
-        policy=policy,
-        warm_start=warm_start,
-        notes=notes,
-    )
-
-
-def _start_of_run(choice: Choice, whole_config: TrainConfig | None) -> Start:
-    """The start of a run that is resumed."""
-    from bounce_mjx.runs.folders import find_run, is_newest, named_run
-
-    excluded = {
-        "config": choice.config or whole_config is not None,
-        "robot": choice.robot,
-        "world": choice.world,
-        "warm_start": choice.warm_start,
-        "algorithm": choice.algorithm,
-    }
-    for name, is_given in excluded.items():
-        if is_given:
-            raise UserError(
-                f"the run {choice.start} has its {name}, with which it is resumed; leave {name} "
-                f"out, or start a new run from its networks: --warm-start {choice.start}"
-            )
-    word = Path(choice.start)
-    if choice.log_dir is not None and not is_newest(word):
-        raise UserError(
-            f"log_dir is where the newest run is looked for, and {word} is named; omit one of them"
-        )
-    place = named_run(word, choice.log_dir or runs_folder(find_task(DEFAULT)))
-    run = find_run(place)
-    config = load_run_config(run)
-    classes: dict[str, type] = {"task": config.env.task}
-    if config.algorithm != PPO_NAME:
-        algorithm = own_algorithm(config.algorithm)
-        if algorithm is None:
-            code = code_of(run, "algorithm")
-            raise not_imported(f"the run {run}", "algorithm", config.algorithm, code)
-        classes["algorithm"] = algorithm
-    # Its settings are no settings of other code.
-    for key, kind in classes.items():
-        if not is_code_of(kind, run, key):
-            raise UserError(
-                f"{run} cannot be resumed with another {key} than it was trained with; import "
-                f"{code_of(run, key)}, or start a new run"
-            )
-    return Start(
-        task=config.env.task,
-        task_name=config.task,
-        algorithm=type(config.ppo),
-        algorithm_name=config.algorithm,
-        said={},
-        run=place,
-        resumed=config,
-    )
-
-
-def _policy_of(path: Path, log_dir: Path) -> tuple[Path, TrainConfig, tuple[str, ...]]:
-    """The policy of a warm start: its name or its checkpoint's folder, the config of its run, and
-    which run latest stands for."""
-    from bounce_mjx.runs.folders import find_choice
-
-    checkpoint, note = find_choice(path, log_dir)
-    start = path if policy_folder(path) else checkpoint.folder
-    return start, load_run_config(checkpoint.run), () if note is None else (note,)
-
-
-def _folder_of_runs(
-    log_dir: Path | None, task: str | None, whole_config: TrainConfig | None
-) -> Path:
-    """Where the newest run is looked for: beside the new one, or among those of the task."""
-    from bounce_mjx.runs.folders import runs_in
-
-    # A new folder has no run yet that latest could stand for.
-    if log_dir is not None and runs_in(log_dir):
-        return log_dir
-    return runs_folder(whole_config.env.task if whole_config else find_task(task or DEFAULT))
-
-
-def _algorithm(choice: Choice, whole_config: TrainConfig | None) -> tuple[str, type[PPOConfig]]:
-    """Name and settings of the algorithm.
-
-    Raises:
-      UserError: there is none, or the whole config disagrees with itself.
-    """
-    if whole_config is not None and choice.algorithm is None:
-        settings = _settings_of(whole_config.algorithm)
-        if settings is not type(whole_config.ppo):
-            raise UserError(
-                f"the config's ppo is {type(whole_config.ppo).__qualname__}, and its algorithm "
-                f"{whole_config.algorithm} has {settings.__qualname__}; name the algorithm that "
-                "has them"
-            )
-        return whole_config.algorithm, settings
-    name = choice.algorithm or PPO_NAME
-    if name == PPO_NAME:
-        return name, PPOConfig
-    algorithm = find_algorithm(name)
-    return own_name(algorithm), algorithm.Config
-
-
-def _settings_of(algorithm: str) -> type[PPOConfig]:
-    """The settings of an algorithm by its name; PPO's without the import of JAX."""
-    return PPOConfig if algorithm == PPO_NAME else find_algorithm(algorithm).Config
-
-
 # Reading: what lies on what ---------------------------------------------------------------------
 
 
@@ -294,33 +94,64 @@ def stack(
     """The layers of a choice, without what the user says.
 
     Args:
+      machine, whole_config: as for `layers_on`.
+
+    Raises:
+      UserError: as `find_start` and `layers_on`.
+    """
+    start = find_start(
+        choice.start, choice.warm_start, choice.algorithm, choice.log_dir, whole_config
+    )
+    return layers_on(start, choice.config, choice.robot, choice.world, machine, whole_config)
+
+
+def layers_on(
+    start: Start,
+    config: Sequence[Path] = (),
+    robot: Path | None = None,
+    world: Path | None = None,
+    machine: Path | None = None,
+    whole_config: TrainConfig | None = None,
+) -> "Stack":
+    """The layers on a start, without what the user says.
+
+    Args:
+      config: presets and files, see `Choice`, as are `robot` and `world`.
       machine: the machine's preset; None asks JAX, which starts its devices.
       whole_config: a config that takes the place of files, and stands alone.
 
     Raises:
-      UserError: as `find_start`; or a file is missing, wrong, or of another start.
+      UserError: a file is missing, wrong, or of another start; or the start has what is given.
     """
-    start = find_start(choice, whole_config)
     if start.resumed is not None:
+        given = {"config": config or whole_config, "robot": robot, "world": world}
+        for name, value in given.items():
+            if value:
+                raise beside_run(start.run, name)
         return Stack(start, (Layer(f"the run {start.run}", start.resumed.model_dump()),))
+    if start.policy is not None and robot is not None:
+        raise UserError(
+            "a warm start and a robot cannot be combined, as the policy brings its arm; leave "
+            "the robot out"
+        )
     machines: list[Layer] = []
     named: list[Layer] = []
     if whole_config is not None:
         files = [Layer("config", whole_config.model_dump(), whole=("env", "ppo"))]
     else:
-        found = preset_files(choice.config, start.task_name, machine)
+        found = preset_files(config, start.task_name, machine)
         machines = _layers_of_files([found.machine])
         named = _layers_of_files([found.named])
         files = _layers_of_files(found.own)
         for layer in (*named, *files):
             _check_start(layer, start)
     changed = _changed_defaults(start.algorithm)
-    policies = [] if start.policy is None else [_layer_of_policy(start, choice.world is not None)]
+    policies = [] if start.policy is None else [_layer_of_policy(start, world is not None)]
     trained = None if start.policy is None else start.policy.env
-    robot, world = robot_and_world(choice.robot, choice.world, start.task, trained)
+    robots, worlds = robot_and_world(robot, world, start.task, trained)
     return Stack(
         start=start,
-        layers=(*machines, *changed, *named, *policies, *files, *robot, *world),
+        layers=(*machines, *changed, *named, *policies, *files, *robots, *worlds),
         notes=(*start.notes, *_notes(changed, named, "ppo."), *_notes(named, policies, "env.")),
     )
 

@@ -12,7 +12,6 @@ import jax
 from rich.console import Console
 
 from bounce_mjx.config.command_line import stdout
-from bounce_mjx.config.validation import validate
 from bounce_mjx.deploy.environments import environment, policy_path
 from bounce_mjx.deploy.interface import check_interface, interface_of
 from bounce_mjx.deploy.wrappers import environments_in, in_library
@@ -27,7 +26,8 @@ from bounce_mjx.runs import folders
 from bounce_mjx.runs.checkpoints import read_actor
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.progress import load_results
-from bounce_mjx.runs.settings import FLAGS, PYTHON, Choice, Stack, stack
+from bounce_mjx.runs.settings import FLAGS, PYTHON, Stack, layers_on
+from bounce_mjx.runs.start import find_start
 from bounce_mjx.task.registry import task_name
 from bounce_mjx.task.task import Task
 from bounce_mjx.training import hosts, job
@@ -180,26 +180,40 @@ def train(
     for name in ("task", "resume"):
         if name in settings:
             raise UserError(f"{name} is the first argument: train({str(settings[name])!r}, ...)")
-    choice: dict[str, Any] = {"robot": robot, "world": world, "warm_start": warm_start}
+    word = None if start is None else str(start)
     if isinstance(start, type):
-        choice["start"] = task_name(start)
-    elif start is not None:
-        choice["start"] = str(start)
-    whole = None
-    if isinstance(config, TrainConfig):
-        whole = config
-    elif isinstance(config, str | Path):
-        choice["config"] = (config,)
-    else:
-        choice["config"] = tuple(config)
-    for key in ("algorithm", "log_dir"):
-        if key in settings:
-            choice[key] = settings[key]
-    layers = stack(validate(Choice, choice, PYTHON), whole_config=whole)
+        word = task_name(start)
+    whole = config if isinstance(config, TrainConfig) else None
+    files: Sequence[str | Path] = ()
+    if isinstance(config, str | Path):
+        files = (config,)
+    elif whole is None:
+        files = config
+    begun = find_start(
+        word,
+        _as_path("warm_start", warm_start),
+        settings.get("algorithm"),
+        _as_path("log_dir", settings.get("log_dir")),
+        whole,
+    )
+    layers = layers_on(
+        begun,
+        [_as_path("config", file) for file in files],
+        _as_path("robot", robot),
+        _as_path("world", world),
+        whole_config=whole,
+    )
     config = layers.config(settings)
     set_up_jax(config.env)
     console = stdout(quiet=quiet or not hosts.is_leader())
     return run_training(layers, config, console, callbacks, report)
+
+
+def _as_path(name: str, value: Any) -> Path | None:
+    """An argument as a path; None without one."""
+    if value is None or isinstance(value, str | Path):
+        return None if value is None else Path(value)
+    raise UserError(f"{name} is {shorten(str(value))}, but must be a path or a name")
 
 
 def run_training(
