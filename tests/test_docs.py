@@ -32,7 +32,7 @@ from bounce_mjx.config.settings import StrictModel, fields_in
 from bounce_mjx.config.user_code import import_code
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.settings import Choice, read_preset, stack
+from bounce_mjx.runs.settings import Choice, read_layers, read_preset
 from bounce_mjx.task import registry, term_names, weighted_terms
 from bounce_mjx.task.bounce import Bounce
 from bounce_mjx.task.bounce_rewards import BounceReward, RewardInputs
@@ -179,7 +179,7 @@ def known_flags() -> set[str]:
     """The flags of every command of the package, and of the maintainers' one."""
     ship = runpy.run_path(str(CHECKOUT / "benchmarks/ship.py"))
     flags = {"--help", "--help-all", "--import", *cli.flags_of(fields_in(ship["ShipCommand"]))}
-    flags |= set(cli.flags_of(fields_of_command(stack(Choice()))))
+    flags |= set(cli.flags_of(fields_of_command(read_layers(Choice()))))
     for info in pkgutil.iter_modules(commands_package.__path__):
         module = importlib.import_module(f"bounce_mjx.commands.{info.name}")
         for name, member in vars(module).items():
@@ -388,7 +388,7 @@ def short_training(folder: Path) -> Callable:
     def train(*given, callbacks=(), **settings):
         calls.append(settings)
         if len(calls) > 1:  # the page's sweep
-            config = stack(Choice()).config(settings)
+            config = read_layers(Choice()).config(settings)
             assert not notes_on_starts(config)
             return config
         return real(*given, callbacks=callbacks, **settings | short, log_dir=folder)

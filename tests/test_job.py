@@ -38,7 +38,7 @@ from bounce_mjx.runs.folders import (
     named_run,
     stored_checkpoints,
 )
-from bounce_mjx.runs.settings import Choice, stack
+from bounce_mjx.runs.settings import Choice, read_layers
 from bounce_mjx.training import hosts, job, saving
 from bounce_mjx.training.events import Event
 from bounce_mjx.training.faults import first_block_fault
@@ -268,20 +268,21 @@ def test_an_algorithm_brings_its_own_trainer(tmp_path: Path, monkeypatch) -> Non
     choice = Choice(algorithm="counting", config=())
     said = {"num_envs": 8, "rollout_length": 8, "num_minibatches": 2, "hidden_layers": (4,)}
     said |= {"block_steps": 64, "eval_every": 64, "total_steps": 128, "log_dir": tmp_path / "runs"}
-    config = stack(choice).config(said | {"stop_when_solved": False})
+    config = read_layers(choice).config(said | {"stop_when_solved": False})
     scores = Scores({1: 5.0, 2: 9.0, 3: 7.0}, {}, False)
     run = _run_of(config, None, (), io.StringIO(), scores)
     assert (config.ppo.start_steps, config.iterations_per_block) == (8, 2)
     assert results_of(run)["best_steps"] == 128 and (run / "algorithm/counting.py").exists()
-    longer = stack(Choice(start=str(run))).config({"total_steps": 192})
+    longer = read_layers(Choice(start=str(run))).config({"total_steps": 192})
     _run_of(longer, run, (), io.StringIO(), scores)
     assert evaluated_steps(run) == [64, 128, 192]
     (tmp_path / "without.py").write_text(
         "from bounce_mjx.learning.algorithm import Algorithm\nclass Without(Algorithm):\n    pass"
     )
     import_code(tmp_path / "without.py")
+    config = read_layers(Choice(algorithm="without")).config(said)
     with pytest.raises(UserError, match="the algorithm Without has no make_trainer"):
-        _run_of(stack(Choice(algorithm="without")).config(said), None, (), io.StringIO(), scores)
+        _run_of(config, None, (), io.StringIO(), scores)
 
 
 def test_a_history_of_checkpoints_stays_where_it_is_asked_for(tmp_path: Path) -> None:
@@ -346,7 +347,7 @@ def test_a_training_stops_once_its_results_have_a_margin(tmp_path: Path) -> None
     assert f"{run} has met all results, 192 steps; add --total-steps N" in shown.getvalue()
     # Results are not needed to resume.
     (run / "results.json").write_text("damaged")
-    layers = stack(Choice(start=str(run)))
+    layers = read_layers(Choice(start=str(run)))
     going_on = layers.config({"total_steps": 10**6})
     assert not going_on.stop_when_solved
     assert going_on.sources["stop_when_solved"] == going_on.sources["total_steps"] == "train"
@@ -876,4 +877,4 @@ def test_a_solved_run_goes_on_with_more_steps_also_beside_a_seed_that_diverged(
     settings = {"num_seeds": SEEDS, "stop_when_solved": True, "margins": {1: 1.0}}
     run = train(tmp_path, RETURNS, trainer=DivergingAtOnce, **settings)
     assert evaluated_steps(run / "seed_000") == [64]
-    assert not stack(Choice(start=str(run))).config({"total_steps": 10**6}).stop_when_solved
+    assert not read_layers(Choice(start=str(run))).config({"total_steps": 10**6}).stop_when_solved

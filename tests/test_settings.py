@@ -22,7 +22,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.runs import presets
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import create_run, pretrained_checkpoint
-from bounce_mjx.runs.settings import Choice, read_preset, stack
+from bounce_mjx.runs.settings import Choice, read_layers, read_preset
 from bounce_mjx.training import job
 from bounce_mjx.training.command import read_command
 from bounce_mjx.training.run import notes_on_intervals, notes_on_starts, notes_on_worlds
@@ -153,7 +153,7 @@ def test_a_source_wins_over_those_before_it(folder: Path) -> None:
     run = create_run(config.model_copy(update={"log_dir": folder / "runs"}))
     assert load_run_config(run).sources == sources
     # Every source is read again, and none is a setting.
-    again = stack(Choice(config=(run / "config.yaml",), algorithm="own")).config()
+    again = read_layers(Choice(config=(run / "config.yaml",), algorithm="own")).config()
     assert again.sources["seed"] == str(run / "config.yaml")
 
 
@@ -162,13 +162,15 @@ def test_an_algorithms_own_default_wins_over_the_machines_preset_alone(folder: P
     (folder / "own.py").write_text(OWN)
     import_code("own.py")
     named = Choice(config=(Path("cpu"),), algorithm="own")
-    layers = stack(named)
+    layers = read_layers(named)
     assert layers.config().ppo.num_epochs == 4
     assert layers.notes == ("configs/cpu.yaml wins over defaults of Own.Config: ppo.num_epochs",)
-    layers = stack(Choice(algorithm="own"))
+    layers = read_layers(Choice(algorithm="own"))
     assert (layers.config().ppo.num_epochs, layers.notes) == (1, ())
     (folder / "my.yaml").write_text("ppo: {num_epochs: 3}")
-    assert stack(Choice(config=(Path("my.yaml"),), algorithm="own")).config().ppo.num_epochs == 3
+    assert (
+        read_layers(Choice(config=(Path("my.yaml"),), algorithm="own")).config().ppo.num_epochs == 3
+    )
 
 
 def test_a_default_that_an_algorithm_makes_or_leaves_out_is_a_default(folder: Path) -> None:
@@ -176,7 +178,7 @@ def test_a_default_that_an_algorithm_makes_or_leaves_out_is_a_default(folder: Pa
     own = OWN.replace("num_epochs: int = 1", "num_epochs: int = Field(default_factory=lambda: 1)")
     (folder / "own.py").write_text(f"from pydantic import Field\n{own}        num_envs: int\n")
     import_code("own.py")
-    config = stack(Choice(algorithm="own")).config()
+    config = read_layers(Choice(algorithm="own")).config()
     assert (config.ppo.num_epochs, config.sources["ppo.num_epochs"]) == (
         1,
         "defaults of Own.Config",
@@ -201,7 +203,7 @@ def test_a_warm_start_is_alike_in_a_file(folder: Path) -> None:
     assert configs[0].env == own.env.model_copy(update={"action_scale": 0.03})
     assert configs[0].ppo.hidden_layers == own.ppo.hidden_layers == (128, 128)
     assert configs[1].sources["env.observation.action"] == "the warm start robust_small"
-    notes = stack(Choice(config=(Path("randomized"),), warm_start=Path("robust_small"))).notes
+    notes = read_layers(Choice(config=(Path("randomized"),), warm_start=Path("robust_small"))).notes
     assert any("the warm start robust_small wins over configs/randomized.yaml" in x for x in notes)
 
 
@@ -253,26 +255,26 @@ def test_a_file_has_the_same_defaults_wherever_it_lies(folder: Path, monkeypatch
 
 
 def test_a_learning_rate_that_adapts_is_said_to_be_the_first_one() -> None:
-    adapts = stack(Choice()).config({"learning_rate": 1e-3, "target_kl": 0.01})
+    adapts = read_layers(Choice()).config({"learning_rate": 1e-3, "target_kl": 0.01})
     (note,) = notes_on_starts(adapts)
     assert note.startswith(
         "ppo.learning_rate 0.001 is only the first one, since ppo.target_kl 0.01"
     )
     for said in ({"learning_rate": 1e-3, "target_kl": 0.0}, {"target_kl": 0.01}):
-        assert not notes_on_starts(stack(Choice()).config(said))
+        assert not notes_on_starts(read_layers(Choice()).config(said))
 
 
 def test_a_world_that_most_episodes_do_not_have_is_said(folder: Path) -> None:
     """A preset's share decides how often a number of a named world is sampled at all."""
     world = Path("ur5e_rtde")
-    sampled = stack(Choice(config=(Path("transfer"),), world=world))
+    sampled = read_layers(Choice(config=(Path("transfer"),), world=world))
     (note,) = notes_on_worlds(sampled.config())
     assert note.startswith("configs/transfer.yaml samples each number of the world configs/worlds/")
     assert "in 20% of the episodes" in note
     path = folder / "whole.yaml"
     path.write_text("env: {randomization: {share: 1.0, shares: null}}")
     for files in ((Path("transfer"), path), (Path("robust_cpu"),)):
-        whole = stack(Choice(config=files, world=world))
+        whole = read_layers(Choice(config=files, world=world))
         assert not notes_on_worlds(whole.config())
 
 
@@ -373,7 +375,7 @@ def test_a_config_that_disagrees_with_itself_is_refused(folder: Path) -> None:
     """It would train PPO with the settings of another algorithm, or a task with another's."""
     (folder / "own.py").write_text(OWN)
     import_code("own.py")
-    ppo = stack(Choice(algorithm="own")).start.algorithm()
+    ppo = read_layers(Choice(algorithm="own")).start.algorithm()
     whole = TrainConfig(algorithm="own", ppo=ppo)
     assert python(config=whole).ppo == ppo
     for algorithm, settings_of_other in (("ppo", ppo), ("own", TrainConfig().ppo)):
@@ -392,7 +394,7 @@ def test_a_run_of_another_algorithm_is_refused_as_such(folder: Path, refused) ->
     (folder / "own.py").write_text(OWN)
     import_code("own.py")
     (folder / "other.py").write_text(OWN.replace("own_cost", "other_cost"))
-    own = stack(Choice(algorithm="own")).config({"log_dir": folder / "runs"})
+    own = read_layers(Choice(algorithm="own")).config({"log_dir": folder / "runs"})
     run = create_run(own)
     refused(f"train {run} --algorithm ppo", "has its algorithm, with which it is resumed")
     user_code._sources.clear()

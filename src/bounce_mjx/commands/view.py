@@ -7,7 +7,7 @@ from typing import Literal
 from bounce_mjx.config.command_line import flag_names, parse, read_flags, stdout
 from bounce_mjx.config.files import flat
 from bounce_mjx.config.settings import StrictModel, fields_in
-from bounce_mjx.runs.settings import Choice, stack
+from bounce_mjx.runs.settings import Choice, read_layers
 from bounce_mjx.task.registry import DEFAULT
 from bounce_mjx.viewers.options import ViewerOptions
 
@@ -35,7 +35,7 @@ def main(args: Sequence[str]) -> None:
     # second reading gives the command's own flags again, and they are left out.
     command = parse(ViewCommand, args, prog=PROG, is_first=True)
     preset = Choice(start=command.task, config=(Path("default"),), robot=command.robot)
-    layers = stack(preset)
+    layers = read_layers(preset)
     of_env = {key: field for key, field in layers.fields.items() if key.startswith("env.")}
     fields = fields_in(ViewCommand) | of_env
     names = flag_names(fields)

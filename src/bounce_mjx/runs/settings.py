@@ -14,9 +14,9 @@ training begins with. Everything else is values. They are layers, and a later on
     9. what the user says: flags of the command, or arguments of `train`
 
 A resumed run has two: its own config, and what the user says; more steps end its
-`stop_when_solved` where that had ended it (`Stack._go_on`). `stack` reads the layers below the
-user's, each file once. `Stack.config` merges all of them and validates the result, once; the config
-then knows what set each of its values (`TrainConfig.sources`).
+`stop_when_solved` where that had ended it (`Layers._go_on`). `layers_on` reads the layers below the
+user's, each file once. `Layers.config` merges all of them and validates the result, once; the
+config then knows what set each of its values (`TrainConfig.sources`).
 """
 
 import dataclasses
@@ -88,9 +88,9 @@ class Choice(ChoiceFlags):
 # Reading: what lies on what ---------------------------------------------------------------------
 
 
-def stack(
+def read_layers(
     choice: Choice, machine: Path | None = None, whole_config: TrainConfig | None = None
-) -> "Stack":
+) -> "Layers":
     """The layers of a choice, without what the user says.
 
     Args:
@@ -112,7 +112,7 @@ def layers_on(
     world: Path | None = None,
     machine: Path | None = None,
     whole_config: TrainConfig | None = None,
-) -> "Stack":
+) -> "Layers":
     """The layers on a start, without what the user says.
 
     Args:
@@ -128,7 +128,7 @@ def layers_on(
         for name, value in given.items():
             if value:
                 raise beside_run(start.run, name)
-        return Stack(start, (Layer(f"the run {start.run}", start.resumed.model_dump()),))
+        return Layers(start, (Layer(f"the run {start.run}", start.resumed.model_dump()),))
     if start.policy is not None and robot is not None:
         raise UserError(
             "a warm start and a robot cannot be combined, as the policy brings its arm; leave "
@@ -149,9 +149,9 @@ def layers_on(
     policies = [] if start.policy is None else [_layer_of_policy(start, world is not None)]
     trained = None if start.policy is None else start.policy.env
     robots, worlds = robot_and_world(robot, world, start.task, trained)
-    return Stack(
+    return Layers(
         start=start,
-        layers=(*machines, *changed, *named, *policies, *files, *robots, *worlds),
+        below=(*machines, *changed, *named, *policies, *files, *robots, *worlds),
         notes=(*start.notes, *_notes(changed, named, "ppo."), *_notes(named, policies, "env.")),
     )
 
@@ -249,11 +249,11 @@ def _layer_of_policy(start: Start, is_in_world: bool) -> Layer:
 
 
 @dataclasses.dataclass(frozen=True)
-class Stack:
+class Layers:
     """The layers below what the user says, the lowest first."""
 
     start: Start
-    layers: tuple[Layer, ...]
+    below: tuple[Layer, ...]
     notes: tuple[str, ...] = ()
     """Which run latest stands for, and where a layer wins over another one that a user may have
     expected to win."""
@@ -266,7 +266,7 @@ class Stack:
     @property
     def title(self) -> str:
         """The sources of the layers in words, the last first."""
-        return _title_of(self.layers)
+        return _title_of(self.below)
 
     def config(
         self,
@@ -290,7 +290,7 @@ class Stack:
         # A start is what it was found to be, such as a checkpoint.
         user = self._layer_of_user(source, {**(said or {}), **self.start.said})
         above = [*self._go_on(user), user]
-        layers = [*self.layers, *above]
+        layers = [*self.below, *above]
         for layer in layers:
             self._check_groups(layer)
         values, sources = _merge(layers)
@@ -457,16 +457,16 @@ def read_preset(
     world: Path | None = None,
     machine: Path | None = None,
 ) -> TrainConfig:
-    """The config of presets, files, a robot and a world: see `Choice` and `stack`.
+    """The config of presets, files, a robot and a world: see `Choice` and `read_layers`.
 
     Args:
       task: by default, the one that the last file names.
 
     Raises:
-      UserError: as `stack` and `Stack.config`.
+      UserError: as `read_layers` and `Layers.config`.
     """
     files = (config,) if isinstance(config, Path) else tuple(config or ())
     for layer in reversed(_layers_of_files(file for file in files if os.path.isfile(file))):
         task = task or layer.values.get("task")
     choice = Choice(start=task, config=files, robot=robot, world=world)
-    return stack(choice, machine).config()
+    return read_layers(choice, machine).config()

@@ -13,7 +13,7 @@ from bounce_mjx.config.files import flat
 from bounce_mjx.config.settings import Count, NonNegativeInt, fields_in
 from bounce_mjx.errors import UserError
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.settings import Choice, ChoiceFlags, Stack, stack
+from bounce_mjx.runs.settings import Choice, ChoiceFlags, Layers, read_layers
 
 PROG = "bounce-mjx train"
 ABOUT = "Trains a policy; by default, one that keeps the ball bouncing."
@@ -64,13 +64,13 @@ class TrainCommand(NamedTuple):
     """A command line that was read."""
 
     flags: TrainFlags
-    layers: Stack
+    layers: Layers
     """The layers below the flags."""
     config: TrainConfig
     """The run's config."""
 
 
-def fields_of_command(layers: Stack) -> dict[str, FieldInfo]:
+def fields_of_command(layers: Layers) -> dict[str, FieldInfo]:
     """What has a flag, by dotted key: the settings of the training, but for the task, which is the
     first word; then the other flags."""
     fields = {key: field for key, field in layers.fields.items() if key != "task"}
@@ -96,7 +96,7 @@ def read_command(args: Sequence[str], machine: Path | None = None) -> TrainComma
     # The flags, of which only some are known yet, hide where another word would stand.
     word = words[0] if words and not words[0].startswith("-") else None
     flags = parse(ChoiceFlags, words[word is not None :], prog=PROG, is_first=True)
-    layers = stack(Choice(start=word, **dict(flags)), machine)
+    layers = read_layers(Choice(start=word, **dict(flags)), machine)
     fields = fields_of_command(layers)
     if helps:
         defaults = flat(TrainFlags().model_dump()) | flat(layers.config().model_dump())

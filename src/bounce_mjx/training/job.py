@@ -195,7 +195,7 @@ class Job:
     """Environment steps of each seed so far."""
     needs_save: bool = False
     """Whether no save of the current state has been started."""
-    is_ended: bool = False
+    callback_has_ended: bool = False
     """Whether a callback has ended the training."""
     failure: BaseException | None = None
     """What a callback raised: it stops the training, as a signal does."""
@@ -330,7 +330,7 @@ class Job:
             return True
         # The policy of a warm start is the one to beat.
         is_worth_it = self.steps > 0 or self.networks is not None
-        is_at_evaluation = self.is_done() or self.steps % self.eval_steps == 0
+        is_at_evaluation = self.is_at_its_end() or self.steps % self.eval_steps == 0
         return is_worth_it and is_at_evaluation and not self.is_evaluated()
 
     def evaluate(self) -> None:
@@ -379,7 +379,7 @@ class Job:
 
     def is_finished(self) -> bool:
         """Whether the training ends here: at its last step, by a callback, or by its results."""
-        return self.is_done() or self.is_solved()
+        return self.is_at_its_end() or self.is_solved()
 
     def train_block(self) -> tuple[BlockMetrics, float]:
         """Trains for a block of I iterations; its metrics, each [S, I], and its duration, s.
@@ -507,9 +507,9 @@ class Job:
         """The seeds that have not diverged."""
         return [seed for seed in self.seeds if seed.progress.fault is None]
 
-    def is_done(self) -> bool:
+    def is_at_its_end(self) -> bool:
         """Whether the last step is reached, or a callback has ended the training."""
-        return self.is_ended or self.steps >= self.config.total_steps
+        return self.callback_has_ended or self.steps >= self.config.total_steps
 
     def is_solved(self) -> bool:
         """Whether the results end the training."""
@@ -518,7 +518,7 @@ class Job:
 
     def why_it_ends(self) -> str:
         """Why the training ends here, in words."""
-        if self.is_ended and self.steps < self.config.total_steps:
+        if self.callback_has_ended and self.steps < self.config.total_steps:
             return f"a callback ended the training after {self.steps:,} steps; {self.go_on}"
         if not self.is_solved():
             return f"the training ends after its {self.steps:,} steps (total_steps)"
@@ -578,8 +578,8 @@ class Job:
                     continue
                 # A comparison of NumPy's numbers has its own False.
                 if isinstance(answer, bool | np.bool_) and not answer:
-                    self.is_ended = True
-        self.is_ended = hosts.any_of(self.is_ended)
+                    self.callback_has_ended = True
+        self.callback_has_ended = hosts.any_of(self.callback_has_ended)
 
     @property
     def go_on(self) -> str:
