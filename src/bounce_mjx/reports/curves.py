@@ -12,6 +12,7 @@ import numpy as np
 
 from bounce_mjx.config.files import flat
 from bounce_mjx.errors import UserError, reason_of, shorten
+from bounce_mjx.learning.config import PPO_NAME
 from bounce_mjx.runs.config import (
     CONFIG_FILE,
     RESUMABLE_KEYS,
@@ -146,7 +147,7 @@ def _settings(run: Path, config: TrainConfig) -> dict[str, Any]:
         contents["env.mjcf"] = (run / ROBOT / MANIFEST_FILE).read_bytes()
     for key, content in contents.items():
         settings[key] = f"{Path(settings[key]).name} {zlib.crc32(content):08x}"
-    if "algorithm" in contents:
+    if config.algorithm != PPO_NAME:
         settings |= _own_settings(run, settings)
     return settings
 

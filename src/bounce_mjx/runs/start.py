@@ -54,9 +54,10 @@ def find_start(
     Raises:
       UserError: there is no such thing, or two of these exclude each other.
     """
-    from bounce_mjx.runs.folders import LATEST, is_newest
-
     if word is not None and not is_task(word):
+        # Imports JAX, which a task's help does not need.
+        from bounce_mjx.runs.folders import LATEST, is_newest
+
         if policy_folder(word):
             if warm_start is not None:
                 raise UserError(
