@@ -247,7 +247,7 @@ def _make(library: str, need, **settings):
             wrap = _adapter("torch.skrl_env", "SkrlEnv", need, "torch", "skrl")
             return wrap(_make("torch", need, **settings))
         case "brax":
-            return _adapter("brax", "make_env", need, "brax")(**settings)
+            return _adapter("brax", "make_env", need)(**settings)
         case "gymnax":
             return _adapter("gymnax_env", "GymnaxBounceBall", need)(environment(**settings))
         case "playground":

@@ -551,7 +551,6 @@ def test_every_task_shows_the_balls_rotation_if_asked(name: str) -> None:
 
 def test_libraries_take_another_task() -> None:
     """Those whose own tests have no other task: the shape of the first observation."""
-    pytest.importorskip("brax")
     import brax.envs
 
     import bounce_mjx.adapters.brax  # noqa: F401

@@ -37,7 +37,7 @@ class Sb3VecEnv(VecEnv):
             the first four environments are tiled.
 
         Raises:
-          UserError: an argument is wrong, or there is no OpenGL library for rendering.
+          UserError: an argument is wrong.
         """
         same_step = AutoresetMode.SAME_STEP
         self._envs = TaskVectorEnv(env, num_envs, autoreset_mode=same_step, **options)

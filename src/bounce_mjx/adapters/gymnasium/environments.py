@@ -61,7 +61,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
           camera: name of a camera of the model; None for the overview.
 
         Raises:
-          UserError: an argument is wrong, or there is no OpenGL library for rendering.
+          UserError: an argument is wrong.
         """
         self._batch = Batch(env, 1, max_episode_steps)
         self._has_ended = False
