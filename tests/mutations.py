@@ -160,7 +160,7 @@ FAULTS = [
     ("a file wins over a flag", "runs/settings.py",
      "layers = [*self.below, *above]", "layers = [*above, *self.below]", "test_settings.py -k wins_over_those"),
     ("the machine's preset wins over an algorithm's defaults", "runs/settings.py",
-     "layers=(*machines, *changed,", "layers=(*changed, *machines,", "test_settings.py -k algorithms_own_default"),
+     "below=(*machines, *changed,", "below=(*changed, *machines,", "test_settings.py -k algorithms_own_default"),
     ("a world loses its own randomisation", "runs/worlds.py",
      'merged({"env": {"randomization": default}}, {"env": world.settings})', 'merged({"env": world.settings}, {"env": {"randomization": default}})', "test_settings.py -k wins_over_those"),
     ("settings of 0.1.0 that change something are dropped", "runs/earlier.py",
