@@ -34,7 +34,7 @@ from bounce_mjx.runs.folders import (
 )
 from bounce_mjx.runs.records import verify
 from bounce_mjx.runs.settings import read_preset
-from bounce_mjx.task.bounce import BounceConfig
+from bounce_mjx.task.bounce import Config as BounceConfig
 
 OBSERVATION = BounceConfig().layout
 

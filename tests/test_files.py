@@ -13,7 +13,7 @@ from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.files import check_output, new_file, write_atomically, write_output
 from bounce_mjx.runs.presets import default_preset
 from bounce_mjx.runs.settings import read_preset
-from bounce_mjx.task.bounce import BounceConfig as EnvConfig
+from bounce_mjx.task.bounce import Config as EnvConfig
 from bounce_mjx.training.setup import JOINED_LOOPS, cache_compilations, join_loops
 
 

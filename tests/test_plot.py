@@ -48,7 +48,8 @@ from bounce_mjx.runs.folders import save_config
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.task import Curve, term_names
-from bounce_mjx.task.bounce import Bounce, BounceConfig, BounceReward
+from bounce_mjx.task.bounce import Bounce, Rewards
+from bounce_mjx.task.bounce import Config as BounceConfig
 from bounce_mjx.task.registry import find_task
 from bounce_mjx.task.results import Result
 from bounce_mjx.task.task import Hits
@@ -58,7 +59,7 @@ from bounce_mjx.training.log import TensorBoardLog
 from tiny_runs import TINY
 
 CHECKOUT = Path(__file__).parents[1]
-TERMS = term_names(BounceReward)
+TERMS = term_names(Rewards)
 CURVES = (
     Curve("episode/return", "", title="return of an episode"),
     *(curve for curve in Bounce.curves if curve.title),

@@ -727,7 +727,7 @@ def test_traced_ranges_beyond_the_queues_are_cut_in_the_world_too(delayed: Env) 
             {"joint_start": (-1.0, 1.0)},
             "starts Joint3 from 0.8199 to 3.02 with the noise",
         ),
-        ("bounce", {"ball_start": ((0, 0, -0.9), (0, 0, -0.8))}, "rests on the paddle at 0.072"),
+        ("bounce", {"ball_start": ((0, 0, -0.9), (0, 0, -0.8))}, "an episode ends where it"),
         ("bounce", {"ball_start": (0.0, 0.3)}, "up to 0.435 m beside the paddle, where none is"),
         ("balance", {"ball_start": (-0.03, 0.03)}, "rests on the paddle at 0.0723 m; give a high"),
         ("catch", {"ball_start": ((0, 0, -0.2), (0, 0, 0))}, "rests on the floor at 0.019 m"),
@@ -738,6 +738,13 @@ def test_a_start_that_no_arm_or_ball_can_have_is_refused(
 ) -> None:
     with pytest.raises(UserError, match=words):
         Env(find_task(task).Config(randomization=terms))
+
+
+def test_a_noise_that_no_ball_can_have_is_refused() -> None:
+    with pytest.raises(UserError, match="env.reset.ball_position 0.5 starts a ball up to 0.71. m"):
+        Env(EnvConfig(reset={"ball_position": 0.5}))
+    with pytest.raises(UserError, match="min_ball_height is .* with env.reset.ball_position 0.1"):
+        Env(EnvConfig(reset={"ball_position": 0.1}, ball_init_pos=(0.59, 0.0, 0.12)))
 
 
 def test_displaced_throws_are_taken() -> None:

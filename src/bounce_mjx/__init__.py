@@ -4,15 +4,15 @@ import importlib
 import sys
 from typing import TYPE_CHECKING, Any
 
+from bounce_mjx.resources import VERSION as __version__
+
 if TYPE_CHECKING:
     from bounce_mjx.config.user_code import import_code
     from bounce_mjx.deploy.environments import environment
     from bounce_mjx.deploy.loading import load_policy
     from bounce_mjx.env.bounce_ball import BounceBall
-    from bounce_mjx.task.bounce import BounceConfig as EnvConfig
+    from bounce_mjx.task.bounce import Config as EnvConfig
     from bounce_mjx.training.run import Run, train
-
-__version__ = "0.1.0"
 
 __all__ = [
     "BounceBall",
@@ -27,7 +27,7 @@ __all__ = [
 
 _PUBLIC = {
     "BounceBall": ("bounce_mjx.env.bounce_ball", "BounceBall"),
-    "EnvConfig": ("bounce_mjx.task.bounce", "BounceConfig"),
+    "EnvConfig": ("bounce_mjx.task.bounce", "Config"),
     "Run": ("bounce_mjx.training.run", "Run"),
     "environment": ("bounce_mjx.deploy.environments", "environment"),
     "import_code": ("bounce_mjx.config.user_code", "import_code"),

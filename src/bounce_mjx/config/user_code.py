@@ -17,6 +17,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
+import pydantic
+
+from bounce_mjx.config.validation import describe
 from bounce_mjx.errors import UserError, reason_of, shorten
 
 Kind = TypeVar("Kind")
@@ -187,6 +190,9 @@ def _run(source: Source) -> None:
     _sources[module.__name__] = source
     try:
         exec(compile(source.content, str(source.path), "exec"), vars(module))
+    except UserError as error:
+        del _sources[module.__name__]
+        raise UserError(f"{source.path} cannot be imported: {error}") from error
     except Exception as error:
         del _sources[module.__name__]
         line = 1
@@ -195,9 +201,12 @@ def _run(source: Source) -> None:
                 line = frame.lineno
         # A SyntaxError has its own.
         line = getattr(error, "lineno", None) or line
+        reason = reason_of(error)
+        if isinstance(error, pydantic.ValidationError):
+            reason = describe(error, {})
         raise UserError(
             f"{source.path} cannot be imported ({type(error).__name__} in line {line}: "
-            f"{shorten(str(error), 300)}); correct it"
+            f"{shorten(reason, 300)}); correct it"
         ) from error
 
 

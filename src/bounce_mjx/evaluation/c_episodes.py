@@ -14,7 +14,7 @@ from bounce_mjx.evaluation.episodes import Batch, Evaluator, add_step, begin, re
 from bounce_mjx.evaluation.statistics import Measured
 from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, edited_model, servo_targets
-from bounce_mjx.world.actuation import Actuation
+from bounce_mjx.world.actuation import ActuationMemory
 from bounce_mjx.world.model import world_model
 from bounce_mjx.world.randomization import Ranges
 
@@ -36,7 +36,9 @@ def make_mujoco_evaluator(env: Env, actor: Actor, episodes: int, recorded: int =
         return begin(env, reset_episodes(env, key, episodes, ranges), recorded)
 
     @jax.jit
-    def decide(policy: Policy, states: State) -> tuple[jax.Array, Actuation, Control, jax.Array]:
+    def decide(
+        policy: Policy, states: State
+    ) -> tuple[jax.Array, ActuationMemory, Control, jax.Array]:
         now = states.pipeline_state
         actions = actor.act(policy, states.obs.T).T
         control, actuation = jax.vmap(env.control, in_axes=-1, out_axes=-1)(now, actions)
@@ -45,7 +47,7 @@ def make_mujoco_evaluator(env: Env, actor: Actor, episodes: int, recorded: int =
 
     @jax.jit
     def finish(
-        now: Batch, actions: jax.Array, actuation: Actuation, physics: PhysicsState
+        now: Batch, actions: jax.Array, actuation: ActuationMemory, physics: PhysicsState
     ) -> Batch:
         finish_step = jax.vmap(env.finish_step, in_axes=-1, out_axes=-1)
         return add_step(env, now, finish_step(now.states, actions, actuation, physics))

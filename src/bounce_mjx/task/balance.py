@@ -82,6 +82,14 @@ class Config(task.WorldConfig):
         return {"ball_init_pos": [x, y, round(z + START_HEIGHT, 4)]}
 
     @property
+    def limits(self) -> task.Limits:
+        """Relative to the paddle's centre."""
+        return (
+            task.Limit("LOST_DEPTH", "below", LOST_DEPTH),
+            task.Limit("LOST_DISTANCE", "distance", LOST_DISTANCE),
+        )
+
+    @property
     def commands(self) -> dict[str, task.Command]:
         """The point from the paddle's centre along the world's x and y, and its speed."""
         coordinate = task.Command(-REACH, REACH, "m", least=-REACH, greatest=REACH, step=0.005)
@@ -143,8 +151,6 @@ class Balance(task.Task):
         offset = truth.ball_position - truth.paddle_position
         point_error = task.length(offset[:2] - _point(step.command))
         home = jnp.array(self.geometry.paddle_home)
-        is_low = offset[2] < -LOST_DEPTH
-        is_far = task.length(offset) > LOST_DISTANCE
         return task.TaskStep(
             state=centre,
             reward=task.weighted_terms(
@@ -153,7 +159,7 @@ class Balance(task.Task):
                 home=task.length(truth.paddle_position - home),
                 action_rate=jnp.mean(jnp.square(step.action - step.last_action)),
             ),
-            ended=is_low | is_far,
+            ended=task.is_beyond(self.config.limits, truth.ball_position, truth.paddle_position),
             metrics={"error": point_error},
         )
 

@@ -114,8 +114,13 @@ class Config(task.WorldConfig):
         x, y, z = paddle
         return {"ball_init_pos": [x, y, round(z + REST_HEIGHT, 4)]}
 
+    @property
+    def limits(self) -> task.Limits:
+        """Relative to the paddle's centre."""
+        return (task.Limit("LOST_DEPTH", "below", LOST_DEPTH),)
 
-class CatchState(NamedTuple):
+
+class State(NamedTuple):
     """What the task keeps of an episode."""
 
     fall: jax.Array
@@ -167,10 +172,10 @@ class Catch(task.Task):
         position = home + aim_offset - seconds * horizontal_velocity
         return position, horizontal_velocity + upward_velocity
 
-    def reset(self, start: task.Start) -> CatchState:
+    def reset(self, start: task.Start) -> State:
         truth = start.truth
         zero = jnp.zeros(())
-        return CatchState(
+        return State(
             fall=truth.ball_velocity[2],
             offset=truth.ball_position - truth.paddle_position,
             contact=zero,
@@ -180,7 +185,7 @@ class Catch(task.Task):
 
     # A control step: contact, rest, reward, end.
 
-    def step(self, state: CatchState, step: task.Step) -> task.TaskStep:
+    def step(self, state: State, step: task.Step) -> task.TaskStep:
         truth = step.truth
         dt = self.config.control_dt
         offset = truth.ball_position - truth.paddle_position
@@ -196,10 +201,10 @@ class Catch(task.Task):
         in_time = contact < CATCH_SECONDS + 0.5 * dt
         caught = state.caught | (in_time & (rest_seconds > REST_SECONDS - 0.5 * dt))
 
-        is_low = offset[2] < -LOST_DEPTH
+        is_lost = task.is_beyond(self.config.limits, truth.ball_position, truth.paddle_position)
         hits_floor = truth.paddle_position[2] < FLOOR
         return task.TaskStep(
-            state=CatchState(
+            state=State(
                 fall=truth.ball_velocity[2],
                 offset=offset,
                 contact=contact,
@@ -213,7 +218,7 @@ class Catch(task.Task):
                 rest=(resting, speed),
                 action_rate=jnp.mean(jnp.square(step.action - step.last_action)),
             ),
-            ended=is_low | hits_floor,
+            ended=is_lost | hits_floor,
             metrics={"caught": caught},
         )
 

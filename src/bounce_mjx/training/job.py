@@ -24,7 +24,6 @@ import jax
 import numpy as np
 from rich.console import Console
 
-import bounce_mjx
 from bounce_mjx.config.user_code import import_flags
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
@@ -33,6 +32,7 @@ from bounce_mjx.interrupt import Interrupted, StopRequest
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.learning.registry import find_algorithm, own_algorithm
 from bounce_mjx.physics.convergence import solver_warning
+from bounce_mjx.resources import VERSION
 from bounce_mjx.runs import checkpoints, folders
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.files import writable
@@ -546,7 +546,7 @@ class Job:
             "seconds": self.clock.seconds,
             "device": self.device,
             "fresh_resets": fresh_resets,
-            "version": bounce_mjx.__version__,
+            "version": VERSION,
         }
 
     # Telling

@@ -278,9 +278,10 @@ class RandomizationConfig(StrictModel):
     @pydantic.field_validator("*", mode="before")
     @classmethod
     def _check_ends(cls, ends: Any, info: pydantic.ValidationInfo) -> Any:
-        """A range of each joint is two lists, and not a list of as many ranges."""
-        is_list = isinstance(ends, list | tuple)
-        if info.field_name in TERMS and is_list and len(ends) != 2:
+        """A range is two ends, and not one value; that of each joint is two lists, and not a list
+        of as many ranges."""
+        is_pair = isinstance(ends, list | tuple) and len(ends) == 2
+        if info.field_name in TERMS and ends is not None and not is_pair:
             raise ValueError(_is_no_range(info.field_name, ends))
         return ends
 

@@ -1,7 +1,7 @@
 """From the ranges of the randomisation to an episode's world, and from that to its physics."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -50,20 +50,25 @@ def check_overlap(
     mj_model: mujoco.MjModel,
     addresses: Addresses,
     terms: Iterable[str],
-    randomized: PhysicsParameters,
+    randomize: Callable[[jax.Array], PhysicsParameters],
 ) -> None:
-    """Refuses parameters of a `randomize` that change what a term changes: the world would say one
+    """Refuses a `randomize` whose parameters change what a term changes: the world would say one
     value, and the physics have the other.
 
     Args:
       mj_model: the model.
       addresses: of its parts.
       terms: names of the active terms.
-      randomized: what `randomize` returns; of its arrays, none is read.
+      randomize: key -> parameters; it is traced, and computes nothing.
 
     Raises:
-      UserError: a term and `randomize` change the same number of the model.
+      UserError: a term and `randomize` change the same number of the model, or it returns something
+        else than parameters.
     """
+    randomized = jax.eval_shape(randomize, jax.random.PRNGKey(0))
+    if not isinstance(randomized, PhysicsParameters):
+        returned = "None" if randomized is None else f"a {type(randomized).__name__}"
+        raise UserError(f"randomize returns {returned}; return a physics.PhysicsParameters")
     given = {name: value for name, value in randomized._asdict().items() if value is not None}
     places: dict[tuple[str, int], str] = {}
     for name in given:
@@ -127,26 +132,26 @@ def nominal_values(
       terms: names of the terms.
       addresses: of the model's parts, if they are known.
     """
-    model = own_parameters(mj_model, addresses)
-    num_joints = len(model.armature)
+    own = own_parameters(mj_model, addresses)
+    num_joints = len(own.armature)
     nominals = {}
     for name in terms:
         term = TERMS[name]
         value = term.nominal
         if value == MODEL:
-            value = _model_nominal(model, term)
+            value = _own_nominal(own, term)
         if value is not None:
             nominals[name] = np.broadcast_to(np.float64(value), term.shape(num_joints))
     return nominals
 
 
-def _model_nominal(model: PhysicsParameters, term: Term) -> Any:
+def _own_nominal(own: PhysicsParameters, term: Term) -> Any:
     """The model's own value of a term; None if the model lacks the parameter."""
     if term.operation != "restitution":
-        return getattr(model, term.parameter)
-    if model.contact_damping is None:
+        return getattr(own, term.parameter)
+    if own.contact_damping is None:
         return None
-    return restitution_of_damping(model.contact_damping, model.contact_stiffness)
+    return restitution_of_damping(own.contact_damping, own.contact_stiffness)
 
 
 def sample_world(
@@ -195,23 +200,23 @@ def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParamet
     physical_terms = [name for name in TERMS if name in world and TERMS[name].parameter]
     if not physical_terms:
         return PhysicsParameters()
-    model = own_parameters(mj_model)
+    own = own_parameters(mj_model)
     parameters = {}
     for name in physical_terms:
         term = TERMS[name]
-        parameters[term.parameter] = apply(term.operation, model, term.parameter, world[name])
+        parameters[term.parameter] = apply(term.operation, own, term.parameter, world[name])
     return PhysicsParameters(**parameters)
 
 
 def apply(
-    operation: Operation, model: PhysicsParameters, parameter: str, sampled: jax.Array
+    operation: Operation, own: PhysicsParameters, parameter: str, sampled: jax.Array
 ) -> jax.Array:
     """A physical parameter of an episode.
 
     Args:
       operation: how the sampled value changes the model's own; with "restitution", the sampled
         value is a restitution and the parameter is the contact's damping.
-      model: the model's own parameters.
+      own: the model's own parameters.
       parameter: name of the field of `PhysicsParameters`.
       sampled: the term's value, of its shape.
 
@@ -222,10 +227,10 @@ def apply(
         # `physics.edited` keeps the model's own limit where that is lower.
         return sampled
     if operation == "restitution":
-        if model.contact_stiffness is None:
+        if own.contact_stiffness is None:
             raise UserError(NO_PAIR)
-        return damping_of_restitution(sampled, model.contact_stiffness)
-    value = jnp.asarray(getattr(model, parameter), sampled.dtype)
+        return damping_of_restitution(sampled, own.contact_stiffness)
+    value = jnp.asarray(getattr(own, parameter), sampled.dtype)
     if operation == "scale":
         return value * sampled
     if operation == "add":
