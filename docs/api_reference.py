@@ -37,7 +37,7 @@ _SECTIONS = (
         "",
         "env.env.Env env.bounce_ball.BounceBall task.bounce.Config env.env.State "
         "world.observation.ObservationLayout world.observation.Kinematics "
-        "physics.parameters.PhysicsParameters",
+        "physics.parameters.PhysicsParameters physics.c_engine.CEngine",
     ),
     ("Batches of environments", "", "env.vector"),
     (
