@@ -1,7 +1,7 @@
 """Policies in the worlds of hidden robots: what identification buys.
 
     python benchmarks/identify.py --seeds 0-19 --logs LOGS
-    python train_jax.py --warm-start robust_small --config finetune --world LOGS/0.yaml
+    python train_jax.py robust_small --config finetune --world LOGS/0.yaml
     python benchmarks/identified_training.py --seed 0 --policies RUN robust
 
 The first command writes the log and the identified world of each robot of benchmarks/identify.py.

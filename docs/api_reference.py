@@ -81,13 +81,15 @@ _SECTIONS = (
         "",
         "training.run.train training.run.Run training.events.Event training.events.Callback "
         "training.video.EvaluationVideo training.job.train training.ppo_trainer.PPOTrainer "
-        "training.trainer.Trainer training.trainer.Snapshot learning.ppo.PPO learning.ppo.Samples "
+        "training.trainer.Trainer training.trainer.Snapshot learning.algorithm.Algorithm "
+        "learning.ppo.PPO learning.ppo.Samples "
         "learning.policy.ActionDistribution learning.policy.NetworkFunctions "
         "learning.statistics.normalize",
     ),
     (
         "Adapters",
         "",
+        "deploy.environments.environment "
         "adapters.gymnasium.environments.TaskEnv adapters.gymnasium.environments.TaskVectorEnv "
         "adapters.sb3.Sb3VecEnv adapters.torch.vector_env.TorchVectorEnv "
         "adapters.torch.vector_env.StepResult adapters.torch.rsl_rl_env.RslRlVecEnv "

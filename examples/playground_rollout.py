@@ -14,7 +14,7 @@ import jax
 import mediapy
 from mujoco_playground import registry, wrapper
 
-from bounce_mjx import Run
+from bounce_mjx import Run, environment
 from bounce_mjx.adapters.playground import PlaygroundBounceBall
 from bounce_mjx.viewers.video import find_ffmpeg
 
@@ -31,8 +31,8 @@ def main(
     num_envs: int = 4,
 ) -> jax.Array:
     """Bounces the ball in several worlds and films the first; the final heights [B], m."""
-    overrides = {"task.target_height_range": [TARGET_HEIGHT, TARGET_HEIGHT]}
-    env = PlaygroundBounceBall(policy=policy, config_overrides=overrides)
+    task = environment(policy=policy, target_height_range=(TARGET_HEIGHT, TARGET_HEIGHT))
+    env = PlaygroundBounceBall(task)
     randomization_rng = jax.random.split(jax.random.PRNGKey(0), num_envs)
     randomization_fn = functools.partial(
         registry.get_domain_randomizer("BounceBall"), rng=randomization_rng

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import optax
 from flax import linen as nn
 
+from bounce_mjx import environment
 from bounce_mjx.adapters.gymnax_env import EnvState, PureJaxRLBounceBall
 
 GAMMA = 0.98
@@ -25,7 +26,7 @@ NUM_MINIBATCHES = 8
 # A reward is up to 12 a step, which would be large for the value network.
 REWARD_SCALE = 0.1
 
-env = PureJaxRLBounceBall()
+env = PureJaxRLBounceBall(environment())
 network = nn.Sequential([nn.Dense(128), nn.tanh, nn.Dense(env.num_actions + 1)])
 tx = optax.adam(LEARNING_RATE)
 

@@ -12,6 +12,7 @@ import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
+from bounce_mjx import environment
 from bounce_mjx.adapters.sb3 import Sb3VecEnv
 
 parser = argparse.ArgumentParser(description=__doc__)
@@ -39,7 +40,9 @@ def learning_rate(progress_remaining: float) -> float:
 
 
 # Most failures come in the first second; short episodes have more first seconds to learn from.
-train_envs = VecNormalize(Sb3VecEnv(arguments.num_envs, max_episode_steps=400), gamma=GAMMA)
+train_envs = VecNormalize(
+    Sb3VecEnv(environment(), arguments.num_envs, max_episode_steps=400), gamma=GAMMA
+)
 model = PPO(
     "MlpPolicy",
     train_envs,

@@ -7,6 +7,7 @@ import argparse
 
 from sbx import PPO
 
+from bounce_mjx import environment
 from bounce_mjx.adapters.sb3 import Sb3VecEnv
 
 parser = argparse.ArgumentParser(description=__doc__)
@@ -22,7 +23,7 @@ def learning_rate(progress_remaining: float) -> float:
 
 model = PPO(
     "MlpPolicy",
-    Sb3VecEnv(arguments.num_envs),
+    Sb3VecEnv(environment(), arguments.num_envs),
     n_steps=32,
     batch_size=8 * arguments.num_envs,
     n_epochs=4,

@@ -1,6 +1,6 @@
 """PPO with a loss term of one's own: close observations have close actions (CAPS, Mysore 2021).
 
-`bounce-mjx train --algorithm examples/smooth_ppo.py:SmoothPPO --smoothness-cost 0.02`
+`bounce-mjx train --import examples/smooth_ppo.py --algorithm smoothppo --smoothness-cost 0.02`
 """
 
 import jax

@@ -27,6 +27,7 @@ import pytest
 import tiny_runs
 from bounce_mjx import BounceBall
 from bounce_mjx.commands.main import main
+from bounce_mjx.config import user_code
 from bounce_mjx.errors import UserError
 from bounce_mjx.robot.model import load_model
 from bounce_mjx.task.bounce import Config as EnvConfig
@@ -154,6 +155,13 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
     )
     assert done.returncode == 0, done.stdout
     return True
+
+
+@pytest.fixture(autouse=True)
+def _no_code_of_another_test(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a process of a user's, two files may not have classes of one name."""
+    monkeypatch.setattr(user_code, "_sources", {})
+    monkeypatch.setattr(user_code, "_command", [])
 
 
 @pytest.fixture

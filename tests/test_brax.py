@@ -55,7 +55,7 @@ def test_folder_without_a_checkpoint_gives_one_sentence(tmp_path):
 
 
 def test_unknown_settings_are_refused():
-    with pytest.raises(UserError, match="bounce_ball: unknown key debug"):
+    with pytest.raises(UserError, match="unexpected keyword argument 'debug'; give"):
         brax.envs.get_environment("bounce_ball", debug=True)
 
 

@@ -19,7 +19,7 @@ from bounce_mjx.config.command_line import flags_of, parse
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import choose_checkpoint
-from bounce_mjx.runs.settings import Choice, read_preset, stack
+from bounce_mjx.runs.settings import Choice, read_layers, read_preset
 from bounce_mjx.training.command import fields_of_command
 from bounce_mjx.viewers.simulation import Simulation
 from tiny_runs import STEPS, TINY, TRAIN_SCRIPT, shared_run
@@ -51,7 +51,12 @@ MISTAKES = (
         "shorter rollout",
     ),
     ("train --action-scale nan", "--action-scale is nan", "a finite number"),
-    ("train --config a.yaml --resume b", "config and resume cannot be combined"),
+    ("train {run} --config a.yaml", "has its config, with which it is resumed"),
+    ("train --resume b", "the run to resume is the first word: bounce-mjx train b"),
+    ("train --task=catch", "the task is the first word: bounce-mjx train catch"),
+    ("train --seed 3 catch", "catch is what the training begins with; give it first"),
+    ("train cach", "no task, policy or run cach; did you mean catch?"),
+    ("train robust_small --warm-start robust", "are two policies; leave one out"),
     ("train --config a.yaml", "a.yaml", "No such file", "configs/default.yaml"),
     ("train --config nope", "no preset is named nope", "cpu, default, finetune"),
     ("train --robot nope", "no robot is named nope", "iiwa, panda, peitian, ur5e"),
@@ -65,7 +70,9 @@ MISTAKES = (
     ("export robst_small", "no policy robst_small; did you mean robust_small?"),
     ("play ur5", "no policy ur5; did you mean ur5e?"),
     ("train --warm-start robust_smal", "did you mean robust_small?"),
-    ("train --resume latst", "there is no checkpoint folder latst; did you mean latest?"),
+    ("train latst", "there is no task, policy or run latst; did you mean latest?"),
+    ("eval --import", "--import needs a file or a module"),
+    ("eval --import no.py", "no.py cannot be read (", "give --import FILE.py"),
     ("eval pretrained --robot ur5e", "give mirror"),
     ("eval pretrained --log-dir typo", "--log-dir is where the newest run is looked for, and pret"),
     ("robustness mirror --log-dir typo", "and mirror is named; omit one of them"),
@@ -102,11 +109,11 @@ MISTAKES = (
     ("train --warm-start robust", "without its value network; give robust_small"),
     ("train --warm-start robust_small --hidden-layers 8", "other hidden layers"),
     ("train --warm-start robust_small --observation.action 1", "another observation"),
-    ("train --warm-start robust_small --robot ur5e", "warm_start and robot"),
+    ("train --warm-start robust_small --robot ur5e", "a warm start and a robot cannot be"),
     ("train --warm-start nowhere", "there is no checkpoint folder nowhere; give a run"),
-    ("train --resume {run} --warm-start robust_small", "--resume cannot change warm_start"),
-    ("train --resume {run} --reward.height.weight 1", "cannot change env.reward.height.weight;"),
-    ("train --resume {run} --block-steps 128", "cannot change block_steps;", "leave those flags"),
+    ("train {run} --warm-start robust_small", "has its warm_start", "--warm-start {run}"),
+    ("train {run} --reward.height.weight 1", "cannot change env.reward.height.weight;"),
+    ("train {run} --block-steps 128", "cannot change block_steps;", "leave those out"),
     ("identify", "no log is given"),
     ("identify nowhere.csv", "the log nowhere.csv cannot be read"),
     ("identify x.csv --check nowhere.yaml", "nowhere.yaml"),
@@ -129,7 +136,8 @@ def test_a_mistake_is_one_sentence(refused: Refuse, monkeypatch, case: tuple[str
     """Before anything is compiled."""
     monkeypatch.setattr(Simulation, "__init__", None)
     line, *words = case
-    refused(line.format(run=shared_run() if "{run}" in line else None), *words)
+    run = shared_run() if "{run}" in line else None
+    refused(line.format(run=run), *(word.format(run=run) for word in words))
 
 
 ALIASES = b"a0: &a0 [1, 2]\n" + b"".join(
@@ -210,7 +218,7 @@ def test_log_dir_that_cannot_be_made(refused: Refuse, tmp_path: Path, log_dir: s
     ("item", "line"),
     [
         ("policy", f"eval run/checkpoints/{STEPS}"),
-        ("training", "train --resume run --total-steps 512"),
+        ("training", "train run --total-steps 512"),
     ],
 )
 def test_damaged_checkpoint_is_refused(refused: Refuse, run: Path, item: str, line: str) -> None:
@@ -240,19 +248,18 @@ def test_the_help_of_a_training_is_one_screen_and_the_whole_help_has_every_flag(
     assert "--num-envs INT          Environments that run in parallel (default: 512)" in pages[0]
     shown = {*re.findall(r"^  (--[\w.-]+)", pages[1], re.MULTILINE)}
     shown |= {*re.findall(r"^  --.+, (--no-[\w.-]+)", pages[1], re.MULTILINE)}
-    known = {*flags_of(fields_of_command(stack(Choice())))}
+    known = {*flags_of(fields_of_command(read_layers(Choice())))}
     assert shown == known
     assert pages[1].index("\nppo:\n") < pages[1].index("--learning-rate FLOAT")
 
 
 def test_a_default_with_a_percent_sign_is_shown(tmp_path: Path, capsys) -> None:
-    """In the path of a task, for example."""
+    """In a path, for example."""
     folder = tmp_path / "50%"
-    folder.mkdir()
-    task = shutil.copy(Path(__file__).parents[1] / "examples/dribble_task.py", folder / "t.py")
+    shutil.copytree(resource_path("pretrained/robust_small"), folder)
     with pytest.raises(SystemExit):
-        console_script(["train", "--task", f"{task}:Dribble", "--help-all"])
-    assert "50%/t.py:Dribble)" in re.sub(r"\s", "", capsys.readouterr().out)
+        console_script(["train", "--warm-start", str(folder), "--help-all"])
+    assert "50%/checkpoints" in re.sub(r"\s", "", capsys.readouterr().out)
 
 
 def test_presets_are_valid() -> None:

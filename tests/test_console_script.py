@@ -218,7 +218,7 @@ print(*sorted(set(bounce_mjx.__all__) & set(dir(bounce_mjx))))
     done = subprocess.run(
         [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True
     )
-    names = "BounceBall EnvConfig Run __version__ load_policy train"
+    names = "BounceBall EnvConfig Run __version__ environment import_code load_policy train"
     assert done.stdout.splitlines() == ["False", "fused", names], done.stderr
 
 

@@ -18,6 +18,7 @@ import onnxruntime
 import pytest
 
 from bounce_mjx import BounceBall, EnvConfig, load_policy
+from bounce_mjx.config.user_code import import_code
 from bounce_mjx.deploy.export import export_onnx, policy_metadata
 from bounce_mjx.deploy.graph import onnx_graph
 from bounce_mjx.deploy.metadata import (
@@ -529,9 +530,9 @@ class Forgetful(Track):
 
 def test_a_task_need_not_look_at_its_last_quantities(tmp_path: Path) -> None:
     (tmp_path / "forgetful.py").write_text(FORGETFUL, encoding="utf-8")
-    name = f"{tmp_path / 'forgetful.py'}:Forgetful"
-    run = make_run(tmp_path / "run", {"observation": {"ball_position": 2}, **LEVEL}, name)
-    policy = load_policy(run, task=name)
+    import_code(tmp_path / "forgetful.py")
+    run = make_run(tmp_path / "run", {"observation": {"ball_position": 2}, **LEVEL}, "forgetful")
+    policy = load_policy(run)
     place = [part.name for part in policy.metadata.observation].index("aim")
     start = sum(part.history * part.size for part in policy.metadata.observation[:place])
     for step in range(3):

@@ -29,10 +29,11 @@ from bounce_mjx.commands import main as console_script
 from bounce_mjx.config import command_line as cli
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.config.settings import StrictModel, fields_in
+from bounce_mjx.config.user_code import import_code
 from bounce_mjx.errors import MissingPackage
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.settings import Choice, read_preset, stack
+from bounce_mjx.runs.settings import Choice, read_layers, read_preset
 from bounce_mjx.task import registry, term_names, weighted_terms
 from bounce_mjx.task.bounce import Bounce
 from bounce_mjx.task.bounce_rewards import RewardInputs, Rewards
@@ -141,7 +142,7 @@ def test_shown_commands_are_understood(command, monkeypatch: pytest.MonkeyPatch)
     # Playground's own program reads its flags.
     if not args or args == ["--help"] or name == "bounce_mjx.adapters.playground":
         return
-    for flag in {"--resume", "--robot", "--world"} & set(args):  # their files would have to exist
+    for flag in {"--import", "--robot", "--world"} & set(args):  # their files would have to exist
         at = args.index(flag)
         args = args[:at] + args[at + 2 :]
     # A module that the command imports below would keep the changed function.
@@ -179,15 +180,16 @@ def test_shown_commands_are_understood(command, monkeypatch: pytest.MonkeyPatch)
 def known_flags() -> set[str]:
     """The flags of every command of the package, and of the maintainers' one."""
     ship = runpy.run_path(str(CHECKOUT / "benchmarks/ship.py"))
-    flags = {"--help", "--help-all", *cli.flags_of(fields_in(ship["ShipCommand"]))}
-    flags |= set(cli.flags_of(fields_of_command(stack(Choice()))))
+    flags = {"--help", "--help-all", "--import", *cli.flags_of(fields_in(ship["ShipCommand"]))}
+    flags |= set(cli.flags_of(fields_of_command(read_layers(Choice()))))
     for info in pkgutil.iter_modules(commands_package.__path__):
         module = importlib.import_module(f"bounce_mjx.commands.{info.name}")
         for name, member in vars(module).items():
             is_command = inspect.isclass(member) and issubclass(member, StrictModel)
             if is_command and name.endswith("Command"):
                 flags |= set(cli.flags_of(fields_in(member)))
-    for task in (Bounce, find_task("examples/dribble_task.py:Dribble")):
+    import_code(CHECKOUT / "examples/dribble_task.py")
+    for task in (Bounce, find_task("dribble")):
         flags |= {f"--{name}".replace("_", "-") for name in task.Config().commands}
     return flags
 
@@ -396,7 +398,9 @@ def test_other_blocks_of_pages_are_what_they_say() -> None:
     assert tomllib.loads(package)["project"]["entry-points"].keys() == {registry.GROUP}
     for program in examples("libraries.md", "py"):
         for line in ast.walk(ast.parse(program)):
-            if isinstance(line, ast.ImportFrom) and line.module.startswith("bounce_mjx"):
+            if isinstance(line, ast.ImportFrom) and line.module == "bounce_mjx":
+                assert {name.name for name in line.names} <= set(bounce_mjx.__all__)
+            elif isinstance(line, ast.ImportFrom) and line.module.startswith("bounce_mjx."):
                 source = CHECKOUT / "src" / f"{line.module.replace('.', '/')}.py"
                 defined = {
                     getattr(x, "name", "") for x in ast.parse(source.read_text("utf-8")).body
@@ -408,7 +412,8 @@ def test_new_term_of_the_rewards_page_is_a_term(tmp_path: Path) -> None:
     """The page's code, as a file of the user's."""
     (example,) = examples("task.md", "python")
     (tmp_path / "straight.py").write_text(example)
-    task = find_task(f"{tmp_path}/straight.py:Straight")
+    import_code(tmp_path / "straight.py")
+    task = find_task("straight")
     config = task.Config(reward={"sideways_velocity": {"weight": 2.0}}).reward
     names = [field.name for field in dataclasses.fields(RewardInputs) if field.name != "reward"]
     inputs = {name: np.zeros(3) for name in names}
@@ -430,7 +435,7 @@ def short_training(folder: Path) -> Callable:
     def train(*given, callbacks=(), **settings):
         calls.append(settings)
         if len(calls) > 1:  # the page's sweep
-            config = stack(Choice()).config(settings)
+            config = read_layers(Choice()).config(settings)
             assert not notes_on_starts(config)
             return config
         return real(*given, callbacks=callbacks, **settings | short, log_dir=folder)

@@ -15,6 +15,7 @@ import pytest
 from rich.console import Console
 
 from bounce_mjx import BounceBall, EnvConfig
+from bounce_mjx.config.user_code import import_code
 from bounce_mjx.env.env import Env, Redraw, State
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import c_episodes, policy_evaluation
@@ -37,7 +38,7 @@ from bounce_mjx.task.registry import find_task
 AUTORESET = int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
 BOUNCES, HORIZONTAL, HEIGHT, SPEED, STABLE = range(5)
 TARGET_X = 0.58856
-DRIBBLE = f"{Path(__file__).parent.parent / 'examples' / 'dribble_task.py'}:Dribble"
+DRIBBLE = Path(__file__).parent.parent / "examples" / "dribble_task.py"
 METRICS = "bounced", "n_bounces", "apex_error", "apex_offset"
 
 
@@ -426,7 +427,8 @@ def test_worlds_and_commands_are_those_of_the_training_or_of_the_options(monkeyp
 
 @pytest.fixture(scope="module")
 def dribbling() -> Env:
-    return Env(find_task(DRIBBLE).Config(ball_init_pos=(0.6, 0.0, 0.2)))
+    import_code(DRIBBLE)
+    return Env(find_task("dribble").Config(ball_init_pos=(0.6, 0.0, 0.2)))
 
 
 @pytest.mark.slow

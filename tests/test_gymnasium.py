@@ -213,7 +213,7 @@ def test_wrong_arguments_and_options_give_one_sentence(vectorised):
     ):
         with pytest.raises(UserError, match=sentence):
             vectorised.reset(options=options)
-    single = environments.TaskEnv()
+    single = environments.make_env()
     for env, option in ((vectorised, "target_hight"), (single, "reset_mask")):
         with pytest.raises(TypeError, match=f"unexpected option '{option}'"):
             env.reset(options={option: np.ones(1, bool)})
@@ -236,8 +236,8 @@ def test_spaces_and_attributes(single, vectorised):
 
 def test_equal_environments_share_their_programs():
     first, second = make_vec(), make_vec(AutoresetMode.SAME_STEP)
-    assert first.task is second.task
-    assert first.task is not make_vec(physics_dt=0.002).task
+    assert first._batch.programs is second._batch.programs
+    assert first._batch.programs is not make_vec(physics_dt=0.002)._batch.programs
 
 
 def test_returned_arrays_belong_to_the_user(vectorised):
@@ -323,7 +323,7 @@ print(env.render().shape)
 
 
 def test_use_before_reset_or_with_a_wrong_action_gives_one_sentence(vectorised):
-    single, vector = environments.TaskEnv(episode_seconds=0.01), make_vec()
+    single, vector = environments.make_env(episode_seconds=0.01), make_vec()
     for env in (single, vector):
         with pytest.raises(UserError, match="before its reset") as caught:
             env.step(env.action_space.sample())
@@ -409,7 +409,7 @@ def test_skrl_wraps_the_vector(need, opengl, vectorised):
 
 
 def test_process_forked_after_jax_ran_refuses_to_hang(monkeypatch):
-    env = environments.TaskEnv()
+    env = environments.make_env()
     monkeypatch.setattr(batch, "_jax_process", 1)
     with pytest.raises(UserError, match='set_start_method."forkserver".*context="forkserver"'):
         env.reset()

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from bounce_mjx import environment
 from bounce_mjx.adapters.gymnax_env import GymnaxBounceBall, PureJaxRLBounceBall
 from bounce_mjx.errors import UserError
 
@@ -19,7 +20,9 @@ LIMIT = 3
 
 @pytest.fixture(scope="module")
 def env() -> PureJaxRLBounceBall:
-    return PureJaxRLBounceBall(episode_seconds=0.01 * LIMIT, target_height_range=(0.4, 0.6))
+    return PureJaxRLBounceBall(
+        environment(episode_seconds=0.01 * LIMIT, target_height_range=(0.4, 0.6))
+    )
 
 
 @pytest.fixture
@@ -82,10 +85,10 @@ def test_spaces_and_settings(env, gymnax):
     actions = jax.vmap(env.action_space().sample)(jax.random.split(jax.random.key(0), 100))
     assert actions.shape == (100, 6) and np.ptp(actions) > 1.9
     assert env.action_space().contains(actions) and not env.action_space().contains(2.0 * actions)
-    with pytest.raises(UserError, match="unknown key target_hight_range"):
-        GymnaxBounceBall(target_hight_range=(0.3, 0.4))
+    with pytest.raises(UserError, match="'target_hight_range'; did you mean target_height_range"):
+        environment(target_hight_range=(0.3, 0.4))
     with pytest.raises(UserError, match="reward.heigth; did you mean reward.height"):
-        GymnaxBounceBall(reward={"heigth": {"weight": 2.0}})
+        environment(reward={"heigth": {"weight": 2.0}})
     # NumPy's rules would give every joint the one number.
     state = jax.eval_shape(env.reset, jax.random.key(0))[1]
     for wrong in (jnp.zeros(()), jnp.zeros(1), jnp.zeros((2, 6))):
@@ -94,7 +97,7 @@ def test_spaces_and_settings(env, gymnax):
 
 
 def test_gymnax_own_wrapper_logs_episodes(gymnax):
-    wrapped = gymnax.LogWrapper(GymnaxBounceBall(episode_seconds=0.02))
+    wrapped = gymnax.LogWrapper(GymnaxBounceBall(environment(episode_seconds=0.02)))
     _, state = wrapped.reset(jax.random.key(0))
     rewards = []
     for i in range(2):

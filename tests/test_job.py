@@ -9,6 +9,7 @@ import json
 import os
 import shutil
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -19,10 +20,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from bounce_mjx.config.user_code import import_code
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.interrupt import Interrupted
 from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.ppo import PPO
 from bounce_mjx.runs import checkpoints
 from bounce_mjx.runs.checkpoints import policy_shapes, read_networks, read_policy, read_record
 from bounce_mjx.runs.config import TrainConfig, load_run_config
@@ -35,7 +38,7 @@ from bounce_mjx.runs.folders import (
     named_run,
     stored_checkpoints,
 )
-from bounce_mjx.runs.settings import Choice, stack
+from bounce_mjx.runs.settings import Choice, read_layers
 from bounce_mjx.training import hosts, job, saving
 from bounce_mjx.training.events import Event
 from bounce_mjx.training.faults import first_block_fault
@@ -143,13 +146,18 @@ def train(
     given = {"block_steps": BLOCK, "eval_every": BLOCK, "total_steps": BLOCK * max(returns)}
     given |= {"stop_when_solved": False} | settings
     config = TrainConfig(ppo=ppo, **given).model_copy(update={"log_dir": log_dir})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PPO, "make_trainer", staticmethod(trainer))
+        return _run_of(config, resume, callbacks, said, scores(returns, margins or {}, screening))
+
+
+def _run_of(config: TrainConfig, resume, callbacks, said, evaluators) -> Path:
     members = job.train(
         config,
         Console(file=said or io.StringIO()),
         resume=resume,
         callbacks=callbacks,
-        make_trainer=trainer,
-        make_evaluators=scores(returns, margins or {}, screening),
+        make_evaluators=evaluators,
     )
     return members[0].run if len(members) == 1 else members[0].run.parent
 
@@ -231,6 +239,52 @@ def test_a_state_is_saved_between_evaluations_where_save_every_asks_for_it(
     assert evaluated_steps(run) == [3 * BLOCK, 6 * BLOCK]
 
 
+OWN_TRAINER = """
+from bounce_mjx.learning.algorithm import Algorithm
+from bounce_mjx.learning.config import PPOConfig
+from test_job import CountingTrainer
+
+class Counting(Algorithm):
+    class Config(PPOConfig):
+        start_steps: int = 8
+        "Steps of random actions."
+
+        @property
+        def batch_steps(self):
+            return 32
+
+    @classmethod
+    def make_trainer(cls, config, env):
+        assert config.ppo.start_steps == 8
+        return CountingTrainer(config, env)
+"""
+
+
+def test_an_algorithm_brings_its_own_trainer(tmp_path: Path, monkeypatch) -> None:
+    """By its name, with its own settings and steps, and it is resumed as PPO is."""
+    (tmp_path / "counting.py").write_text(OWN_TRAINER)
+    import_code(tmp_path / "counting.py")
+    monkeypatch.setitem(sys.modules, "test_job", sys.modules[__name__])
+    choice = Choice(algorithm="counting", config=())
+    said = {"num_envs": 8, "rollout_length": 8, "num_minibatches": 2, "hidden_layers": (4,)}
+    said |= {"block_steps": 64, "eval_every": 64, "total_steps": 128, "log_dir": tmp_path / "runs"}
+    config = read_layers(choice).config(said | {"stop_when_solved": False})
+    scores = Scores({1: 5.0, 2: 9.0, 3: 7.0}, {}, False)
+    run = _run_of(config, None, (), io.StringIO(), scores)
+    assert (config.ppo.start_steps, config.iterations_per_block) == (8, 2)
+    assert results_of(run)["best_steps"] == 128 and (run / "algorithm/counting.py").exists()
+    longer = read_layers(Choice(start=str(run))).config({"total_steps": 192})
+    _run_of(longer, run, (), io.StringIO(), scores)
+    assert evaluated_steps(run) == [64, 128, 192]
+    (tmp_path / "without.py").write_text(
+        "from bounce_mjx.learning.algorithm import Algorithm\nclass Without(Algorithm):\n    pass"
+    )
+    import_code(tmp_path / "without.py")
+    config = read_layers(Choice(algorithm="without")).config(said)
+    with pytest.raises(UserError, match="the algorithm Without has no make_trainer"):
+        _run_of(config, None, (), io.StringIO(), scores)
+
+
 def test_a_history_of_checkpoints_stays_where_it_is_asked_for(tmp_path: Path) -> None:
     """In addition to the best one; what was trained after one that is resumed counts no more."""
 
@@ -293,7 +347,7 @@ def test_a_training_stops_once_its_results_have_a_margin(tmp_path: Path) -> None
     assert f"{run} has met all results, 192 steps; add --total-steps N" in shown.getvalue()
     # Results are not needed to resume.
     (run / "results.json").write_text("damaged")
-    layers = stack(Choice(resume=run))
+    layers = read_layers(Choice(start=str(run)))
     going_on = layers.config({"total_steps": 10**6})
     assert not going_on.stop_when_solved
     assert going_on.sources["stop_when_solved"] == going_on.sources["total_steps"] == "train"
@@ -347,7 +401,7 @@ def test_a_callback_sees_blocks_and_evaluations_and_ends_the_training(tmp_path: 
 
     said = io.StringIO()
     run = train(tmp_path, {1: 5.0, 2: 9.0, 3: 7.0}, callbacks=[Tracker()], said=said)
-    ends = "a callback ended the training after 128 steps; continue with: bounce-mjx train --resume"
+    ends = "a callback ended the training after 128 steps; continue with: bounce-mjx train "
     assert ends in said.getvalue()
     # The first block, during which other programs are compiled, says nothing about those to come.
     blocks = [line for line in said.getvalue().splitlines() if "steps/s" in line]
@@ -412,7 +466,7 @@ def test_a_signal_saves_and_says_how_to_resume(tmp_path: Path, number: signal.Si
     # None is begun whose end nobody waits for.
     assert num_evaluations == 1
     (run,) = tmp_path.iterdir()
-    continues = f"stopped after 128 steps; continue with: bounce-mjx train --resume {run}"
+    continues = f"stopped after 128 steps; continue with: bounce-mjx train {run}"
     assert continues in str(stopped.value)
     assert latest_checkpoint(run).steps == 2 * BLOCK
     train(tmp_path, RETURNS, run)
@@ -588,7 +642,7 @@ def test_a_training_that_ends_without_room_says_so(tmp_path: Path, monkeypatch) 
         sentence = (
             r"\(No space left on device\), so the end of the training is lost; make room, and"
         )
-        with pytest.raises(UserError, match=f"{sentence} continue with: bounce-mjx train --resume"):
+        with pytest.raises(UserError, match=f"{sentence} continue with: bounce-mjx train "):
             train(tmp_path, {1: 5.0, 2: 9.0, 3: 7.0})
     (run,) = tmp_path.iterdir()
     assert iterations_of(latest_checkpoint(run)) == 1
@@ -757,7 +811,7 @@ def test_a_device_that_fails_is_told_with_the_last_checkpoint(tmp_path: Path) ->
     (run,) = tmp_path.iterdir()
     assert str(failed.value) == (
         "cpu failed after 128 steps (INTERNAL: CUDA_ERROR_UNKNOWN in a graph); continue with: "
-        f"bounce-mjx train --resume {run} (the last checkpoint is {run}/checkpoints/128)"
+        f"bounce-mjx train {run} (the last checkpoint is {run}/checkpoints/128)"
     )
 
 
@@ -823,4 +877,4 @@ def test_a_solved_run_goes_on_with_more_steps_also_beside_a_seed_that_diverged(
     settings = {"num_seeds": SEEDS, "stop_when_solved": True, "margins": {1: 1.0}}
     run = train(tmp_path, RETURNS, trainer=DivergingAtOnce, **settings)
     assert evaluated_steps(run / "seed_000") == [64]
-    assert not stack(Choice(resume=run)).config({"total_steps": 10**6}).stop_when_solved
+    assert not read_layers(Choice(start=str(run))).config({"total_steps": 10**6}).stop_when_solved

@@ -49,7 +49,7 @@ VALUES = {
     "env.randomization.shares": {"restitution": 0.5}, "env.randomization.warmup_steps": 1000,
     "env.reward.target_y": 0.1, "ppo.training_episode_seconds": 3.0, "ppo.entropy_cost": 0.01,
     "ppo.critic_metrics": ["ball_xy_error"], "ppo.hidden_layers": [8], "ppo.critic_layers": [8],
-    "algorithm": "own.py:Own",
+    "algorithm": "own",
     "ppo.min_learning_rate": 2e-5, "env.randomization.camera_rate": [60, 90],
     "env.randomization.command_interval": [1, 2], "env.physics": "mjx", "ppo.decay_steps": 1000,
 }  # fmt: skip

@@ -22,8 +22,8 @@ from mujoco_playground import manipulation, registry, wrapper
 from mujoco_playground._src import mjx_env
 from mujoco_playground.config import manipulation_params
 
+from bounce_mjx.adapters import playground  # noqa: F401
 from bounce_mjx.adapters.gymnasium.registration import TASKS
-from bounce_mjx.adapters.playground import PlaygroundBounceBall
 from bounce_mjx.task.registry import find_task
 
 ENV_NAME = "BounceBall"
@@ -118,7 +118,7 @@ def test_torchrl_wraps_playgrounds_environment(need):
 
 def test_wrong_settings_of_playground_give_one_sentence():
     with pytest.raises(UserError, match="control_dt"):
-        PlaygroundBounceBall(config_overrides={"ctrl_dt": 0.0})
+        registry.load(ENV_NAME, config_overrides={"ctrl_dt": 0.0})
 
 
 def test_playground_renders_states(opengl):

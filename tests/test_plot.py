@@ -116,9 +116,8 @@ def test_runs_that_differ_in_the_seed_are_one_group(runs: list[Path]) -> None:
 def test_a_sweep_of_an_own_algorithms_setting_is_several_groups(tmp_path: Path) -> None:
     """Though its code is not run."""
     runs = []
-    algorithm = f"{CHECKOUT / 'examples/smooth_ppo.py'}:SmoothPPO"
     for cost in (0.02, 0.2):
-        config = TrainConfig(algorithm=algorithm)
+        config = TrainConfig(algorithm="smoothppo")
         run = write_run(tmp_path / str(cost), config, {"episode/return": {1: 1.0}})
         path = run / "config.yaml"
         path.write_text(path.read_text().replace("ppo:\n", f"ppo:\n  smoothness_cost: {cost}\n"))

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bounce_mjx import BounceBall, Run, load_policy
+from bounce_mjx import BounceBall, Run, environment, load_policy
 from bounce_mjx.adapters.gymnasium.registration import ENV_ID, TASK_ID
 from bounce_mjx.config.files import dump_config
-from bounce_mjx.deploy.environments import policy_environment
+from bounce_mjx.deploy.environments import environment_config
 from bounce_mjx.deploy.export import policy_metadata
 from bounce_mjx.deploy.interface import interface_in, interface_of
 from bounce_mjx.deploy.metadata import from_entries, to_entries
@@ -217,7 +217,7 @@ def test_a_wrapper_of_brax_that_repeats_an_action_is_refused(need) -> None:
     from bounce_mjx.adapters.brax import BraxBounceBall
 
     run = Run("pretrained")
-    for env in (BounceBall(), BraxBounceBall()):
+    for env in (BounceBall(), BraxBounceBall(environment())):
         assert run.policy_in(training.wrap(env, 100))
         with pytest.raises(UserError, match="EpisodeWrapper may change .* the control step"):
             run.policy_in(training.wrap(env, 100, action_repeat=4))
@@ -236,9 +236,10 @@ def _make(library: str, need, **settings):
         case "wrapped":
             return gymnasium.wrappers.RecordEpisodeStatistics(gymnasium.make(TASK_ID, **settings))
         case "sb3":
-            return _adapter("sb3", "Sb3VecEnv", need, "stable_baselines3")(2, **settings)
+            wrap = _adapter("sb3", "Sb3VecEnv", need, "stable_baselines3")
+            return wrap(environment(**settings), 2)
         case "torch":
-            return _adapter("torch", "TorchVectorEnv", need, "torch")(num_envs=2, **settings)
+            return _adapter("torch", "TorchVectorEnv", need, "torch")(environment(**settings), 2)
         case "rsl_rl":
             wrap = _adapter("torch.rsl_rl_env", "RslRlVecEnv", need, "torch", "rsl_rl")
             return wrap(_make("torch", need, **settings))
@@ -246,11 +247,11 @@ def _make(library: str, need, **settings):
             wrap = _adapter("torch.skrl_env", "SkrlEnv", need, "torch", "skrl")
             return wrap(_make("torch", need, **settings))
         case "brax":
-            return _adapter("brax", "BraxBounceBall", need)(**settings)
+            return _adapter("brax", "make_env", need)(**settings)
         case "gymnax":
-            return _adapter("gymnax_env", "GymnaxBounceBall", need)(**settings)
+            return _adapter("gymnax_env", "GymnaxBounceBall", need)(environment(**settings))
         case "playground":
-            make = _adapter("playground", "PlaygroundBounceBall", need, "mujoco_playground")
+            make = _adapter("playground.environment", "make_env", need, "mujoco_playground")
             return make(**settings)
 
 
@@ -290,7 +291,7 @@ def test_every_library_gets_the_environment_of_the_policy(name: str, slow_run: P
         assert steps in (None, round(20.0 / trained.control_dt)), library
         with pytest.raises(UserError, match="is of another environment"):
             Run(policy).policy_in(_make(library, need))
-    assert policy_environment(policy, world="training").randomization.terms == (
+    assert environment_config(policy=policy, world="training").randomization.terms == (
         trained.randomization.terms
     )
 
@@ -319,7 +320,10 @@ def test_a_policy_refuses_another_environment(slow_run: Path) -> None:
         (lambda: load_policy("ur5e", env=BounceBall()), "its robot is ur5e, there AIR4-560"),
         (lambda: load_policy("robust").step(np.zeros(29)), r"load_policy\(..., env=env\)"),
         (lambda: gymnasium.make(TASK_ID, policy="robusst"), "did you mean robust"),
-        (lambda: gymnasium.make(TASK_ID, world="training"), "none is given; give policy"),
+        (
+            lambda: gymnasium.make(TASK_ID, world="training"),
+            "the world training is that of a policy; give",
+        ),
         (lambda: Run("pretrained").policy_in(3), "int holds no environment of bounce_mjx"),
     ):
         with pytest.raises(UserError, match=words):
@@ -337,9 +341,10 @@ def test_a_setting_without_an_effect_is_refused(library: str, need) -> None:
     warmup = {"randomization": config.randomization}
     match library:
         case "torch" | "rsl_rl" | "skrl":
-            env = BounceBall(config)
-            assert environments_in(_make(library, need, env=env)) == [env]
-            refused = [({"env": env, "world": "training"}, "env and world both say")]
+            # They count the steps.
+            (env,) = environments_in(_make(library, need, start=config))
+            assert env.config == config
+            refused = []
         case "playground":
             make_config = _adapter(
                 "playground.environment", "default_config", need, "mujoco_playground"
@@ -390,7 +395,7 @@ def test_an_exported_file_brings_the_whole_environment(tmp_path: Path, monkeypat
         again = type(config.env).model_validate(metadata.environment)
         assert again == config.env, name
     with pytest.raises(UserError, match="an earlier version exported it"):
-        policy_environment(_without_environment(tmp_path))
+        environment_config(policy=_without_environment(tmp_path))
 
 
 def _without_environment(folder: Path) -> Path:

@@ -12,6 +12,8 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from bounce_mjx import BounceBall, EnvConfig
+from bounce_mjx.config import user_code
+from bounce_mjx.config.user_code import import_code
 from bounce_mjx.env.env import State
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.episodes import make_evaluator
@@ -39,7 +41,8 @@ def recipe(name: str, folder: Path) -> type[ppo.PPO]:
     """The algorithm of that name on the page, found as `--algorithm` finds it."""
     (block,) = (block for block in RECIPES if f"class {name}(" in block)
     (folder / f"{name}.py").write_text(block)
-    return find_algorithm(f"{folder}/{name}.py:{name}")
+    import_code(folder / f"{name}.py")
+    return find_algorithm(name.lower())
 
 
 def point_of_the_page() -> type:
@@ -436,7 +439,8 @@ def some_samples(trainer, params) -> ppo.Samples:
 
 
 def test_the_examples_term_weighs_the_change_of_the_action(trainer, params):
-    name = f"{Path(__file__).parents[1] / 'examples/smooth_ppo.py'}:SmoothPPO"
+    import_code(Path(__file__).parents[1] / "examples/smooth_ppo.py")
+    name = "smoothppo"
     kind = find_algorithm(name)
     settings = kind.Config(**trainer.config.model_dump(), smoothness_cost=1e5)
     smooth, samples = kind(settings, trainer.env, 100), some_samples(trainer, params)
@@ -564,24 +568,23 @@ class Own(PPO):
 def test_settings_of_an_own_algorithm_are_keys(tmp_path):
     """A policy is read without them, and without the code."""
     (tmp_path / "own.py").write_text(OWN)
-    name = f"{tmp_path / 'own.py'}:Own"
-    flags = ["--config", "cpu", "--algorithm", name, "--own-cost", "2"]
+    import_code(tmp_path / "own.py")
+    flags = ["--config", "cpu", "--algorithm", "own", "--own-cost", "2"]
     config = read_command(flags, "cpu").config
     assert find_algorithm(config.algorithm)(config.ppo, BounceBall(), 100).config.own_cost == 2.0
     config = config.model_copy(update={"log_dir": tmp_path / "runs"})
     policy = jax.tree.map(lambda x: np.ones(x.shape, x.dtype), policy_shapes(config))
     run = write_run(config, 64, policy)
-    assert load_run_config(run, algorithm=name).ppo.own_cost == 2.0
+    assert load_run_config(run).ppo.own_cost == 2.0
+    user_code._sources.clear()
     without = load_run_config(run)
     assert not hasattr(without.ppo, "own_cost")
     jax.tree.map(
         np.testing.assert_array_equal, read_policy(latest_checkpoint(run), without), policy
     )
-    with pytest.raises(UserError, match=r"which is code; name it to run it: --algorithm /.+:Own"):
-        read_command(["--resume", str(run)])
-    with pytest.raises(UserError, match="has no subclass 'Other' of PPO"):
-        read_command(["--algorithm", name.replace("Own", "Other")])
-    with pytest.raises(UserError, match="there is no algorithm 'sac'; give ppo or FILE.py:CLASS"):
+    with pytest.raises(UserError, match=r"the algorithm own, whose code is .+/algorithm/own.py"):
+        read_command([str(run)])
+    with pytest.raises(UserError, match="there is no algorithm 'sac'; give ppo, or --import"):
         read_command(["--algorithm", "sac"])
 
 

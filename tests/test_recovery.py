@@ -50,7 +50,7 @@ def train(log_dir: Path, steps: int, *flags: str) -> Path:
 
 
 def resume(run: Path, *flags: str) -> None:
-    train_command.main(["--resume", str(run), "--no-report", *flags])
+    train_command.main([str(run), "--no-report", *flags])
 
 
 def evaluations(run: Path) -> list[dict]:
@@ -179,7 +179,7 @@ def test_killed_at_any_moment(tmp_path: Path, straight: Path) -> None:
             arrays(checkpoint)
             assert checkpoint.number >= saved
             saved = checkpoint.number
-            args = ["--resume", str(run)]
+            args = [str(run)]
         else:
             shutil.rmtree(log_dir, ignore_errors=True)
     assert saved > 64
@@ -269,7 +269,7 @@ def test_a_second_start_compiles_nothing_and_trains_the_same(
         training.process.send_signal(signal.SIGTERM)
         assert training.wait() == 0, training.said
     assert "Traceback" not in training.said
-    assert "continue with: bounce-mjx train --resume" in training.said
+    assert "continue with: bounce-mjx train " in training.said
     (first,) = (tmp_path / "first").iterdir()
     stopped = latest_checkpoint(first)
     args = [*flags, "--total-steps", stopped.number, "--log-dir", tmp_path / "second"]

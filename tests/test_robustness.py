@@ -12,6 +12,7 @@ from rich.console import Console
 
 from bounce_mjx import EnvConfig
 from bounce_mjx.commands import robustness as robustness_command
+from bounce_mjx.config.user_code import import_code
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import robustness
@@ -27,7 +28,7 @@ from bounce_mjx.task import Tally
 from bounce_mjx.task.registry import find_task
 from bounce_mjx.world.randomization import TERMS
 
-DRIBBLE = f"{Path(__file__).parent.parent / 'examples' / 'dribble_task.py'}:Dribble"
+DRIBBLE = Path(__file__).parent.parent / "examples" / "dribble_task.py"
 RESULTS = ("consecutive bounces", "horizontal position", "height", "upward speed", "stable")
 
 
@@ -398,7 +399,8 @@ def test_command_writes_its_results(measured, tmp_path: Path, monkeypatch, capsy
 @pytest.mark.slow
 def test_a_perturbation_of_one_task_is_skipped_for_others(tmp_path: Path) -> None:
     """The shipped suite runs for a task without its commands, whose own command has its limits."""
-    dribble = find_task(DRIBBLE).Config()
+    import_code(DRIBBLE)
+    dribble = find_task("dribble").Config()
     shipped, of_bounce = (
         load_suite(resource_path("configs/robustness.yaml"), config)
         for config in (dribble, EnvConfig())

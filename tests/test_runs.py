@@ -20,6 +20,7 @@ from pydantic import Field
 from bounce_mjx import Run
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.config.user_code import import_code
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.resources import resource_path
@@ -129,8 +130,8 @@ def test_the_newest_run_is_introduced(runs: Path, name: Path | None, capsys) -> 
 def test_latest_is_a_name_for_every_command(runs: Path, monkeypatch) -> None:
     monkeypatch.chdir(runs)
     assert named_run(Path("latest"), runs) == named_run(None, runs) == runs / "2026-01-02"
-    command = train_command.read_command(["--resume", "latest", "--log-dir", str(runs)])
-    assert command.layers.resume == runs / "2026-01-02"
+    command = train_command.read_command(["latest", "--log-dir", str(runs)])
+    assert command.layers.start.run == runs / "2026-01-02"
     (runs / "latest").mkdir()
     assert named_run(Path("latest"), runs) == Path("latest")
 
@@ -248,7 +249,7 @@ def test_an_edited_copy_of_the_robot_is_refused(robot_run: Path, refused) -> Non
     with (robot_run / "robot" / name).open("a") as file:
         file.write("\n")
     words = f"{robot_run}/robot is not the robot", f"{name} is not as it was"
-    refused(["train", "--resume", robot_run], *words)
+    refused(["train", robot_run], *words)
     # Every other command reads the config in the same way.
     with pytest.raises(UserError, match="restore that folder"):
         load_run_config(robot_run)
@@ -277,7 +278,8 @@ def test_a_task_has_its_own_preset_of_a_name(tmp_path: Path, monkeypatch) -> Non
     monkeypatch.setattr(presets_module, "has_accelerator", lambda: False)
     assert read_preset(None).seed == read_preset(Path("cpu"), task="bounce").seed == 2
     assert read_preset(Path("seed")).seed == 3
-    assert read_preset(None, task=f"{DRIBBLE}:Dribble").seed == 1
+    import_code(DRIBBLE)
+    assert read_preset(None, task="dribble").seed == 1
 
 
 @pytest.fixture
@@ -300,6 +302,8 @@ def test_a_file_of_the_user_lies_on_the_preset_of_its_task(presets: Path) -> Non
     cpu = read_preset(Path("cpu")).ppo
     assert given == cpu.model_copy(update={"learning_rate": 0.001}) != cpu
     assert read_file(presets, "task: track") == read_preset(Path("cpu"), task="track")
+    with pytest.raises(UserError, match="given.yaml is of the task track, and .* first word, or"):
+        read_preset(Path("given.yaml"), task="bounce")
     assert read_file(presets, "base: randomized") == read_preset(Path("randomized"))
     alone = read_file(presets, "base: null\nseed: 3")
     assert alone == TrainConfig(seed=3)

@@ -14,6 +14,7 @@ from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, VecVideoRecorder
 
+from bounce_mjx import environment
 from bounce_mjx.adapters.gymnasium.registration import ENV_ID
 from bounce_mjx.adapters.sb3 import Sb3VecEnv
 from bounce_mjx.adapters.torch.policy import to_policy
@@ -29,7 +30,7 @@ TARGET = 28
 
 @pytest.fixture
 def envs() -> Sb3VecEnv:
-    return Sb3VecEnv(NUM_ENVS, max_episode_steps=LIMIT)
+    return Sb3VecEnv(environment(), NUM_ENVS, max_episode_steps=LIMIT)
 
 
 def test_vec_env_equals_sb3s_vector_of_single_environments(envs):
@@ -98,7 +99,7 @@ def test_methods_of_single_environments(envs):
 
 
 def test_the_time_limit_is_that_of_the_task() -> None:
-    assert Sb3VecEnv(2, task="catch").episode_steps == 300
+    assert Sb3VecEnv(environment("catch"), 2).episode_steps == 300
 
 
 PPO_SETTINGS = {"n_steps": 16, "batch_size": 24, "n_epochs": 1}
@@ -149,7 +150,7 @@ def test_a_network_of_sb3_becomes_a_policy(envs):
 
 def test_videos_tile_the_first_environments(opengl, need, tmp_path):
     movies = need("moviepy")
-    envs = Sb3VecEnv(NUM_ENVS, render_mode="rgb_array", width=96, height=64)
+    envs = Sb3VecEnv(environment(), NUM_ENVS, render_mode="rgb_array", width=96, height=64)
     recorder = VecVideoRecorder(envs, str(tmp_path), lambda step: step == 0, video_length=4)
     recorder.reset()
     for _ in range(5):

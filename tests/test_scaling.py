@@ -96,7 +96,7 @@ def test_each_of_several_seeds_trains_as_if_alone(seeds: Path, alone: Path, tmp_
 @pytest.mark.slow
 def test_several_seeds_resume_exactly(seeds: Path, tmp_path: Path):
     run = train(tmp_path / "half", "--num-seeds", str(SEEDS), "--total-steps", str(STEPS))
-    train_command.main(["--resume", str(run), "--total-steps", str(2 * STEPS), "--no-report"])
+    train_command.main([str(run), "--total-steps", str(2 * STEPS), "--no-report"])
     ours, theirs = (arrays(latest_checkpoint(r)) for r in (run, seeds))
     for name in theirs:
         np.testing.assert_array_equal(ours[name], theirs[name], err_msg=name)
@@ -117,7 +117,7 @@ def test_eight_devices_train_as_one(alone: Path, tmp_path: Path, monkeypatch: py
     assert "device: 8 x cpu" in eight.said
     (run,) = (tmp_path / "runs").iterdir()
     total = ["--total-steps", str(2 * STEPS)]
-    train_command.main(["--resume", str(run), "--num-devices", "1", "--no-report", *total])
+    train_command.main([str(run), "--num-devices", "1", "--no-report", *total])
     assert_equal_up_to_rounding(arrays(latest_checkpoint(run)), arrays(latest_checkpoint(alone)))
 
 

@@ -13,14 +13,16 @@ import yaml
 import bounce_mjx
 from arms import ARM
 from bounce_mjx.commands.main import main
+from bounce_mjx.config import user_code
 from bounce_mjx.config.command_line import flag_names
 from bounce_mjx.config.files import flat
 from bounce_mjx.config.settings import merged
+from bounce_mjx.config.user_code import import_code
 from bounce_mjx.errors import UserError
 from bounce_mjx.runs import presets
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import create_run, pretrained_checkpoint
-from bounce_mjx.runs.settings import Choice, read_preset, stack
+from bounce_mjx.runs.settings import Choice, read_layers, read_preset
 from bounce_mjx.training import job
 from bounce_mjx.training.command import read_command
 from bounce_mjx.training.run import notes_on_intervals, notes_on_starts, notes_on_worlds
@@ -101,6 +103,7 @@ def test_flag_file_and_python_are_alike_for_every_key(group: str, folder: Path) 
     alone."""
     (folder / "arm.xml").write_text(ARM)
     (folder / "own.py").write_text(OWN)
+    import_code("own.py")
     groups = ("", "env.", "env.reward.", "env.randomization.", "ppo.")
     keys = [k for k in KEYS if max(filter(k.startswith, groups), key=len) == group]
     flags = flag_names(KEYS)
@@ -128,10 +131,11 @@ def test_flag_file_and_python_are_alike_for_every_key(group: str, folder: Path) 
 def test_a_source_wins_over_those_before_it(folder: Path) -> None:
     """One key of each layer, which a later layer has too."""
     (folder / "own.py").write_text(OWN)
+    import_code("own.py")
     (folder / "a.yaml").write_text("seed: 1\neval_seed: 1\neval_episodes: 1\nnum_seeds: 1")
     (folder / "b.yaml").write_text("seed: 2\neval_seed: 2\neval_episodes: 2")
     line = "--config a.yaml --config b.yaml --world ur5e_rtde --eval-seed 3 --action-scale 0.02"
-    config = read_command([*line.split(), "--algorithm", "own.py:Own"]).config
+    config = read_command([*line.split(), "--algorithm", "own"]).config
     sources = config.sources
     values = {
         "ppo.num_envs": (512, "configs/cpu.yaml"),
@@ -147,25 +151,25 @@ def test_a_source_wins_over_those_before_it(folder: Path) -> None:
     flatly = flat(config.model_dump())
     assert {key: (flatly[key], sources[key]) for key in values} == values
     run = create_run(config.model_copy(update={"log_dir": folder / "runs"}))
-    assert load_run_config(run, algorithm="own.py:Own").sources == sources
+    assert load_run_config(run).sources == sources
     # Every source is read again, and none is a setting.
-    again = stack(Choice(config=(run / "config.yaml",), algorithm="own.py:Own")).config()
+    again = read_layers(Choice(config=(run / "config.yaml",), algorithm="own")).config()
     assert again.sources["seed"] == str(run / "config.yaml")
 
 
 def test_an_algorithms_own_default_wins_over_the_machines_preset_alone(folder: Path) -> None:
     """A preset that the user names wins, and a line says so."""
     (folder / "own.py").write_text(OWN)
-    named = Choice(config=(Path("cpu"),), algorithm="own.py:Own")
-    layers = stack(named)
+    import_code("own.py")
+    named = Choice(config=(Path("cpu"),), algorithm="own")
+    layers = read_layers(named)
     assert layers.config().ppo.num_epochs == 4
     assert layers.notes == ("configs/cpu.yaml wins over defaults of Own.Config: ppo.num_epochs",)
-    layers = stack(Choice(algorithm="own.py:Own"))
+    layers = read_layers(Choice(algorithm="own"))
     assert (layers.config().ppo.num_epochs, layers.notes) == (1, ())
     (folder / "my.yaml").write_text("ppo: {num_epochs: 3}")
     assert (
-        stack(Choice(config=(Path("my.yaml"),), algorithm="own.py:Own")).config().ppo.num_epochs
-        == 3
+        read_layers(Choice(config=(Path("my.yaml"),), algorithm="own")).config().ppo.num_epochs == 3
     )
 
 
@@ -173,7 +177,8 @@ def test_a_default_that_an_algorithm_makes_or_leaves_out_is_a_default(folder: Pa
     """It may make one anew for each config, and a narrower type needs none."""
     own = OWN.replace("num_epochs: int = 1", "num_epochs: int = Field(default_factory=lambda: 1)")
     (folder / "own.py").write_text(f"from pydantic import Field\n{own}        num_envs: int\n")
-    config = stack(Choice(algorithm="own.py:Own")).config()
+    import_code("own.py")
+    config = read_layers(Choice(algorithm="own")).config()
     assert (config.ppo.num_epochs, config.sources["ppo.num_epochs"]) == (
         1,
         "defaults of Own.Config",
@@ -185,16 +190,20 @@ def test_a_warm_start_is_alike_in_a_file(folder: Path) -> None:
     """It brings the environment too, and what the file says lies on it."""
     own = load_run_config(pretrained_checkpoint("robust_small").run)
     (folder / "warm.yaml").write_text("warm_start: robust_small\nenv: {action_scale: 0.03}")
+    with pytest.raises(
+        UserError, match="warm.yaml starts from robust_small; give --warm-start rob"
+    ):
+        read_command(["--config", "warm.yaml"])
     configs = [
         read_command("--warm-start robust_small --action-scale 0.03".split()).config,
-        read_command(["--config", "warm.yaml"]).config,
-        python(warm_start="robust_small", action_scale=0.03),
+        read_command(["robust_small", "--config", "warm.yaml"]).config,
+        python("robust_small", action_scale=0.03),
     ]
     assert configs[0] == configs[1] == configs[2]
     assert configs[0].env == own.env.model_copy(update={"action_scale": 0.03})
     assert configs[0].ppo.hidden_layers == own.ppo.hidden_layers == (128, 128)
     assert configs[1].sources["env.observation.action"] == "the warm start robust_small"
-    notes = stack(Choice(config=(Path("randomized"),), warm_start=Path("robust_small"))).notes
+    notes = read_layers(Choice(config=(Path("randomized"),), warm_start=Path("robust_small"))).notes
     assert any("the warm start robust_small wins over configs/randomized.yaml" in x for x in notes)
 
 
@@ -221,8 +230,9 @@ def test_a_whole_config_stands_alone_below_what_python_says() -> None:
     for arguments, sentence in (
         ({"nonsense": 5}, "train: unknown key nonsense; known keys here are"),
         ({"num_env": 5}, "train: unknown key num_env; did you mean ppo.num_envs?"),
-        ({"task": "catch"}, "the config is of the task bounce, and task is catch; leave it out"),
-        ({"resume": "somewhere"}, "config and resume cannot be combined"),
+        ({"start": "catch"}, "the config is of the task bounce, and the first argument is catch"),
+        ({"task": "catch"}, "task is the first argument: train('catch', ...)"),
+        ({"resume": "runs/x"}, "resume is the first argument: train('runs/x', ...)"),
         ({"num_envs": 0}, "train: ppo.num_envs is 0, but must be greater than or equal to 1"),
     ):
         with pytest.raises(UserError) as caught:
@@ -245,26 +255,26 @@ def test_a_file_has_the_same_defaults_wherever_it_lies(folder: Path, monkeypatch
 
 
 def test_a_learning_rate_that_adapts_is_said_to_be_the_first_one() -> None:
-    adapts = stack(Choice()).config({"learning_rate": 1e-3, "target_kl": 0.01})
+    adapts = read_layers(Choice()).config({"learning_rate": 1e-3, "target_kl": 0.01})
     (note,) = notes_on_starts(adapts)
     assert note.startswith(
         "ppo.learning_rate 0.001 is only the first one, since ppo.target_kl 0.01"
     )
     for said in ({"learning_rate": 1e-3, "target_kl": 0.0}, {"target_kl": 0.01}):
-        assert not notes_on_starts(stack(Choice()).config(said))
+        assert not notes_on_starts(read_layers(Choice()).config(said))
 
 
 def test_a_world_that_most_episodes_do_not_have_is_said(folder: Path) -> None:
     """A preset's share decides how often a number of a named world is sampled at all."""
     world = Path("ur5e_rtde")
-    sampled = stack(Choice(config=(Path("transfer"),), world=world))
+    sampled = read_layers(Choice(config=(Path("transfer"),), world=world))
     (note,) = notes_on_worlds(sampled.config())
     assert note.startswith("configs/transfer.yaml samples each number of the world configs/worlds/")
     assert "in 20% of the episodes" in note
     path = folder / "whole.yaml"
     path.write_text("env: {randomization: {share: 1.0, shares: null}}")
     for files in ((Path("transfer"), path), (Path("robust_cpu"),)):
-        whole = stack(Choice(config=files, world=world))
+        whole = read_layers(Choice(config=files, world=world))
         assert not notes_on_worlds(whole.config())
 
 
@@ -280,7 +290,9 @@ def test_a_mistake_names_the_layer_that_has_it(folder: Path, refused) -> None:
     (folder / "empty.yaml").write_text("foo: {}")
     refused("train --config empty.yaml --seed 1", "error: empty.yaml: unknown key foo;")
     (folder / "own.py").write_text(OWN.replace("own_cost: float = 0.5", 'own_cost: int = "a"'))
-    refused("train --algorithm own.py:Own --seed 1", "error: default: ppo.own_cost is a, but")
+    refused(
+        "train --import own.py --algorithm own --seed 1", "error: default: ppo.own_cost is a, but"
+    )
     # It would end the preset's group, unseen below the flag.
     (folder / "empty.yaml").write_text("ppo:")
     refused(
@@ -303,10 +315,9 @@ def test_a_mistake_names_the_layer_that_has_it(folder: Path, refused) -> None:
     refused("train --config dots.yaml --num-envs 8", nested)
     (folder / "dots.yaml").write_text("reward.height.weight: 1")
     refused("train --config dots.yaml", "nest it: env: {reward: {height: {weight: ...}}}")
-    # A warm start is looked for before the config is validated.
     (folder / "d.yaml").write_text("warm_start: no")
-    refused("train --config d.yaml", "error: d.yaml: warm_start is False, but must be a path")
-    (folder / "e.yaml").write_text("warm_start: robust_small\nlog_dir: 5")
+    refused("train --config d.yaml", "error: d.yaml starts from False; give --warm-start")
+    (folder / "e.yaml").write_text("log_dir: 5")
     refused("train --config e.yaml", "error: e.yaml: log_dir is 5, but must be a path")
 
 
@@ -341,7 +352,7 @@ def test_the_source_is_what_set_the_value_that_counts(folder: Path) -> None:
     """A policy brings its task; a world ends a curriculum that it has no use for."""
     config = read_command("--config finetune --warm-start track".split()).config
     assert (config.task, config.sources["task"]) == ("track", "the warm start track")
-    config = read_command("--warm-start track --task track".split()).config
+    config = read_command("track --warm-start track".split()).config
     assert config.sources["task"] == "flags"
     (folder / "world.yaml").write_text(
         "env: {randomization: {command_interval: [2.0, 4.0]}}\nsources: {randomization: A test.}"
@@ -363,16 +374,17 @@ def test_the_source_is_what_set_the_value_that_counts(folder: Path) -> None:
 def test_a_config_that_disagrees_with_itself_is_refused(folder: Path) -> None:
     """It would train PPO with the settings of another algorithm, or a task with another's."""
     (folder / "own.py").write_text(OWN)
-    ppo = stack(Choice(algorithm="own.py:Own")).algorithm()
-    whole = TrainConfig(algorithm="own.py:Own", ppo=ppo)
+    import_code("own.py")
+    ppo = read_layers(Choice(algorithm="own")).start.algorithm()
+    whole = TrainConfig(algorithm="own", ppo=ppo)
     assert python(config=whole).ppo == ppo
-    for algorithm, settings_of_other in (("ppo", ppo), ("own.py:Own", TrainConfig().ppo)):
+    for algorithm, settings_of_other in (("ppo", ppo), ("own", TrainConfig().ppo)):
         mixed = TrainConfig(algorithm=algorithm, ppo=settings_of_other)
         with pytest.raises(UserError, match="name the algorithm that has them"):
             bounce_mjx.train(config=mixed, quiet=True)
     # Plain values are PPO's, as the code of a file does not run here.
     with pytest.raises(ValueError, match="num_env"):
-        TrainConfig(algorithm="own.py:Own", ppo={"num_env": 8})
+        TrainConfig(algorithm="own", ppo={"num_env": 8})
     with pytest.raises(ValueError, match="these are the settings of Bounce, and task is track"):
         TrainConfig(task="track", env=TrainConfig().env)
 
@@ -380,13 +392,20 @@ def test_a_config_that_disagrees_with_itself_is_refused(folder: Path) -> None:
 def test_a_run_of_another_algorithm_is_refused_as_such(folder: Path, refused) -> None:
     """Its settings are no settings of the algorithm that the user names: the run is not damaged."""
     (folder / "own.py").write_text(OWN)
+    import_code("own.py")
     (folder / "other.py").write_text(OWN.replace("own_cost", "other_cost"))
-    own = stack(Choice(algorithm="own.py:Own")).config({"log_dir": folder / "runs"})
+    own = read_layers(Choice(algorithm="own")).config({"log_dir": folder / "runs"})
     run = create_run(own)
-    line, refusal = f"train --resume {run}", "--resume cannot change the algorithm"
-    refused(f"{line} --algorithm other.py:Own", refusal)
-    refused(f"{line} --algorithm ppo", refusal)
-    refused(f"{line} --task catch", "--resume cannot change the task")
+    refused(f"train {run} --algorithm ppo", "has its algorithm, with which it is resumed")
+    user_code._sources.clear()
+    code = run / "algorithm/own.py"
+    refused(f"train {run}", f"whose code is {code}; import it to run it: bounce-mjx train {run}")
+    refused(
+        f"train {run} --import other.py", "cannot be resumed with another algorithm than it was"
+    )
+    # Whatever acts with the policy needs none of it.
+    user_code._sources.clear()
+    assert load_run_config(run).ppo.num_envs == own.ppo.num_envs
 
 
 def test_the_printed_config_is_a_config_where_a_run_is_chosen(folder: Path, capsys) -> None:
@@ -397,7 +416,8 @@ def test_the_printed_config_is_a_config_where_a_run_is_chosen(folder: Path, caps
     main(["train", *line, "--print-config"])
     (folder / "again.yaml").write_text(capsys.readouterr().out)
     assert "using the newest run: runs/2026-01-01" in read_command(line).layers.notes[0]
-    assert read_command(["--config", "again.yaml"]).config.ppo.hidden_layers == (128, 128)
+    line = ["--warm-start", str(policy.run), "--config", "again.yaml"]
+    assert read_command(line).config.ppo.hidden_layers == (128, 128)
 
 
 def test_the_printed_config_is_a_config_and_says_its_sources(folder: Path) -> None:
@@ -434,7 +454,7 @@ def test_what_a_file_cannot_say_is_told(folder: Path, refused) -> None:
     (folder / "my.yaml").write_text("task: null")
     refused(line, "my.yaml: task is None, but must be a name")
     (folder / "run").mkdir()
-    refused("train --resume run --log-dir typo", "log_dir is where the newest run is looked for")
+    refused("train run --log-dir typo", "log_dir is where the newest run is looked for")
 
 
 def test_no_setting_of_a_task_takes_a_flag_of_the_algorithms(folder: Path) -> None:
@@ -443,6 +463,8 @@ def test_no_setting_of_a_task_takes_a_flag_of_the_algorithms(folder: Path) -> No
     before = "    apex_range: tuple"
     assert before in text
     own = '    num_envs: int = 3\n    """A number of its own."""\n'
-    (folder / "own.py").write_text(text.replace(before, own + before), encoding="utf-8")
+    text = text.replace(before, own + before).replace("class Dribble(", "class Numbered(")
+    (folder / "own.py").write_text(text, encoding="utf-8")
+    import_code("own.py")
     with pytest.raises(UserError, match="env.num_envs and ppo.num_envs have the same name; give"):
-        read_command(["--config", "cpu", "--task", "own.py:Dribble", "--num-envs", "8"])
+        read_command(["numbered", "--config", "cpu", "--num-envs", "8"])

@@ -21,7 +21,9 @@ from bounce_mjx.commands.eval import EvalCommand
 from bounce_mjx.commands.main import main
 from bounce_mjx.commands.play import PlayCommand
 from bounce_mjx.commands.task_commands import parse_with_commands
+from bounce_mjx.config import user_code
 from bounce_mjx.config.files import dump_config
+from bounce_mjx.config.user_code import import_code
 from bounce_mjx.config.validation import validate
 from bounce_mjx.env.env import Env, EnvState
 from bounce_mjx.env.vector import VectorStep
@@ -41,8 +43,8 @@ from tiny_runs import TINY
 
 CHECKOUT = Path(__file__).parent.parent
 
-REST = f"{CHECKOUT / 'tests' / 'rest_task.py'}:Rest"
-DRIBBLE = f"{CHECKOUT / 'examples' / 'dribble_task.py'}:Dribble"
+REST = CHECKOUT / "tests" / "rest_task.py"
+DRIBBLE = CHECKOUT / "examples" / "dribble_task.py"
 
 
 # A row of the results of `REST`.
@@ -67,11 +69,11 @@ def test_a_task_without_events_goes_through_every_command(
         assert status == code, said
         return said
 
-    task = ("--task", REST)
-    said = command("train", *task, *TINY, "--total-steps", "128")
+    task = ("--task", "rest", "--import", str(REST))
+    said = command("train", "rest", *task[2:], *TINY, "--total-steps", "128")
     assert re.search(RESULT, said) and "report:" in said
     (line,) = re.findall(r"measure it: bounce-mjx (eval .+)", said)
-    assert shlex.split(line)[2:] == list(task)
+    assert shlex.split(line)[2:] == list(task[2:])
     (folder,) = (tmp_path / "runs" / "rest").iterdir()
     assert "rests" in (folder / "report.html").read_text(encoding="utf-8")
     assert re.search(RESULT, command("eval", *task, "--episodes", "4"))
@@ -80,7 +82,7 @@ def test_a_task_without_events_goes_through_every_command(
     assert "target_height" in command("view", *task, *flags, code=2)
     command("plot", *task, "--formats", "svg")
     command("export", *task, "--onnx", "rest.onnx")
-    policy, again = load_policy("rest.onnx"), load_policy(folder, task=REST)
+    policy, again = load_policy("rest.onnx"), load_policy(folder)
     assert again.metadata == policy.metadata
     measured = {
         "joint_angles": policy.metadata.default_joint_angles,
@@ -393,13 +395,14 @@ COMMON_MISTAKES = {
 def test_a_common_mistake_in_a_task_is_one_sentence(mistake: str, tmp_path: Path) -> None:
     """In a file like the page's: before anything is compiled, with its line where it has one."""
     right, wrong, words = COMMON_MISTAKES[mistake]
-    text = Path(DRIBBLE.rpartition(":")[0]).read_text(encoding="utf-8")
+    text = DRIBBLE.read_text(encoding="utf-8")
     assert right in text
     path = tmp_path / "mine.py"
     path.write_text(text.replace(right, wrong, 1), encoding="utf-8")
 
     def trace() -> None:
-        env = Env(validate(find_task(f"{path}:Dribble").Config, {}, "mine.yaml"))
+        import_code(path)
+        env = Env(validate(find_task("dribble").Config, {}, "mine.yaml"))
         jax.eval_shape(lambda key: env.step(env.reset(key), jnp.zeros(6)), jax.random.key(0))
 
     with pytest.raises(UserError, match=words) as refused:
@@ -768,12 +771,14 @@ def test_libraries_take_another_task() -> None:
     import brax.envs
 
     import bounce_mjx.adapters.brax  # noqa: F401
+    from bounce_mjx import environment
     from bounce_mjx.adapters.gymnax_env import GymnaxBounceBall
 
-    key, size = jax.random.PRNGKey(0), find_task(DRIBBLE).Config().layout.size
-    env = brax.envs.get_environment("bounce_ball", task=DRIBBLE)
+    import_code(DRIBBLE)
+    key, size = jax.random.PRNGKey(0), find_task("dribble").Config().layout.size
+    env = brax.envs.get_environment("bounce_ball", task="dribble")
     assert jax.eval_shape(env.reset, key).obs.shape == (size,)
-    env = GymnaxBounceBall(task=DRIBBLE)
+    env = GymnaxBounceBall(environment("dribble"))
     assert jax.eval_shape(env.reset, key, env.default_params)[0].shape == (size,)
 
 
@@ -781,14 +786,18 @@ def test_libraries_take_another_task() -> None:
 def mine(tmp_path: Path) -> Path:
     """A copy of the example that no other test has named."""
     path = tmp_path / "mine.py"
-    text = Path(DRIBBLE.rpartition(":")[0]).read_text(encoding="utf-8")
+    text = DRIBBLE.read_text(encoding="utf-8")
     path.write_text(f"{text}\n# {tmp_path}\n", encoding="utf-8")
     return path
 
 
 def in_another_process(*lines: str) -> str:
     """What the lines print in a process in which no task was named."""
-    head = ("from pathlib import Path", "from bounce_mjx.runs.config import load_run_config")
+    head = (
+        "from pathlib import Path",
+        "from bounce_mjx.config.user_code import import_code",
+        "from bounce_mjx.runs.config import load_run_config",
+    )
     done = subprocess.run(
         [sys.executable, "-c", "\n".join([*head, *lines])], capture_output=True, text=True
     )
@@ -796,32 +805,62 @@ def in_another_process(*lines: str) -> str:
 
 
 @pytest.mark.slow
-def test_a_run_keeps_its_task_which_runs_only_if_the_user_names_it(
+def test_a_run_keeps_its_task_which_runs_only_if_the_user_imports_it(
     mine: Path, tmp_path: Path
 ) -> None:
-    config = read_preset(None, task=f"{mine}:Dribble").model_copy(update={"log_dir": tmp_path})
+    import_code(mine)
+    config = read_preset(None, task="dribble").model_copy(update={"log_dir": tmp_path})
     run_folder = create_run(config)
     copy = run_folder / "task" / "mine.py"
     assert copy.read_bytes() == mine.read_bytes()
-    assert "task: task/mine.py:Dribble\n" in (run_folder / CONFIG_FILE).read_text()
-    # Here the file was named by its content.
+    assert "task: dribble\n" in (run_folder / CONFIG_FILE).read_text()
     assert load_run_config(run_folder).env == config.env
 
     marker = tmp_path / "ran"
-    source = copy.read_text() + f"open({str(marker)!r}, 'w')\n"
-    mine.write_text(source)
-    other = create_run(
-        read_preset(None, task=f"{mine}:Dribble").model_copy(update={"log_dir": tmp_path})
+    copy.write_text(copy.read_text() + f"open({str(marker)!r}, 'w')\n")
+    said = in_another_process(f"load_run_config(Path({str(run_folder)!r}))")
+    assert (
+        f'has the task dribble, whose code is {copy}; import it to run it: import_code("{copy}")'
+        in said
     )
-    marker.unlink()
-    said = in_another_process(f"load_run_config(Path({str(other)!r}))")
-    assert "is code; name it to run it: --task " in said
     assert not marker.exists()
     said = in_another_process(
-        f"config = load_run_config(Path({str(other)!r}), {f'{mine}:Dribble'!r})",
+        f"import_code({str(copy)!r})",
+        f"config = load_run_config(Path({str(run_folder)!r}))",
         "print(type(config.env).__name__, config.env.apex_range)",
     )
     assert said == "Config (0.065, 0.085)\n" and marker.exists()
+
+
+def test_a_command_without_its_import_prints_the_whole_command(
+    mine: Path, tmp_path: Path, refused
+) -> None:
+    import_code(mine)
+    run_folder = create_run(
+        read_preset(None, task="dribble").model_copy(update={"log_dir": tmp_path / "runs"})
+    )
+    (run_folder / "checkpoints/1").mkdir(parents=True)
+    copy = run_folder / "task" / "mine.py"
+    for line in (f"eval {run_folder}", f"play {run_folder}", f"train {run_folder} --seed 3"):
+        user_code._sources.clear()
+        refused(line, f"import it to run it: bounce-mjx {line} --import {copy}")
+
+
+def test_a_run_of_a_time_when_a_task_was_file_and_class_is_read(mine: Path, tmp_path: Path) -> None:
+    """Its config names the copy of the file, and the record of a checkpoint the original."""
+    import_code(mine)
+    config = read_preset(None, task="dribble").model_copy(update={"log_dir": tmp_path})
+    run_folder = write_policy(config)
+    path = run_folder / CONFIG_FILE
+    path.write_text(path.read_text().replace("task: dribble", "task: task/mine.py:Dribble"))
+    (record,) = run_folder.glob("checkpoints/*/record/metadata")
+    stored = json.loads(record.read_text())
+    stored["config"]["task"] = f"{mine}:Dribble"
+    record.write_text(json.dumps(stored))
+    seal(record.parent.parent)
+    again = load_run_config(run_folder)
+    assert again == config.model_copy(update={"log_dir": again.log_dir})
+    checkpoints.read_policy(find_checkpoint(run_folder), again)
 
 
 def write_policy(config: TrainConfig) -> Path:
@@ -832,22 +871,17 @@ def write_policy(config: TrainConfig) -> Path:
 
 
 def test_a_checkpoint_is_read_without_the_original_files(mine: Path, tmp_path: Path) -> None:
-    """Its record names the original of the task's file, which nobody has named anew; the run's own
-    copy was named."""
-    config = read_preset(None, task=f"{mine}:Dribble").model_copy(update={"log_dir": tmp_path})
+    """The run's own copy is imported, and nothing else runs."""
+    import_code(mine)
+    config = read_preset(None, task="dribble").model_copy(update={"log_dir": tmp_path})
     run_folder = write_policy(config)
     marker = tmp_path / "ran"
     mine.write_text(f"open({str(marker)!r}, 'w')\n")
-
-    def read(run_folder: Path) -> None:
-        config = load_run_config(run_folder, f"{run_folder}/task/mine.py:Dribble")
-        checkpoints.read_policy(find_checkpoint(run_folder), config)
-
-    read(run_folder)
-    assert not marker.exists()
-    mine.unlink()
     moved = run_folder.rename(tmp_path / "moved")
-    read(moved)
+    user_code._sources.clear()
+    import_code(moved / "task/mine.py")
+    checkpoints.read_policy(find_checkpoint(moved), load_run_config(moved))
+    assert not marker.exists()
 
 
 def test_a_checkpoint_does_not_bring_code_into_a_run_without(mine: Path, tmp_path: Path) -> None:
@@ -872,34 +906,51 @@ def test_another_file_than_the_runs_is_told(
 ) -> None:
     from bounce_mjx.training.command import read_command
 
-    config = read_preset(None, task=f"{mine}:Dribble").model_copy(update={"log_dir": tmp_path})
+    import_code(mine)
+    config = read_preset(None, task="dribble").model_copy(update={"log_dir": tmp_path})
     run_folder = create_run(config)
+    assert read_command([str(run_folder)]).config.env == config.env
     changed = tmp_path / "changed.py"
     changed.write_text(mine.read_text().replace("weight: float = 4.0", "weight: float = 5.0"))
-    flags = ["--resume", str(run_folder), "--task", f"{changed}:Dribble"]
-    with pytest.raises(UserError, match=r"--resume cannot change the task, and .*changed\.py"):
-        read_command(flags)
-    assert load_run_config(run_folder, f"{changed}:Dribble").env.reward.apex.weight == 4.0
-    assert "changed.py:Dribble differs from the task that" in capsys.readouterr().err
-    flags[-1] = f"{mine}:Dribble"
-    assert read_command(flags).config.env == config.env
+    user_code._sources.clear()
+    import_code(changed)
+    with pytest.raises(UserError, match=r"cannot be resumed with another task than it was trained"):
+        read_command([str(run_folder)])
+    assert load_run_config(run_folder).env.reward.apex.weight == 4.0
+    assert "changed.py differs from the task that" in capsys.readouterr().err
+
+
+def test_two_files_with_a_task_of_one_name_are_refused(mine: Path, tmp_path: Path) -> None:
+    """Neither wins in silence; a copy is the same code, and a class of a package's name no task."""
+    changed = tmp_path / "changed.py"
+    changed.write_text(mine.read_text().replace("weight: float = 4.0", "weight: float = 5.0"))
+    import_code(mine)
+    import_code(shutil.copy(mine, tmp_path / "copy.py"))
+    assert find_task("dribble") is find_task("Dribble")
+    import_code(changed)
+    with pytest.raises(UserError, match="dribble is a class of .*; import one of them, or rename"):
+        find_task("dribble")
+    named = type("Catch", (rest_task.Rest,), {"Config": type("Config", (rest_task.Config,), {})})
+    with pytest.raises(UserError, match="has the name of the task catch; rename it"):
+        task_name(named)
 
 
 def test_a_config_file_cannot_name_code(mine: Path, tmp_path: Path) -> None:
     path = tmp_path / "config.yaml"
-    path.write_text("task: mine.py:Dribble\nenv: {apex_range: [0.06, 0.07]}\n")
-    with pytest.raises(UserError, match=r"which is code; name it to run it: --task "):
+    path.write_text("task: dribble\nenv: {apex_range: [0.06, 0.07]}\n")
+    with pytest.raises(UserError, match="is of the task dribble, and this training of bounce"):
+        read_command(["--config", str(path)])
+    with pytest.raises(UserError, match="no task, policy or run dribble; .*--import FILE.py for a"):
         read_preset(path)
-    assert read_preset(path, task=f"{mine}:Dribble").env.apex_range == (0.06, 0.07)
+    import_code(mine)
+    assert read_preset(path, task="dribble").env.apex_range == (0.06, 0.07)
 
 
 @pytest.mark.parametrize(
     ("name", "words"),
     [
         ("bonce", "there is no task 'bonce' .*; did you mean bounce?"),
-        ("missing.py:Task", r"missing\.py cannot be read .*; give FILE.py:CLASS"),
-        (DRIBBLE.replace("Dribble", "Dribbl"), "has no subclass 'Dribbl' of Task .*Dribble"),
-        (DRIBBLE.replace("Dribble", "Config"), "has no subclass 'Config' of Task"),
+        ("missing.py:Task", "there is no task 'missing.py:Task' .*--import the file of your own"),
     ],
 )
 def test_a_wrong_task_is_one_sentence(name: str, words: str) -> None:
@@ -913,7 +964,7 @@ def test_a_mistake_in_a_tasks_file_names_its_line(tmp_path: Path) -> None:
     with pytest.raises(
         UserError, match=r"wrong\.py cannot be imported \(ZeroDivisionError in line 3"
     ):
-        find_task(f"{path}:Task")
+        import_code(path)
 
 
 def test_a_package_can_have_tasks(
@@ -922,7 +973,7 @@ def test_a_package_can_have_tasks(
     """Its entry point gives the task a name, which its runs keep."""
     package = tmp_path / "my_tasks"
     package.mkdir()
-    shutil.copy(DRIBBLE.rpartition(":")[0], package / "__init__.py")
+    shutil.copy(DRIBBLE, package / "__init__.py")
     info = tmp_path / "my_tasks-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my_tasks\nVersion: 1.0\n")
@@ -964,7 +1015,8 @@ def test_a_tasks_class_without_a_config_is_one_sentence() -> None:
 def test_a_robot_serves_another_task() -> None:
     """Its arm and its start pose are kept; the heights are those of the task above its paddle."""
     preset, robot = CHECKOUT / "configs/cpu.yaml", CHECKOUT / "configs/robots/ur5e.yaml"
-    config, bounce = read_preset(preset, robot, DRIBBLE).env, read_preset(preset, robot).env
+    import_code(DRIBBLE)
+    config, bounce = read_preset(preset, robot, "dribble").env, read_preset(preset, robot).env
     assert config.mjcf == bounce.mjcf and config.robot == bounce.robot
     assert config.default_joint_angles == bounce.default_joint_angles
     # A viewer offers targets over the paddle, as far as over that of the package's own arm.
@@ -1001,8 +1053,9 @@ def test_a_task_may_name_a_command_or_a_setting_like_a_flag(
 ) -> None:
     """The flag that stands in no group stays, and the other one has its group."""
     (tmp_path / "sized.py").write_text(NAMED_LIKE_FLAGS)
-    task_flag = ["--task", f"{tmp_path / 'sized.py'}:Sized"]
-    env = find_task(task_flag[1]).Config()
+    import_code(tmp_path / "sized.py")
+    task_flag = ["--task", "sized"]
+    env = find_task("sized").Config()
     flags = "--commands.size 0.5 --size 64 64 --copy 0.25 --commands.help 1 --depth 1".split()
     command, given = parse_with_commands(PlayCommand, [*task_flag, *flags], prog="play")
     assert command.viewing.size == (64, 64)
@@ -1012,7 +1065,7 @@ def test_a_task_may_name_a_command_or_a_setting_like_a_flag(
     assert command.episodes == 7
     assert given.checked(env) == {"episodes": 0.5, "model_config": 1.0, "size": 0.1}
     flags = "--no-report --env.report 0.25 --seed 8 --env.seed 9".split()
-    command = read_command([*task_flag, *flags])
+    command = read_command(["sized", *flags])
     assert (command.flags.report, command.config.seed) == (False, 8)
     assert (command.config.env.report, command.config.env.seed) == (0.25, 9)
 

@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from bounce_mjx.commands import train as train_command
+from bounce_mjx.config.user_code import import_code
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.policy import make_networks, untrained_policy
@@ -124,8 +125,8 @@ class Own(PPO):
 
 def test_networks_of_an_own_algorithm_are_no_warm_start(tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text(OWN_NETWORKS)
-    name = f"{tmp_path}/own.py:Own"
-    flags = [*TINY, "--log-dir", str(tmp_path / "runs"), "--algorithm", name]
+    import_code(tmp_path / "own.py")
+    flags = [*TINY, "--log-dir", str(tmp_path / "runs"), "--algorithm", "own"]
     config = train_command.read_command(flags).config
     with pytest.raises(UserError, match="Own makes networks of its own, which --warm-start cannot"):
         read_start(config.model_copy(update={"warm_start": Path("robust_small")}), Env(config.env))
@@ -138,7 +139,7 @@ def test_networks_of_an_own_algorithm_are_no_warm_start(tmp_path: Path) -> None:
         NETWORKS: {"params": np.zeros(3), "statistics": np.zeros(3)},
     }
     save_checkpoint(run, config, STEPS, items)
-    with pytest.raises(UserError, match="cannot be read as networks of PPO .its algorithm is /.+"):
+    with pytest.raises(UserError, match="cannot be read as networks of PPO .its algorithm is own"):
         read_networks(best_checkpoint(run), config)
 
 

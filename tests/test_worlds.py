@@ -17,7 +17,7 @@ from bounce_mjx.robot.config import LimitsConfig, RobotConfig
 from bounce_mjx.robot.model import add_balls, scene_spec
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.settings import read_preset
-from bounce_mjx.runs.worlds import in_world, robot_in_world
+from bounce_mjx.runs.worlds import in_named_world, robot_in_world
 from bounce_mjx.task.catch import Catch
 from bounce_mjx.world.config import ActionConfig
 from bounce_mjx.world.model import model_nominals
@@ -107,12 +107,12 @@ def test_a_world_with_ranges_of_axes_trains_and_is_doubled(tmp_path: Path) -> No
     given = read_command(["--world", str(world), "--randomization.paddle-tilt", "-0.1", "0.1"])
     assert given.config.env.randomization.paddle_tilt == (-0.1, 0.1)
     trained = TrainConfig()
-    there, named = in_world(trained, world)
+    there, named = in_named_world(trained.env, world)
     conditions = load_suite(
         resource_path("configs/robustness.yaml"),
-        there.env,
-        there.env,
-        named.double_assumed(model_nominals(there.env)),
+        there,
+        there,
+        named.double_assumed(model_nominals(there)),
     )
     nominal, twice = (c for c in conditions if c.perturbation.group in ("nominal", TWICE))
     np.testing.assert_allclose(nominal.ranges["paddle_tilt"], TILT)
@@ -122,21 +122,21 @@ def test_a_world_with_ranges_of_axes_trains_and_is_doubled(tmp_path: Path) -> No
 
 def test_assumed_numbers_are_doubled_entry_by_entry() -> None:
     """As `bounce-mjx robustness --world` doubles them: about the model's value of each entry."""
-    there, named = in_world(TrainConfig(), Path("fast_servo"))
-    nominals = model_nominals(there.env)
+    there, named = in_named_world(TrainConfig().env, Path("fast_servo"))
+    nominals = model_nominals(there)
     doubled = named.double_assumed(nominals)
     assert doubled.keys() == {f"twice {key}" for key in named.assumed}
     for name, settings in doubled.items():
         key = name.removeprefix("twice ")
         term = key.removeprefix("randomization.")
         assert settings.keys() == {"randomization"} and settings["randomization"].keys() == {term}
-        low, high = getattr(there.env.randomization, term)
+        low, high = getattr(there.randomization, term)
         expected_low = np.clip(2.0 * np.array(low) - nominals[term], *TERMS[term].bounds)
         expected_high = np.clip(2.0 * np.array(high) - nominals[term], *TERMS[term].bounds)
         doubled_low, doubled_high = settings["randomization"][term]
         np.testing.assert_allclose(doubled_low, expected_low)
         np.testing.assert_allclose(doubled_high, expected_high)
-        validate(type(there.env), merged(there.env.model_dump(), settings), key)
+        validate(type(there), merged(there.model_dump(), settings), key)
 
 
 def test_less_of_a_limit_is_harder(tmp_path: Path) -> None:
@@ -203,7 +203,7 @@ def test_a_robots_own_balls_and_stiff_contact_are_taken_by_another_task(tmp_path
     env = {"mjcf": str(scene), "physics_dt": 0.0005, "num_balls": 2}
     robot = tmp_path / "robot.yaml"
     robot.write_text(yaml.safe_dump({"task": "juggle", "env": env}))
-    config = read_command(["--task", "catch", "--robot", str(robot)]).config.env
+    config = read_command(["catch", "--robot", str(robot)]).config.env
     assert config.physics_dt == 0.0005
     assert config.ball_init_pos == pytest.approx(Catch.Config().ball_init_pos, abs=1e-3)
     assert policy_metadata(TrainConfig(task="juggle", env=env), 1).num_balls == 2
@@ -211,14 +211,14 @@ def test_a_robots_own_balls_and_stiff_contact_are_taken_by_another_task(tmp_path
 
 def test_a_policy_is_measured_in_the_world_alone() -> None:
     trained = read_preset(Path("transfer"))
-    there, named = in_world(trained, Path("fast_servo"))
-    drawn = there.env.randomization
+    there, named = in_named_world(trained.env, Path("fast_servo"))
+    drawn = there.randomization
     assert set(drawn.terms) == set(named.settings["randomization"])
     assert drawn.share == 1.0 and drawn.camera_rate == (150.0, 203.0)
-    assert there.env.observation == trained.env.observation
-    assert there.env.action_scale == trained.env.action_scale
+    assert there.observation == trained.env.observation
+    assert there.action_scale == trained.env.action_scale
     with pytest.raises(UserError, match="fast_servo"):
-        in_world(trained, Path("ur5e_rtde"))
+        in_named_world(trained.env, Path("ur5e_rtde"))
 
 
 def test_a_world_of_a_robot_brings_its_limits_to_a_policy() -> None:
@@ -226,11 +226,11 @@ def test_a_world_of_a_robot_brings_its_limits_to_a_policy() -> None:
     own = trained.env.robot.limits
     free = {"robot": trained.env.robot.model_copy(update={"limits": LimitsConfig()})}
     config = trained.model_copy(update={"env": trained.env.model_copy(update=free)})
-    there, _ = in_world(config, Path("ur5e_rtde"))
-    assert own.velocity is not None and there.env.robot.limits == own
-    assert there.env.action_scale == trained.env.action_scale
-    assert there.env.randomization.action_latency == (0.015, 0.045)
+    there, _ = in_named_world(config.env, Path("ur5e_rtde"))
+    assert own.velocity is not None and there.robot.limits == own
+    assert there.action_scale == trained.env.action_scale
+    assert there.randomization.action_latency == (0.015, 0.045)
     measured = free | {"action": ActionConfig(base="measured")}
     config = trained.model_copy(update={"env": trained.env.model_copy(update=measured)})
     with pytest.raises(UserError, match="ur5e_rtde.*action.base"):
-        in_world(config, Path("ur5e_rtde"))
+        in_named_world(config.env, Path("ur5e_rtde"))

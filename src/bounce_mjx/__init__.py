@@ -7,17 +7,30 @@ from typing import TYPE_CHECKING, Any
 from bounce_mjx.resources import VERSION as __version__
 
 if TYPE_CHECKING:
+    from bounce_mjx.config.user_code import import_code
+    from bounce_mjx.deploy.environments import environment
     from bounce_mjx.deploy.loading import load_policy
     from bounce_mjx.env.bounce_ball import BounceBall
     from bounce_mjx.task.bounce import Config as EnvConfig
     from bounce_mjx.training.run import Run, train
 
-__all__ = ["BounceBall", "EnvConfig", "Run", "__version__", "load_policy", "train"]
+__all__ = [
+    "BounceBall",
+    "EnvConfig",
+    "Run",
+    "__version__",
+    "environment",
+    "import_code",
+    "load_policy",
+    "train",
+]
 
 _PUBLIC = {
     "BounceBall": ("bounce_mjx.env.bounce_ball", "BounceBall"),
     "EnvConfig": ("bounce_mjx.task.bounce", "Config"),
     "Run": ("bounce_mjx.training.run", "Run"),
+    "environment": ("bounce_mjx.deploy.environments", "environment"),
+    "import_code": ("bounce_mjx.config.user_code", "import_code"),
     "load_policy": ("bounce_mjx.deploy.loading", "load_policy"),
     "train": ("bounce_mjx.training.run", "train"),
 }

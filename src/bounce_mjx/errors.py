@@ -22,6 +22,11 @@ class UserError(Exception):
     expected one and the remedy."""
 
 
+class UnexpectedArgument(UserError, TypeError):
+    """An argument or an option with an unknown name; libraries that try several expect a TypeError
+    with these words of Python's own."""
+
+
 class MissingPackage(UserError, ImportError):
     """An optional package cannot be imported."""
 

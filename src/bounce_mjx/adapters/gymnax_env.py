@@ -5,17 +5,15 @@ The functions are pure and take one environment: apply `jax.vmap` to batch them.
 """
 
 import functools
-import os
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from bounce_mjx.deploy.environments import environment_config, refuse_warmup
+from bounce_mjx.deploy.environments import refuse_warmup
 from bounce_mjx.env.env import Env, State
 from bounce_mjx.errors import needed
-from bounce_mjx.task.task import Task
 
 
 @struct.dataclass
@@ -41,29 +39,14 @@ class GymnaxBounceBall:
     name = "BounceBall"
     """Name of the environment."""
 
-    def __init__(
-        self,
-        task: str | type[Task] | None = None,
-        policy: str | os.PathLike | None = None,
-        world: str | os.PathLike | None = None,
-        **settings: Any,
-    ):
-        """Makes the environment.
-
-        Args:
-          task: its class, its name, or FILE.py:CLASS; None for the policy's, or the default one.
-          policy: a name, a run's folder, a checkpoint in it or an .onnx file, whose environment it
-            is (`deploy.environments`).
-          world: of the policy: nominal (the default), training for the worlds that its training
-            sampled, or a named world.
-          settings: fields of the task's config, such as episode_seconds=30.
+    def __init__(self, env: Env):
+        """Wraps an environment, such as from `environment`.
 
         Raises:
-          UserError: a setting is wrong, or the policy's environment has another value.
+          UserError: it has a warm-up.
         """
-        config = environment_config(self.name, task, policy, world, settings)
-        refuse_warmup(config, self.name)
-        self.task = Env(config)
+        refuse_warmup(env.config, self.name)
+        self.task = env
         """The environment; its own `task` is the task."""
         self.default_params = EnvParams(self.task.config.episode_steps)
         """The time limit of the settings."""

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, needed
 
 with needed("Stable-Baselines3", "bounce_mjx[sb3]"):
@@ -27,18 +28,19 @@ class Sb3VecEnv(VecEnv):
     `TimeLimit.truncated` alone, because many entries would take longer than the physics.
     """
 
-    def __init__(self, num_envs: int = 256, **settings: Any):
+    def __init__(self, env: Env, num_envs: int = 256, **options: Any):
         """Makes the environments; the first reset compiles them.
 
         Args:
-          settings: other arguments of `TaskVectorEnv`, such as max_episode_steps=400 and
-            episode_seconds=30. Of pictures, the first four environments are tiled.
+          env: such as from `environment`.
+          options: other arguments of `TaskVectorEnv`, such as max_episode_steps=400. Of pictures,
+            the first four environments are tiled.
 
         Raises:
-          UserError: an argument is wrong; an unknown argument is a TypeError too.
+          UserError: an argument is wrong.
         """
         same_step = AutoresetMode.SAME_STEP
-        self._envs = TaskVectorEnv(num_envs=num_envs, autoreset_mode=same_step, **settings)
+        self._envs = TaskVectorEnv(env, num_envs, autoreset_mode=same_step, **options)
         self._actions: np.ndarray | None = None
         self.render_mode = self._envs.render_mode
         self.spec: gymnasium.envs.registration.EnvSpec | None = None
@@ -113,7 +115,7 @@ class Sb3VecEnv(VecEnv):
         if hasattr(type(self), attr_name):
             raise UserError(
                 f"set_attr got {attr_name!r}, which is fixed by the settings; give these to "
-                "Sb3VecEnv, and the commands of the next reset to set_options"
+                "environment(...), and the commands of the next reset to set_options"
             )
         setattr(self, attr_name, value)
 

@@ -10,6 +10,7 @@ import yaml
 
 from bounce_mjx.config.command_line import Flag, parse
 from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.config.user_code import import_flags
 from bounce_mjx.config.validation import validate
 from bounce_mjx.robot.config import PaddleConfig, RobotConfig
 from bounce_mjx.runs.config import TrainConfig
@@ -66,11 +67,14 @@ def main(args: Sequence[str]) -> None:
     out = command.out or Path(f"{command.mjcf.stem.rpartition(':')[2]}.yaml")
     write_output(out, _as_yaml(args, settings))
     print(f"config: {out}")
-    flags = ["--robot", str(out)]
+    flags = ["--robot", str(out), *import_flags(task)]
+    viewed = flags
+    trained = flags
     if command.task != DEFAULT:
-        flags = ["--task", command.task, *flags]
-    print(f"see it: bounce-mjx view {shlex.join(flags)} --actions zero")
-    print(f"train it: bounce-mjx train {shlex.join(flags)}")
+        viewed = ["--task", command.task, *flags]
+        trained = [command.task, *flags]
+    print(f"see it: bounce-mjx view {shlex.join(viewed)} --actions zero")
+    print(f"train it: bounce-mjx train {shlex.join(trained)}")
 
 
 def _settings(command: AdoptCommand, adoption: "Adoption", task: type[Task]) -> dict[str, Any]:

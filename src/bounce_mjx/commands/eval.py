@@ -14,10 +14,10 @@ from bounce_mjx.commands.which_policy import (
     WhichPolicy,
     check_one_world,
     film_command,
-    in_what_if_world,
 )
 from bounce_mjx.config.command_line import Flag, stdout
 from bounce_mjx.config.settings import Count, NonNegativeInt
+from bounce_mjx.config.user_code import import_flags
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import config as evaluation
 from bounce_mjx.world.randomization import RandomizationConfig
@@ -78,8 +78,7 @@ def main(args: Sequence[str]) -> None:
     check_one_world(command.nominal, command.world, command.randomization)
     command.check_log_dir(command.checkpoint)
     checkpoint = command.choose(command.checkpoint, command.robot)
-    config = command.config_of(checkpoint, command.robot, command.world)
-    config = in_what_if_world(config, command.randomization)
+    config = command.config_of(checkpoint, command.robot, command.world, command.randomization)
     if command.limits and config.env.robot.limits.velocity is None:
         raise UserError("the policy's arm has no command limits (env.robot.limits); omit --limits")
     task_commands = given_commands.checked(config.env)
@@ -148,6 +147,11 @@ def main(args: Sequence[str]) -> None:
         # A film is on the config's engine.
         if failures and command.physics == "config":
             first_to_end = min(failures, key=lambda failure: failure.seconds)
-            shown = film_command(args, _NOT_OF_PLAY, "--episode", str(first_to_end.episode))
+            shown = film_command(
+                args,
+                _NOT_OF_PLAY,
+                *("--episode", str(first_to_end.episode)),
+                imports=import_flags(config.env.task),
+            )
             print(f"film of one: {shown}")
     sys.exit(0 if report.passed else 1)

@@ -32,8 +32,6 @@ def main(args: Sequence[str]) -> None:
     command.check_log_dir(command.checkpoint)
     set_up_jax()
     checkpoint = choose_checkpoint(command.checkpoint, command.folder)
-    # Refuses a run of a task in a file that --task does not name.
-    command.config_of_run(checkpoint.run)
     print(f"checkpoint: {checkpoint.folder} ({checkpoint.steps:,} steps)")
     content = export_onnx(checkpoint)
     write_output(command.onnx, content)

@@ -10,6 +10,7 @@ import os
 import sys
 from collections.abc import Sequence
 
+from bounce_mjx.config.user_code import run_imports
 from bounce_mjx.errors import UserError, exit_on_user_error, needed, suggest
 from bounce_mjx.interrupt import end_on_ctrl_c
 from bounce_mjx.resources import VERSION
@@ -35,6 +36,7 @@ A robot arm learns tasks with a ball, such as bouncing it on a paddle.
 {commands}
 
 bounce-mjx COMMAND --help lists the arguments of a command. bounce-mjx --version prints the version.
+--import FILE.py, of any command, brings your own tasks and algorithms.
 """
 
 
@@ -73,4 +75,6 @@ def main(args: Sequence[str] | None = None) -> None:
             os.environ["MUJOCO_GL"] = opengl
         with needed(f"bounce-mjx {name}", "bounce_mjx"):
             command = importlib.import_module(f"bounce_mjx.commands.{name}")
-        command.main(rest)
+        # The user's own tasks and algorithms, which then have names.
+        _, _, *words = run_imports(["bounce-mjx", name, *rest])
+        command.main(words)

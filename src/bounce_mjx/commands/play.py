@@ -12,7 +12,6 @@ from bounce_mjx.commands.which_policy import (
     OtherWorld,
     WhichPolicy,
     check_one_world,
-    in_what_if_world,
     suite_conditions,
 )
 from bounce_mjx.config.command_line import Flag, stdout
@@ -114,8 +113,7 @@ def main(args: Sequence[str]) -> None:
 def _config(checkpoint: "Checkpoint", command: PlayCommand) -> TrainConfig:
     """The config of a checkpoint's training, with the world that is to be shown."""
     world = None if command.condition else command.world
-    config = command.config_of(checkpoint, command.robot, world)
-    return in_what_if_world(config, command.randomization)
+    return command.config_of(checkpoint, command.robot, world, command.randomization)
 
 
 def _evaluation_seed(command: PlayCommand) -> int:

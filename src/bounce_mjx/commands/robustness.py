@@ -15,6 +15,7 @@ from bounce_mjx.commands.which_policy import (
 )
 from bounce_mjx.config.command_line import parse, stdout
 from bounce_mjx.config.settings import Count, NonNegativeInt
+from bounce_mjx.config.user_code import import_flags
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import config as evaluation
 
@@ -109,5 +110,7 @@ def main(args: Sequence[str]) -> None:
     if lost and not command.assumed and command.physics == "config":
         worst = min(lost, key=lambda outcome: outcome.lasted)
         film = "--condition", worst.label, "--episode", str(worst.lost[0])
-        print(f"film of one that ended: {film_command(args, _NOT_OF_PLAY, *film)}")
+        imports = import_flags(config.env.task)
+        shown = film_command(args, _NOT_OF_PLAY, *film, imports=imports)
+        print(f"film of one that ended: {shown}")
     sys.exit(0 if report.passed else 1)

@@ -9,8 +9,10 @@ from bounce_mjx.commands.which_policy import WhichPolicy
 from bounce_mjx.config.command_line import Flag, flag_names, parse, read_flags, typed
 from bounce_mjx.config.files import flat
 from bounce_mjx.config.settings import fields_in
+from bounce_mjx.config.user_code import own_names
 from bounce_mjx.errors import UserError, warn_once
 from bounce_mjx.task.registry import find_task, registered_tasks
+from bounce_mjx.task.task import Task
 from bounce_mjx.world.config import Command, WorldConfig
 
 CommandT = TypeVar("CommandT", bound=WhichPolicy)
@@ -70,7 +72,7 @@ def _fields_of(task: str | None) -> dict[str, FieldInfo]:
     """The commands of a task, or of every task, as settings by dotted key."""
     commands: dict[str, Command] = {}
     # Without --task, the run may be of any task.
-    for name in [task] if task else registered_tasks():
+    for name in [task] if task else (*registered_tasks(), *own_names(Task)):
         try:
             commands |= find_task(name).Config().commands
         except UserError as error:

@@ -40,7 +40,7 @@ def main(args: Sequence[str]) -> None:
         in_daemon_thread(jax.devices)
     from bounce_mjx.training import hosts
     from bounce_mjx.training.events import say
-    from bounce_mjx.training.job import TrainingStopped, named_task
+    from bounce_mjx.training.job import TrainingStopped, imports_of
     from bounce_mjx.training.run import run_training
 
     with hosts.leave_at_once(), exit_on_user_error():
@@ -69,7 +69,7 @@ def main(args: Sequence[str]) -> None:
             say(console, str(stop))
             # Does not wait for a compilation or an evaluation in another thread.
             leave(0)
-        words = shlex.join([str(run.checkpoint.run), *named_task(config)])
+        words = shlex.join([str(run.checkpoint.run), *imports_of(config)])
         say(console, f"measure it: bounce-mjx eval {words}")
         say(console, f"watch it: bounce-mjx play {words}")
         if is_watched:

@@ -7,7 +7,7 @@ from typing import Literal
 from bounce_mjx.config.command_line import flag_names, parse, read_flags, stdout
 from bounce_mjx.config.files import flat
 from bounce_mjx.config.settings import StrictModel, fields_in
-from bounce_mjx.runs.settings import Choice, stack
+from bounce_mjx.runs.settings import Choice, read_layers
 from bounce_mjx.task.registry import DEFAULT
 from bounce_mjx.viewers.options import ViewerOptions
 
@@ -22,7 +22,7 @@ class ViewCommand(StrictModel):
     """random: uniform; zero: the servos hold their angles; mirror: the mirror law, a model-based
     controller."""
     task: str = DEFAULT
-    """Name of the task, or FILE.py:CLASS for your own."""
+    """Name of the task."""
     robot: Path | None = None
     """Config of a robot: the file that bounce-mjx adopt wrote, or the name of one in
     configs/robots/ (ur5e, panda or iiwa)."""
@@ -34,8 +34,8 @@ def main(args: Sequence[str]) -> None:
     # The task and the robot, read first, decide which flags of the environment there are. The
     # second reading gives the command's own flags again, and they are left out.
     command = parse(ViewCommand, args, prog=PROG, is_first=True)
-    preset = Choice(config=(Path("default"),), robot=command.robot, task=command.task)
-    layers = stack(preset)
+    preset = Choice(start=command.task, config=(Path("default"),), robot=command.robot)
+    layers = read_layers(preset)
     of_env = {key: field for key, field in layers.fields.items() if key.startswith("env.")}
     fields = fields_in(ViewCommand) | of_env
     names = flag_names(fields)

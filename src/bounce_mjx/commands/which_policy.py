@@ -10,14 +10,13 @@ from pydantic import Field
 
 from bounce_mjx.config.command_line import Flag, plain_words
 from bounce_mjx.config.settings import StrictModel
-from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError, suggest
 from bounce_mjx.resources import policy_folder
 from bounce_mjx.runs import config as run_configs
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.presets import named_file
 from bounce_mjx.runs.settings import read_preset
-from bounce_mjx.runs.worlds import in_world
+from bounce_mjx.runs.worlds import in_named_world, in_sampled_world, trained_in
 from bounce_mjx.task.registry import DEFAULT, find_task
 from bounce_mjx.world.randomization import RandomizationConfig
 
@@ -75,24 +74,6 @@ def check_one_world(nominal: bool, world: Path | None, randomization: Randomizat
         raise UserError(f"{' and '.join(given)} cannot be combined; omit one")
 
 
-def in_what_if_world(config: TrainConfig, randomization: RandomizationConfig) -> TrainConfig:
-    """A config with the terms of the world that a user gives, if any, in place of its own.
-
-    Raises:
-      UserError: a term does not fit the arm, or what is given has no term to act on.
-    """
-    if not randomization.terms:
-        if randomization != RandomizationConfig():
-            raise UserError(
-                "--randomization is given without a term of the world, such as "
-                "--randomization.air-drag 0 0.2; give one, or omit it"
-            )
-        return config
-    given = dict(config.env) | {"randomization": randomization}
-    env = validate(type(config.env), given, "the flags --randomization")
-    return config.model_copy(update={"env": env})
-
-
 def suite_conditions(
     suite: Path, config: TrainConfig, world: Path | None
 ) -> tuple[Path, list["Condition"], int]:
@@ -113,18 +94,21 @@ def suite_conditions(
     path = named_file(suite, "configs")
     if world is None:
         return path, load_suite(path, config.env), 0
-    there, named = in_world(config, world)
-    assumed = named.double_assumed(model_nominals(there.env))
-    return path, load_suite(path, config.env, there.env, assumed), len(assumed)
+    there, named = in_named_world(config.env, world)
+    assumed = named.double_assumed(model_nominals(there))
+    return path, load_suite(path, config.env, there, assumed), len(assumed)
 
 
-def film_command(args: Sequence[str], omitted: Sequence[str], *film: str) -> str:
+def film_command(
+    args: Sequence[str], omitted: Sequence[str], *film: str, imports: Sequence[str] = ()
+) -> str:
     """The command that shows an episode of the evaluation that a command line started.
 
     Args:
       args: the words of the command line.
       omitted: its flags that `play` lacks; a name that ends with = has a value.
       film: the flags of the episode.
+      imports: those of the user's own task.
     """
     without_value = {flag for flag in omitted if not flag.endswith("=")}
     without_value |= {flag.replace("--", "--no-", 1) for flag in without_value}
@@ -135,7 +119,7 @@ def film_command(args: Sequence[str], omitted: Sequence[str], *film: str) -> str
             next(words, None)
         elif word not in without_value and f"{word.partition('=')[0]}=" not in omitted:
             kept.append(word)
-    return shlex.join(["bounce-mjx", "play", *kept, *film])
+    return shlex.join(["bounce-mjx", "play", *kept, *film, *imports])
 
 
 class WhichPolicy(StrictModel):
@@ -143,7 +127,7 @@ class WhichPolicy(StrictModel):
     for its paths, and for the robot and the world if it simulates."""
 
     task: str | None = None
-    """Task of the run. A run of a task in a file, FILE.py:CLASS, needs it, as the file is code."""
+    """Task whose newest run it is, by default bounce."""
     log_dir: Path | None = None
     """Folder in which to look for the newest run; by default, that of the task's runs."""
 
@@ -209,29 +193,36 @@ class WhichPolicy(StrictModel):
         Raises:
           UserError: as `load_run_config`.
         """
-        return run_configs.load_run_config(run, self.task)
+        return run_configs.load_run_config(run)
 
     def config_of(
-        self, checkpoint: "Checkpoint", robot: Path | None = None, world: Path | None = None
+        self,
+        checkpoint: "Checkpoint",
+        robot: Path | None = None,
+        world: Path | None = None,
+        randomization: RandomizationConfig | None = None,
     ) -> TrainConfig:
-        """The config of a checkpoint's run, or that of the mirror law: the task's preset.
+        """The config of a checkpoint's run, or that of the mirror law, the task's preset; with its
+        environment in the world of the episodes.
 
         Args:
           robot: of the mirror law.
           world: in place of that of the training.
+          randomization: terms of a world in place of that of the training.
 
         Raises:
-          UserError: as `load_run_config`, `read_preset` and `in_world`.
+          UserError: as `load_run_config`, `read_preset`, `trained_in` and `in_sampled_world`.
         """
         from bounce_mjx.baselines.mirror import observing
         from bounce_mjx.runs.folders import MIRROR_LAW
 
         if checkpoint is MIRROR_LAW:
-            preset = read_preset(Path("default"), robot, self.task)
-            config = preset.model_copy(update={"env": observing(preset.env)})
+            config = read_preset(Path("default"), robot, self.task)
+            env = observing(config.env)
         else:
             config = self.config_of_run(checkpoint.run)
-        if world is None:
-            return config
-        config, _ = in_world(config, world)
-        return config
+            env = config.env
+        env = trained_in(env, world)
+        if randomization is not None:
+            env = in_sampled_world(env, randomization)
+        return config.model_copy(update={"env": env})

@@ -248,7 +248,7 @@ def _add_arguments(
     shown: Sequence[str] | None,
 ) -> None:
     """Adds the arguments, in groups; `defaults` are by dotted name."""
-    parser.usage = f"{parser.prog} [FLAGS]"
+    positional = ""
     flags = flag_names(fields)
     groups = {}
     for key, field in fields.items():
@@ -261,10 +261,11 @@ def _add_arguments(
         if name not in groups:
             groups[name] = parser.add_argument_group(name)
         if mark.is_positional:
-            parser.usage += f" {options['metavar']}"
+            positional += f" {options['metavar']}"
             groups[name].add_argument(key, **options)
         else:
             groups[name].add_argument(flags[key], dest=key, **options)
+    parser.usage = f"{parser.prog}{positional} [FLAGS]"
 
 
 def _help_of(field: FieldInfo, default: Any, is_short: bool) -> str:

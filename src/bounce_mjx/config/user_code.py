@@ -1,15 +1,21 @@
-"""Classes in files of the user, as a setting names them: FILE.py:CLASS.
+"""The user's own code: imported once, by `--import` or as any module, its classes have names.
 
-Such a file is code, which runs only if the user names the file. Code is known by its content: a
-run's copy of a file that the user has named is the same code.
+A class has its own name in lower case, such as dribble of `class Dribble(Task)`. Nothing else ever
+runs a file: neither a config nor a run brings code into a process. A run has a copy of the code
+that it was trained with; code is compared by its content.
 """
 
+import importlib
+import inspect
+import itertools
 import os
+import shlex
 import sys
 import traceback
 import types
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import pydantic
 
@@ -18,95 +24,180 @@ from bounce_mjx.errors import UserError, reason_of, shorten
 
 Kind = TypeVar("Kind")
 
-# The modules of the files that the user has named, by their content.
-_modules: dict[bytes, types.ModuleType] = {}
-# The classes that the user has named for those of runs, by the run's FILE.py:CLASS.
-_admitted: dict[str, type] = {}
+_FLAG = "--import"
+_PACKAGE = "bounce_mjx."
+# Begin of the names of the modules of imported files.
+_PREFIX = "bounce_mjx_file_"
 
 
-def is_file(name: str) -> bool:
-    """Whether a name is FILE.py:CLASS."""
-    return name.rpartition(":")[0].endswith(".py")
+class Source(NamedTuple):
+    """A file of code."""
+
+    path: Path
+    content: bytes
+    """What was imported, which may have been edited since."""
 
 
-def source_file(name: str) -> Path:
-    """Absolute path of the file in FILE.py:CLASS, without .. in it."""
-    return Path(os.path.abspath(Path(name.rpartition(":")[0]).expanduser()))
+# Of the imported files, by the name of their module.
+_sources: dict[str, Source] = {}
+_numbers = itertools.count()
+# The words of the command that runs here, for the command that has an import in addition.
+_command: list[str] = []
 
 
-def read_source(name: str) -> bytes:
-    """Content of the file in FILE.py:CLASS.
+def import_code(place: str | os.PathLike) -> None:
+    """Imports a file of the user's own tasks or algorithms, whose classes then have names. A file
+    of the same content, such as a run's copy of it, is the same code, and runs once.
+
+    Args:
+      place: FILE.py, or the name of a module.
 
     Raises:
-      UserError: the file cannot be read.
+      UserError: it cannot be read or imported.
     """
-    path = source_file(name)
+    if not str(place).endswith(".py"):
+        _import_module(str(place))
+        return
+    path = Path(os.path.abspath(Path(place).expanduser()))
     try:
-        return path.read_bytes()
+        content = path.read_bytes()
     except OSError as error:
         raise UserError(
-            f"{shorten(str(path))} cannot be read ({reason_of(error)}); give FILE.py:CLASS"
+            f"{shorten(str(path))} cannot be read ({reason_of(error)}); give {_FLAG} FILE.py"
+        ) from error
+    if all(content != source.content for source in _sources.values()):
+        _run(Source(path, content))
+
+
+def run_imports(command: Sequence[str]) -> list[str]:
+    """Imports what a command line names with --import; its other words.
+
+    Args:
+      command: such as bounce-mjx, eval, RUN, --import, FILE.py.
+
+    Raises:
+      UserError: a place is missing, or cannot be imported.
+    """
+    _command[:] = command
+    others = []
+    words = iter(command)
+    for word in words:
+        flag, equals, place = word.partition("=")
+        if flag != _FLAG:
+            others.append(word)
+            continue
+        place = place if equals else next(words, "")
+        if not place or place.startswith("--"):
+            raise UserError(f"{_FLAG} needs a file or a module; give {_FLAG} FILE.py")
+        import_code(place)
+    return others
+
+
+def class_of(name: str, base: type[Kind]) -> type[Kind] | None:
+    """The user's class of a name, of those that were imported; None without one.
+
+    Raises:
+      UserError: two files have one of this name.
+    """
+    found = [kind for kind in _subclasses(base) if own_name(kind) == name.lower()]
+    if not found:
+        return None
+    newest = found[-1]
+    for other in found:
+        if not _is_same(source_of(other), source_of(newest)):
+            places = f"{_place_of(other)} and {_place_of(newest)}"
+            raise UserError(f"{name} is a class of {places}; import one of them, or rename one")
+    return newest
+
+
+def own_names(base: type) -> list[str]:
+    """The names of the user's classes that were imported."""
+    return list(dict.fromkeys(map(own_name, _subclasses(base))))
+
+
+def own_name(kind: type) -> str:
+    """The name of a user's class."""
+    return kind.__name__.lower()
+
+
+def plain_name(name: str) -> str:
+    """The name in a file of a time when one was FILE.py:CLASS; any other is returned unchanged."""
+    file, _, class_name = name.rpartition(":")
+    return class_name.lower() if file.endswith(".py") else name
+
+
+def source_of(kind: type) -> Source | None:
+    """The file of a class; None for one of a notebook or an interpreter."""
+    if kind.__module__ in _sources:
+        return _sources[kind.__module__]
+    try:
+        path = Path(os.path.abspath(inspect.getsourcefile(kind) or ""))
+        return Source(path, path.read_bytes())
+    except (TypeError, OSError):
+        return None
+
+
+def import_flags(*kinds: type) -> list[str]:
+    """The flags with which a later command imports these classes again; none for those of the
+    package, and of no file."""
+    flags = []
+    for kind in kinds:
+        source = None if kind.__module__.startswith(_PACKAGE) else source_of(kind)
+        if source is not None and str(source.path) not in flags:
+            flags += [_FLAG, str(source.path)]
+    return flags
+
+
+def not_imported(source: str, key: str, name: str, file: Path | None) -> UserError:
+    """The refusal of a run or a file whose code was not imported in this process.
+
+    Args:
+      source: of the name, such as the run.
+      key: task or algorithm.
+      file: the code, where it is known.
+    """
+    place = file or "FILE.py"
+    code = f", whose code is {file}" if file else ""
+    advice = f'import_code("{place}")'
+    if _command:
+        advice = shlex.join([*_command, _FLAG, str(place)])
+    return UserError(f"{source} has the {key} {name}{code}; import it to run it: {advice}")
+
+
+def _import_module(name: str) -> None:
+    # The user's own modules lie in the working directory.
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())
+    try:
+        importlib.import_module(name)
+    except Exception as error:
+        raise UserError(
+            f"{shorten(name)} cannot be imported ({reason_of(error)}); give {_FLAG} FILE.py, or "
+            "the name of a module"
         ) from error
 
 
-def is_same_code(name: str, other: str) -> bool:
-    """Whether two names stand for the same class, which one of the same name in a copy of its file
-    is too."""
-    if not (is_file(name) and is_file(other)):
-        return name == other
-    is_same_class = name.rpartition(":")[2] == other.rpartition(":")[2]
-    return is_same_class and read_source(name) == read_source(other)
-
-
-def class_in_file(name: str, base: type[Kind]) -> type[Kind]:
-    """The subclass of `base` in FILE.py:CLASS, whose code runs once in a process.
-
-    Raises:
-      UserError: the file cannot be imported, or has no such class.
-    """
-    source = read_source(name)
-    if source not in _modules:
-        _modules[source] = _run(source, source_file(name))
-    return _class_in(_modules[source], name, base)
-
-
-def known_class(name: str, base: type[Kind]) -> type[Kind] | None:
-    """The subclass of `base` in FILE.py:CLASS if code with the same content has been named in this
-    process; nothing of the file is run.
-
-    Raises:
-      UserError: the file cannot be read, or has no such class.
-    """
-    if name in _admitted:
-        return _admitted[name]
-    module = _modules.get(read_source(name))
-    return None if module is None else _class_in(module, name, base)
-
-
-def admit(name: str, named: type) -> None:
-    """Lets a class that the user has named stand for a run's FILE.py:CLASS, whose code may be
-    another one."""
-    _admitted[name] = named
-
-
-def _run(source: bytes, path: Path) -> types.ModuleType:
-    """The module of a file, whose code runs here.
+def _run(source: Source) -> None:
+    """Runs a file as a module.
 
     Raises:
       UserError: it raises an error.
     """
-    module = types.ModuleType(f"bounce_mjx_{path.stem}_{len(_modules)}")
-    module.__file__ = str(path)
+    module = types.ModuleType(f"{_PREFIX}{source.path.stem}_{next(_numbers)}")
+    module.__file__ = str(source.path)
     # Dataclasses and pickles look for their module there.
     sys.modules[module.__name__] = module
+    _sources[module.__name__] = source
     try:
-        exec(compile(source, str(path), "exec"), vars(module))
+        exec(compile(source.content, str(source.path), "exec"), vars(module))
     except UserError as error:
-        raise UserError(f"{path} cannot be imported: {error}") from error
+        del _sources[module.__name__]
+        raise UserError(f"{source.path} cannot be imported: {error}") from error
     except Exception as error:
+        del _sources[module.__name__]
         line = 1
         for frame in traceback.extract_tb(error.__traceback__):
-            if frame.filename == str(path):
+            if frame.filename == str(source.path):
                 line = frame.lineno
         # A SyntaxError has its own.
         line = getattr(error, "lineno", None) or line
@@ -114,23 +205,30 @@ def _run(source: bytes, path: Path) -> types.ModuleType:
         if isinstance(error, pydantic.ValidationError):
             reason = describe(error, {})
         raise UserError(
-            f"{path} cannot be imported ({type(error).__name__} in line {line}: "
+            f"{source.path} cannot be imported ({type(error).__name__} in line {line}: "
             f"{shorten(reason, 300)}); correct it"
         ) from error
-    return module
 
 
-def _class_in(module: types.ModuleType, name: str, base: type[Kind]) -> type[Kind]:
-    """The subclass of `base` of FILE.py:CLASS in the file's module."""
-    classes = {
-        key: value
-        for key, value in vars(module).items()
-        if isinstance(value, type) and issubclass(value, base) and value is not base
-    }
-    class_name = name.rpartition(":")[2]
-    if class_name not in classes:
-        raise UserError(
-            f"{source_file(name)} has no subclass {shorten(class_name)!r} of {base.__name__} "
-            f"(it has: {', '.join(classes) or 'none'}); give FILE.py:CLASS"
-        )
-    return classes[class_name]
+def _subclasses(base: type[Kind]) -> Iterator[type[Kind]]:
+    """The user's subclasses of a class of the package, as their modules have them: not one that a
+    module has defined anew since, nor one within a function."""
+    for kind in base.__subclasses__():
+        module = sys.modules.get(kind.__module__)
+        is_forgotten = kind.__module__.startswith(_PREFIX) and kind.__module__ not in _sources
+        is_own = not kind.__module__.startswith(_PACKAGE) and not is_forgotten
+        if is_own and getattr(module, kind.__qualname__, None) is kind:
+            yield kind
+        yield from _subclasses(kind)
+
+
+def _is_same(one: Source | None, other: Source | None) -> bool:
+    """Whether two sources are one file, or its copy."""
+    if one is None or other is None:
+        return one is other
+    return one.path == other.path or one.content == other.content
+
+
+def _place_of(kind: type) -> str:
+    source = source_of(kind)
+    return kind.__module__ if source is None else str(source.path)

@@ -10,7 +10,7 @@ import math
 from pathlib import Path
 from typing import NamedTuple
 
-from bounce_mjx.config.user_code import is_file
+from bounce_mjx.config.user_code import plain_name
 from bounce_mjx.deploy.metadata import Metadata
 from bounce_mjx.errors import UserError
 from bounce_mjx.task.registry import task_name
@@ -27,7 +27,7 @@ class Interface(NamedTuple):
     arm's limits, is not in it, as the same numbers mean the same with and without."""
 
     task: str
-    """Name of the task; of one in a file, its class."""
+    """Name of the task."""
     robot: str
     """Name of the arm, as its MJCF file states it."""
     start_pose: tuple[float, ...]
@@ -51,7 +51,7 @@ def interface_of(env: WorldConfig) -> Interface:
       UserError: the MJCF file is missing or wrong.
     """
     return Interface(
-        task=_class_or_name(task_name(env.task)),
+        task=task_name(env.task),
         robot=robot_name(env.mjcf),
         start_pose=env.default_joint_angles,
         control_step=env.control_dt,
@@ -69,7 +69,7 @@ def interface_in(metadata: Metadata) -> Interface:
     names = {"past_actions": "action"}
     parts = [(names.get(part.name, part.name), part.history) for part in metadata.observation]
     return Interface(
-        task=_class_or_name(metadata.task),
+        task=plain_name(metadata.task),
         robot=metadata.robot,
         start_pose=metadata.default_joint_angles,
         control_step=metadata.control_dt,
@@ -115,11 +115,6 @@ def robot_name(mjcf: Path | None) -> str:
     from bounce_mjx.robot.model import scene_spec
 
     return scene_spec(mjcf, RobotConfig())[0].modelname
-
-
-def _class_or_name(task: str) -> str:
-    """A task's name; of FILE.py:CLASS the class, as a run has a copy of the file."""
-    return task.rpartition(":")[2] if is_file(task) else task
 
 
 def _quantities(parts: list[tuple[str, int]], velocity: str) -> tuple[str, ...]:

@@ -12,7 +12,6 @@ from bounce_mjx.resources import POLICIES, policy_folder
 
 def load_policy(
     policy: str | os.PathLike,
-    task: str | None = None,
     joint_names: Sequence[str] | Mapping[str, str] | None = None,
     env: Any = None,
 ) -> DeployedPolicy:
@@ -23,7 +22,6 @@ def load_policy(
         "robust_small", or that of a task such as "juggle" or of an arm; a `.onnx` file from
         `bounce-mjx export`; or a run's folder or a checkpoint in it, which is first exported with
         JAX. A folder of that name comes first.
-      task: FILE.py:CLASS, for a run of a task in a file, which is code.
       joint_names: the driver's names of the joints in the driver's order, such as `fr3_joint1`;
         angles, velocities, actions and commands then have this order. A name belongs to the joint
         whose name it ends with; for others, a mapping from the driver's names to the policy's.
@@ -40,7 +38,7 @@ def load_policy(
         path = folder / f"{policy}.onnx"
         source = f"the policy {policy}"
     try:
-        model = _export(path, task) if path.is_dir() else path.read_bytes()
+        model = _export(path) if path.is_dir() else path.read_bytes()
     except OSError as error:
         raise UserError(
             f"the policy {path} cannot be read ({error.strerror}); give {', '.join(POLICIES)}, "
@@ -98,11 +96,10 @@ def check_names(names: Sequence[str], joints: Sequence[str], option: str) -> tup
     return tuple(names)
 
 
-def _export(run: Path, task: str | None) -> bytes:
+def _export(run: Path) -> bytes:
     """The ONNX file of a run's policy."""
     try:
         from bounce_mjx.deploy.export import export_onnx
-        from bounce_mjx.runs.config import load_run_config
         from bounce_mjx.runs.folders import find_checkpoint
     except ImportError as error:
         raise UserError(
@@ -110,5 +107,4 @@ def _export(run: Path, task: str | None) -> bytes:
             "export on the machine that trained it, and give the .onnx file"
         ) from error
     checkpoint = find_checkpoint(run)
-    load_run_config(checkpoint.run, task)
     return export_onnx(checkpoint)

@@ -1,9 +1,13 @@
-"""The environment of this package in one of any library, below wrappers that change nothing of what
-a policy relies on: its observations, its actions and its control step."""
+"""A policy in an environment of any library: the environment of this package in it, below wrappers
+that change nothing of what the policy relies on (its observations, its actions, its control step),
+and the library's own arrays."""
 
-from collections.abc import Iterator
+import importlib
+from collections.abc import Callable, Iterator
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from bounce_mjx.env.env import Env
@@ -91,6 +95,35 @@ def environments_in(env: Any) -> list[Env]:
         if not any(found is other for other in environments):
             environments.append(found)
     return environments
+
+
+def in_library(act: Callable[[jax.Array], jax.Array], size: int) -> Callable[[Any], Any]:
+    """A policy for the arrays of any library.
+
+    Args:
+      act: observations [..., N] -> actions [..., A].
+      size: length N of an observation.
+
+    Returns:
+      The same for arrays of NumPy, tensors of PyTorch, or arrays of JAX, of which it gives the same
+      kind; UserError for observations of another length.
+    """
+
+    def policy(observation: Any) -> Any:
+        if observation.shape[-1:] != (size,):
+            raise UserError(
+                f"the observation has the shape {list(observation.shape)}, but the last axis must "
+                f"have {size} entries"
+            )
+        if isinstance(observation, np.ndarray):
+            return np.array(act(jnp.asarray(observation, jnp.float32)))
+        if isinstance(observation, jax.Array):
+            return act(observation)
+        # A tensor, whose library need not be installed.
+        actions = act(jax.dlpack.from_dlpack(observation.detach().contiguous()))
+        return importlib.import_module("torch").from_dlpack(actions)
+
+    return policy
 
 
 def _below(env: Any, outermost: str) -> Iterator[Env]:

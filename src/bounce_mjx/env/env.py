@@ -191,6 +191,11 @@ class Env:
         return type(self), (self.config, self._randomize)
 
     @property
+    def is_of_its_settings(self) -> bool:
+        """Whether the settings alone decide what it does: nothing else samples its physics."""
+        return self._randomize is None
+
+    @property
     def unwrapped(self) -> "Env":
         """The environment itself, as there is no wrapper around it."""
         return self

@@ -30,6 +30,7 @@ from bounce_mjx.env.vector import AnyEnv
 from bounce_mjx.errors import UserError
 from bounce_mjx.gpu.rows import pack, unpack
 from bounce_mjx.learning import statistics
+from bounce_mjx.learning.algorithm import Algorithm
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.metrics import Metrics, matching_metrics, rollout_metrics, step_metrics
 from bounce_mjx.learning.policy import ActionDistribution, Networks, Policy, make_networks
@@ -163,7 +164,7 @@ class LearnerState(NamedTuple):
     """Learning rate that the KL rule has reached []."""
 
 
-class PPO:
+class PPO(Algorithm):
     """Training as two pure functions, `init` and `run`; `jax.jit` them (the second argument of
     `run` is static). A subclass may change every method (docs/algorithms.md; of `make_networks` the
     value network alone). Its `update` returns the metric loss/gradient_norm, or loss/value or
@@ -171,6 +172,10 @@ class PPO:
 
     Config = PPOConfig
     """Type of the settings; a subclass may add some, which become keys and flags."""
+
+    @classmethod
+    def make_trainer(cls, config: Any, env: Any) -> None:
+        """None, for the trainer of this package, which runs the two functions on each device."""
 
     def __init__(self, config: PPOConfig, env: AnyEnv, episode_steps: int):
         """

@@ -1,28 +1,30 @@
-"""Algorithms by name: that of the package, and those in a file."""
+"""Algorithms by name: that of the package, and those of imported code."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
-from bounce_mjx.config.user_code import class_in_file, is_file
+from bounce_mjx.config.user_code import class_of
 from bounce_mjx.errors import UserError, shorten
+from bounce_mjx.learning.algorithm import Algorithm
 from bounce_mjx.learning.config import PPO_NAME
 
-if TYPE_CHECKING:
-    from bounce_mjx.learning.ppo import PPO
 
-
-def find_algorithm(name: str) -> type[PPO]:
-    """The algorithm of a name: ppo, or a subclass of `PPO` in FILE.py:CLASS.
+def find_algorithm(name: str) -> type[Algorithm]:
+    """The algorithm of a name: ppo, or a subclass of `PPO` or `Algorithm` in imported code.
 
     Raises:
       UserError: there is none.
     """
-    # A command line is read without JAX.
-    from bounce_mjx.learning.ppo import PPO
+    if name == PPO_NAME:
+        # A command line is read without JAX.
+        from bounce_mjx.learning.ppo import PPO
 
-    if is_file(name):
-        return class_in_file(name, PPO)
-    if name != PPO_NAME:
-        raise UserError(f"there is no algorithm {shorten(name)!r}; give ppo or FILE.py:CLASS")
-    return PPO
+        return PPO
+    algorithm = own_algorithm(name)
+    if algorithm is None:
+        raise UserError(
+            f"there is no algorithm {shorten(name)!r}; give ppo, or --import the file of your own"
+        )
+    return algorithm
+
+
+def own_algorithm(name: str) -> type[Algorithm] | None:
+    """The algorithm of imported code that has a name; None for that of the package."""
+    return None if name == PPO_NAME else class_of(name, Algorithm)

@@ -11,13 +11,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bounce_mjx.config.files import flat
-from bounce_mjx.config.user_code import is_file, read_source
 from bounce_mjx.errors import UserError, reason_of, shorten
+from bounce_mjx.learning.config import PPO_NAME
 from bounce_mjx.runs.config import (
     CONFIG_FILE,
     RESUMABLE_KEYS,
     ROBOT,
     TrainConfig,
+    code_of,
     load_run_config,
 )
 from bounce_mjx.runs.files import MANIFEST_FILE
@@ -139,13 +140,14 @@ def _settings(run: Path, config: TrainConfig) -> dict[str, Any]:
     settings = flat(config.model_dump(mode="json", exclude=set(_FREE_KEYS)))
     contents = {}
     for key in ("task", "algorithm"):
-        if is_file(settings[key]):
-            contents[key] = read_source(settings[key])
+        code = code_of(run, key)
+        if code is not None:
+            contents[key] = code.read_bytes()
     if settings["env.mjcf"] is not None:
         contents["env.mjcf"] = (run / ROBOT / MANIFEST_FILE).read_bytes()
     for key, content in contents.items():
         settings[key] = f"{Path(settings[key]).name} {zlib.crc32(content):08x}"
-    if "algorithm" in contents:
+    if config.algorithm != PPO_NAME:
         settings |= _own_settings(run, settings)
     return settings
 

@@ -28,11 +28,10 @@ import numpy as np
 
 from bounce_mjx.baselines.mirror import MirrorLaw
 from bounce_mjx.config.files import differing_keys
-from bounce_mjx.config.user_code import is_file
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.evaluation.results import Report
-from bounce_mjx.learning.config import PPO_NAME
+from bounce_mjx.learning.config import PPO_NAME, PPOConfig
 from bounce_mjx.learning.policy import Actor, Policy, make_networks, networks_of, untrained_policy
 from bounce_mjx.learning.ppo import PPO, Params, names_of_critic_metrics
 from bounce_mjx.learning.registry import find_algorithm
@@ -164,11 +163,11 @@ def read_networks(
     try:
         stored = _read_arrays(checkpoint, item, jax.eval_shape(initial))
     except DamagedCheckpoint as error:
-        if not is_file(config.algorithm):
+        if config.algorithm == PPO_NAME:
             raise
         raise UserError(
             f"{checkpoint.folder} cannot be read as networks of PPO (its algorithm is "
-            f"{config.algorithm}); --resume it, or give another run"
+            f"{config.algorithm}); resume it, or give another run"
         ) from error
     return stored["params"], stored["statistics"], names
 
@@ -184,7 +183,7 @@ def read_start(config: TrainConfig, env: Env) -> tuple[Params, RunningStatistics
         or hidden layers are not those of the training, or one of the two makes other networks.
     """
     algorithm = find_algorithm(config.algorithm)
-    if algorithm.make_networks is not PPO.make_networks:
+    if getattr(algorithm, "make_networks", None) is not PPO.make_networks:
         raise UserError(
             f"{algorithm.__name__} makes networks of its own, which --warm-start cannot fill; "
             "leave one of them out"
@@ -232,7 +231,7 @@ def read_record(checkpoint: Checkpoint) -> Record:
     run_config = load_run_config(checkpoint.run)
     record = verify(checkpoint)
     try:
-        stored = without_own_settings(earlier.present_settings(record.config))
+        stored = earlier.present_settings(record.config)
         differing = _differing_keys(run_config, stored)
     # Pydantic's own is one.
     except ValueError as error:
@@ -253,21 +252,17 @@ def _differing_keys(run_config: TrainConfig, stored: dict[str, Any]) -> set[str]
     """
     names = {"task": run_config.task, "algorithm": run_config.algorithm}
     stored = {"task": DEFAULT, "algorithm": PPO_NAME} | stored
-    others = {key for key, name in names.items() if not _is_same_name(str(stored[key]), name)}
+    others = {key for key, name in names.items() if stored[key] != name}
     if others:
         return others
     env = type(run_config.env).model_validate(stored.get("env", {}))
-    config = TrainConfig.model_validate(stored | names | {"env": env})
+    algorithm = type(run_config.ppo)
+    if algorithm is PPOConfig:
+        stored = without_own_settings(stored)
+    ppo = algorithm.model_validate(stored.get("ppo", {}))
+    config = TrainConfig.model_validate(stored | names | {"env": env, "ppo": ppo})
     # The record has the path of the original MJCF file, and the run's config that of its copy.
     return differing_keys(run_config, config) - RESUMABLE_KEYS - {"env.mjcf"}
-
-
-def _is_same_name(stored: str, name: str) -> bool:
-    """Whether a record names the task or the algorithm of its run. It has the path of the original
-    file, which may be gone or be another one by now, and the run's config that of its copy."""
-    if is_file(stored) and is_file(name):
-        return stored.rpartition(":")[2] == name.rpartition(":")[2]
-    return stored == name
 
 
 def _read_arrays(checkpoint: Checkpoint, item: str, template: Any) -> Any:

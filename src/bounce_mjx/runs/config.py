@@ -1,7 +1,5 @@
 """The settings of a training run, typed, and the reading of a run's own."""
 
-import shlex
-import sys
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,16 +9,16 @@ from pydantic import Field
 from pydantic.fields import FieldInfo
 
 from bounce_mjx.config.settings import Count, NonNegativeInt, Steps, StrictModel, fields_in
-from bounce_mjx.config.user_code import admit, is_file, is_same_code, known_class, source_file
+from bounce_mjx.config.user_code import not_imported, source_of
 from bounce_mjx.config.validation import validate
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import UserError, warn_once
 from bounce_mjx.evaluation.config import DEFAULT_SEED
 from bounce_mjx.learning.config import PPO_NAME, PPOConfig
-from bounce_mjx.learning.registry import find_algorithm
+from bounce_mjx.learning.registry import own_algorithm
 from bounce_mjx.robot.config import is_packaged
 from bounce_mjx.runs.files import check_integrity
 from bounce_mjx.runs.presets import BASE, SOURCES, read_config_file
-from bounce_mjx.task.registry import DEFAULT, find_task, task_name
+from bounce_mjx.task.registry import DEFAULT, find_task, is_task, task_name
 from bounce_mjx.task.task import Task
 from bounce_mjx.world.config import WorldConfig
 
@@ -56,11 +54,11 @@ class TrainConfig(StrictModel):
     """A training run: the task, the trainer, the length and the evaluations."""
 
     task: str = DEFAULT
-    """Name of the task, or FILE.py:CLASS for your own."""
+    """Name of the task."""
     env: pydantic.SerializeAsAny[WorldConfig] = Field(default_factory=_default_env)
     """The world and the task: the settings of the task's `Config`."""
     algorithm: str = PPO_NAME
-    """ppo, or FILE.py:CLASS for a subclass of `bounce_mjx.learning.ppo.PPO`."""
+    """ppo, or the name of an imported subclass of `bounce_mjx.learning.ppo.PPO`."""
     ppo: pydantic.SerializeAsAny[PPOConfig] = PPOConfig()
     """The trainer: the settings of the algorithm's `Config`."""
     seed: NonNegativeInt = 0
@@ -169,12 +167,6 @@ class TrainConfig(StrictModel):
         """Equal settings are equal, whatever set them."""
         return isinstance(other, TrainConfig) and dict(self) == dict(other)
 
-    @pydantic.field_validator("task", "algorithm")
-    @classmethod
-    def _make_absolute(cls, name: str) -> str:
-        """A run's config is read from other folders too."""
-        return f"{source_file(name)}:{name.rpartition(':')[2]}" if is_file(name) else name
-
     @pydantic.model_validator(mode="before")
     @classmethod
     def _name_task(cls, values: Any) -> Any:
@@ -196,12 +188,12 @@ class TrainConfig(StrictModel):
 
 
 def _check_task(env: WorldConfig, name: str) -> None:
-    """A task of a file is not looked for, as its code may not run.
+    """Checks the settings of a task against its name.
 
     Raises:
-      ValueError: the settings are those of another task.
+      ValueError: they are those of another task.
     """
-    if env.task is None or is_file(name) or find_task(name) is env.task:
+    if env.task is None or task_name(env.task) == name:
         return
     raise ValueError(
         f"these are the settings of {env.task.__qualname__}, and task is {name}; leave task out"
@@ -246,33 +238,33 @@ def _check_names(env: type[WorldConfig], algorithm: type[PPOConfig]) -> None:
             )
 
 
-def load_run_config(
-    run: Path, task: str | None = None, algorithm: str | None = None
-) -> TrainConfig:
-    """Reads the resolved config of a run.
-
-    Args:
-      task: the task as the user names it. A run whose task is a file needs the name once in a
-        process, because the file is code.
-      algorithm: the algorithm as the user names it; needed only to train on.
+def load_run_config(run: Path) -> TrainConfig:
+    """Reads the resolved config of a run. Without the code of the user's own algorithm, it lacks
+    the settings of that, of which whatever acts with the policy needs none.
 
     Raises:
       UserError: the file is missing or damaged, the run's copy of its robot was edited, or its task
-        is a file that the user has not named.
+        is code that was not imported.
     """
     path = run / CONFIG_FILE
     values = {"task": DEFAULT} | read_config_file(path)
     values.pop(BASE, None)
     sources = _sources_in(values.pop(SOURCES, None))
-    its_task = _task_of_run(values["task"], run, task)
-    # Here, as the name may stand for code that the user has named otherwise.
+    its_task = task_in(f"the run {run}", values["task"], code_of(run, "task"))
+    if not is_code_of(its_task, run, "task"):
+        place = source_of(its_task)
+        warn_once(
+            f"{place.path if place else its_task.__module__} differs from the task that {run} was "
+            f"trained with, {code_of(run, 'task')}"
+        )
+    # Here, as an error names this file.
     env = validate(its_task.Config, values.get("env", {}), str(path), "env")
     values = values | {"env": env}
-    if algorithm is None:
-        values = without_own_settings(values)
+    algorithm = own_algorithm(values.get("algorithm", PPO_NAME))
+    if algorithm is not None and is_code_of(algorithm, run, "algorithm"):
+        values |= {"ppo": validate(algorithm.Config, values.get("ppo", {}), str(path), "ppo")}
     else:
-        settings = find_algorithm(algorithm).Config
-        values |= {"ppo": validate(settings, values.get("ppo", {}), str(path), "ppo")}
+        values = without_own_settings(values)
     config = validate(TrainConfig, values, str(path))
     config.set_sources(sources)
     if config.env.mjcf is not None and not is_packaged(config.env.mjcf):
@@ -290,7 +282,7 @@ def without_own_settings(stored: dict[str, Any]) -> dict[str, Any]:
     """A run's plain config without the settings of the user's own algorithm, if it has one: its
     code does not run, and whatever acts with its policy needs none of them."""
     ppo = stored.get("ppo")
-    if not isinstance(ppo, dict) or not is_file(str(stored.get("algorithm", PPO_NAME))):
+    if not isinstance(ppo, dict) or stored.get("algorithm", PPO_NAME) == PPO_NAME:
         return stored
     known = {key: value for key, value in ppo.items() if key in PPOConfig.model_fields}
     return stored | {"ppo": known}
@@ -317,45 +309,32 @@ def _sources_in(stored: Any) -> dict[str, str]:
     return sources
 
 
-def _task_of_run(name: str, run: Path, given: str | None) -> type[Task]:
-    """The task of a run; its copy of a task's file is not run unless the user has named code with
-    the same content.
+def code_of(run: Path, key: str) -> Path | None:
+    """A run's copy of the code of its task or its algorithm; None where a package has it.
 
     Args:
-      name: name in the run's config.
-      given: name that the user gave, or None. Another file's task is taken with a warning.
-
-    Raises:
-      UserError: the user has not named the file; or the run has another task.
+      key: task or algorithm.
     """
-    if given is not None:
-        if not is_same_code(name, given):
-            if not is_file(name):
-                raise UserError(
-                    f"{run} has the task {name}, and the task asked for is {given}; leave it out"
-                )
-            note = f"{given} differs from the task that {run} was trained with, {name}"
-            print(f"warning: {note}", file=sys.stderr)
-        if is_file(name):
-            admit(name, find_task(given))
-    return task_in(f"the run {run}", name)
+    files = sorted((run / key).glob("*.py"))
+    return files[0] if files else None
 
 
-def task_in(source: str, name: str) -> type[Task]:
+def is_code_of(kind: type, run: Path, key: str) -> bool:
+    """Whether a task or an algorithm is the one that a run has a copy of, or that of a package."""
+    copy = code_of(run, key)
+    source = source_of(kind)
+    return copy is None or source is None or copy.read_bytes() == source.content
+
+
+def task_in(source: str, name: str, code: Path | None = None) -> type[Task]:
     """The task that a file or a run names.
 
+    Args:
+      code: its code, where it is known.
+
     Raises:
-      UserError: there is none, or it is in a file that the user has not named.
+      UserError: there is none, or it is code that was not imported.
     """
-    task = known_class(name, Task) if is_file(name) else find_task(name)
-    if task is None:
-        raise unnamed_code(source, "task", name)
-    return task
-
-
-def unnamed_code(source: str, key: str, name: str) -> UserError:
-    """The refusal to run the file of a task or an algorithm that the user has not named."""
-    return UserError(
-        f"{source} has its {key} in a file, which is code; name it to run it: --{key} "
-        f"{shlex.quote(name)}"
-    )
+    if code is not None and not is_task(name):
+        raise not_imported(source, "task", name, code)
+    return find_task(name)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from bounce_mjx.config.settings import merged, nested
+from bounce_mjx.config.user_code import plain_name
 from bounce_mjx.lazy import jax
 
 RECORD_FILE = "run.json"
@@ -40,6 +41,9 @@ def present_settings(config: dict[str, Any]) -> dict[str, Any]:
         value = _value(config, key)
         if value is not _NOTHING and (harmless is _ANY or harmless == value):
             config = _without(config, key)
+    for key in {"task", "algorithm"} & config.keys():
+        if isinstance(config[key], str):
+            config = config | {key: plain_name(config[key])}
     for key, present in _MOVED.items():
         value = _value(config, key)
         if value is not _NOTHING:

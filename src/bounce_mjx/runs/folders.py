@@ -3,7 +3,7 @@
     runs/<task>/<time stamp, UTC>/
         config.yaml                     the resolved config
         robot/                          a copy of --mjcf and its files, with a manifest
-        task/, algorithm/               copies of the files of own ones
+        task/, algorithm/               copies of the code of own ones
         report.html, robustness.*, failures.png   see `reports`
         events.out.tfevents.*           TensorBoard scalars
         results.json                    all evaluations, and the time of each activity
@@ -35,9 +35,10 @@ from pathlib import Path
 from typing import Any
 
 from bounce_mjx.config.files import dump_config
-from bounce_mjx.config.user_code import is_file, read_source, source_file
+from bounce_mjx.config.user_code import source_of
 from bounce_mjx.errors import UserError, suggest, warn_once
 from bounce_mjx.lazy import mujoco
+from bounce_mjx.learning.registry import own_algorithm
 from bounce_mjx.resources import (
     POLICIES,
     PRETRAINED,
@@ -52,7 +53,7 @@ from bounce_mjx.runs.files import seal, writable, write_atomically
 from bounce_mjx.runs.presets import BASE
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.records import Checkpoint, DamagedCheckpoint, Record, verify
-from bounce_mjx.task.registry import DEFAULT, find_task
+from bounce_mjx.task.registry import DEFAULT, find_task, own_task
 
 LATEST = "latest"
 """Name of the newest run on the command line."""
@@ -98,13 +99,12 @@ def create_run(config: TrainConfig) -> Path:
 def save_config(run: Path, config: TrainConfig) -> None:
     """Writes the run's resolved config, and copies of its robot and of its task's file unless the
     run has them."""
-    for key in ("task", "algorithm"):
-        if is_file(name := getattr(config, key)):
-            file = f"{key}/{source_file(name).name}"
-            if not (run / key).exists():
-                (run / key).mkdir()
-                write_atomically(run / file, read_source(name))
-            config = config.model_copy(update={key: f"{file}:{name.rpartition(':')[2]}"})
+    own = {"task": own_task(config.task), "algorithm": own_algorithm(config.algorithm)}
+    for key, kind in own.items():
+        source = None if kind is None else source_of(kind)
+        if source is not None and not (run / key).exists():
+            (run / key).mkdir()
+            write_atomically(run / key / source.path.name, source.content)
     if (mjcf := config.env.mjcf) is not None:
         # As a config's own path is absolute and without .. in it.
         here = Path(os.path.abspath(run))

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from bounce_mjx.config.files import read_mapping
-from bounce_mjx.config.user_code import is_file
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.lazy import jax
 from bounce_mjx.resources import resource_path
@@ -122,21 +121,16 @@ def shown_file(file: Path) -> str:
 def read_config_file(
     path: Path, kind: str = "config file", example: str = _EXAMPLE
 ) -> dict[str, Any]:
-    """The values of a config file (`read_mapping`). The files of the task and the algorithm have
-    absolute paths; the MJCF file starts, as they do, at the folder of the file.
+    """The values of a config file (`read_mapping`), in which the MJCF file starts at the folder of
+    the file.
 
     Raises:
       UserError: the file is missing, is no mapping, or names a task or an algorithm by no text.
     """
     values = present_settings(read_mapping(path, kind, example))
     for key in {"task", "algorithm"} & values.keys():
-        name = values[key]
-        if not isinstance(name, str):
-            raise UserError(f"{shown_file(path)}: {key} is {name}, but must be a name")
-        if is_file(name):
-            file, _, class_name = name.rpartition(":")
-            absolute = os.path.abspath(path.parent / Path(file).expanduser())
-            values = values | {key: f"{absolute}:{class_name}"}
+        if not isinstance(values[key], str):
+            raise UserError(f"{shown_file(path)}: {key} is {values[key]}, but must be a name")
     env = values.get("env")
     mjcf = env.get("mjcf") if isinstance(env, dict) else None
     if isinstance(mjcf, str) and not mjcf.startswith("~") and not is_packaged(Path(mjcf)):

@@ -1,22 +1,22 @@
 """The settings of a training, from wherever they come.
 
-They are layers, and a later one wins:
+One word fixes the classes (`start.py`): which task, which algorithm and which policy or run a
+training begins with. Everything else is values. They are layers, and a later one wins:
 
     1. the defaults of the task and of the algorithm
     2. the preset for this machine
     3. what the user's own algorithm changes of PPO's defaults
     4. a preset that the user names, in place of the machine's
-    5. --warm-start: the environment and the networks of a policy, whether a flag or a file of the
-       user's names it
+    5. a warm start: the environment and the networks of a policy
     6. the user's files and further presets, each on those before it
     7. --robot, or the robot of --world
     8. --world
     9. what the user says: flags of the command, or arguments of `train`
 
 A resumed run has two: its own config, and what the user says; more steps end its
-`stop_when_solved` where that had ended it (`Stack._go_on`). `stack` finds the layers below the
-user's. `Stack.config` merges all of them and validates the result, once; the config then knows what
-set each of its values (`TrainConfig.sources`).
+`stop_when_solved` where that had ended it (`Layers._go_on`). `layers_on` reads the layers below the
+user's, each file once. `Layers.config` merges all of them and validates the result, once; the
+config then knows what set each of its values (`TrainConfig.sources`).
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ import itertools
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import pydantic
 from pydantic.fields import FieldInfo
@@ -33,26 +33,18 @@ from pydantic.fields import FieldInfo
 from bounce_mjx.config.command_line import Flag
 from bounce_mjx.config.files import differing_keys, flat
 from bounce_mjx.config.settings import Layer, StrictModel, default_of, has_default, merged, nested
-from bounce_mjx.config.user_code import is_file, is_same_code
-from bounce_mjx.config.validation import describe, groups_of, path_of, validate
+from bounce_mjx.config.validation import describe, groups_of, path_of
 from bounce_mjx.errors import UserError, shorten
-from bounce_mjx.learning.config import PPO_NAME, PPOConfig
-from bounce_mjx.learning.registry import find_algorithm
-from bounce_mjx.resources import policy_folder
+from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.runs.config import (
-    CONFIG_FILE,
     DEFAULT_SOURCE,
     RESUMABLE_KEYS,
     TrainConfig,
     fields_of,
-    load_run_config,
-    runs_folder,
-    unnamed_code,
 )
 from bounce_mjx.runs.presets import BASE, SOURCES, preset_files, read_config_file, shown_file
+from bounce_mjx.runs.start import Start, beside_run, find_start
 from bounce_mjx.runs.worlds import robot_and_world
-from bounce_mjx.task.registry import DEFAULT, find_task
-from bounce_mjx.task.task import Task
 from bounce_mjx.world.named import without_idle_curriculum
 
 FLAGS = "flags"
@@ -61,8 +53,8 @@ PYTHON = "train"
 """Source of the arguments of `train`."""
 
 
-class Choice(StrictModel):
-    """What decides which layers there are: flags of the command, and arguments of `train`."""
+class ChoiceFlags(StrictModel):
+    """The flags of a choice."""
 
     config: Annotated[tuple[Path, ...], Flag(metavar="NAME|FILE", is_repeated=True)] = ()
     """Preset, such as cpu or finetune (a YAML file in configs/), or a YAML file of yours. A task's
@@ -75,110 +67,119 @@ class Choice(StrictModel):
     world: Annotated[Path | None, Flag(metavar="NAME|FILE")] = None
     """Named world in place of the preset's: a YAML file, or the name of one in configs/worlds/
     (ur5e_rtde, panda_fci, iiwa_fri or fast_servo). It may have a robot."""
-    resume: Path | None = None
-    """Folder of a run, or latest for the newest run, to continue in place from its newest
-    checkpoint; or a checkpoint in it, which then counts as the newest. The other flags may then
-    change only total-steps, eval-every, save-every, eval-episodes, screening-episodes, eval-seed,
-    stop-when-solved, num-devices and log-dir. With total-steps, a run that has met all results
-    continues."""
-
-    # Keys of the config too, where their docstrings are. The folder is asked only for `latest`.
-    task: str | None = None
     algorithm: str | None = None
     warm_start: Path | None = None
     log_dir: Path | None = None
 
 
+class Choice(ChoiceFlags):
+    """What decides which layers there are: the word and the flags of the command, or arguments of
+    `train`."""
+
+    start: Annotated[str | None, Flag(metavar="[TASK|POLICY|RUN]", is_positional=True)] = None
+    """First word: a task (bounce by default, balance, catch, juggle, track, or one of yours, which
+    --import FILE.py names), trained from the start; a policy that comes with the package, such as
+    robust_small, from whose networks a training starts, in its environment; or a run's folder,
+    latest for the newest run, or a checkpoint in it, which continues in place. Of a resumed run,
+    flags may change only total-steps, eval-every, save-every, keep-checkpoints, eval-episodes,
+    screening-episodes, eval-seed, stop-when-solved and num-devices."""
+
+
 # Reading: what lies on what ---------------------------------------------------------------------
 
 
-def stack(
+def read_layers(
     choice: Choice, machine: Path | None = None, whole_config: TrainConfig | None = None
-) -> "Stack":
+) -> "Layers":
     """The layers of a choice, without what the user says.
 
     Args:
+      machine, whole_config: as for `layers_on`.
+
+    Raises:
+      UserError: as `find_start` and `layers_on`.
+    """
+    start = find_start(
+        choice.start, choice.warm_start, choice.algorithm, choice.log_dir, whole_config
+    )
+    return layers_on(start, choice.config, choice.robot, choice.world, machine, whole_config)
+
+
+def layers_on(
+    start: Start,
+    config: Sequence[Path] = (),
+    robot: Path | None = None,
+    world: Path | None = None,
+    machine: Path | None = None,
+    whole_config: TrainConfig | None = None,
+) -> "Layers":
+    """The layers on a start, without what the user says.
+
+    Args:
+      config: presets and files, see `Choice`, as are `robot` and `world`.
       machine: the machine's preset; None asks JAX, which starts its devices.
       whole_config: a config that takes the place of files, and stands alone.
 
     Raises:
-      UserError: a file or a run is missing or wrong, two parts of the choice exclude each other, or
-        a task or an algorithm is a file that the user has not named.
+      UserError: a file is missing, wrong, or of another start; or the start has what is given.
     """
-    if choice.resume is not None:
-        return _stack_of_run(choice, whole_config)
-    # The task decides which file a preset's name stands for, so that only a path can name a task or
-    # a warm start. These files are read again below, in their places.
-    paths = [file for file in choice.config if os.path.isfile(file)]
-    from_paths = _layers_of_files(paths) if whole_config is None else [_layer_of(whole_config)]
-    policy = _policy(choice, from_paths, whole_config)
-    task_name, task = _task(choice, from_paths, policy, whole_config)
+    if start.resumed is not None:
+        given = {"config": config or whole_config, "robot": robot, "world": world}
+        for name, value in given.items():
+            if value:
+                raise beside_run(start.run, name)
+        return Layers(start, (Layer(f"the run {start.run}", start.resumed.model_dump()),))
+    if start.policy is not None and robot is not None:
+        raise UserError(
+            "a warm start and a robot cannot be combined, as the policy brings its arm; leave "
+            "the robot out"
+        )
     machines: list[Layer] = []
     named: list[Layer] = []
-    files = from_paths
-    if whole_config is None:
-        found = preset_files(choice.config, task_name, machine)
+    if whole_config is not None:
+        files = [Layer("config", whole_config.model_dump(), whole=("env", "ppo"))]
+    else:
+        found = preset_files(config, start.task_name, machine)
         machines = _layers_of_files([found.machine])
         named = _layers_of_files([found.named])
         files = _layers_of_files(found.own)
-    algorithm_name, algorithm = _algorithm(choice, [*machines, *named, *files], whole_config)
-    changed = _changed_defaults(algorithm)
-    start = [] if policy is None else [policy.layer(is_in_world=choice.world is not None)]
-    policy_notes = () if policy is None else policy.notes
-    trained = None if policy is None else policy.config.env
-    robot, world = robot_and_world(choice.robot, choice.world, task, trained)
-    decided = {"task": task_name, "algorithm": algorithm_name}
-    if policy is not None:
-        decided["warm_start"] = policy.start
-    return Stack(
-        task=task,
-        algorithm=algorithm,
-        layers=(*machines, *changed, *named, *start, *files, *robot, *world),
-        decided=decided,
-        notes=(*policy_notes, *_notes(changed, named, "ppo."), *_notes(named, start, "env.")),
+        for layer in (*named, *files):
+            _check_start(layer, start)
+    changed = _changed_defaults(start.algorithm)
+    policies = [] if start.policy is None else [_layer_of_policy(start, world is not None)]
+    trained = None if start.policy is None else start.policy.env
+    robots, worlds = robot_and_world(robot, world, start.task, trained)
+    return Layers(
+        start=start,
+        below=(*machines, *changed, *named, *policies, *files, *robots, *worlds),
+        notes=(*start.notes, *_notes(changed, named, "ppo."), *_notes(named, policies, "env.")),
     )
 
 
-def _stack_of_run(choice: Choice, whole_config: TrainConfig | None) -> "Stack":
-    """The layer of a run that is resumed."""
-    from bounce_mjx.runs.folders import find_run, is_newest, named_run
+def _check_start(layer: Layer, start: Start) -> None:
+    """Checks that a file, which has values alone, is of what the training begins with.
 
-    excluded = {
-        "config": choice.config or whole_config is not None,
-        "robot": choice.robot,
-        "world": choice.world,
-    }
-    for name, is_given in excluded.items():
-        if is_given:
-            raise UserError(f"{name} and resume cannot be combined; leave one out")
-    if choice.log_dir is not None and not is_newest(choice.resume):
+    Raises:
+      UserError: it is of another task, algorithm or warm start.
+    """
+    task = layer.values.get("task", start.task_name)
+    algorithm = layer.values.get("algorithm", start.algorithm_name)
+    warm_start = layer.values.get("warm_start")
+    if task != start.task_name:
         raise UserError(
-            f"log_dir is where the newest run is looked for, and {choice.resume} is named; omit "
-            "one of them"
+            f"{layer.source} is of the task {task}, and this training of {start.task_name}; give "
+            f"{task} as the first word, or remove the key"
         )
-    log_dir = choice.log_dir or runs_folder(find_task(choice.task or DEFAULT))
-    resume = named_run(choice.resume, log_dir)
-    run = find_run(resume)
-    # First, since the run's settings are no settings of another task or algorithm.
-    stored = {"task": DEFAULT, "algorithm": PPO_NAME} | read_config_file(run / CONFIG_FILE)
-    for key in ("task", "algorithm"):
-        asked = getattr(choice, key)
-        if asked is not None and not is_same_code(stored[key], asked):
-            raise UserError(
-                f"--resume cannot change the {key}, and {asked} differs from {stored[key]}; "
-                "restore it, name the run's copy, or start a new run"
-            )
-    config = load_run_config(run, choice.task, choice.algorithm)
-    if is_file(config.algorithm) and choice.algorithm is None:
-        raise unnamed_code(f"the run {run}", "algorithm", config.algorithm)
-    return Stack(
-        task=config.env.task,
-        algorithm=type(config.ppo),
-        layers=(Layer(f"the run {run}", config.model_dump()),),
-        decided={"task": config.task, "algorithm": config.algorithm},
-        resume=resume,
-        resumed=config,
-    )
+    if algorithm != start.algorithm_name and "algorithm" not in start.said:
+        raise UserError(
+            f"{layer.source} is of the algorithm {algorithm}; give --algorithm {algorithm}, or "
+            "remove the key"
+        )
+    if warm_start is not None and start.warm_start is None:
+        raise UserError(
+            f"{layer.source} starts from {warm_start}; give --warm-start {warm_start}, or remove "
+            "the key"
+        )
 
 
 def _layers_of_files(files: Iterable[Path | None]) -> list[Layer]:
@@ -191,87 +192,6 @@ def _layers_of_files(files: Iterable[Path | None]) -> list[Layer]:
             values.pop(SOURCES, None)
             layers.append(Layer(shown_file(file), values))
     return layers
-
-
-def _layer_of(config: TrainConfig) -> Layer:
-    return Layer("config", config.model_dump(), whole=("env", "ppo"))
-
-
-def _last(layers: Sequence[Layer], key: str) -> Any:
-    """The value of a key in the last layer that has it; None without one."""
-    return next((layer.values[key] for layer in reversed(layers) if key in layer.values), None)
-
-
-def _last_path(layers: Sequence[Layer], key: str) -> Path | None:
-    """`_last` of a path of the config, which is needed before the config is validated.
-
-    Raises:
-      UserError: it is no path.
-    """
-    layer = next((layer for layer in reversed(layers) if key in layer.values), None)
-    if layer is None or layer.values[key] is None:
-        return None
-    config = validate(TrainConfig, {key: layer.values[key]}, layer.source)
-    return getattr(config, key)
-
-
-def _task(
-    choice: Choice,
-    files: Sequence[Layer],
-    policy: "_Policy | None",
-    whole_config: TrainConfig | None,
-) -> tuple[str, type[Task]]:
-    """Name and class of the task: the user's, the files', or that of the policy.
-
-    Raises:
-      UserError: there is none, or it is a file that the user has not named.
-    """
-    if whole_config is not None:
-        if choice.task is not None and not is_same_code(choice.task, whole_config.task):
-            raise UserError(
-                f"the config is of the task {whole_config.task}, and task is {choice.task}; leave "
-                "it out"
-            )
-        return whole_config.task, whole_config.env.task
-    if choice.task is not None:
-        return choice.task, find_task(choice.task)
-    name = _last(files, "task")
-    if name is not None:
-        if is_file(name):
-            raise unnamed_code(_title_of(files), "task", name)
-        return name, find_task(name)
-    if policy is not None:
-        return policy.config.task, policy.config.env.task
-    return DEFAULT, find_task(DEFAULT)
-
-
-def _algorithm(
-    choice: Choice, layers: Sequence[Layer], whole_config: TrainConfig | None
-) -> tuple[str, type[PPOConfig]]:
-    """Name and settings of the algorithm.
-
-    Raises:
-      UserError: there is none, or it is a file that the user has not named.
-    """
-    if whole_config is not None and choice.algorithm is None:
-        settings = _settings_of(whole_config.algorithm)
-        # Code that was imported otherwise has another class of the same name.
-        if settings.__qualname__ != type(whole_config.ppo).__qualname__:
-            raise UserError(
-                f"the config's ppo is {type(whole_config.ppo).__qualname__}, and its algorithm "
-                f"{whole_config.algorithm} has {settings.__qualname__}; name the algorithm that "
-                "has them"
-            )
-        return whole_config.algorithm, type(whole_config.ppo)
-    name = choice.algorithm or _last(layers, "algorithm") or PPO_NAME
-    if choice.algorithm is None and is_file(name):
-        raise unnamed_code(_title_of(layers), "algorithm", name)
-    return name, _settings_of(name)
-
-
-def _settings_of(algorithm: str) -> type[PPOConfig]:
-    """The settings of an algorithm by its name; PPO's without the import of JAX."""
-    return PPOConfig if algorithm == PPO_NAME else find_algorithm(algorithm).Config
 
 
 def _title_of(layers: Sequence[Layer]) -> str:
@@ -311,93 +231,42 @@ def _as_in_yaml(value: Any) -> Any:
     return list(map(_as_in_yaml, value)) if isinstance(value, list | tuple) else value
 
 
-class _Policy(NamedTuple):
-    """The policy of a warm start."""
+def _layer_of_policy(start: Start, is_in_world: bool) -> Layer:
+    """The task, the environment and the networks of the policy of a warm start. A named world
+    replaces the randomisation."""
+    from bounce_mjx.runs.checkpoints import NETWORK_KEYS
 
-    start: Path
-    """Its name, or its checkpoint's folder."""
-    config: TrainConfig
-    """The config of its run."""
-    notes: tuple[str, ...]
-    """Which run latest stands for."""
-
-    def layer(self, is_in_world: bool) -> Layer:
-        """Its task, environment and networks. A named world replaces the randomisation."""
-        from bounce_mjx.runs.checkpoints import NETWORK_KEYS
-
-        env = self.config.env.model_dump()
-        if is_in_world:
-            del env["randomization"]
-        networks = self.config.ppo.model_dump(include={*NETWORK_KEYS, "critic_metrics"})
-        values = {"task": self.config.task, "env": env, "ppo": networks}
-        whole = tuple(f"env.{key}" for key in env)
-        return Layer(f"the warm start {self.start}", values, whole=whole)
-
-
-def _policy(
-    choice: Choice, files: Sequence[Layer], whole_config: TrainConfig | None
-) -> _Policy | None:
-    """The policy of the warm start that the user or a file asks for.
-
-    Raises:
-      UserError: there is none, or a robot is given too.
-    """
-    if "warm_start" in choice.model_fields_set:
-        path = choice.warm_start
-    else:
-        # A whole config has its environment already.
-        path = _last_path(files, "warm_start") if whole_config is None else None
-    if path is None:
-        return None
-    if choice.robot:
-        raise UserError(
-            "warm_start and robot cannot be combined, as the policy brings its arm; leave robot out"
-        )
-    from bounce_mjx.runs.folders import find_choice, runs_in
-
-    task = choice.task or _last(files, "task")
-    if choice.task is None and task is not None and is_file(task) and whole_config is None:
-        raise unnamed_code(_title_of(files), "task", task)
-    log_dir = choice.log_dir or _last_path(files, "log_dir")
-    # A new folder has no run yet that latest could stand for.
-    if log_dir is None or not runs_in(log_dir):
-        log_dir = runs_folder(whole_config.env.task if whole_config else find_task(task or DEFAULT))
-    checkpoint, note = find_choice(path, log_dir)
-    config = load_run_config(checkpoint.run, task)
-    start = path if policy_folder(path) else checkpoint.folder
-    return _Policy(start, config, () if note is None else (note,))
+    env = start.policy.env.model_dump()
+    if is_in_world:
+        del env["randomization"]
+    networks = start.policy.ppo.model_dump(include={*NETWORK_KEYS, "critic_metrics"})
+    values = {"task": start.policy.task, "env": env, "ppo": networks}
+    whole = tuple(f"env.{key}" for key in env)
+    return Layer(f"the warm start {start.warm_start}", values, whole=whole)
 
 
 # Merging and validating -------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True)
-class Stack:
+class Layers:
     """The layers below what the user says, the lowest first."""
 
-    task: type[Task]
-    algorithm: type[PPOConfig]
-    """The settings of the algorithm."""
-    layers: tuple[Layer, ...]
-    decided: dict[str, Any]
-    """Values that no layer changes any more, such as the checkpoint that a warm start found."""
+    start: Start
+    below: tuple[Layer, ...]
     notes: tuple[str, ...] = ()
     """Which run latest stands for, and where a layer wins over another one that a user may have
     expected to win."""
-    resume: Path | None = None
-    """The resumed run's folder, or a checkpoint in it."""
-    resumed: TrainConfig | None = None
-    """Its config."""
 
     @functools.cached_property
     def fields(self) -> dict[str, FieldInfo]:
         """The settings that there are, by dotted key."""
-        return fields_of(self.task.Config, self.algorithm)
+        return fields_of(self.start.task.Config, self.start.algorithm)
 
     @property
     def title(self) -> str:
         """The sources of the layers in words, the last first."""
-        return _title_of(self.layers)
+        return _title_of(self.below)
 
     def config(
         self,
@@ -417,13 +286,16 @@ class Stack:
           UserError: a key is unknown, a value is out of range, or it must be that of the resumed
             run. The error names the layer that set it.
         """
-        user = self._layer_of_user(PYTHON if flags is None else FLAGS, said or {})
+        source = PYTHON if flags is None else FLAGS
+        # A start is what it was found to be, such as a checkpoint.
+        user = self._layer_of_user(source, {**(said or {}), **self.start.said})
         above = [*self._go_on(user), user]
-        layers = [*self.layers, *above]
+        layers = [*self.below, *above]
         for layer in layers:
             self._check_groups(layer)
         values, sources = _merge(layers)
-        values = merged(values, self.decided)
+        # One that extends the task of a warm start.
+        values["task"] = self.start.task_name
         try:
             config = self._validated(values)
         except _Mistake as mistake:
@@ -432,14 +304,14 @@ class Stack:
                 text = describe(mistake.error, self.fields, flags, mistake.group)
                 raise UserError(f"{text} (see {prog} --help)") from mistake.error
             text = describe(mistake.error, self.fields, group=mistake.group)
-            if source != PYTHON and mistake.path in (["robot"], ["world"], ["resume"]):
+            if source != PYTHON and mistake.path in (["robot"], ["world"]):
                 (name,) = mistake.path
                 text = f"{name} is no setting; leave it out, and give --{name} or train({name}=...)"
             raise UserError(f"{shorten(source)}: {text}") from mistake.error
-        if self.resumed is not None:
-            _check_resumable(self.resumed, config)
+        if self.start.resumed is not None:
+            _check_resumable(self.start.resumed, config)
             _, changed = _merge(above)
-            sources = self.resumed.sources | changed
+            sources = self.start.resumed.sources | changed
         config.set_sources(sources)
         return config
 
@@ -485,13 +357,13 @@ class Stack:
     def _go_on(self, user: Layer) -> list[Layer]:
         """A layer for a run that has met all results, where a number of steps is asked for: it goes
         on to that number."""
-        if self.resume is None or "total_steps" not in user.values:
+        if self.start.run is None or "total_steps" not in user.values:
             return []
         from bounce_mjx.runs.folders import find_run, latest_checkpoint
         from bounce_mjx.runs.progress import Progress, are_solved
         from bounce_mjx.runs.records import verify
 
-        checkpoint = latest_checkpoint(find_run(self.resume), self.resume)
+        checkpoint = latest_checkpoint(find_run(self.start.run), self.start.run)
         progress = verify(checkpoint).progress
         seeds = [Progress.model_validate(seed) for seed in progress.get("seeds", [progress])]
         if are_solved(seeds):
@@ -499,7 +371,7 @@ class Stack:
         return []
 
     def _validated(self, values: dict[str, Any]) -> TrainConfig:
-        groups = {"env": self.task.Config, "ppo": self.algorithm}
+        groups = {"env": self.start.task.Config, "ppo": self.start.algorithm}
         typed = dict(values)
         for name, kind in groups.items():
             try:
@@ -570,8 +442,8 @@ def _has(values: dict[str, Any], path: Sequence[str], may_be_empty: bool) -> boo
 def _check_resumable(resumed: TrainConfig, config: TrainConfig) -> None:
     if changed := differing_keys(resumed, config) - RESUMABLE_KEYS:
         raise UserError(
-            f"--resume cannot change {', '.join(sorted(changed))}; leave those flags out, or "
-            "start a new run"
+            f"a resumed run cannot change {', '.join(sorted(changed))}; leave those out, or start "
+            "a new run"
         )
 
 
@@ -585,11 +457,16 @@ def read_preset(
     world: Path | None = None,
     machine: Path | None = None,
 ) -> TrainConfig:
-    """The config of presets, files, a robot and a world: see `Choice` and `stack`.
+    """The config of presets, files, a robot and a world: see `Choice` and `read_layers`.
+
+    Args:
+      task: by default, the one that the last file names.
 
     Raises:
-      UserError: as `stack` and `Stack.config`.
+      UserError: as `read_layers` and `Layers.config`.
     """
     files = (config,) if isinstance(config, Path) else tuple(config or ())
-    choice = Choice(config=files, robot=robot, world=world, task=task)
-    return stack(choice, machine).config()
+    for layer in reversed(_layers_of_files(file for file in files if os.path.isfile(file))):
+        task = task or layer.values.get("task")
+    choice = Choice(start=task, config=files, robot=robot, world=world)
+    return read_layers(choice, machine).config()

@@ -1,4 +1,5 @@
-"""Robots and named worlds as layers of settings."""
+"""Robots and worlds: as layers of a training's settings, and the environment of a training in
+another world."""
 
 import os
 from pathlib import Path
@@ -7,12 +8,18 @@ from typing import Any
 from bounce_mjx.config.settings import Layer, merged
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
-from bounce_mjx.runs.config import TrainConfig, task_in
+from bounce_mjx.runs.config import task_in
 from bounce_mjx.runs.presets import ROBOTS, WORLDS, named_file, read_config_file, shown_file
 from bounce_mjx.task.registry import DEFAULT
 from bounce_mjx.task.task import Task
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.named import CURRICULUM, NamedWorld, read_world
+from bounce_mjx.world.randomization import RandomizationConfig
+
+NOMINAL = "nominal"
+"""World: the model's own."""
+TRAINING = "training"
+"""World: each that a policy's training sampled."""
 
 
 def robot_and_world(
@@ -47,21 +54,59 @@ def robot_and_world(
     return robots, [_layer_of_world(task, named, path)]
 
 
-def in_world(config: TrainConfig, world: Path) -> tuple[TrainConfig, NamedWorld]:
-    """A run's config in a named world, with the observation and the actions of its policy.
+def env_of_task(
+    task: type[Task], robot: Path | None = None, world: str | os.PathLike | None = None
+) -> WorldConfig:
+    """The environment of a task with a robot, in a world.
 
     Args:
-      world: a file, or the name of a file in configs/worlds/.
+      robot: a file, or a name in configs/robots/.
+      world: as for `trained_in`, but for that of a training.
 
     Raises:
-      UserError: the world is wrong, or of another robot than the run.
+      UserError: one of them is missing or wrong, or the world is of another robot.
     """
-    env, named = env_in_world(config.env, world)
-    return config.model_copy(update={"env": env}), named
+    if world == TRAINING:
+        raise UserError(
+            f"the world {TRAINING} is that of a policy; give a policy, or a named world"
+        )
+    named = None if world in (None, NOMINAL) else Path(world)
+    robots, worlds = robot_and_world(robot, named, task, None)
+    values: dict[str, Any] = {}
+    for layer in (*robots, *worlds):
+        values = merged(values, layer.values)
+    source = " on ".join(layer.source for layer in (*worlds, *robots)) or task.__name__
+    return validate(task.Config, values.get("env", {}), source, "env")
 
 
-def env_in_world(trained: WorldConfig, world: Path) -> tuple[WorldConfig, NamedWorld]:
-    """`in_world` of the environment alone."""
+def trained_in(trained: WorldConfig, world: str | os.PathLike | None) -> WorldConfig:
+    """The environment of a training in a world, with the observation and the actions of its policy.
+
+    Args:
+      world: None for each world that the training sampled, as it did; training for the same without
+        its curriculum; nominal for the model's own; or a named world's file or name in
+        configs/worlds/.
+
+    Raises:
+      UserError: the world is missing or wrong, or of another robot than the training.
+    """
+    if world is None:
+        return trained
+    if world == NOMINAL:
+        return trained.model_copy(update={"randomization": RandomizationConfig()})
+    if world == TRAINING:
+        ended = {"warmup_steps": 0, "first_command_range": 1.0}
+        randomization = trained.randomization.model_copy(update=ended)
+        return trained.model_copy(update={"randomization": randomization})
+    return in_named_world(trained, Path(world))[0]
+
+
+def in_named_world(trained: WorldConfig, world: Path) -> tuple[WorldConfig, NamedWorld]:
+    """`trained_in` of a named world, and the world itself.
+
+    Raises:
+      UserError: the world is wrong, or of another robot than the training.
+    """
     path = named_file(world, WORLDS, "world")
     named = read_world(path)
     values = trained.model_dump()
@@ -71,6 +116,24 @@ def env_in_world(trained: WorldConfig, world: Path) -> tuple[WorldConfig, NamedW
         values = merged(values, _layer_of_same_robot(trained, named, path).values["env"])
     values = merged(values, named.settings)
     return validate(type(trained), values, f"the world {shown_file(path)}", "env"), named
+
+
+def in_sampled_world(trained: WorldConfig, randomization: RandomizationConfig) -> WorldConfig:
+    """The environment of a training with the terms of the world that a user gives, if any, in place
+    of its own.
+
+    Raises:
+      UserError: a term does not fit the arm, or what is given has no term to act on.
+    """
+    if randomization.terms:
+        given = dict(trained) | {"randomization": randomization}
+        return validate(type(trained), given, "the flags --randomization")
+    if randomization != RandomizationConfig():
+        raise UserError(
+            "--randomization is given without a term of the world, such as "
+            "--randomization.air-drag 0 0.2; give one, or omit it"
+        )
+    return trained
 
 
 def _layer_of_world(task: type[Task], world: NamedWorld, path: Path) -> Layer:

@@ -1,10 +1,9 @@
-"""Tasks by name: those of the package, those of installed packages, and those in a file."""
+"""Tasks by name: those of the package, those of installed packages, and those of imported code."""
 
 import importlib
 import importlib.metadata
-import inspect
 
-from bounce_mjx.config.user_code import class_in_file, is_file
+from bounce_mjx.config.user_code import class_of, own_name
 from bounce_mjx.errors import UserError, reason_of, shorten, suggest
 from bounce_mjx.task.task import Task
 from bounce_mjx.world.config import WorldConfig
@@ -22,17 +21,18 @@ _OF_THE_PACKAGE = {
 
 
 def find_task(name: str) -> type[Task]:
-    """The task of a name, of an entry point in `GROUP`, or of FILE.py:CLASS.
+    """The task of a name: one of the package, of an entry point in `GROUP`, or of imported code.
 
     Raises:
       UserError: there is none, it cannot be imported, or it is no task.
     """
-    if is_file(name):
-        return class_in_file(name, Task)
     # Without a look at the installed packages, which takes 10 ms.
     known = _OF_THE_PACKAGE if name in _OF_THE_PACKAGE else registered_tasks()
     if name not in known:
-        advice = suggest(name, known) or "give FILE.py:CLASS or a known name"
+        own = class_of(name, Task)
+        if own is not None:
+            return own
+        advice = suggest(name, known) or "give one of these, or --import the file of your own"
         raise UserError(
             f"there is no task {shorten(name)!r} (known: {', '.join(sorted(known))}); {advice}"
         )
@@ -53,11 +53,36 @@ def find_task(name: str) -> type[Task]:
     return task
 
 
+def is_task(name: str) -> bool:
+    """Whether a word is the name of a task."""
+    if name in _OF_THE_PACKAGE or class_of(name, Task) is not None:
+        return True
+    return name in registered_tasks()
+
+
 def task_name(task: type[Task]) -> str:
-    """The name under which `find_task` finds a task: its registered name, or FILE.py:CLASS."""
+    """The name under which `find_task` finds a task.
+
+    Raises:
+      UserError: another task has it.
+    """
     place = f"{task.__module__}:{task.__qualname__}"
-    names = [name for name, value in registered_tasks().items() if value == place]
-    return names[0] if names else f"{inspect.getsourcefile(task)}:{task.__qualname__}"
+    known = registered_tasks()
+    names = [name for name, value in known.items() if value == place]
+    if names:
+        return names[0]
+    name = own_name(task)
+    if name in known:
+        raise UserError(
+            f"the class {task.__qualname__} of {task.__module__} has the name of the task {name}; "
+            "rename it"
+        )
+    return name
+
+
+def own_task(name: str) -> type[Task] | None:
+    """The task of imported code that has a name; None for that of a package."""
+    return None if name in registered_tasks() else class_of(name, Task)
 
 
 def task_config(task: str | type[Task]) -> type[WorldConfig]:

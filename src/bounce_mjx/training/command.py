@@ -1,5 +1,6 @@
 """The command line of a training."""
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -10,14 +11,15 @@ from pydantic.fields import FieldInfo
 from bounce_mjx.config.command_line import flag_names, parse, read_flags, typed
 from bounce_mjx.config.files import flat
 from bounce_mjx.config.settings import Count, NonNegativeInt, fields_in
+from bounce_mjx.errors import UserError
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.settings import Choice, Stack, stack
+from bounce_mjx.runs.settings import Choice, ChoiceFlags, Layers, read_layers
 
 PROG = "bounce-mjx train"
 ABOUT = "Trains a policy; by default, one that keeps the ball bouncing."
 
 _SHORT_HELP = (
-    "task config robot world warm_start resume seed num_seeds total_steps stop_when_solved "
+    "start config robot world warm_start seed num_seeds total_steps stop_when_solved "
     "log_dir report watch print_config algorithm ppo.num_envs ppo.learning_rate ppo.hidden_layers"
 ).split()
 
@@ -62,20 +64,23 @@ class TrainCommand(NamedTuple):
     """A command line that was read."""
 
     flags: TrainFlags
-    layers: Stack
+    layers: Layers
     """The layers below the flags."""
     config: TrainConfig
     """The run's config."""
 
 
-def fields_of_command(layers: Stack) -> dict[str, FieldInfo]:
-    """What has a flag, by dotted key: the settings of the training, then the other flags."""
+def fields_of_command(layers: Layers) -> dict[str, FieldInfo]:
+    """What has a flag, by dotted key: the settings of the training, but for the task, which is the
+    first word; then the other flags."""
+    fields = {key: field for key, field in layers.fields.items() if key != "task"}
     others = fields_in(TrainFlags)
-    return layers.fields | {key: x for key, x in others.items() if key not in layers.fields}
+    return fields | {key: field for key, field in others.items() if key not in fields}
 
 
 def read_command(args: Sequence[str], machine: Path | None = None) -> TrainCommand:
-    """Reads a command line: first the flags that decide which others there are, then all.
+    """Reads a command line: first the word and the flags that decide which others there are, then
+    all.
 
     Args:
       machine: the machine's preset; None asks JAX, which starts its devices.
@@ -87,7 +92,11 @@ def read_command(args: Sequence[str], machine: Path | None = None) -> TrainComma
     """
     helps = {"-h", "--help", "--help-all"}.intersection(args)
     words = [word for word in args if word not in helps]
-    layers = stack(parse(Choice, words, prog=PROG, is_first=True), machine)
+    _refuse_flags_of_the_word(words)
+    # The flags, of which only some are known yet, hide where another word would stand.
+    word = words[0] if words and not words[0].startswith("-") else None
+    flags = parse(ChoiceFlags, words[word is not None :], prog=PROG, is_first=True)
+    layers = read_layers(Choice(start=word, **dict(flags)), machine)
     fields = fields_of_command(layers)
     if helps:
         defaults = flat(TrainFlags().model_dump()) | flat(layers.config().model_dump())
@@ -96,7 +105,21 @@ def read_command(args: Sequence[str], machine: Path | None = None) -> TrainComma
         # Prints, and exits.
         read_flags(fields, ["--help"], prog=PROG, description=ABOUT, defaults=defaults, **options)
     given = read_flags(fields, words, prog=PROG, description=ABOUT, defaults={})
+    if given.get("start") != word:
+        raise UserError(
+            f"{given['start']} is what the training begins with; give it first: {PROG} "
+            f"{given['start']} ..."
+        )
     names = flag_names(fields)
     said = {key: value for key, value in given.items() if key in layers.fields}
     flags = typed(TrainFlags, given, names, PROG)
     return TrainCommand(flags, layers, layers.config(said, names, PROG))
+
+
+def _refuse_flags_of_the_word(words: Sequence[str]) -> None:
+    """Refuses the flags in whose place the first word stands."""
+    for word, following in itertools.zip_longest(words, words[1:]):
+        flag, _, value = word.partition("=")
+        if flag in ("--task", "--resume"):
+            what = {"--task": "the task", "--resume": "the run to resume"}[flag]
+            raise UserError(f"{what} is the first word: {PROG} {value or following or 'WORD'}")

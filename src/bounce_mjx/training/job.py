@@ -24,12 +24,13 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from bounce_mjx.config.user_code import is_file
+from bounce_mjx.config.user_code import import_flags
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.interrupt import Interrupted, StopRequest
 from bounce_mjx.learning.policy import Policy
+from bounce_mjx.learning.registry import find_algorithm, own_algorithm
 from bounce_mjx.physics.convergence import solver_warning
 from bounce_mjx.resources import VERSION
 from bounce_mjx.runs import checkpoints, folders
@@ -46,7 +47,6 @@ from bounce_mjx.training.seeds import SeedRun
 from bounce_mjx.training.trainer import BlockMetrics, Snapshot, Trainer
 
 Result = TypeVar("Result")
-MakeTrainer = Callable[[TrainConfig, Env], Trainer]
 MakeEvaluators = Callable[..., Evaluators]
 
 # Imported during the compilation, because these imports take half a second each.
@@ -63,7 +63,6 @@ def train(
     *,
     resume: Path | None = None,
     callbacks: Sequence[events.Callback] = (),
-    make_trainer: MakeTrainer = PPOTrainer,
     make_evaluators: MakeEvaluators = Evaluators,
 ) -> list[SeedRun]:
     """Trains with a config, and returns its seeds.
@@ -71,7 +70,6 @@ def train(
     Args:
       resume: the run to continue, whose config is `config`: its folder, or a checkpoint in it.
       callbacks: see `Callback`.
-      make_trainer: builds the trainer; raises UserError where the config does not fit it.
       make_evaluators: builds what evaluates the policies, with the arguments of `Evaluators`.
 
     Raises:
@@ -84,7 +82,7 @@ def train(
     """
     hosts.agree(config, resume)
     with contextlib.ExitStack() as stack:
-        job = open_job(config, console, stack, resume, callbacks, make_trainer)
+        job = open_job(config, console, stack, resume, callbacks)
         try:
             job.compile(make_evaluators)
             while True:
@@ -108,7 +106,6 @@ def open_job(
     stack: contextlib.ExitStack,
     resume: Path | None = None,
     callbacks: Sequence[events.Callback] = (),
-    make_trainer: MakeTrainer = PPOTrainer,
 ) -> "Job":
     """Builds what may refuse the config, then makes the folder of a new run, or reads the resumed
     one, and says what is trained.
@@ -153,9 +150,19 @@ def open_job(
     return job
 
 
-def named_task(config: TrainConfig) -> list[str]:
-    """The flag with which a later command has to name a task's file again."""
-    return ["--task", config.task] if is_file(config.task) else []
+def make_trainer(config: TrainConfig, env: Env) -> Trainer:
+    """What trains with the algorithm of a config: the algorithm's own trainer, or that of PPO.
+
+    Raises:
+      UserError: the config does not fit it.
+    """
+    own_trainer = find_algorithm(config.algorithm).make_trainer(config, env)
+    return PPOTrainer(config, env) if own_trainer is None else own_trainer
+
+
+def imports_of(config: TrainConfig) -> list[str]:
+    """The flags with which a later command imports the user's own task again."""
+    return import_flags(config.env.task)
 
 
 @dataclasses.dataclass
@@ -188,7 +195,7 @@ class Job:
     """Environment steps of each seed so far."""
     needs_save: bool = False
     """Whether no save of the current state has been started."""
-    is_ended: bool = False
+    callback_has_ended: bool = False
     """Whether a callback has ended the training."""
     failure: BaseException | None = None
     """What a callback raised: it stops the training, as a signal does."""
@@ -323,7 +330,7 @@ class Job:
             return True
         # The policy of a warm start is the one to beat.
         is_worth_it = self.steps > 0 or self.networks is not None
-        is_at_evaluation = self.is_done() or self.steps % self.eval_steps == 0
+        is_at_evaluation = self.is_at_its_end() or self.steps % self.eval_steps == 0
         return is_worth_it and is_at_evaluation and not self.is_evaluated()
 
     def evaluate(self) -> None:
@@ -372,7 +379,7 @@ class Job:
 
     def is_finished(self) -> bool:
         """Whether the training ends here: at its last step, by a callback, or by its results."""
-        return self.is_done() or self.is_solved()
+        return self.is_at_its_end() or self.is_solved()
 
     def train_block(self) -> tuple[BlockMetrics, float]:
         """Trains for a block of I iterations; its metrics, each [S, I], and its duration, s.
@@ -500,9 +507,9 @@ class Job:
         """The seeds that have not diverged."""
         return [seed for seed in self.seeds if seed.progress.fault is None]
 
-    def is_done(self) -> bool:
+    def is_at_its_end(self) -> bool:
         """Whether the last step is reached, or a callback has ended the training."""
-        return self.is_ended or self.steps >= self.config.total_steps
+        return self.callback_has_ended or self.steps >= self.config.total_steps
 
     def is_solved(self) -> bool:
         """Whether the results end the training."""
@@ -511,7 +518,7 @@ class Job:
 
     def why_it_ends(self) -> str:
         """Why the training ends here, in words."""
-        if self.is_ended and self.steps < self.config.total_steps:
+        if self.callback_has_ended and self.steps < self.config.total_steps:
             return f"a callback ended the training after {self.steps:,} steps; {self.go_on}"
         if not self.is_solved():
             return f"the training ends after its {self.steps:,} steps (total_steps)"
@@ -571,15 +578,15 @@ class Job:
                     continue
                 # A comparison of NumPy's numbers has its own False.
                 if isinstance(answer, bool | np.bool_) and not answer:
-                    self.is_ended = True
-        self.is_ended = hosts.any_of(self.is_ended)
+                    self.callback_has_ended = True
+        self.callback_has_ended = hosts.any_of(self.callback_has_ended)
 
     @property
     def go_on(self) -> str:
         """How to continue the run."""
-        name = self.config.algorithm
-        algorithm = ["--algorithm", name] if is_file(name) else []
-        flags = [*named_task(self.config), *algorithm, "--resume", str(self.run)]
+        algorithm = own_algorithm(self.config.algorithm)
+        own = [self.config.env.task] if algorithm is None else [self.config.env.task, algorithm]
+        flags = [str(self.run), *import_flags(*own)]
         return f"continue with: bounce-mjx train {shlex.join(flags)}"
 
     # Signals and faults

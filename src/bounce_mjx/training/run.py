@@ -12,12 +12,11 @@ import jax
 from rich.console import Console
 
 from bounce_mjx.config.command_line import stdout
-from bounce_mjx.config.validation import validate
-from bounce_mjx.deploy.environments import environment_config, in_library, policy_path
+from bounce_mjx.deploy.environments import environment, policy_path
 from bounce_mjx.deploy.interface import check_interface, interface_of
-from bounce_mjx.deploy.wrappers import environments_in
+from bounce_mjx.deploy.wrappers import environments_in, in_library
 from bounce_mjx.env.env import Env
-from bounce_mjx.errors import reason_of, shorten
+from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.evaluation.config import EvaluationOptions
 from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
 from bounce_mjx.evaluation.results import Report
@@ -27,7 +26,10 @@ from bounce_mjx.runs import folders
 from bounce_mjx.runs.checkpoints import read_actor
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.progress import load_results
-from bounce_mjx.runs.settings import FLAGS, PYTHON, Choice, Stack, stack
+from bounce_mjx.runs.settings import FLAGS, PYTHON, Layers, layers_on
+from bounce_mjx.runs.start import find_start
+from bounce_mjx.task.registry import task_name
+from bounce_mjx.task.task import Task
 from bounce_mjx.training import hosts, job
 from bounce_mjx.training.events import Callback, say
 from bounce_mjx.training.setup import set_up_jax
@@ -40,8 +42,6 @@ class Run:
 
     folder: Path
     """The folder, or the name of a policy that comes with the package, such as robust."""
-    task: str | None = None
-    """The task as the user names it: a run of a task in a file, FILE.py:CLASS, needs it once."""
 
     def __post_init__(self):
         object.__setattr__(self, "folder", policy_path(self.folder))
@@ -49,12 +49,12 @@ class Run:
     @property
     def config(self) -> TrainConfig:
         """The run's config."""
-        return load_run_config(self.folder, self.task)
+        return load_run_config(self.folder)
 
     @property
     def seeds(self) -> tuple["Run", ...]:
         """The run of each seed; with one seed, this run."""
-        return tuple(Run(seed, self.task) for seed in folders.runs_of_seeds(self.folder))
+        return tuple(Run(seed) for seed in folders.runs_of_seeds(self.folder))
 
     @property
     def checkpoint(self) -> folders.Checkpoint:
@@ -78,7 +78,7 @@ class Run:
     def policy(self) -> Callable[[jax.Array], jax.Array]:
         """The best checkpoint's policy: the most likely actions [..., A] of observations [..., N].
         It can be compiled and differentiated."""
-        return _read_policy(self.checkpoint, self.task)
+        return _read_policy(self.checkpoint)
 
     def env(self, world: str | Path | None = None, **settings: Any) -> Env:
         """The environment of the policy's training.
@@ -91,7 +91,7 @@ class Run:
         Raises:
           UserError: a setting is wrong, or the policy relies on another value of it.
         """
-        return Env(environment_config("Run.env", self.task, self.folder, world, settings))
+        return environment(world=world, policy=self.folder, **settings)
 
     def policy_in(self, env: Any) -> Callable[[Any], Any]:
         """The best checkpoint's policy in an environment of any library: the most likely actions
@@ -107,8 +107,8 @@ class Run:
         name = next((x for x in POLICIES if policy_path(x) == self.folder), str(self.folder))
         config = self.config.env
         advice = f"make the environment with policy={name!r}, or take Run({name!r}).env()"
-        for environment in environments_in(env):
-            check_interface(interface_of(config), interface_of(environment.config), name, advice)
+        for found in environments_in(env):
+            check_interface(interface_of(config), interface_of(found.config), name, advice)
         return in_library(jax.jit(self.policy), config.layout.size)
 
     def evaluate(self, **options: Any) -> Report:
@@ -128,22 +128,19 @@ class Run:
 
 # A program may ask for the policy in each of its steps.
 @functools.lru_cache(maxsize=16)
-def _read_policy(
-    checkpoint: folders.Checkpoint, task: str | None
-) -> Callable[[jax.Array], jax.Array]:
-    config = load_run_config(checkpoint.run, task)
+def _read_policy(checkpoint: folders.Checkpoint) -> Callable[[jax.Array], jax.Array]:
+    config = load_run_config(checkpoint.run)
     _, arrays, actor = read_actor(checkpoint, config)
     return functools.partial(actor(Env(config.env)).act, arrays)
 
 
 def train(
-    task: str | None = None,
+    start: str | Path | type[Task] | None = None,
     config: str | Path | Sequence[str | Path] | TrainConfig = (),
     *,
     robot: str | Path | None = None,
     world: str | Path | None = None,
     warm_start: str | Path | None = None,
-    resume: str | Path | None = None,
     callbacks: Sequence[Callback] = (),
     report: bool = False,
     quiet: bool = False,
@@ -159,15 +156,16 @@ def train(
     with an option that halves compilation; MJX needs a process of its own then.
 
     Args:
-      task: name of a task, or FILE.py:CLASS.
+      start: the first word of the command: the name or the class of a task; a policy of the
+        package, from whose networks and environment the training starts; or a run's folder or a
+        checkpoint in it, to continue in place, of which only the length and the evaluations may
+        change.
       config: name of a preset or a YAML file, or several, each of which lies on those before it; by
         default, the preset for this machine. Or a whole config, which stands alone.
       robot: name or file of a robot's config.
       world: name or file of a world.
       warm_start: run, or policy of the package, from whose networks and environment the training
         starts.
-      resume: run, or a checkpoint in it, to continue in place; only its length and evaluations
-        may change.
       callbacks: functions that are called with an `Event` for each block and each evaluation; the
         training ends once one returns False.
       report: whether to write report.html into the run's folder.
@@ -179,31 +177,47 @@ def train(
       UserError: a setting is wrong; or as `job.train`.
       TrainingStopped: the user stopped the training.
     """
-    choice: dict[str, Any] = {"robot": robot, "world": world, "resume": resume}
-    whole = None
-    if isinstance(config, TrainConfig):
-        whole = config
-    elif isinstance(config, str | Path):
-        choice["config"] = (config,)
-    else:
-        choice["config"] = tuple(config)
-    said = dict(settings)
-    if task is not None:
-        said["task"] = task
-    if warm_start is not None:
-        said["warm_start"] = warm_start
-    for key in ("task", "algorithm", "warm_start", "log_dir"):
-        if key in said:
-            choice[key] = said[key]
-    layers = stack(validate(Choice, choice, PYTHON), whole_config=whole)
-    config = layers.config(said)
+    for name in ("task", "resume"):
+        if name in settings:
+            raise UserError(f"{name} is the first argument: train({str(settings[name])!r}, ...)")
+    word = None if start is None else str(start)
+    if isinstance(start, type):
+        word = task_name(start)
+    whole = config if isinstance(config, TrainConfig) else None
+    files: Sequence[str | Path] = ()
+    if isinstance(config, str | Path):
+        files = (config,)
+    elif whole is None:
+        files = config
+    begun = find_start(
+        word,
+        _as_path("warm_start", warm_start),
+        settings.get("algorithm"),
+        _as_path("log_dir", settings.get("log_dir")),
+        whole,
+    )
+    layers = layers_on(
+        begun,
+        [_as_path("config", file) for file in files],
+        _as_path("robot", robot),
+        _as_path("world", world),
+        whole_config=whole,
+    )
+    config = layers.config(settings)
     set_up_jax(config.env)
     console = stdout(quiet=quiet or not hosts.is_leader())
     return run_training(layers, config, console, callbacks, report)
 
 
+def _as_path(name: str, value: Any) -> Path | None:
+    """An argument as a path; None without one."""
+    if value is None or isinstance(value, str | Path):
+        return None if value is None else Path(value)
+    raise UserError(f"{name} is {shorten(str(value))}, but must be a path or a name")
+
+
 def run_training(
-    layers: Stack,
+    layers: Layers,
     config: TrainConfig,
     console: Console,
     callbacks: Sequence[Callback],
@@ -216,17 +230,18 @@ def run_training(
         as `job.train`.
     """
     config.check_eval_seed()
-    if layers.resume is None:
+    resume = layers.start.run
+    if resume is None:
         say(console, f"config: {layers.title}")
     notes = notes_on_starts(config) + notes_on_worlds(config) + notes_on_intervals(config)
     for note in (*layers.notes, *notes):
         say(console, f"note: {note}")
-    seeds = job.train(config, console, resume=layers.resume, callbacks=callbacks)
+    seeds = job.train(config, console, resume=resume, callbacks=callbacks)
     best = print_results(seeds, console)
     if report and hosts.is_leader():
         leave_report(best, console)
     run = best.run if len(seeds) == 1 else best.run.parent
-    return Run(run, config.task)
+    return Run(run)
 
 
 def notes_on_starts(config: TrainConfig) -> list[str]:
@@ -303,7 +318,7 @@ def leave_report(seed: job.SeedRun, console: Console) -> None:
 
         path = write_report(seed.run, seed.progress.best.recording)
     except Exception as error:
-        again = shlex.join([str(seed.run), *job.named_task(seed.config)])
+        again = shlex.join([str(seed.run), *job.imports_of(seed.config)])
         reason = reason_of(error)
         say(console, f"report: not drawn ({reason}); draw it with: bounce-mjx report {again}")
     else:

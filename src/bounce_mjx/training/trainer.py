@@ -29,8 +29,8 @@ class Trainer(Protocol):
     """S independent runs of one algorithm, one for each seed, whose policies have the network that
     the config's `ppo` describes.
 
-    The job makes one by calling a class, or a function (`make_trainer` of `training.job.train`),
-    with the run's config and its environment; it may raise a UserError there. Then it calls
+    The job asks the algorithm for one (`Algorithm.make_trainer`), which may raise a UserError where
+    the config does not fit. Then it calls
     `compile`, `start` once, and `run` for each block. It may ask for `state_template` at any time,
     and after `start` for a `snapshot`.
     """

@@ -12,7 +12,7 @@ with needed("brax", "bounce_mjx"):
     import_mjx()
     import brax.envs
 
-from bounce_mjx.adapters.brax.environment import ENV_NAME, BraxBounceBall
+from bounce_mjx.adapters.brax.environment import ENV_NAME, BraxBounceBall, make_env
 from bounce_mjx.adapters.brax.ppo import (
     device_put_replicated,
     load_brax_policy,
@@ -32,4 +32,4 @@ __all__ = [
 
 # An Env has the interface of brax's Env; this lets it pass brax's isinstance checks.
 brax.envs.Env.register(Env)
-brax.envs.register_environment(ENV_NAME, BraxBounceBall)
+brax.envs.register_environment(ENV_NAME, make_env)

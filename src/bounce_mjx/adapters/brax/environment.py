@@ -3,7 +3,6 @@
 import copy
 import dataclasses
 import functools
-import os
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -17,15 +16,9 @@ from brax.io import image, mjcf
 from flax import struct
 
 from bounce_mjx.adapters.randomization import randomized_task
-from bounce_mjx.deploy.environments import (
-    environment_config,
-    refuse_beside,
-    refuse_warmup,
-    with_settings,
-)
+from bounce_mjx.deploy.environments import environment, refuse_warmup
 from bounce_mjx.env.env import Env, EnvState, State
 from bounce_mjx.errors import UserError
-from bounce_mjx.task.task import Task
 from bounce_mjx.viewers.offscreen import choose_opengl
 from bounce_mjx.world.config import WorldConfig
 
@@ -72,45 +65,16 @@ class PipelineState:
 class BraxBounceBall(brax.envs.Env):
     """One environment with brax's interface; `task` is the `Env` in it."""
 
-    def __init__(
-        self,
-        config: WorldConfig | None = None,
-        task: str | type[Task] | None = None,
-        policy: str | os.PathLike | None = None,
-        world: str | os.PathLike | None = None,
-        **settings: Any,
-    ):
-        """Makes the environment.
-
-        Args:
-          config: all settings; None for the defaults of the task.
-          task: its class, its name, or FILE.py:CLASS, if there is no config; None for the policy's,
-            or the default one.
-          policy: a name, a run's folder, a checkpoint in it or an .onnx file, whose environment it
-            is (`deploy.environments`), if there is no config.
-          world: of the policy: nominal (the default), training for the worlds that its training
-            sampled, or a named world.
-          settings: fields of the task's config, such as control_dt=0.02, on top of `config`. A
-            group that is given in part keeps the other values. Not episode_seconds: brax's
-            wrappers and trainers end the episodes, after their own `episode_length`
-            (`task.config.episode_steps` is the config's).
+    def __init__(self, env: Env):
+        """Wraps an environment, such as from `environment`. Its time limit has no effect: brax's
+        wrappers and trainers end the episodes, after their own `episode_length`
+        (`task.config.episode_steps` is the config's).
 
         Raises:
-          UserError: a setting is wrong, has no effect here, or the policy's environment has another
-            value.
+          UserError: it has a warm-up.
         """
-        if "episode_seconds" in settings:
-            raise UserError(
-                f"{ENV_NAME}: episode_seconds has no effect here; give brax's wrapper or trainer "
-                "an episode_length in steps"
-            )
-        if config is None:
-            config = environment_config(ENV_NAME, task, policy, world, settings)
-        else:
-            refuse_beside("config", task=task, policy=policy, world=world)
-            config = with_settings(config, settings, ENV_NAME)
-        refuse_warmup(config, ENV_NAME)
-        self.task = Env(config)
+        refuse_warmup(env.config, ENV_NAME)
+        self.task = env
         self.dt = self.task.dt
         """Time of one control step, s."""
         self.mj_model = self.task.mj_model
@@ -175,6 +139,32 @@ class BraxBounceBall(brax.envs.Env):
         """
         choose_opengl()
         return image.render_array(self.sys, trajectory, height, width, camera)
+
+
+def make_env(config: WorldConfig | None = None, **settings: Any) -> BraxBounceBall:
+    """What `brax.envs.get_environment` calls: a `BraxBounceBall` of an `environment`.
+
+    Args:
+      config: all settings, on which the others lie; None for those of the task or the policy.
+      settings: the arguments of `environment` (its start is called task), such as policy="robust"
+        or control_dt=0.02. Not episode_seconds, which would have no effect.
+
+    Raises:
+      UserError: a setting is wrong, or has no effect here.
+    """
+    if "episode_seconds" in settings:
+        raise UserError(
+            f"{ENV_NAME}: episode_seconds has no effect here; give brax's wrapper or trainer "
+            "an episode_length in steps"
+        )
+    start = settings.pop("task", None)
+    if config is not None:
+        given = {"task": start} | {name: settings.get(name) for name in ("policy", "world")}
+        for name, value in given.items():
+            if value is not None:
+                raise UserError(f"config and {name} both say the environment; give one of them")
+        start = config
+    return BraxBounceBall(environment(start, **settings))
 
 
 def _complete(state: EnvState) -> EnvState:

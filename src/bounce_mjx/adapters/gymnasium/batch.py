@@ -11,20 +11,15 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from bounce_mjx.adapters.gymnasium.programs import Episodes, Programs, shared_programs
-from bounce_mjx.deploy.environments import environment_config, refuse_warmup, settings_class
-from bounce_mjx.errors import UserError, suggest
-from bounce_mjx.task.task import Task
+from bounce_mjx.deploy.environments import refuse_warmup
+from bounce_mjx.env.env import Env
+from bounce_mjx.errors import UnexpectedArgument, UserError
 
 Commands = dict[str, float | np.ndarray]
 """Some of the task's commands, each [] or [B]; NaN samples it."""
 
 # The process in which a program has run. JAX's threads are lost when this process forks.
 _jax_process: int | None = None
-
-
-class UnexpectedArgument(UserError, TypeError):
-    """An argument or an option with an unknown name; libraries that try several expect a TypeError
-    with these words of Python's own."""
 
 
 class ResetNeeded(UserError, gymnasium.error.ResetNeeded):
@@ -51,35 +46,19 @@ class StepArrays(NamedTuple):
 class Batch:
     """B episodes. They can be pickled and copied in the middle of an episode."""
 
-    def __init__(
-        self,
-        task: str | type[Task] | None,
-        policy: str | os.PathLike | None,
-        world: str | os.PathLike | None,
-        num_envs: int,
-        max_episode_steps: int | None,
-        settings: dict[str, Any],
-    ):
+    def __init__(self, env: Env, num_envs: int, max_episode_steps: int | None):
         """Compiles nothing; the first start and the first step do, unless equal ones exist.
 
         Args:
-          task: its class, its name, or FILE.py:CLASS; None for the policy's, or the default one.
-          policy: whose environment it is (`environment_config`), or None.
-          world: that of the policy.
           max_episode_steps: a shorter time limit than the config's, in steps; None or -1 for the
             config's.
-          settings: fields of the task's config.
 
         Raises:
-          UserError: an argument is wrong; an unknown setting is a TypeError too.
+          UserError: an argument is wrong, or the environment has a warm-up.
         """
-        title = "the environment's settings"
-        known = settings_class(task, policy, settings).model_fields
-        for name in settings.keys() - known.keys():
-            advice = suggest(name, known) or f"give {', '.join(known)}"
-            raise UnexpectedArgument(f"got an unexpected keyword argument {name!r}; {advice}")
-        self.config = environment_config(title, task, policy, world, settings)
-        refuse_warmup(self.config, title)
+        self.env = env
+        self.config = env.config
+        refuse_warmup(self.config, "the environment's settings")
         self.num_envs = whole_number("num_envs", num_envs)
         self.episode_steps = self.config.episode_steps
         """Time limit of an episode in steps."""
@@ -95,18 +74,18 @@ class Batch:
 
     @functools.cached_property
     def programs(self) -> Programs:
-        """The compiled functions; equal batches share them."""
-        return shared_programs(self.config)
+        """The compiled functions; batches of equal environments share them."""
+        return shared_programs(self.env)
 
     @property
     def action_space(self) -> Box:
         """The space of the actions of one environment."""
-        return Box(-1.0, 1.0, (self.programs.task.action_size,), np.float32)
+        return Box(-1.0, 1.0, (self.env.action_size,), np.float32)
 
     @property
     def observation_space(self) -> Box:
         """The space of the observations of one environment."""
-        return Box(-np.inf, np.inf, (self.programs.task.observation_size,), np.float32)
+        return Box(-np.inf, np.inf, (self.env.observation_size,), np.float32)
 
     def start(self, mask: np.ndarray, seeds: np.ndarray, commands: Commands) -> np.ndarray:
         """Starts new episodes where the mask [B] is true: the observations of all environments
@@ -144,7 +123,7 @@ class Batch:
             self._episodes, actions, self.episode_steps, seeds, reset_before, reset_after
         )
         rows = np.asarray(rows)
-        size = self.programs.task.observation_size
+        size = self.env.observation_size
         numbers = rows[2 * size :].astype(np.float64)
         return StepArrays(
             observation=_with_batch_first(rows[:size]),

@@ -1,10 +1,7 @@
-"""The classes behind `gymnasium.make` and `gymnasium.make_vec`, with NumPy arrays.
-
-Keyword arguments are the settings of the task's config.
-"""
+"""The classes behind `gymnasium.make` and `gymnasium.make_vec`, with NumPy arrays; `make_env` and
+`make_vector_env` are what the registry calls."""
 
 import dataclasses
-import os
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -25,9 +22,9 @@ from bounce_mjx.adapters.gymnasium.batch import (
     checked_actions,
 )
 from bounce_mjx.adapters.gymnasium.pictures import Pictures
+from bounce_mjx.deploy.environments import Start, environment
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
-from bounce_mjx.task.task import Task
 
 # Of one environment.
 _CHOSEN = np.ones(1, bool)
@@ -47,34 +44,26 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def __init__(
         self,
-        task: str | type[Task] | None = None,
+        env: Env,
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
         width: int = 640,
         height: int = 480,
         camera: str | None = None,
-        policy: str | os.PathLike | None = None,
-        world: str | os.PathLike | None = None,
-        **settings: Any,
     ):
-        """Makes the environment. The first reset compiles it, unless an equal one exists.
+        """Wraps an environment. The first reset compiles it, unless an equal one exists.
 
         Args:
-          task: its class, its name, or FILE.py:CLASS; None for the policy's, or the default one.
+          env: such as from `environment`.
           max_episode_steps: a shorter time limit than the config's, in steps; None or -1 for the
             config's.
           width: of the pictures, in pixels, as is `height`.
           camera: name of a camera of the model; None for the overview.
-          policy: a name, a run's folder, a checkpoint in it or an .onnx file: the environment of
-            its training, on which settings may change only what the policy does not rely on.
-          world: of the policy: nominal (the default), training for the worlds that its training
-            sampled, or a named world.
-          settings: fields of the task's config, such as episode_seconds=30.
 
         Raises:
-          UserError: an argument is wrong; an unknown argument is a TypeError too.
+          UserError: an argument is wrong.
         """
-        self._batch = Batch(task, policy, world, 1, max_episode_steps, settings)
+        self._batch = Batch(env, 1, max_episode_steps)
         self._has_ended = False
         self._pictures = Pictures(self._batch, render_mode, width, height, camera)
         self.render_mode = render_mode
@@ -93,8 +82,8 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     @property
     def task(self) -> Env:
-        """The environment on JAX; equal environments share it."""
-        return self._batch.programs.task
+        """The environment on JAX."""
+        return self._batch.env
 
     @property
     def mj_model(self) -> mujoco.MjModel:
@@ -169,7 +158,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
 
     def __init__(
         self,
-        task: str | type[Task] | None = None,
+        env: Env,
         num_envs: int = 1,
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
@@ -177,9 +166,6 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         width: int = 640,
         height: int = 480,
         camera: str | None = None,
-        policy: str | os.PathLike | None = None,
-        world: str | os.PathLike | None = None,
-        **settings: Any,
     ):
         """Makes `num_envs` environments; the other arguments and the errors are as in `TaskEnv`.
 
@@ -187,7 +173,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
           autoreset_mode: the reset of an ended episode: in the next step, in the same step, or
             disabled, which leaves it to reset(options={"reset_mask": ...}).
         """
-        self._batch = Batch(task, policy, world, num_envs, max_episode_steps, settings)
+        self._batch = Batch(env, num_envs, max_episode_steps)
         self._pictures = Pictures(self._batch, render_mode, width, height, camera)
         self.num_envs = self._batch.num_envs
         self.render_mode = render_mode
@@ -339,6 +325,44 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
             info |= {"final_obs": final_obs, "_final_obs": ended}
             info |= {"final_info": final_info, "_final_info": ended}
         return info
+
+
+def make_env(
+    task: Start | None = None,
+    render_mode: str | None = None,
+    max_episode_steps: int | None = None,
+    width: int = 640,
+    height: int = 480,
+    camera: str | None = None,
+    **settings: Any,
+) -> TaskEnv:
+    """What `gymnasium.make` calls: a `TaskEnv` of an `environment`.
+
+    Args:
+      task: the start of the environment.
+      settings: its other arguments, such as policy="robust", world="ur5e_rtde" or
+        episode_seconds=30.
+    """
+    env = environment(task, **settings)
+    return TaskEnv(env, render_mode, max_episode_steps, width, height, camera)
+
+
+def make_vector_env(
+    task: Start | None = None,
+    num_envs: int = 1,
+    render_mode: str | None = None,
+    max_episode_steps: int | None = None,
+    autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+    width: int = 640,
+    height: int = 480,
+    camera: str | None = None,
+    **settings: Any,
+) -> TaskVectorEnv:
+    """What `gymnasium.make_vec` calls: a `TaskVectorEnv` of an `environment`, as `make_env`."""
+    env = environment(task, **settings)
+    return TaskVectorEnv(
+        env, num_envs, render_mode, max_episode_steps, autoreset_mode, width, height, camera
+    )
 
 
 class EpisodeSeeds:

@@ -1,7 +1,7 @@
 """B episodes on JAX that start and end separately, and their compiled functions.
 
 Each episode has its own random key, so that a seed starts the same one in a batch of any size.
-Batches of equal configs share their programs, of which JAX keeps one for each size.
+Batches of equal environments share their programs, of which JAX keeps one for each size.
 """
 
 import functools
@@ -29,11 +29,11 @@ class Episodes(NamedTuple):
 
 
 class Programs:
-    """The functions of `Episodes`, compiled for one config."""
+    """The functions of `Episodes`, compiled for one environment."""
 
-    def __init__(self, config: WorldConfig):
+    def __init__(self, env: Env):
         cache_compilations()
-        self.task = Env(config)
+        self.task = env
         self.start = jax.jit(self._start)
         self.step = jax.jit(self._step, donate_argnums=0)
 
@@ -117,17 +117,20 @@ class Programs:
         return Episodes(states.pipeline_state, states.obs, metrics, length)
 
 
-def shared_programs(config: WorldConfig) -> Programs:
-    """The programs of a config."""
+def shared_programs(env: Env) -> Programs:
+    """The programs of an environment, which those of equal settings share."""
+    if not env.is_of_its_settings:
+        return Programs(env)
     # An edited file is another model.
-    mjcf = config.mjcf
-    return _programs(config, mjcf.stat().st_mtime_ns if mjcf and mjcf.exists() else None)
+    mjcf = env.config.mjcf
+    edited = mjcf.stat().st_mtime_ns if mjcf and mjcf.exists() else None
+    return _programs(type(env), env.config, edited)
 
 
 @functools.lru_cache(maxsize=32)
-def _programs(config: WorldConfig, edited: int | None) -> Programs:
+def _programs(kind: type[Env], config: WorldConfig, edited: int | None) -> Programs:
     del edited
-    return Programs(config)
+    return Programs(kind(config))
 
 
 def _keys(seeds: jax.Array) -> jax.Array:

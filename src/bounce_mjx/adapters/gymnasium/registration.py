@@ -15,7 +15,7 @@ _MODULE = "bounce_mjx.adapters.gymnasium.environments"
 
 
 def register() -> None:
-    """Adds the environments, for `gymnasium.make` and `gymnasium.make_vec`; their classes are
+    """Adds the environments, for `gymnasium.make` and `gymnasium.make_vec`; their modules are
     imported on first use."""
     arguments = {ENV_ID: {"task": "bounce"}, TASK_ID: {}}
     arguments |= {f"bounce_mjx/{task.title()}-v0": {"task": task} for task in TASKS}
@@ -23,7 +23,7 @@ def register() -> None:
         # Without max_episode_steps, because the environment keeps its config's time limit.
         gymnasium.register(
             name,
-            entry_point=f"{_MODULE}:TaskEnv",
-            vector_entry_point=f"{_MODULE}:TaskVectorEnv",
+            entry_point=f"{_MODULE}:make_env",
+            vector_entry_point=f"{_MODULE}:make_vector_env",
             kwargs=given,
         )

@@ -12,7 +12,12 @@ import numpy as np
 from flax import struct
 
 from bounce_mjx.adapters.randomization import randomized_task
-from bounce_mjx.deploy.environments import environment_config, refuse_warmup
+from bounce_mjx.deploy.environments import (
+    Start,
+    environment,
+    environment_config,
+    refuse_warmup,
+)
 from bounce_mjx.env import env as core
 from bounce_mjx.env.env import Env, EnvState
 from bounce_mjx.errors import UserError, needed
@@ -20,8 +25,8 @@ from bounce_mjx.lazy import import_mjx
 from bounce_mjx.physics import PhysicsState
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.arm import locate
-from bounce_mjx.task.task import Task
 from bounce_mjx.viewers.offscreen import choose_opengl
+from bounce_mjx.world.config import WorldConfig
 
 with needed("MuJoCo Playground", "playground<1"):
     mjx = import_mjx()
@@ -31,14 +36,18 @@ with needed("MuJoCo Playground", "playground<1"):
 ENV_NAME = "BounceBall"
 
 
-def default_config(
-    task: str | type[Task] | None = None,
-    policy: str | os.PathLike | None = None,
-    world: str | os.PathLike | None = None,
-) -> config_dict.ConfigDict:
-    """The settings of a task's config, or of a policy's environment (`deploy.environments`), some
-    under Playground's own names."""
-    config = environment_config(ENV_NAME, task, policy, world, {})
+def default_config(task: Start | None = None, **settings: Any) -> config_dict.ConfigDict:
+    """The settings of an environment, some under Playground's own names.
+
+    Args:
+      task: the start of the environment.
+      settings: the other arguments of `environment`.
+    """
+    return config_of(environment_config(task, **settings))
+
+
+def config_of(config: WorldConfig) -> config_dict.ConfigDict:
+    """The settings of an environment in Playground's form."""
     return config_dict.create(
         ctrl_dt=config.control_dt,
         sim_dt=config.physics_dt,
@@ -79,45 +88,20 @@ class TaskData:
 class PlaygroundBounceBall(MjxEnv):
     """One environment with Playground's interface; `task` is the `Env` in it."""
 
-    def __init__(
-        self,
-        config: config_dict.ConfigDict | None = None,
-        config_overrides: dict[str, Any] | None = None,
-        task: str | type[Task] | None = None,
-        policy: str | os.PathLike | None = None,
-        world: str | os.PathLike | None = None,
-    ):
-        """Makes the environment; a config must be the one of the task or the policy.
-
-        Its `episode_length` and `action_repeat` end and repeat nothing: as for Playground's own
-        environments, those of the wrapper or the trainer do.
+    def __init__(self, env: Env, config: config_dict.ConfigDict | None = None):
+        """Wraps an environment, such as from `environment`.
 
         Args:
-          task: its class, its name, or FILE.py:CLASS; None for the policy's, or the default one.
-          policy: a name, a run's folder, a checkpoint in it or an .onnx file, whose environment it
-            is (`deploy.environments`).
-          world: of the policy: nominal (the default), training for the worlds that its training
-            sampled, or a named world.
+          config: its settings in Playground's form, of which `impl` is that of `mjx_model`;
+            `episode_length` and `action_repeat` end and repeat nothing: as for Playground's own
+            environments, those of the wrapper or the trainer do.
 
         Raises:
-          UserError: a setting is wrong, or the policy's environment has another value.
+          UserError: it has a warm-up.
         """
-        if config is None:
-            config = default_config(task, policy, world)
-        elif world is not None and config.task != default_config(task, policy, world).task:
-            raise UserError(
-                f"config and world both say the world, and {world} is another one; give the world "
-                "to default_config alone"
-            )
-        super().__init__(config, config_overrides)
-        settings = self._config.task.to_dict() | {
-            "control_dt": self._config.ctrl_dt,
-            "physics_dt": self._config.sim_dt,
-            "episode_seconds": self._config.episode_length * self._config.ctrl_dt,
-        }
-        task_config = environment_config(ENV_NAME, task, policy, world, settings)
-        refuse_warmup(task_config, ENV_NAME)
-        self.task = Env(task_config)
+        refuse_warmup(env.config, ENV_NAME)
+        super().__init__(config_of(env.config) if config is None else config)
+        self.task = env
 
     def reset(self, rng: jax.Array) -> State:
         """Starts an episode; consumes the key `rng`."""
@@ -195,6 +179,44 @@ class PlaygroundBounceBall(MjxEnv):
         """
         choose_opengl()
         return super().render(trajectory, *args, **kwargs)
+
+
+def make_env(
+    config: config_dict.ConfigDict | None = None,
+    config_overrides: dict[str, Any] | None = None,
+    task: Start | None = None,
+    policy: str | os.PathLike | None = None,
+    world: str | os.PathLike | None = None,
+) -> PlaygroundBounceBall:
+    """What Playground's `registry.load` calls: a `PlaygroundBounceBall` of an `environment`.
+
+    Args:
+      config: must be the one of the task or the policy (`default_config`), whose values it may
+        change; None for that.
+      config_overrides: values on top, by dotted key.
+      task: the start of the environment; policy and world are as in `environment`.
+
+    Raises:
+      UserError: a setting is wrong, or the policy's environment has another value.
+    """
+    if config is None:
+        config = default_config(task, policy=policy, world=world)
+    elif world is not None and config.task != default_config(task, policy=policy, world=world).task:
+        raise UserError(
+            f"config and world both say the world, and {world} is another one; give the world "
+            "to default_config alone"
+        )
+    # As Playground's own environments do.
+    config = config.lock()
+    if config_overrides:
+        config.update_from_flattened_dict(config_overrides)
+    settings = config.task.to_dict() | {
+        "control_dt": config.ctrl_dt,
+        "physics_dt": config.sim_dt,
+        "episode_seconds": config.episode_length * config.ctrl_dt,
+    }
+    env = environment(task, world, policy=policy, **settings)
+    return PlaygroundBounceBall(env, config)
 
 
 def _common(state: State | core.State) -> dict[str, Any]:

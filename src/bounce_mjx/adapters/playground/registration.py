@@ -13,8 +13,8 @@ from bounce_mjx.adapters import randomization
 from bounce_mjx.adapters.brax.ppo import network_settings, ppo_settings
 from bounce_mjx.adapters.playground.environment import (
     ENV_NAME,
-    PlaygroundBounceBall,
     default_config,
+    make_env,
 )
 from bounce_mjx.resources import TASK_POLICIES
 from bounce_mjx.robot.model import load_model
@@ -34,7 +34,7 @@ def register() -> None:
     if ENV_NAME in manipulation.ALL_ENVS:
         return
     for name, task in ENVIRONMENTS.items():
-        make = functools.partial(PlaygroundBounceBall, task=task)
+        make = functools.partial(make_env, task=task)
         manipulation.register_environment(name, make, functools.partial(default_config, task))
     registry.ALL_ENVS = (*registry.ALL_ENVS, *ENVIRONMENTS)
 
@@ -49,7 +49,7 @@ def register() -> None:
 
         setattr(module, function, call)
 
-    extend(manipulation, "load", lambda task, *x, **y: PlaygroundBounceBall(*x, **y, task=task))
+    extend(manipulation, "load", lambda task, *x, **y: make_env(*x, **y, task=task))
     randomizer = "get_domain_randomizer"
     extend(manipulation, randomizer, lambda task: functools.partial(domain_randomize, task=task))
     extend(manipulation_params, "brax_ppo_config", lambda task, *_, **__: brax_ppo_config(task))

@@ -6,7 +6,6 @@ donated to the next step, so a step returns no view of it.
 """
 
 import numbers
-import os
 from typing import NamedTuple
 
 import jax
@@ -14,7 +13,6 @@ import jax.numpy as jnp
 import torch
 
 from bounce_mjx.adapters.torch.packing import Layout
-from bounce_mjx.deploy.environments import environment_config, refuse_beside
 from bounce_mjx.env import vector
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
@@ -52,37 +50,28 @@ class TorchVectorEnv:
 
     def __init__(
         self,
-        env: Env | None = None,
+        env: Env,
         num_envs: int = 4096,
         *,
         seed: int = 0,
         critic_metrics: tuple[str, ...] | None = None,
         reward_scale: float = 1.0,
-        policy: str | os.PathLike | None = None,
-        world: str | os.PathLike | None = None,
     ):
         """Compiles nothing; the first calls of `reset` and `step` do.
 
         Args:
-          env: the task; None for the policy's, or the default one.
+          env: such as from `environment`.
           seed: seed of all resets.
           critic_metrics: names of the metrics that are additional inputs of the value network;
             a pattern such as world/* names many; None for the task's own.
           reward_scale: factor of the rewards.
-          policy: a name, a run's folder, a checkpoint in it or an .onnx file, whose environment it
-            is (`deploy.environments`), in place of `env`.
-          world: of the policy: nominal (the default), training for the worlds that its training
-            sampled, or a named world.
 
         Raises:
-          UserError: torch cannot use JAX's device, a metric or num_envs is wrong, or there is no
-            such policy.
+          UserError: torch cannot use JAX's device, or a metric or num_envs is wrong.
         """
-        if env is not None:
-            refuse_beside("env", policy=policy, world=world)
         if not isinstance(num_envs, numbers.Integral) or num_envs < 1:
             raise UserError(f"num_envs is {num_envs!r}, but must be a whole number of at least 1")
-        self.env = env or Env(environment_config("TorchVectorEnv", None, policy, world, {}))
+        self.env = env
         self.num_envs = num_envs
         self.num_observations = self.env.observation_size
         self.num_actions = self.env.action_size

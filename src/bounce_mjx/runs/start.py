@@ -1,0 +1,202 @@
+"""What a training begins with: one word fixes the classes of its settings."""
+
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from bounce_mjx.config.user_code import not_imported, own_name
+from bounce_mjx.errors import UserError, shorten, suggest
+from bounce_mjx.learning.config import PPO_NAME, PPOConfig
+from bounce_mjx.learning.registry import find_algorithm, own_algorithm
+from bounce_mjx.resources import POLICIES, policy_folder
+from bounce_mjx.runs.config import TrainConfig, code_of, is_code_of, load_run_config, runs_folder
+from bounce_mjx.task.registry import DEFAULT, find_task, is_task, registered_tasks, task_name
+from bounce_mjx.task.task import Task
+
+
+class Start(NamedTuple):
+    """What a training begins with, which fixes the classes of its settings."""
+
+    task: type[Task]
+    task_name: str
+    algorithm: type[PPOConfig]
+    """The settings of the algorithm."""
+    algorithm_name: str
+    said: dict[str, Any]
+    """What the user says by it, by keys of the config."""
+    policy: TrainConfig | None = None
+    """Config of the policy of a warm start."""
+    warm_start: Path | None = None
+    """Name of that policy, or its checkpoint's folder."""
+    run: Path | None = None
+    """Folder of the run that is resumed, or a checkpoint in it."""
+    resumed: TrainConfig | None = None
+    """Config of that run."""
+    notes: tuple[str, ...] = ()
+    """Which run latest stands for."""
+
+
+def find_start(
+    word: str | None = None,
+    warm_start: Path | None = None,
+    algorithm: str | None = None,
+    log_dir: Path | None = None,
+    whole_config: TrainConfig | None = None,
+) -> Start:
+    """What a word means: a task, a policy or a run; and what is said beside it.
+
+    Args:
+      warm_start: a policy or a run from whose networks the training starts.
+      algorithm: its name; by default, ppo.
+      log_dir: where the newest run is looked for first.
+      whole_config: whose task and algorithm these are, in place of a word.
+
+    Raises:
+      UserError: there is no such thing, or two of these exclude each other.
+    """
+    if word is not None and not is_task(word):
+        # Imports JAX, which a task's help does not need.
+        from bounce_mjx.runs.folders import LATEST, is_newest
+
+        if policy_folder(word):
+            if warm_start is not None:
+                raise UserError(
+                    f"{word} and the warm start {warm_start} are two policies; leave one out"
+                )
+            warm_start, word = Path(word), None
+        elif is_newest(Path(word)) or os.path.isdir(word):
+            for name, given in {"warm_start": warm_start, "algorithm": algorithm}.items():
+                if given is not None:
+                    raise beside_run(word, name)
+            return _start_of_run(Path(word), log_dir)
+        else:
+            known = list(dict.fromkeys((*registered_tasks(), *POLICIES)))
+            own = "a run's folder, or --import FILE.py for a task of your own"
+            advice = suggest(word, [*known, LATEST]) or f"give {', '.join(known)}, {own}"
+            raise UserError(f"there is no task, policy or run {shorten(word)}; {advice}")
+    policy, notes = None, ()
+    if warm_start is not None:
+        folder = _folder_of_runs(log_dir, word, whole_config)
+        warm_start, policy, notes = _policy_of(warm_start, folder)
+    said: dict[str, Any] = {}
+    if word is not None:
+        task = find_task(word)
+        said["task"] = task_name(task)
+    elif whole_config is not None:
+        task = whole_config.env.task
+    elif policy is not None:
+        task = policy.env.task
+    else:
+        task = find_task(DEFAULT)
+    if whole_config is not None and whole_config.env.task is not task:
+        raise UserError(
+            f"the config is of the task {whole_config.task}, and the first argument is {word}; "
+            "leave it out"
+        )
+    if warm_start is not None:
+        said["warm_start"] = warm_start
+    algorithm_name, settings = _algorithm(algorithm, whole_config)
+    if algorithm is not None:
+        said["algorithm"] = algorithm_name
+    return Start(
+        task=task,
+        task_name=task_name(task),
+        algorithm=settings,
+        algorithm_name=algorithm_name,
+        said=said,
+        policy=policy,
+        warm_start=warm_start,
+        notes=notes,
+    )
+
+
+def beside_run(run: str | os.PathLike, name: str) -> UserError:
+    """The refusal of what a run has already, with which it is resumed."""
+    return UserError(
+        f"the run {run} has its {name}, with which it is resumed; leave {name} out, or start a new "
+        f"run from its networks: --warm-start {run}"
+    )
+
+
+def _start_of_run(word: Path, log_dir: Path | None) -> Start:
+    """The start of a run that is resumed."""
+    from bounce_mjx.runs.folders import find_run, is_newest, named_run
+
+    if log_dir is not None and not is_newest(word):
+        raise UserError(
+            f"log_dir is where the newest run is looked for, and {word} is named; omit one of them"
+        )
+    place = named_run(word, log_dir or runs_folder(find_task(DEFAULT)))
+    run = find_run(place)
+    config = load_run_config(run)
+    classes: dict[str, type] = {"task": config.env.task}
+    if config.algorithm != PPO_NAME:
+        algorithm = own_algorithm(config.algorithm)
+        if algorithm is None:
+            code = code_of(run, "algorithm")
+            raise not_imported(f"the run {run}", "algorithm", config.algorithm, code)
+        classes["algorithm"] = algorithm
+    # Its settings are no settings of other code.
+    for key, kind in classes.items():
+        if not is_code_of(kind, run, key):
+            raise UserError(
+                f"{run} cannot be resumed with another {key} than it was trained with; import "
+                f"{code_of(run, key)}, or start a new run"
+            )
+    return Start(
+        task=config.env.task,
+        task_name=config.task,
+        algorithm=type(config.ppo),
+        algorithm_name=config.algorithm,
+        said={},
+        run=place,
+        resumed=config,
+    )
+
+
+def _policy_of(path: Path, log_dir: Path) -> tuple[Path, TrainConfig, tuple[str, ...]]:
+    """The policy of a warm start: its name or its checkpoint's folder, the config of its run, and
+    which run latest stands for."""
+    from bounce_mjx.runs.folders import find_choice
+
+    checkpoint, note = find_choice(path, log_dir)
+    start = path if policy_folder(path) else checkpoint.folder
+    return start, load_run_config(checkpoint.run), () if note is None else (note,)
+
+
+def _folder_of_runs(
+    log_dir: Path | None, task: str | None, whole_config: TrainConfig | None
+) -> Path:
+    """Where the newest run is looked for: beside the new one, or among those of the task."""
+    from bounce_mjx.runs.folders import runs_in
+
+    # A new folder has no run yet that latest could stand for.
+    if log_dir is not None and runs_in(log_dir):
+        return log_dir
+    return runs_folder(whole_config.env.task if whole_config else find_task(task or DEFAULT))
+
+
+def _algorithm(name: str | None, whole_config: TrainConfig | None) -> tuple[str, type[PPOConfig]]:
+    """Name and settings of the algorithm.
+
+    Raises:
+      UserError: there is none, or the whole config disagrees with itself.
+    """
+    if whole_config is not None and name is None:
+        settings = _settings_of(whole_config.algorithm)
+        if settings is not type(whole_config.ppo):
+            raise UserError(
+                f"the config's ppo is {type(whole_config.ppo).__qualname__}, and its algorithm "
+                f"{whole_config.algorithm} has {settings.__qualname__}; name the algorithm that "
+                "has them"
+            )
+        return whole_config.algorithm, settings
+    if name in (None, PPO_NAME):
+        return PPO_NAME, PPOConfig
+    algorithm = find_algorithm(name)
+    return own_name(algorithm), algorithm.Config
+
+
+def _settings_of(algorithm: str) -> type[PPOConfig]:
+    """The settings of an algorithm by its name; PPO's without the import of JAX."""
+    return PPOConfig if algorithm == PPO_NAME else find_algorithm(algorithm).Config
