@@ -354,11 +354,13 @@ class CheckedTask:
             lasted=ones > 0,
             commands={name: (each.low, each.high) for name, each in self._config.commands.items()},
         )
-        results = code(episodes)
+        # The figures are none of real episodes.
+        with np.errstate(all="ignore"):
+            results = code(episodes)
+            self._code("details")(episodes)
         is_sequence = isinstance(results, tuple | list)
         if not is_sequence or not all(isinstance(result, Result) for result in results):
             raise UserError(
                 f"{code.named} returns {described(results)}; return a tuple of task.Result, such "
                 "as (task.share_of_episodes(...),)"
             )
-        self._code("details")(episodes)
