@@ -34,7 +34,7 @@ from brax.envs.base import State, Wrapper
 from brax.training.agents.ppo.networks import PPONetworks
 from brax.training.distribution import NormalDistribution
 from brax.training.networks import FeedForwardNetwork
-from trainers import OnBlock, TrainingEnded, block_iterations
+from trainer_interface import OnBlock, TrainingEnded, block_iterations
 
 from bounce_mjx.adapters.brax import device_put_replicated
 from bounce_mjx.adapters.brax.ppo import ppo_settings

@@ -103,7 +103,7 @@ def rk4(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def elliptic(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The shipped model with elliptic cones of friction, which its frictionless contact ignores."""
+    """The shipped model with elliptic cones, which MuJoCo's own friction has alone."""
     path = tmp_path_factory.mktemp("model") / "elliptic.xml"
     return shipped_model(path, 'cone="pyramidal"', 'cone="elliptic"')
 
@@ -131,12 +131,10 @@ def test_the_engine_decides_unless_the_user_does(
     fused, chosen = EnvConfig(), EnvConfig(physics="fused")
     mjx, falls_to_mjx = EnvConfig(physics="mjx"), EnvConfig(mjcf=rk4)
     without, with_friction = EnvConfig(mjcf=elliptic), EnvConfig(mjcf=elliptic, friction=0.3)
-    for configs in ((fused,), (chosen,), (fused, chosen), (without,)):
+    for configs in ((fused,), (chosen,), (fused, chosen), (without,), (without, with_friction)):
         assert flags(*configs) == joined
     for configs in ((mjx,), (falls_to_mjx,), (fused, mjx), (chosen, falls_to_mjx)):
         assert flags(*configs) == user
-    # The fused physics has no elliptic cone of friction.
-    assert flags(with_friction) == flags(without, with_friction) == user
 
 
 def test_the_presets_of_all_machines_have_one_task() -> None:

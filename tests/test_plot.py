@@ -380,6 +380,13 @@ def test_a_missed_bound_is_not_printed_as_its_value(value, bound, passed, text: 
         assert f"stable {text} ({bound})" in unsolved_line(Report((result,), {}))
 
 
+def test_the_advice_after_several_seeds_is_not_to_train_several() -> None:
+    report = Report((Result("stable", "episodes, %", 90.0, ">= 99", False),), {})
+    assert "--num-seeds" in unsolved_line(report)
+    assert "each of the 2 seeds is in a local optimum" in unsolved_line(report, num_seeds=2)
+    assert "--num-seeds" not in unsolved_line(report, num_seeds=2)
+
+
 def as_shown(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 

@@ -4,13 +4,13 @@ import importlib
 import sys
 from typing import TYPE_CHECKING, Any
 
+from bounce_mjx.resources import VERSION as __version__
+
 if TYPE_CHECKING:
     from bounce_mjx.deploy.loading import load_policy
     from bounce_mjx.env.bounce_ball import BounceBall
     from bounce_mjx.task.bounce import Config as EnvConfig
     from bounce_mjx.training.run import Run, train
-
-__version__ = "0.1.0"
 
 __all__ = ["BounceBall", "EnvConfig", "Run", "__version__", "load_policy", "train"]
 

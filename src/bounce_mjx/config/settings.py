@@ -48,6 +48,12 @@ Duration = Annotated[Positive, Field(le=3600.0)]
 Friction = Annotated[NonNegative, Field(le=10.0)]
 """Coefficient of sliding friction."""
 
+BallInertia = Annotated[Positive, Field(le=0.67)]
+"""Moment of inertia of a ball per mass and squared radius."""
+
+HOLLOW = 2.0 / 3.0
+"""That of a thin shell, as a table-tennis ball is."""
+
 
 def _check_pair(ends: Any) -> Any:
     if not isinstance(ends, list | tuple) or len(ends) != 2:

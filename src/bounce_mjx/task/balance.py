@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 from bounce_mjx import task
-from bounce_mjx.config.settings import Coordinate, Friction
+from bounce_mjx.config.settings import HOLLOW, BallInertia, Coordinate, Friction
 from bounce_mjx.lazy import jax, jnp
 
 REACH = 0.03
@@ -66,6 +66,9 @@ class Config(task.WorldConfig):
     """The noise of a reset."""
     friction: Friction | None = 0.3
     """Coefficient of sliding friction between ball and paddle; null for the MJCF's."""
+    ball_inertia: BallInertia | None = HOLLOW
+    """Moment of inertia of the ball per mass and squared radius: 0.667 of a hollow ball, 0.4 of a
+    solid one; null for the MJCF's."""
     observation: Observation = Observation(ball_quaternion=0, ball_angular_velocity=0)
     """The quantities that the policy sees: what a robot with a camera measures, and the point."""
     randomization: task.RandomizationConfig = task.RandomizationConfig(

@@ -185,6 +185,10 @@ class WorldSettings(settings.StrictModel):
     friction: settings.Friction | None = None
     """Coefficient of sliding friction between ball and paddle; null for the MJCF's, which is 0 for
     the project's own robot. `randomization.contact_friction` replaces it."""
+    ball_inertia: settings.BallInertia | None = None
+    """Moment of inertia of the ball per mass and squared radius: 0.4 of a solid ball, 0.667 of a
+    hollow one, as table-tennis balls are; null for the MJCF's, which is 0.4 for the project's own
+    robot. It acts where the ball has friction. `randomization.ball_inertia` replaces it."""
     action_scale: Annotated[settings.Positive, Field(le=0.5)] = 0.02
     """Change of the servo target for an action of 1, rad."""
     max_joint_velocity: Annotated[settings.Positive, Field(le=50.0)] = 2.0 * math.pi
@@ -235,6 +239,19 @@ class WorldConfig(WorldSettings):
             raise ValueError(
                 f"control_dt {self.control_dt} is not a whole number of physics steps of "
                 f"{self.physics_dt} s; choose a multiple of physics_dt"
+            )
+        return self
+
+    @pydantic.model_validator(mode="after")
+    def _check_contact_duration(self):
+        """A contact is not shorter than its physics steps can simulate."""
+        durations = self.randomization.contact_duration
+        least = 4.0 * self.physics_dt
+        if durations is not None and min(durations) < least * (1.0 - 1e-6):
+            raise ValueError(
+                f"randomization.contact_duration begins at {min(durations):g} s, but a contact "
+                f"needs four physics steps, which are {least:g} s with physics_dt "
+                f"{self.physics_dt:g}; give at least that, or a shorter physics_dt"
             )
         return self
 

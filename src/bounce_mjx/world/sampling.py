@@ -14,7 +14,12 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.physics import PhysicsParameters
 from bounce_mjx.physics.edited import INSEPARABLE, NO_PAIR, edits, own_parameters
 from bounce_mjx.physics.scalars import Quaternion, quaternion_matrix, quaternion_product
-from bounce_mjx.robot.contact import damping_of_restitution, restitution_of_damping
+from bounce_mjx.robot.contact import (
+    damping_of_restitution,
+    duration_of_stiffness,
+    restitution_of_damping,
+    stiffness_of_duration,
+)
 from bounce_mjx.robot.model import Addresses, contact_pairs
 from bounce_mjx.robot.numbers import field_of
 from bounce_mjx.world.randomization import MODEL, TERMS, Operation, Ranges, Term, World
@@ -22,6 +27,7 @@ from bounce_mjx.world.randomization import MODEL, TERMS, Operation, Ranges, Term
 # The fields that the terms of the contact change.
 _CONTACT_FIELDS = {
     "restitution": ("pair_solref",),
+    "contact_duration": ("pair_solref",),
     "contact_friction": ("pair_friction", "pair_dim"),
 }
 
@@ -96,6 +102,9 @@ def _places_of_parameter(
     for edit in edits(mj_model, addresses):
         if edit.parameter == parameter:
             places |= _places(mj_model, edit.field, edit.index)
+    if parameter == "ball_inertia":
+        for ball in addresses.balls:
+            places |= _places(mj_model, "body_inertia", ball.body)
     return places
 
 
@@ -147,10 +156,12 @@ def nominal_values(
 
 def _own_nominal(own: PhysicsParameters, term: Term) -> Any:
     """The model's own value of a term; None if the model lacks the parameter."""
-    if term.operation != "restitution":
+    if term.operation not in ("restitution", "duration"):
         return getattr(own, term.parameter)
     if own.contact_damping is None:
         return None
+    if term.operation == "duration":
+        return duration_of_stiffness(own.contact_stiffness)
     return restitution_of_damping(own.contact_damping, own.contact_stiffness)
 
 
@@ -202,10 +213,24 @@ def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParamet
         return PhysicsParameters()
     own = own_parameters(mj_model)
     parameters = {}
+    if "contact_duration" in world:
+        own = _with_duration(own, world["contact_duration"])
+        # Without a term of its own, it follows the stiffness.
+        parameters["contact_damping"] = own.contact_damping
     for name in physical_terms:
         term = TERMS[name]
         parameters[term.parameter] = apply(term.operation, own, term.parameter, world[name])
     return PhysicsParameters(**parameters)
+
+
+def _with_duration(own: PhysicsParameters, duration: jax.Array) -> PhysicsParameters:
+    """The model's own parameters with a contact that lasts as long (s) and has the same damping
+    ratio."""
+    if own.contact_stiffness is None:
+        raise UserError(NO_PAIR)
+    stiffness = stiffness_of_duration(duration)
+    faster = jnp.sqrt(stiffness / own.contact_stiffness)
+    return own._replace(contact_stiffness=stiffness, contact_damping=own.contact_damping * faster)
 
 
 def apply(
@@ -223,6 +248,8 @@ def apply(
     Raises:
       UserError: the term is a restitution, and the model has no contact pair of ball and paddle.
     """
+    if operation == "duration":
+        return stiffness_of_duration(sampled)
     if operation in ("replace", "limit"):
         # `physics.edited` keeps the model's own limit where that is lower.
         return sampled
