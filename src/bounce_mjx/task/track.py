@@ -133,7 +133,7 @@ class Config(task.WorldConfig):
                 "m",
                 least=heights.least,
                 greatest=heights.greatest,
-                span=(z + 0.3, z + 0.7),
+                span=heights.within(z + 0.3, z + 0.7),
                 setting="height_range",
                 reason=heights.reason,
             ),
