@@ -1,16 +1,19 @@
 """A policy on the topics of ROS 2, with the controller forward_position_controller of ros2_control.
 
-`python examples/ros2_bridge.py POLICY [JOINT ...]` subscribes to /joint_states and /ball
-(PointStamped, in the frame of the base), and publishes /forward_position_controller/commands at
-500 Hz. The joints are the driver's names in the order of the controller, if they differ from the
-policy's.
+`python examples/ros2_bridge.py POLICY --rests-at Q ... --box X Y Z X2 Y2 Z2 [--joints NAME ...]`
+subscribes to /joint_states and /ball (PointStamped, in the frame of the base), and publishes
+/forward_position_controller/commands at 500 Hz. The joints are the driver's names in the order of
+the controller, if they differ from the policy's.
+
+This controller publishes no target, so that the operator says where the arm rests: the angles (rad)
+on the robot's own panel, and not those of /joint_states, which this program could read wrongly.
 Publish a message on /start for each episode, also after a fault; if the arm was moved with its
-servos off, start the program again. Read "Safety steps" in
-docs/real-robot.md first.
+servos off, start the program again. Read "Safety steps" in docs/real-robot.md first.
 """
 
-import sys
+import argparse
 
+import numpy as np
 import rclpy
 from geometry_msgs.msg import PointStamped
 from rclpy.node import Node
@@ -29,18 +32,19 @@ NEWEST_ONLY = 1
 class Bridge(Node):
     """Takes the newest messages once each control step, and publishes one command in each tick."""
 
-    def __init__(self, policy, target_height: float = 0.7):
+    def __init__(self, policy, rests_at: list[float], box: dict, target_height: float = 0.7):
         """Subscribes to the topics; `rclpy.spin` runs it.
 
         Args:
           policy: the result of `load_policy`.
+          rests_at: joint angles [J] at which the operator says that the arm rests, rad.
+          box: the `box` of `DeployedPolicy.supervise`, m; empty for none.
           target_height: m.
         """
         super().__init__("bounce_mjx")
         self.joint_names = policy.metadata.joint_names
-        # The arm rests, and the first command is where it is measured.
-        policy.reset()
-        self.arm = policy.supervise(RATE)
+        policy.reset(np.array(rests_at))
+        self.arm = policy.supervise(RATE, **box)
         self.measurements = {"target_height": target_height}
         self.picture_stamp = None
         """When the newest picture of the ball was taken."""
@@ -101,11 +105,36 @@ class Bridge(Node):
         return measurements
 
 
+def parse_arguments(words: list[str] | None = None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("policy", help="name, file or run")
+    parser.add_argument("--joints", nargs="+", help="the driver's names, in its order")
+    parser.add_argument(
+        "--rests-at",
+        type=float,
+        nargs="+",
+        required=True,
+        metavar="Q",
+        help="angles at which the arm rests, by the robot's own panel, rad",
+    )
+    box = parser.add_mutually_exclusive_group(required=True)
+    box.add_argument(
+        "--box",
+        type=float,
+        nargs=6,
+        metavar=("X", "Y", "Z", "X2", "Y2", "Z2"),
+        help="the lowest and the highest x, y and z that the paddle may reach, m",
+    )
+    box.add_argument("--no-box", action="store_true", help="let the paddle go anywhere")
+    return parser.parse_args(words)
+
+
 def main() -> None:
-    policy_name = sys.argv[1]
-    joint_names = sys.argv[2:]
+    arguments = parse_arguments()
+    box = {} if arguments.no_box else {"box": (arguments.box[:3], arguments.box[3:])}
+    policy = load_policy(arguments.policy, joint_names=arguments.joints)
     rclpy.init()
-    rclpy.spin(Bridge(load_policy(policy_name, joint_names=joint_names or None)))
+    rclpy.spin(Bridge(policy, arguments.rests_at, box))
 
 
 if __name__ == "__main__":

@@ -1,12 +1,17 @@
 """A policy on a Universal Robots arm, by ur_rtde (`pip install ur_rtde`), at 500 Hz.
 
-`python examples/ur_rtde_bridge.py ROBOT_IP POLICY` reads the ball from UDP datagrams "x y z age" (m
-in the frame of the base, s) on port 5005 of this computer; for a camera on another one, give the
-address at which this one is reached (`--listen`). Read "Safety steps" in docs/real-robot.md first.
+`python examples/ur_rtde_bridge.py ROBOT_IP POLICY --box 0.2 -0.5 -0.2 1.0 0.5 0.6` reads the ball
+from UDP datagrams "x y z age" (m in the frame of the base, s) on port 5005 of this computer; for a
+camera on another one, give the address at which this one is reached (`--listen`). Each episode
+starts when Enter is pressed, with the hands away from the arm. Read "Safety steps" in
+docs/real-robot.md first.
 """
 
 import argparse
+import select
 import socket
+import sys
+from collections.abc import Callable
 
 import numpy as np
 
@@ -71,8 +76,23 @@ class Camera:
         self.newest = {"ball_position": numbers[:3], "ball_age": float(numbers[3])}
 
 
-def bounce(policy, rtde_c, rtde_r, camera, task_commands: dict, seconds: float) -> list[str]:
-    """Bounces for a time, again after each lost ball, until another fault.
+def has_pressed_enter() -> bool:
+    """Whether the operator has given the word since the last call."""
+    has_line, _, _ = select.select([sys.stdin], [], [], 0.0)
+    return bool(has_line and sys.stdin.readline())
+
+
+def bounce(
+    policy,
+    rtde_c,
+    rtde_r,
+    camera,
+    task_commands: dict,
+    seconds: float,
+    box: dict,
+    is_told: Callable[[], bool] = has_pressed_enter,
+) -> list[str]:
+    """Bounces for a time, again on the operator's word after each lost ball, until another fault.
 
     Args:
       policy: the result of `load_policy`.
@@ -80,15 +100,18 @@ def bounce(policy, rtde_c, rtde_r, camera, task_commands: dict, seconds: float) 
       rtde_r: its `RTDEReceiveInterface`.
       camera: its `measure` returns the ball's part of the measurements.
       task_commands: such as the target height, m.
+      box: the `box` of `DeployedPolicy.supervise`, m; empty for none.
+      is_told: whether the operator has given the word to start since it was last asked.
 
     Returns:
       Why the arm stopped, each time.
     """
-    # The arm rests, and the first command is where it is measured.
-    policy.reset()
-    arm = policy.supervise(RATE)
+    # Where the controller holds the arm, which no reading of ours can be wrong about.
+    policy.reset(np.array(rtde_r.getTargetQ()))
+    arm = policy.supervise(RATE, **box)
     control_dt = policy.metadata.control_dt
     reasons = []
+    was_ready = False
     # A period begins before reading and computing, so that a control step lasts whole periods.
     t_start = rtde_c.initPeriod()
     try:
@@ -110,7 +133,13 @@ def bounce(policy, rtde_c, rtde_r, camera, task_commands: dict, seconds: float) 
                 # The first sample is not believed yet, and nothing is sent.
                 rtde_c.waitPeriod(t_start)
                 t_start = rtde_c.initPeriod()
-            if arm.state == "ready" and ball["ball_age"] < MAX_FIRST_BALL_AGE:
+            is_ready = arm.state == "ready"
+            if is_ready and not was_ready:
+                print("the arm is ready")
+            was_ready = is_ready
+            # A word that comes before the arm is ready does not count.
+            has_word = is_told()
+            if is_ready and has_word and ball["ball_age"] < MAX_FIRST_BALL_AGE:
                 arm.start()
             elif arm.state == "stopped":
                 reasons.append(arm.reason)
@@ -131,6 +160,26 @@ def servo(rtde_c, joint_angles: np.ndarray) -> None:
     rtde_c.servoJ(joint_angles.tolist(), velocity, acceleration, 1.0 / RATE, LOOKAHEAD_TIME, GAIN)
 
 
+def add_box(parser: argparse.ArgumentParser) -> None:
+    """Adds the flags of the box, of which one has to be given."""
+    box = parser.add_mutually_exclusive_group(required=True)
+    box.add_argument(
+        "--box",
+        type=float,
+        nargs=6,
+        metavar=("X", "Y", "Z", "X2", "Y2", "Z2"),
+        help="the lowest and the highest x, y and z that the paddle may reach, m",
+    )
+    box.add_argument("--no-box", action="store_true", help="let the paddle go anywhere")
+
+
+def box_of(arguments: argparse.Namespace) -> dict:
+    """The setting of `DeployedPolicy.supervise` for the flags of `add_box`."""
+    if arguments.no_box:
+        return {}
+    return {"box": (arguments.box[:3], arguments.box[3:])}
+
+
 def main() -> None:
     # Here, so that the rest can be imported on a computer without ur_rtde.
     from rtde_control import RTDEControlInterface
@@ -142,6 +191,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--target-height", type=float, default=0.7, help="m")
     parser.add_argument("--listen", default="127.0.0.1", help="address for the ball's datagrams")
+    add_box(parser)
     arguments = parser.parse_args()
 
     rtde_c = RTDEControlInterface(arguments.robot, RATE)
@@ -149,7 +199,10 @@ def main() -> None:
     policy = load_policy(arguments.policy, joint_names=JOINTS)
     camera = Camera(address=arguments.listen)
     task_commands = {"target_height": arguments.target_height}
-    reasons = bounce(policy, rtde_c, rtde_r, camera, task_commands, arguments.seconds)
+    print("press Enter for each episode, when the ball is over the paddle and no hand is near")
+    reasons = bounce(
+        policy, rtde_c, rtde_r, camera, task_commands, arguments.seconds, box_of(arguments)
+    )
     for reason in reasons:
         print(reason)
     print(f"{camera.ignored} datagrams were ignored")

@@ -1,5 +1,7 @@
 """The bridges to robots, on stand-ins of their libraries in front of MuJoCo's C engine."""
 
+import argparse
+import re
 import runpy
 import sys
 import types
@@ -15,6 +17,7 @@ from bounce_mjx.resources import resource_path
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 RATE, SECONDS = 500, 9.0
+BOX = ((0.1, -0.5, -0.4), (1.1, 0.5, 0.6))
 
 
 class World:
@@ -75,9 +78,20 @@ def knocked(world: World) -> None:
 
 def test_ur_rtde_bridge() -> None:
     world, supervised = World(), []
-    policy = load_policy("robust")
-    make = policy.supervise
-    policy.supervise = lambda rate: supervised.append(make(rate)) or supervised[-1]
+    boxes = []
+
+    def watched_policy() -> Any:
+        policy = load_policy("robust")
+        make = policy.supervise
+
+        def supervise(rate: float, **settings: Any) -> Any:
+            boxes.append(settings)
+            supervised.append(make(rate, **settings))
+            return supervised[-1]
+
+        policy.supervise = supervise
+        return policy
+
     bridge = runpy.run_path(str(EXAMPLES / "ur_rtde_bridge.py"))
 
     class Control:
@@ -111,6 +125,9 @@ def test_ur_rtde_bridge() -> None:
 
         broken = False
 
+        def getTargetQ(self) -> list[float]:
+            return world.data.ctrl[:6].tolist()
+
         def getActualQd(self) -> list[float]:
             return [np.nan] * 6 if self.broken else world.data.qvel[:6].tolist()
 
@@ -135,13 +152,28 @@ def test_ur_rtde_bridge() -> None:
     camera.socket, camera.newest, camera.ignored = Socket(), {}, 0
     control, receive = Control(), Receive()
     wished = {"target_height": 0.5}
-    reasons = bridge["bounce"](policy, control, receive, camera, wished, SECONDS)
+    asked = []
+
+    def is_told() -> bool:
+        """The operator gives the word when the arm has been ready for half a second."""
+        is_ready = supervised[-1].state == "ready"
+        asked.append(is_ready)
+        return is_ready and all(asked[-50:]) and len(asked) >= 50
+
+    box = {"box": BOX}
+    policy = watched_policy()
+    reasons = bridge["bounce"](policy, control, receive, camera, wished, SECONDS, box, is_told)
     assert control.stopped and world.ticks == SECONDS * RATE
+    assert boxes == [box]
+    # After the lost ball the arm was ready, and waited for the word.
+    waits = "".join("r" if is_ready else "." for is_ready in asked)
+    assert len(re.findall("r{50}", waits)) == 2
     check(world, reasons)
     assert camera.ignored == 5
     # Only a lost ball starts it again by itself.
     receive.broken = True
-    reasons = bridge["bounce"](policy, control, receive, camera, wished, SECONDS)
+    policy = watched_policy()
+    reasons = bridge["bounce"](policy, control, receive, camera, wished, SECONDS, {}, is_told)
     assert len(reasons) == 1 and "joint_velocities holds nan" in reasons[0]
     assert world.ticks < 2 * SECONDS * RATE
     # A lost connection ends the program, and stops the arm first.
@@ -152,8 +184,44 @@ def test_ur_rtde_bridge() -> None:
 
     receive.getActualQ = lose_connection
     with pytest.raises(RuntimeError, match="connection lost"):
-        bridge["bounce"](policy, control, receive, camera, wished, SECONDS)
+        bridge["bounce"](policy, control, receive, camera, wished, SECONDS, {}, is_told)
     assert control.stopped
+
+
+def test_a_bridge_does_not_begin_at_readings_that_its_controller_contradicts() -> None:
+    """Here the second joint is read with another sign: nothing is sent, and the reason is said."""
+    bridge = runpy.run_path(str(EXAMPLES / "ur_rtde_bridge.py"))
+    policy = load_policy("robust")
+    parked = np.radians([0, 40, 110, 0, -60, 0]) + 0.3
+    sent, ticks = [], []
+    control = message(
+        initPeriod=lambda: None,
+        waitPeriod=ticks.append,
+        servoJ=lambda *command: sent.append(command),
+        servoStop=lambda: None,
+    )
+    receive = message(
+        getTargetQ=parked.tolist,
+        getActualQ=lambda: (parked * [1, -1, 1, 1, 1, 1]).tolist(),
+        getActualQd=lambda: [0.0] * 6,
+        getTimestamp=lambda: 0.002 * len(ticks),
+    )
+    camera = message(measure=lambda control_dt: {"ball_age": np.inf})
+    reasons = bridge["bounce"](policy, control, receive, camera, {}, 3.0, {}, lambda: True)
+    assert not sent and len(reasons) == 1
+    assert "Joint2 is 2 rad from where its commands rest" in reasons[0]
+
+
+def test_a_bridge_asks_for_a_box(capsys: pytest.CaptureFixture) -> None:
+    bridge = runpy.run_path(str(EXAMPLES / "ur_rtde_bridge.py"))
+    parser = argparse.ArgumentParser()
+    bridge["add_box"](parser)
+    with pytest.raises(SystemExit):
+        parser.parse_args([])
+    assert "--box --no-box is required" in capsys.readouterr().err
+    given = "--box 0.2 -0.5 -0.2 1 0.5 0.6".split()
+    assert bridge["box_of"](parser.parse_args(given)) == {"box": ([0.2, -0.5, -0.2], [1, 0.5, 0.6])}
+    assert bridge["box_of"](parser.parse_args(["--no-box"])) == {}
 
 
 def message(**fields: Any) -> types.SimpleNamespace:
@@ -209,7 +277,13 @@ def test_ros2_bridge(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(
             sys.modules, name.split(".")[0], sys.modules.get(name.split(".")[0], module)
         )
-    node = runpy.run_path(str(EXAMPLES / "ros2_bridge.py"))["Bridge"](load_policy("robust"), 0.5)
+    bridge = runpy.run_path(str(EXAMPLES / "ros2_bridge.py"))
+    rests_at = world.data.ctrl[:6].tolist()
+    node = bridge["Bridge"](load_policy("robust"), rests_at, {"box": BOX}, 0.5)
+    # The operator says where the arm rests, and where the paddle may go.
+    for words in (["robust", "--no-box"], ["robust", "--rests-at", "0", "0"]):
+        with pytest.raises(SystemExit):
+            bridge["parse_arguments"](words)
     ((period, tick),) = node.timers
     assert period == 1.0 / RATE
     backwards = world.names[::-1]

@@ -371,18 +371,17 @@ def test_an_arm_that_was_moved_starts_from_where_it_is() -> None:
     arm = running()
     arm.supervisor.stop("an emergency stop")
     # Braking and resting need no measurement.
-    for _ in range(100):
+    for _ in range(150):
         rows = arm.supervisor.commands({"joint_angles": None, "ball": "lost"})
     assert arm.supervisor.state == "stopped"
     stopped, moved = rows[-1], HOME + 0.6
+    np.testing.assert_array_equal(arm.supervisor.commands(measured(arm.angles))[-1], stopped)
+    # Nothing is sent to an arm that is elsewhere, so that its servos may be switched on again.
     for _ in range(20):
-        rows = arm.supervisor.commands(measured(moved))
-        np.testing.assert_array_equal(rows, np.tile(stopped, (10, 1)))
+        assert arm.supervisor.commands(measured(moved)).shape == (0, 6)
     arm.supervisor.restart()
-    # The commands go on where they rest, wherever the arm seems to be.
     for _ in range(110):
-        rows = arm.supervisor.commands(measured(moved))
-        np.testing.assert_array_equal(rows, np.tile(stopped, (10, 1)))
+        assert arm.supervisor.commands(measured(moved)).shape == (0, 6)
     assert arm.supervisor.state == "stopped" and arm.supervisor.fault == "joint_astray"
     assert "rad from where its commands rest" in arm.supervisor.reason
     # Nor is anything raised before the next first command.
@@ -402,6 +401,30 @@ def test_an_arm_that_was_moved_starts_from_where_it_is() -> None:
     # At 0.3 rad/s, the speed of every way home.
     speeds = 1000.0 * np.abs(np.diff(np.asarray(moves.rows[1:]), axis=0))
     assert 0.29 < speeds.max() < 0.3 + 1e-6
+
+
+@pytest.mark.parametrize("name", ["robust", "ur5e", "iiwa"])
+def test_nothing_is_sent_after_a_restart_until_the_arm_is_where_its_commands_rest(
+    name: str,
+) -> None:
+    """As after an emergency stop, when somebody moved the arm with its servos off."""
+    arm, home, seen = supervised(name)
+    for step in range(20):
+        rest = arm.commands(seen(home, step, 0.3))[-1]
+    arm.stop("an emergency stop")
+    while arm.state != "stopped":
+        arm.commands(seen(home, step, 0.3))
+    arm.restart()
+    for step in range(20, 40):
+        assert arm.commands(seen(home + 0.6, step, 0.3)).shape == (0, len(home))
+        assert arm.state == "homing"
+    assert "from where its commands rest" in arm.reason
+    # It is pushed back.
+    for step in range(40, 90):
+        away = 0.6 - 0.012 * (step - 39)
+        commands = arm.commands(seen(home + away, step, 0.3))
+        assert len(commands) == 0 or away < 0.1
+    np.testing.assert_allclose(commands, np.tile(rest, (5, 1)), atol=4e-3)
 
 
 @pytest.mark.parametrize("earlier", [False, True], ids=["once", "again"])
@@ -463,6 +486,18 @@ def test_a_step_refuses_what_no_world_can_hold(wrong: dict, words: str) -> None:
     assert policy.step_number == -1
     # A lost ball is no error.
     policy.step(measured(ball_position=[1.4, -1.4, 0.02]))
+
+
+def test_another_command_than_the_only_one_of_the_training_is_refused() -> None:
+    """The network's input is the same for all, so that none would be heeded."""
+    policy = load_policy("pretrained")
+    constant = policy.metadata.commands["target_height"]._replace(range=(0.5, 0.5))
+    policy.metadata = policy.metadata._replace(commands={"target_height": constant})
+    policy.step(measured(target_height=np.float32(0.5)))
+    for height in (0.3, 0.51, 0.9):
+        words = f"target_height is {height}, but the training had 0.5 alone .m.; give that"
+        with pytest.raises(UserError, match=words):
+            policy.step(measured(target_height=height))
 
 
 def test_zeros_of_a_driver_without_data_are_no_command() -> None:

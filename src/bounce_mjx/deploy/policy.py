@@ -25,6 +25,8 @@ _LARGEST_TIME = 1e15
 # A command that is farther outside its range than the range is long, and than this (in its unit),
 # is in another unit.
 _ROOM = 0.5
+# Two values of a command that are one.
+_SAME_COMMAND = 1e-6
 # Resolution of a time as a share of a control step.
 _FINE = 0.25
 
@@ -445,8 +447,17 @@ def _index_of(joints: Sequence[str], name: str) -> int:
 
 
 def _check_command(name: str, value: float, ends: tuple[float, float], unit: str) -> None:
-    """Raises UserError for a command that no world of the training can hold."""
+    """Raises UserError for a command that no world of the training can hold, or for another one
+    than the only one of the training."""
     low, high = ends
+    if low == high:
+        # The network has never seen another value, and cannot heed it.
+        if abs(value - low) > _SAME_COMMAND:
+            raise UserError(
+                f"{name} is {value:.3g}, but the training had {low:.3g} alone ({unit}); give that, "
+                f"or train with a range of {name}"
+            )
+        return
     room = max(high - low, _ROOM)
     if not low - room <= value <= high + room:
         raise UserError(

@@ -107,7 +107,8 @@ class Supervisor:
         self._waits_for: str | None = None
         """Why the arm waits on its way home."""
         self._has_found_arm = False
-        """Whether the arm has been measured where its commands rest; nothing is sent before."""
+        """Whether the arm has been measured where its commands rest; nothing is sent before, nor
+        once a stopped arm is elsewhere."""
         self._is_moving_home = False
         self._waited = 0
         """Control steps in a row in which the arm was not where its commands rest."""
@@ -170,7 +171,7 @@ class Supervisor:
 
     def restart(self, moved: bool = False) -> None:
         """Goes home after a stop, for the next `start`. The commands go on where they rest, and
-        wait until the arm is there.
+        nothing is sent until the arm is there.
 
         Args:
           moved: whether the arm was moved with its servos off. Its commands then begin anew where
@@ -188,6 +189,7 @@ class Supervisor:
         # A stop from here on stays.
         self._stop = None
         self._is_moving_home = False
+        self._has_found_arm = False
         self._waited = 0
         if moved:
             self._policy.reset()
@@ -196,13 +198,15 @@ class Supervisor:
             self._policy.samples.forget(self._targets)
 
     def commands(self, measurements: Mapping[str, Any]) -> np.ndarray:
-        """Commands [M, J] of a control step at the robot's rate, rad; none ([0, J]) until a first
-        sample is believed (`Samples`), and the arm is where `DeployedPolicy.reset` was told that it
-        rests, so that nothing is sent.
+        """Commands [M, J] of a control step at the robot's rate, rad; none ([0, J]), so that
+        nothing is sent, until a first sample is believed (`Samples`), and the arm is where
+        `DeployedPolicy.reset` was told that it rests; after a `restart`, until it is where the
+        commands rest; and once a stopped arm that had a second to settle is elsewhere.
 
         Args:
           measurements: as for `DeployedPolicy.step`. Before `start`, only the joint angles are
-            needed, and none while the arm brakes and after. Without `time` no step is late, and
+            needed, and none while the arm brakes; after that, the joint angles tell whether the
+            stopped arm was moved. Without `time` no step is late, and
             without `ball_age` a picture is as old as the time since the ball's position last
             changed.
 
@@ -222,6 +226,8 @@ class Supervisor:
                 self._follow(measurements)
             elif self.state in ("homing", "ready"):
                 self._go_home(measurements)
+            elif self.state == "stopped" and self._has_found_arm:
+                self._has_found_arm = self._is_not_moved(measurements)
         except Exception as error:
             if not self._has_begun:
                 raise
@@ -232,6 +238,8 @@ class Supervisor:
                 self._stop = stop._replace(is_at_rest=True)
             return self._no_commands
         if stop is not None:
+            if not stop.is_at_rest:
+                self._waited = 0
             # What this step was to send is not sent.
             if self._end is not None:
                 self._motion.end = self._end
@@ -302,6 +310,20 @@ class Supervisor:
             policy.samples.rest(angles)
             return measured
         return measured if self._rests(angles) else None
+
+    def _is_not_moved(self, measurements: Mapping[str, Any]) -> bool:
+        """Whether a stopped arm is where its commands rest, has had no time to settle, or is not
+        measured."""
+        self._waited += 1
+        try:
+            angles = self._policy.check(
+                {"joint_angles": measurements["joint_angles"]}, ("joint_angles",)
+            )["joint_angles"]
+        except (UserError, KeyError, TypeError):
+            return True
+        if self._waited * self._metadata.control_dt <= _SETTLING:
+            return True
+        return bool(np.all(np.abs(angles - self._targets) <= self._watch.offset))
 
     def _rests(self, angles: np.ndarray) -> bool:
         """Whether the arm is where its commands rest. Else there is a reason for which it waits,
