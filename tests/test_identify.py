@@ -576,8 +576,9 @@ def test_an_interval_is_the_spread_over_other_logs() -> None:
     """Of a mean of windows, each of which has an error of its own, however many rows agree within
     it; with many windows and with few."""
     random = np.random.default_rng(0)
-    for windows in (8, 200):
-        inside = 0
+    for windows, least in ((8, 0.8), (200, 0.88)):
+        inside = []
+        spreads = []
         for trial in range(60):
             own = random.normal(size=windows)
             # Each window says 100 times, exactly, what its own mean is.
@@ -587,10 +588,10 @@ def test_an_interval_is_the_spread_over_other_logs() -> None:
             generator = np.random.default_rng(trial)
             changes = resample(informations, gradients, np.ones(1, bool), generator)
             low, high = estimate + np.percentile(changes[:, 0], [2.5, 97.5])
-            inside += low <= 0.0 <= high
-        assert inside >= 0.88 * 60
-        # Of few windows, the interval is that of a fit without one of them.
-        assert 0.9 < np.std(changes) * np.sqrt(windows) < (2.0 if windows == 8 else 1.3)
+            inside.append(low <= 0.0 <= high)
+            spreads.append(np.std(changes) * np.sqrt(windows))
+        assert np.mean(inside) >= least
+        assert np.mean(spreads) == pytest.approx(1.0, abs=0.1)
 
 
 def test_a_model_that_does_not_explain_a_log_is_named() -> None:
@@ -730,7 +731,7 @@ def test_what_no_search_varied_has_the_deviation_of_its_prior() -> None:
     chosen = searched.copy()
     chosen[gains] = False
     deviations = [certainty(problem, fit, which).deviation for which in (searched, chosen)]
-    assert np.all(deviations[0][gains] < 0.97 * layout.deviation[gains])
+    assert np.median(deviations[0][gains] / layout.deviation[gains]) < 0.9
     np.testing.assert_allclose(deviations[1][gains], layout.deviation[gains])
     np.testing.assert_allclose(deviations[1][chosen], deviations[0][chosen])
 

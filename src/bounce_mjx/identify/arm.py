@@ -51,7 +51,7 @@ _LAG_SHARES = (0.0, 0.3, 0.6)
 # the factor of the least error that the least gain may have.
 _FOLLOWING_GAINS = (1.0, 8.0, 30.0, 100.0)
 _FOLLOWING_DELAYS = (5e-4, 1e-3, 3e-3)
-_AS_EXACT = 1.05
+_AS_EXACT = 1.01
 # Steps in which servos of an arm that is carried and of one that is not are fitted and compared.
 _COMPARED = 5
 # Candidates with the model's own servos, and with others, from each of which a search over a few

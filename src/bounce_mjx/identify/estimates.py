@@ -8,6 +8,7 @@ import numpy as np
 
 from bounce_mjx.identify.identification import Identified
 from bounce_mjx.identify.servos import servos_of
+from bounce_mjx.identify.unknowns import OF_SERVOS
 from bounce_mjx.world.randomization import TERMS
 
 # Half the width of a 95% interval in standard deviations, and its ends as quantiles.
@@ -15,8 +16,6 @@ HALF_WIDTH = 1.96
 _ENDS = (2.5, 97.5)
 UNSEEN = 0.7
 """An unknown whose deviation fell by less than this factor is not shown by the log."""
-# Terms of a follower's servos, which were chosen and not estimated.
-_OF_FOLLOWER = ("servo_lag", "servo_gain", "servo_damping", "joint_frictionloss")
 
 
 class Estimate(NamedTuple):
@@ -105,7 +104,7 @@ def is_seen_by(found: Identified) -> np.ndarray:
 def is_chosen(found: Identified) -> np.ndarray:
     """Which unknowns [P] were chosen for a follower, and not searched."""
     chosen = np.zeros(len(found.fit.vector), bool)
-    for name in _OF_FOLLOWER if found.is_follower else ():
+    for name in OF_SERVOS if found.is_follower else ():
         chosen[found.layout.terms[name]] = True
     return chosen
 

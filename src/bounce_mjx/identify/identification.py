@@ -33,7 +33,7 @@ from bounce_mjx.identify.response import measure_response
 from bounce_mjx.identify.sensors import sensor_noise
 from bounce_mjx.identify.servos import servos_of
 from bounce_mjx.identify.simulation import Simulated, make_simulator
-from bounce_mjx.identify.unknowns import Layout
+from bounce_mjx.identify.unknowns import OF_SERVOS, Layout
 from bounce_mjx.identify.windows import Windows, cut_enough, held_out_rows
 from bounce_mjx.robot.model import joint_names
 from bounce_mjx.world.config import WorldConfig
@@ -170,10 +170,13 @@ def identify(
     nominal_vector = own.layout.vector(known)
     before = fit._replace(predicted=own.predict(nominal_vector, fit.starts))
     is_estimated = layout.free(stages)
+    is_chosen = np.zeros_like(is_estimated)
     if not is_shown:
         # By `follow`; its servos were chosen.
         is_estimated[layout.slices["delay"]] = True
         is_estimated[layout.slices["servo_offset"]] = True
+        for name in OF_SERVOS:
+            is_chosen[layout.terms[name]] = True
     counts = np.any(windows.split(fit.weights)[1] > 0.0, axis=(1, 2))
     by_sensor = problem._replace(noise=sensors, correlation=1.0)
     return Identified(
@@ -181,7 +184,7 @@ def identify(
         windows=windows,
         noise=sensors,
         fit=fit,
-        certainty=certainty(problem, fit, is_estimated),
+        certainty=certainty(problem, fit, is_estimated, is_chosen),
         before=_measure_errors(by_sensor, before),
         after=_measure_errors(by_sensor, fit),
         held_out=_measure_errors(by_sensor, unseen),

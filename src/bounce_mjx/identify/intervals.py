@@ -32,7 +32,9 @@ class Certainty(NamedTuple):
         return np.std(self.changes, axis=0)
 
 
-def certainty(problem: Problem, fit: Fit, is_estimated: np.ndarray) -> Certainty:
+def certainty(
+    problem: Problem, fit: Fit, is_estimated: np.ndarray, is_chosen: np.ndarray | None = None
+) -> Certainty:
     """The estimates that other logs of the robot would give, by a bootstrap (Efron 1979) over
     blocks of windows, in the linearised problem.
 
@@ -58,6 +60,7 @@ def certainty(problem: Problem, fit: Fit, is_estimated: np.ndarray) -> Certainty
     Args:
       is_estimated: which unknowns [P] are at the minimum; no search has moved the others from their
         prior mean, or from the number that was chosen for them.
+      is_chosen: those of the latter [P], which the log says nothing about; by default none.
     """
     layout = problem.layout
     deviations, _, searched = problem.scale_starts()
@@ -81,6 +84,10 @@ def certainty(problem: Problem, fit: Fit, is_estimated: np.ndarray) -> Certainty
     informations = _informations(reduced.informations, problem.windows.has_ball)
     informations *= counts[:, None, None]
     gradients = np.mean(np.split(reduced.gradients * counts[:, None], 2, axis=1), axis=0)
+    if is_chosen is not None:
+        informations[:, is_chosen] = 0.0
+        informations[:, :, is_chosen] = 0.0
+        gradients[:, is_chosen] = 0.0
     changes = resample(informations, gradients, is_estimated, np.random.default_rng(0)) * scale
     information = _positive(np.sum(informations, axis=0))
     return Certainty(information / np.outer(scale, scale), changes)
