@@ -3,7 +3,7 @@
 import numpy as np
 
 from bounce_mjx.deploy.metadata import Metadata, joint_ends
-from bounce_mjx.robot.setpoints import Setpoint, command, joint_limits, next_setpoint
+from bounce_mjx.robot.setpoints import Setpoint, joint_limits, next_setpoint, position_at
 
 
 class Motion:
@@ -98,7 +98,9 @@ class Motion:
         if self._limits is None or self.start is None:
             return np.tile(self.end.position, (len(times), 1))
         since_start = np.asarray(times)[:, None]
-        return command(self.start, self.end.acceleration, since_start, np, self._limits.smoothing)
+        return position_at(
+            self.start, self.end.acceleration, since_start, np, self._limits.smoothing
+        )
 
 
 def paddle_position(metadata: Metadata, joint_angles: np.ndarray) -> np.ndarray:
