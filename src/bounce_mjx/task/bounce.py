@@ -198,6 +198,8 @@ class Bounce(task.Task):
     Config = BounceConfig
     config: BounceConfig
     folder = "bounce_ball"
+    ball_rests = False
+    ball_thrown = False
     curves = (
         task.Curve(
             "episode/bounces_at_end", "n_bounces", "episodes", "bounces in a row at its end"
