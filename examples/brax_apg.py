@@ -1,7 +1,4 @@
-"""brax's analytic policy gradients: the gradient of the return flows through the physics.
-
-`python examples/brax_apg.py` needs the extra `brax`.
-"""
+"""brax's analytic policy gradients: the gradient of the return flows through the physics."""
 
 import functools
 from typing import Any

@@ -1,7 +1,5 @@
-"""brax's PPO in worlds that brax's domain randomisation draws; the checkpoint's policy as a page.
-
-`python examples/brax_ppo.py` needs the extra `brax`.
-"""
+"""brax's PPO in worlds that brax's domain randomisation draws; the checkpoint's policy as a
+page."""
 
 import functools
 from pathlib import Path

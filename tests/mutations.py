@@ -139,7 +139,7 @@ FAULTS = [
      "(is_asked_for or self.is_evaluated())", "self.is_evaluated()", "test_job.py -k save_every"),
     ("a callback that returns False is ignored", "training/job.py",
      "isinstance(answer, bool | np.bool_) and not answer", "False", "test_job.py -k callback_sees"),
-    ("a signal does not stop the training", "training/job.py", "return hosts.any_of(self.stop.requested)", "return hosts.any_of(False)", "test_job.py -k signal_saves"),
+    ("a signal does not stop the training", "training/job.py", "return hosts.any_of(self.stop.requested or self.failure is not None)", "return hosts.any_of(False)", "test_job.py -k signal_saves"),
     ("a stopped training saves nothing", "training/job.py",
      "        if self.needs_save:\n            self.save()\n", "", "test_job.py -k signal_saves"),
     ("a training ends a block too early", "training/job.py",

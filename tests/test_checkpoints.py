@@ -4,6 +4,7 @@ sentence."""
 import os
 import pickle
 import random
+import resource
 import shutil
 from pathlib import Path
 
@@ -146,6 +147,23 @@ def test_a_checkpoint_that_cannot_be_removed_stays_beside_the_new_one(
     assert {checkpoint.number for checkpoint in stored_checkpoints(run)} == {64, 128}
     save_checkpoint(run, CONFIG, 192, items_of(state))
     assert [checkpoint.number for checkpoint in stored_checkpoints(run)] == [192]
+
+
+@pytest.mark.filterwarnings("error::pytest.PytestUnraisableExceptionWarning")
+def test_a_disk_that_fills_during_a_save_is_one_sentence(run: Path, capfd) -> None:
+    """Whatever the threads say that write its many files."""
+    arrays = {f"layer {i}": np.random.default_rng(i).normal(size=2**18) for i in range(8)}
+    _, limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2**19, limit))
+    try:
+        with pytest.raises(
+            checkpoints.NotSavedError, match=r"cannot be written \(File too large\)"
+        ):
+            save_checkpoint(run, CONFIG, 128, {"training": arrays})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+    assert capfd.readouterr() == ("", "")
+    assert [checkpoint.number for checkpoint in stored_checkpoints(run)] == [64]
 
 
 @pytest.fixture(scope="module")

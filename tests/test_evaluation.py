@@ -349,6 +349,7 @@ def test_c_evaluates_each_episode_in_its_own_world(networks, random_policy):
     assert all(model.opt.disableflags & AUTORESET for model in models)
 
 
+@pytest.mark.slow
 def test_mujoco_evaluator_agrees_with_the_fused_one(networks, random_policy):
     env = BounceBall(EnvConfig(episode_seconds=1.0))
     assert env.backend == "fused"

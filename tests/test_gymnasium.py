@@ -20,6 +20,7 @@ from bounce_mjx.adapters.gymnasium import batch, environments
 from bounce_mjx.adapters.gymnasium.registration import ENV_ID, TASK_ID, TASKS
 from bounce_mjx.errors import UserError
 from bounce_mjx.task.registry import find_task, registered_tasks
+from bounce_mjx.viewers import offscreen
 
 NUM_ENVS = 3
 # A ball without a paddle reaches the floor after 30 steps.
@@ -30,14 +31,14 @@ NOTHING = np.zeros((NUM_ENVS, 6), np.float32)
 
 
 @pytest.fixture(scope="module")
-def single(opengl):
+def single():
     env = gymnasium.make(ENV_ID, render_mode="rgb_array", episode_seconds=0.01 * LIMIT)
     yield env
     env.close()
 
 
 @pytest.fixture(scope="module")
-def vectorised(opengl):
+def vectorised():
     env = gymnasium.make_vec(
         ENV_ID, NUM_ENVS, render_mode="rgb_array", max_episode_steps=LIMIT, width=96, height=64
     )
@@ -132,7 +133,7 @@ def test_each_task_of_the_package_has_a_name() -> None:
     assert observation[layout["target_height"]] == pytest.approx(0.5)
 
 
-def test_gymnasium_checks_pass(single):
+def test_gymnasium_checks_pass(opengl, single):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         # An observation without limits is what the task has.
@@ -271,7 +272,7 @@ def test_wrappers_work_on_the_vector(vectorised, need):
     assert isinstance(reward, torch.Tensor)
 
 
-def test_pictures_show_the_state(single, vectorised):
+def test_pictures_show_the_state(opengl, single, vectorised):
     single.reset(seed=0)
     first = single.render()
     assert first.shape == (480, 640, 3) and first.dtype == np.uint8
@@ -285,6 +286,40 @@ def test_pictures_show_the_state(single, vectorised):
     pictures = vectorised.render()
     assert [picture.shape for picture in pictures] == [(64, 96, 3)] * NUM_ENVS
     assert not np.array_equal(pictures[0], pictures[1])
+
+
+def test_the_first_picture_opens_opengl(monkeypatch) -> None:
+    """SB3's `make_vec_env` asks for pictures that nobody draws; OpenGL beside triton ends the
+    process."""
+
+    def refuse() -> None:
+        raise UserError("no OpenGL")
+
+    monkeypatch.setattr(offscreen, "choose_opengl", refuse)
+    single = environments.TaskEnv(render_mode="rgb_array", episode_seconds=0.01 * LIMIT)
+    vector = make_vec(render_mode="rgb_array")
+    for env in (single, vector):
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+        with pytest.raises(UserError, match="no OpenGL"):
+            env.render()
+        env.close()
+
+
+def test_a_program_that_closes_no_environment_ends_in_silence(opengl) -> None:
+    """Also where a library has asked for its own ends before OpenGL is opened."""
+    script = f"""
+import weakref
+class Library: pass
+library = Library()
+weakref.finalize(library, print, "end")
+import gymnasium, bounce_mjx.adapters.gymnasium
+env = gymnasium.make({ENV_ID!r}, render_mode="rgb_array", width=64, height=48)
+env.reset()
+print(env.render().shape)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "(48, 64, 3)\nend\n", "")
 
 
 def test_use_before_reset_or_with_a_wrong_action_gives_one_sentence(vectorised):
@@ -323,7 +358,7 @@ def test_np_random_decides_the_episodes(single):
     np.testing.assert_array_equal(env.reset()[0], later)
 
 
-def test_copies_and_pickles_continue_the_episodes(vectorised, single):
+def test_copies_and_pickles_continue_the_episodes(opengl, vectorised, single):
     for env in (vectorised, single.unwrapped):
         env.reset(seed=3)
         action = env.action_space.sample()
@@ -356,7 +391,7 @@ def test_torchrl_wraps_single_and_vectorised_environments(need):
                 assert torch.equal(data["observation"][:, TARGET] != target, ended)
 
 
-def test_skrl_wraps_the_vector(need, vectorised):
+def test_skrl_wraps_the_vector(need, opengl, vectorised):
     """Tensors with the numbers of the arrays; skrl's trainers call the rest at every step."""
     wrap_env, torch = need("skrl.envs.wrappers.torch").wrap_env, need("torch")
     envs = wrap_env(vectorised, verbose=False)

@@ -39,6 +39,7 @@ from bounce_mjx.identify.following import (
 from bounce_mjx.identify.inspection import examine
 from bounce_mjx.identify.log import Log, find_gaps
 from bounce_mjx.identify.reading import read_csv
+from bounce_mjx.identify.servos import servos_of
 from bounce_mjx.identify.simulation import (
     _paddle_speeds,
     compensated,
@@ -829,6 +830,39 @@ def test_a_flight_with_drag_and_spin_is_fitted_directly() -> None:
     np.testing.assert_allclose(pull, [-0.4, 6.0, -9.81])
 
 
+@pytest.mark.parametrize("of_joint", [0.0, 0.5, 1.0])
+def test_the_total_delay_counts_the_joints_own_damping(of_joint: float) -> None:
+    """It is the time by which the joints of C's model are behind targets that move steadily,
+    whoever damps them; and the candidates of a search are as late as the log."""
+    config = read_preset(Path("default")).env
+    model, layout = world_model(config, visual=False), Layout(6, False, 0.001)
+    addresses = find_addresses(model)
+    servos, joints = list(addresses.actuators), list(addresses.arm_qvel)
+    model.actuator_gainprm[servos, 0], model.actuator_biasprm[servos, 1] = 1000.0, -1000.0
+    model.actuator_biasprm[servos, 2] = -20.0 * (1.0 - of_joint)
+    model.dof_damping[joints] = 20.0 * of_joint
+    model.opt.gravity[:] = 0.0
+    data, home = mujoco.MjData(model), np.array(config.default_joint_angles)
+    data.qpos[list(addresses.arm_qpos)] = home
+    for _ in range(800):
+        # At the end of a step, a servo has answered the target of its middle.
+        data.ctrl[servos] = home + 0.05 * (data.time + 0.5 * model.opt.timestep)
+        mujoco.mj_step(model, data)
+    behind = home + 0.05 * data.time - data.qpos[list(addresses.arm_qpos)]
+    vector = layout.vector({"action_latency": np.array(0.0), "servo_lag": np.array(0.0)})
+    found = identified(layout, flight_log(), vector, np.diag((1e-3 * layout.deviation) ** 2))
+    printed = float(total_delay(found, model).split(" ")[2])
+    assert printed == pytest.approx(1e3 * np.mean(behind) / 0.05, abs=0.6)
+    assert printed == pytest.approx(19.5, abs=0.1)
+    late = _late_servos(layout, servos_of(model), 0.05)
+    assert np.all(np.abs(layout.world(late)["action_latency"] - 0.05) < 0.05)
+    for world in (layout.world(vector) for vector in late):
+        delays = servos_of(model).delays(world["servo_gain"], world["servo_damping"])
+        assert world["action_latency"] + world["servo_lag"] + np.mean(delays) == pytest.approx(
+            0.05, abs=1e-3
+        )
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("late", [0.012, 0.003])
 def test_an_arm_is_explained_no_worse_than_by_a_delay_and_offsets(
@@ -1041,8 +1075,8 @@ def test_a_search_begins_from_slow_servos_and_from_long_lags_that_delay_alike() 
     model = world_model(config, visual=False)
     servo = model.actuator("act1")
     of_model = float(-servo.biasprm[2] / servo.gainprm[0])
-    late = 0.0563
-    for candidates in (_own_servos(layout, config, late), _late_servos(layout, config, late)):
+    late, servos = 0.0563, servos_of(model)
+    for candidates in (_own_servos(layout, servos, late), _late_servos(layout, servos, late)):
         world = layout.world(candidates)
         servos = of_model * (world["servo_damping"] / world["servo_gain"])[:, 0]
         total = world["action_latency"] + world["servo_lag"] + servos

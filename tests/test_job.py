@@ -329,19 +329,41 @@ def test_a_callback_sees_blocks_and_evaluations_and_ends_the_training(tmp_path: 
     assert results["fresh_resets"]
 
 
-def test_an_error_in_a_callback_ends_the_training(tmp_path: Path) -> None:
-    """What was saved stays, and the training resumes from it."""
+@pytest.mark.parametrize("is_at_evaluation", [False, True])
+def test_an_error_in_a_callback_ends_the_training_once_all_is_saved(
+    tmp_path: Path, is_at_evaluation: bool
+) -> None:
+    """Nothing that was trained is lost, and the other callbacks know the event."""
+    seen = []
 
     def fail(event: Event) -> None:
+        is_evaluation = event.report is not None
+        if event.steps == 2 * BLOCK and is_evaluation == is_at_evaluation:
+            raise RuntimeError("pruned")
+
+    said = io.StringIO()
+    callbacks = [fail, lambda event: seen.append(event.steps)]
+    with pytest.raises(RuntimeError, match="pruned"):
+        train(tmp_path, {1: 5.0, 2: 9.0, 3: 7.0}, callbacks=callbacks, said=said)
+    (run,) = tmp_path.iterdir()
+    assert seen[-1] == 2 * BLOCK
+    assert "a callback failed after 128 steps; continue with: bounce-mjx train" in said.getvalue()
+    assert iterations_of(latest_checkpoint(run)) == 2
+    train(tmp_path, {2: 9.0, 3: 7.0}, run)
+    assert results_of(run)["best_steps"] == 2 * BLOCK
+
+
+def test_an_error_in_a_callback_is_the_cause_where_its_state_cannot_be_saved(
+    tmp_path: Path, monkeypatch
+) -> None:
+    def prune(event: Event) -> None:
         if event.steps == 2 * BLOCK:
             raise RuntimeError("pruned")
 
-    with pytest.raises(RuntimeError, match="pruned"):
-        train(tmp_path, {1: 5.0, 2: 9.0}, callbacks=[fail])
-    (run,) = tmp_path.iterdir()
-    assert iterations_of(latest_checkpoint(run)) == 1
-    train(tmp_path, {1: 5.0, 2: 9.0}, run)
-    assert results_of(run)["best_steps"] == 2 * BLOCK
+    fail(monkeypatch, 2)
+    with pytest.raises(UserError, match="the end of the training is lost") as caught:
+        train(tmp_path, {1: 5.0, 2: 9.0}, callbacks=[prune])
+    assert str(caught.value.__cause__) == "pruned"
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])

@@ -71,6 +71,25 @@ def test_recorder_keeps_an_earlier_log(tmp_path: Path) -> None:
         recorder.step({"joint_angles": [0.1, 0.2]}, [0.3, 0.4])
 
 
+@pytest.mark.parametrize("num_balls", [None, 2])
+def test_recorder_writes_each_of_several_balls(num_balls: int | None, tmp_path: Path) -> None:
+    """As many as the first row has, or as it is told; of a picture that lacks one, the other."""
+    path = tmp_path / "log.csv"
+    balls = np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
+    with Recorder(path, JOINTS, num_balls=num_balls) as recorder:
+        first = {"time": 5.0, "joint_angles": [0.1, 0.2]}
+        recorder.step(first | ({"ball_position": balls} if num_balls is None else {}), [0.3, 0.4])
+        lost = np.where([[False], [True]], np.nan, balls + 1.0)
+        recorder.step(first | {"time": 5.01, "ball_position": lost, "ball_age": 0.0}, [0.3, 0.4])
+        recorder.picture(5.015, balls + 2.0)
+    rows = np.genfromtxt(path, delimiter=",", names=True, deletechars="")
+    x = [rows[f"ball_position.{i}.x_[m]"][-2:] for i in (1, 2)]
+    np.testing.assert_allclose(x, [[1.1, 2.1], [np.nan, 2.4]])
+    log = read_csv(path, JOINTS)
+    np.testing.assert_allclose(log.ball_positions[-2:, 0], [1.1, 2.1])
+    assert any("shows several balls" in note for note in log.notes)
+
+
 def changed(line: str, row: int, column: int, cell: str) -> str:
     cells = line.split(",")
     cells[column] = cell
@@ -692,6 +711,81 @@ def test_a_fault_of_a_log_is_named_with_its_place(name: str) -> None:
         right = "joint_angles" if name == "unit" else "servo_targets"
         assert f"write {right}.Joint3 [deg]" in checkup.faults[0].text or is_of_all
         assert all("[deg]" in fault.text and right in fault.text for fault in checkup.faults)
+
+
+def one_after_another(delays: list[float], seconds: float = 30.0) -> Log:
+    """Six joints that move one after another, each late by a delay of its own, s."""
+    times = np.arange(0.0, seconds, 0.01)
+    slot = seconds / len(delays)
+    angles, targets = np.zeros((2, len(times), len(delays)))
+    for j, delay in enumerate(delays):
+
+        def path(at: np.ndarray, begin: float = j * slot) -> np.ndarray:
+            since = np.clip(at - begin, 0.0, slot)
+            return 0.3 * np.sin(np.pi * since / slot) ** 2 * np.sin(2.0 * np.pi * 1.1 * since)
+
+        targets[:, j], angles[:, j] = path(times), path(times - delay)
+    angles += 1e-4 * np.random.default_rng(0).normal(size=angles.shape)
+    nothing = np.zeros(0)
+    return Log("here", times, angles, times, targets, nothing, np.zeros((0, 3)), nothing)
+
+
+def delayed(late) -> Log:
+    """The sound log, whose angles are later by late(t) more."""
+    log = sound_log()
+    at = log.times - late(log.times)
+    return with_angles(
+        lambda angles: angles.__setitem__(
+            slice(None), np.stack([np.interp(at, log.times, x) for x in angles.T], axis=1)
+        )
+    )(log)
+
+
+@pytest.mark.parametrize("begin, end", [(6.0, 40.0), (15.0, 40.0), (24.0, 40.0), (12.0, 18.0)])
+@pytest.mark.parametrize("size", [0.1, 0.045, -0.05])
+def test_a_delay_that_steps_is_named_with_its_time(begin: float, end: float, size: float) -> None:
+    """For good or for a while; and no joint is blamed for it."""
+    log = delayed(lambda t: size * ((t > begin) & (t < end)))
+    (finding,) = examine([log], ARM)[0].findings
+    assert (finding.kind, finding.where, finding.is_fault) == ("step", "the stamps", True)
+    numbers = re.match(r"from about (\S+) s on, all joints follow (\d+) ms (\w+)", finding.text)
+    assert float(numbers[1]) == pytest.approx(begin, abs=1.1)
+    assert float(numbers[2]) == pytest.approx(1e3 * abs(size), abs=3.0)
+    assert numbers[3] == ("later" if size > 0.0 else "earlier")
+    assert ("1 more times" in finding.text) == (end < 30.0)
+
+
+@pytest.mark.parametrize("ppm", [300.0, 1000.0, -2000.0])
+def test_clocks_that_drift_apart_are_named(ppm: float) -> None:
+    """Two clocks of 300 parts in a million are 9 ms apart after half a minute."""
+    (finding,) = examine([delayed(lambda t: 1e-6 * ppm * t)], ARM)[0].findings
+    assert (finding.kind, finding.where) == ("drift", "the stamps")
+    before, after = map(float, re.findall(r"-?\d+", finding.text)[:2])
+    assert after - before == pytest.approx(30e-3 * ppm, abs=3.0)
+
+
+@pytest.mark.parametrize("delays", [[10, 20, 30, 45, 55, 65], [10, 10, 30, 30, 70, 70]])
+def test_a_delay_of_a_joint_is_no_drift(delays: list[int]) -> None:
+    """Of joints that move one after another, whose clocks are one."""
+    log = one_after_another([1e-3 * delay for delay in delays])
+    (checkup,) = examine([log], ARM)
+    np.testing.assert_allclose([1e3 * x.delay for x in checkup.joints], delays, atol=1.5)
+    assert checkup.findings == ()
+    late = one_after_another([0.02, 0.02, 0.02, 0.02, 0.02, 0.09])
+    (fault,) = examine([late], ARM)[0].faults
+    assert (fault.kind, fault.where) == ("own delay", "Joint6")
+
+
+def test_a_joint_in_degrees_in_both_columns_is_named() -> None:
+    """By a speed that no joint has; no other joint is blamed."""
+    log = sound_log()
+    factor = np.array([1.0, 1.0, 1.0, np.degrees(1.0), 1.0, 1.0])
+    log = log._replace(
+        joint_angles=log.joint_angles * factor, servo_targets=log.servo_targets * factor
+    )
+    (finding,) = examine([log], ARM)[0].findings
+    assert (finding.kind, finding.where) == ("too fast", "Joint4")
+    assert "write joint_angles.Joint4 [deg] and servo_targets.Joint4 [deg]" in finding.text
 
 
 def test_a_joint_that_moved_far_while_nothing_was_recorded_is_not_wrapped() -> None:

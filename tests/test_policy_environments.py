@@ -13,10 +13,11 @@ import pytest
 from bounce_mjx import BounceBall, Run, load_policy
 from bounce_mjx.adapters.gymnasium.registration import ENV_ID, TASK_ID
 from bounce_mjx.config.files import dump_config
-from bounce_mjx.deploy.environments import environment_of, policy_environment
+from bounce_mjx.deploy.environments import policy_environment
 from bounce_mjx.deploy.export import policy_metadata
 from bounce_mjx.deploy.interface import interface_in, interface_of
 from bounce_mjx.deploy.metadata import from_entries, to_entries
+from bounce_mjx.deploy.wrappers import environments_in
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import POLICIES
 from bounce_mjx.runs.config import load_run_config
@@ -67,6 +68,161 @@ def test_robust_keeps_the_ball_in_the_environment_that_it_brings() -> None:
     assert not ended.any()
 
 
+class _Shaped(gymnasium.RewardWrapper):
+    """A user's wrapper that leaves observations and actions alone."""
+
+    def reward(self, reward: float) -> float:
+        return 2.0 * reward
+
+
+class _Repeated(gymnasium.Wrapper):
+    """A user's wrapper that acts for two control steps."""
+
+    def step(self, action: np.ndarray):
+        self.env.step(action)
+        return self.env.step(action)
+
+
+class _Acting:
+    """An observation for each step, in a wrapper and in the environment alone."""
+
+    ACTIONS = np.random.default_rng(0).uniform(-0.5, 0.5, (3, 6)).astype(np.float32)
+
+    def __init__(self, wrap):
+        env = wrap(gymnasium.make(ENV_ID))
+        observations = [env.reset(seed=3)[0]]
+        observations += [env.step(action)[0] for action in self.ACTIONS]
+        self.observations = [np.asarray(observation) for observation in observations]
+
+    def is_as(self, other: "_Acting") -> bool:
+        pairs = zip(self.observations, other.observations, strict=True)
+        return all(a.shape == b.shape and np.array_equal(a, b) for a, b in pairs)
+
+
+def _gymnasiums_wrappers() -> dict:
+    """Each wrapper of Gymnasium that this environment can have."""
+    of = gymnasium.wrappers
+    box = gymnasium.spaces.Box(-np.inf, np.inf, (29,), np.float32)
+    wrappers = {
+        "TransformObservation": lambda env: of.TransformObservation(env, lambda x: 2 * x, box),
+        "TransformAction": lambda env: of.TransformAction(env, lambda x: -x, env.action_space),
+        "TransformReward": lambda env: of.TransformReward(env, lambda x: 2 * x),
+        "TimeLimit": lambda env: of.TimeLimit(env, 100),
+        "ClipReward": lambda env: of.ClipReward(env, 0.0, 1.0),
+        "DtypeObservation": lambda env: of.DtypeObservation(env, np.float64),
+        "DtypeObservation to int": lambda env: of.DtypeObservation(env, np.int32),
+        "FrameStackObservation": lambda env: of.FrameStackObservation(env, 2),
+        "DelayObservation": lambda env: of.DelayObservation(env, 1),
+        "MaxAndSkipObservation": lambda env: of.MaxAndSkipObservation(env, 4),
+        "RepeatAction": lambda env: of.RepeatAction(env, 4),
+        "RescaleAction": lambda env: of.RescaleAction(env, -2.0, 2.0),
+        "ReshapeObservation": lambda env: of.ReshapeObservation(env, (29, 1)),
+        "StickyAction": lambda env: of.StickyAction(env, 0.9),
+        "of the user": _Shaped,
+        "of the user that repeats": _Repeated,
+    }
+    plain = "ClipAction NormalizeObservation NormalizeReward RecordEpisodeStatistics Autoreset"
+    for name in f"{plain} OrderEnforcing TimeAwareObservation FlattenObservation".split():
+        wrappers[name] = getattr(of, name)
+    return wrappers
+
+
+ACCEPTED = {
+    "TimeLimit",
+    "ClipReward",
+    "DtypeObservation",
+    "ClipAction",
+    "NormalizeReward",
+    "RecordEpisodeStatistics",
+    "Autoreset",
+    "OrderEnforcing",
+    "of the user",
+    "TransformReward",
+}
+
+
+def test_a_wrapper_is_accepted_only_where_it_changes_nothing() -> None:
+    """Whether it does is measured: by the observations of a few steps."""
+    plain = _Acting(lambda env: env)
+    accepted = set()
+    for name, wrap in _gymnasiums_wrappers().items():
+        env = wrap(gymnasium.make(ENV_ID))
+        try:
+            Run("pretrained").policy_in(env)
+        except UserError as error:
+            assert "give the environment within it" in str(error), name
+        else:
+            accepted.add(name)
+            assert _Acting(wrap).is_as(plain), name
+    assert accepted == ACCEPTED
+    # Also around others, and with a policy of a robot.
+    env = gymnasium.wrappers.TimeLimit(
+        gymnasium.wrappers.RepeatAction(gymnasium.make(ENV_ID), 4), 9
+    )
+    with pytest.raises(UserError, match="RepeatAction may change the observations, the actions or"):
+        load_policy("pretrained", env=env)
+    assert load_policy("pretrained", env=gymnasium.wrappers.ClipAction(gymnasium.make(ENV_ID)))
+
+
+def test_each_environment_of_a_vector_is_looked_at() -> None:
+    run = Run("pretrained")
+
+    def make(wrap=lambda env: env, **settings):
+        return lambda: wrap(gymnasium.make(ENV_ID, **settings))
+
+    vector = gymnasium.vector.SyncVectorEnv
+    assert run.policy_in(vector([make(), make(gymnasium.wrappers.OrderEnforcing)]))
+    with pytest.raises(UserError, match="NormalizeObservation may change"):
+        run.policy_in(vector([make(), make(gymnasium.wrappers.NormalizeObservation)]))
+    with pytest.raises(UserError, match=r"its control step is 0.01 s, there 0.008 s"):
+        run.policy_in(vector([make(), make(control_dt=0.008)]))
+
+
+def test_the_wrappers_of_sb3_are_known(need) -> None:
+    need("stable_baselines3")
+    from stable_baselines3.common import atari_wrappers, monitor, vec_env
+
+    run = Run("pretrained")
+
+    def make():
+        return monitor.Monitor(gymnasium.make(ENV_ID))
+
+    alone = vec_env.DummyVecEnv([make, make])
+    for env in (alone, vec_env.VecMonitor(alone), vec_env.VecCheckNan(alone)):
+        assert run.policy_in(env)
+    skipping = vec_env.DummyVecEnv([make, lambda: atari_wrappers.MaxAndSkipEnv(make(), 4)])
+    for env, words in (
+        (vec_env.VecNormalize(alone), "VecNormalize may change"),
+        (vec_env.VecFrameStack(alone, 2), "VecFrameStack may change"),
+        (skipping, "MaxAndSkipEnv may change"),
+    ):
+        with pytest.raises(UserError, match=words):
+            run.policy_in(env)
+
+
+def test_a_wrapper_of_torchrl_that_repeats_an_action_is_refused(need) -> None:
+    need("torchrl")
+    from torchrl.envs import GymWrapper
+
+    run = Run("pretrained")
+    assert run.policy_in(GymWrapper(gymnasium.make(ENV_ID)))
+    with pytest.raises(UserError, match="GymWrapper may change .* the control step"):
+        run.policy_in(GymWrapper(gymnasium.make(ENV_ID), frame_skip=4))
+
+
+def test_a_wrapper_of_brax_that_repeats_an_action_is_refused(need) -> None:
+    need("brax")
+    from brax.envs.wrappers import training
+
+    from bounce_mjx.adapters.brax import BraxBounceBall
+
+    run = Run("pretrained")
+    for env in (BounceBall(), BraxBounceBall()):
+        assert run.policy_in(training.wrap(env, 100))
+        with pytest.raises(UserError, match="EpisodeWrapper may change .* the control step"):
+            run.policy_in(training.wrap(env, 100, action_repeat=4))
+
+
 LIBRARIES = "gymnasium vector wrapped sb3 torch rsl_rl skrl brax gymnax playground".split()
 
 
@@ -90,7 +246,7 @@ def _make(library: str, need, **settings):
             wrap = _adapter("torch.skrl_env", "SkrlEnv", need, "torch", "skrl")
             return wrap(_make("torch", need, **settings))
         case "brax":
-            return _adapter("brax", "BraxBounceBall", need, "brax")(**settings)
+            return _adapter("brax", "BraxBounceBall", need)(**settings)
         case "gymnax":
             return _adapter("gymnax_env", "GymnaxBounceBall", need)(**settings)
         case "playground":
@@ -126,7 +282,8 @@ def test_every_library_gets_the_environment_of_the_policy(name: str, slow_run: P
     assert Run(policy).env().config == nominal
     for library in LIBRARIES:
         env = _make(library, need, policy=policy)
-        config = environment_of(env).config
+        (inner,) = environments_in(env)
+        config = inner.config
         assert config == nominal, library
         assert interface_of(config) == interface_of(trained), library
         steps = _time_limit(library, env)
@@ -167,9 +324,6 @@ def test_a_policy_refuses_another_environment(slow_run: Path) -> None:
     ):
         with pytest.raises(UserError, match=words):
             make()
-    scaled = gymnasium.wrappers.NormalizeObservation(gymnasium.make(ENV_ID))
-    with pytest.raises(UserError, match="NormalizeObservation changes the observations"):
-        Run("pretrained").policy_in(scaled)
     policy = Run("pretrained").policy_in(BounceBall())
     with pytest.raises(UserError, match=r"has the shape \[2\], but the last axis must have 29"):
         policy(np.zeros(2))
@@ -184,7 +338,7 @@ def test_a_setting_without_an_effect_is_refused(library: str, need) -> None:
     match library:
         case "torch" | "rsl_rl" | "skrl":
             env = BounceBall(config)
-            assert environment_of(_make(library, need, env=env)) is env
+            assert environments_in(_make(library, need, env=env)) == [env]
             refused = [({"env": env, "world": "training"}, "env and world both say")]
         case "playground":
             make_config = _adapter(

@@ -15,15 +15,17 @@ from scipy.spatial.transform import Rotation
 from against_c import XML, converged, differences, push_by_air
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.config.validation import validate
+from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.c_episodes import episode_models
 from bounce_mjx.learning.ppo import PPO
-from bounce_mjx.physics import Control, PhysicsState, edited_model, servo_targets
+from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, edited_model, servo_targets
 from bounce_mjx.physics.control import drag
 from bounce_mjx.robot.actuators import largest_torques, torque_ranges
 from bounce_mjx.robot.config import RobotConfig
 from bounce_mjx.robot.contact import damping_of_restitution, restitution_of_damping
 from bounce_mjx.robot.model import load_model
+from bounce_mjx.task.registry import find_task
 from bounce_mjx.world.actuation import add_delay, start_actuation
 from bounce_mjx.world.model import model_nominals
 from bounce_mjx.world.randomization import TERMS, RandomizationConfig
@@ -631,3 +633,113 @@ def test_targets_change_at_their_interval(at_rest: Run) -> None:
         np.testing.assert_allclose(at_rest.target_age[:, w], 0.01 * age, atol=1e-9)
     # The policy sees a new target before a reward depends on it.
     np.testing.assert_array_equal(at_rest.rewarded_height, heights[:-1])
+
+
+@pytest.mark.parametrize(
+    ("terms", "given", "words"),
+    [
+        ({"ball_mass": (2.0, 2.0)}, {"ball_mass": 0.01}, "returns ball_mass, which is sampled"),
+        # The damping of a restitution is that of the model's own stiffness.
+        (
+            {"restitution": (0.8, 0.9)},
+            {"contact_stiffness": 1e5},
+            "returns contact_stiffness, which is sampled by randomization.restitution",
+        ),
+        (
+            {"joint_damping": (0.0, 1.0)},
+            {"entries": {"dof_damping[2]": 1.0}},
+            r"returns dof_damping\[2\], which is sampled by randomization.joint_damping",
+        ),
+        ({}, None, "randomize returns None; return a physics.PhysicsParameters"),
+    ],
+)
+def test_what_a_term_samples_no_randomize_gives(terms: dict, given: dict, words: str) -> None:
+    """The world, the metric and a critic would say one value, and the physics have the other."""
+    parameters = None
+    if given is not None:
+        arrays = jax.tree.map(jnp.asarray, given)
+        parameters = PhysicsParameters(**arrays)
+    with pytest.raises(UserError, match=words):
+        Env(EnvConfig(randomization=terms), randomize=lambda key: parameters)
+
+
+def test_a_randomize_beside_other_terms_is_taken() -> None:
+    config = EnvConfig(randomization={"ball_mass": (2.0, 2.0), "armature": (1.0, 2.0)})
+    given = PhysicsParameters(entries={"dof_damping[2]": jnp.ones(())}, ball_radius=jnp.ones(()))
+    assert Env(config, randomize=lambda key: given).config is config
+
+
+DELAYED = {"action_latency": (0.0, 0.03), "ball_latency": (0.0, 0.02), "camera_rate": (60, 120)}
+
+
+@pytest.fixture(scope="module")
+def delayed() -> Env:
+    terms = DELAYED | {"joint_start": (-0.1, 0.1), "ball_start": (-0.1, 0.1)}
+    return Env(EnvConfig(randomization=terms))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"action_latency": (0.1, 0.1)}, "action_latency goes up to 0.1, but the queue of late ac"),
+        ({"ball_latency": (0.0, 0.03)}, "ball_latency goes up to 0.03, but the queue of late pic"),
+        ({"camera_rate": (30.0, 60.0)}, "camera_rate goes down to 30, but the queue of late pict"),
+        ({"action_latency": (0.02, 0.01)}, r"action_latency \(0.02, 0.01\) is not a range within"),
+        ({"action_latency": (-1.0, 0.01)}, r"action_latency \(-1.0, 0.01\) is not a range within"),
+        ({"joint_start": (jnp.zeros(3), jnp.ones(3))}, r"\(3,\) and \(3,\); give two .* \(6,\)"),
+        ({"joint_start": (-1.0, 1.0)}, "joint_start .* starts Joint3 from 0.8199 to 3.02 with the"),
+        ({"ball_start": (-0.5, 0.0)}, "ball_start .* up to 0.72. m beside the paddle"),
+        ({"ball_latency": 0.02}, "ball_latency has ends of the shapes a float; give two numbers"),
+        ({"target_height": (0.6, 0.4)}, "target_height is from 0.6 to 0.4; exchange the two"),
+        ({"target_height": (-1.0, 0.4)}, "target_height is -1.0, but must be a finite number >="),
+    ],
+)
+def test_a_reset_refuses_ranges_on_which_it_cannot_act(
+    changes: dict, words: str, delayed: Env
+) -> None:
+    """The world said 100 ms, and the action arrived after 30."""
+    with pytest.raises(UserError, match=words):
+        jax.eval_shape(
+            lambda key: delayed.reset(key, delayed.ranges() | changes), jax.random.key(0)
+        )
+
+
+def test_traced_ranges_beyond_the_queues_are_cut_in_the_world_too(delayed: Env) -> None:
+    """Also those that are set within an episode."""
+    late = {"action_latency": 0.2, "ball_latency": 0.2, "camera_rate": 2.0}
+
+    def worlds(key: jax.Array, late: dict) -> tuple[dict, dict]:
+        ends = {name: (value, value) for name, value in late.items()}
+        state = delayed.reset(key, delayed.ranges() | ends).pipeline_state
+        return state.world, delayed.with_world(state, state.world | late).world
+
+    for world in jax.jit(worlds)(jax.random.key(0), jax.tree.map(jnp.float32, late)):
+        assert float(world["action_latency"]) == pytest.approx(0.03)
+        assert float(world["ball_latency"]) == pytest.approx(0.02)
+        assert float(world["camera_rate"]) == pytest.approx(60.0)
+
+
+@pytest.mark.parametrize(
+    ("task", "terms", "words"),
+    [
+        (
+            "bounce",
+            {"joint_start": (-1.0, 1.0)},
+            "starts Joint3 from 0.8199 to 3.02 with the noise",
+        ),
+        ("bounce", {"ball_start": ((0, 0, -0.9), (0, 0, -0.8))}, "rests on the paddle at 0.072"),
+        ("bounce", {"ball_start": (0.0, 0.3)}, "up to 0.435 m beside the paddle, where none is"),
+        ("balance", {"ball_start": (-0.03, 0.03)}, "rests on the paddle at 0.0723 m; give a high"),
+        ("catch", {"ball_start": ((0, 0, -0.2), (0, 0, 0))}, "rests on the floor at 0.019 m"),
+    ],
+)
+def test_a_start_that_no_arm_or_ball_can_have_is_refused(
+    task: str, terms: dict, words: str
+) -> None:
+    with pytest.raises(UserError, match=words):
+        Env(find_task(task).Config(randomization=terms))
+
+
+def test_displaced_throws_are_taken() -> None:
+    for task in ("catch", "juggle"):
+        Env(find_task(task).Config(randomization={"ball_start": (-0.03, 0.03)}))

@@ -12,6 +12,7 @@ from rich.console import Console
 
 from bounce_mjx import EnvConfig
 from bounce_mjx.commands import robustness as robustness_command
+from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import robustness
 from bounce_mjx.evaluation.config import EvaluationOptions
@@ -418,3 +419,30 @@ def test_a_perturbation_of_one_task_is_skipped_for_others(tmp_path: Path) -> Non
         suite(tmp_path, dict(name="target", terms={"target_height": 0.5}), trained=dribble)
     with pytest.raises(UserError, match="apex is 0.001, but must be a finite number >= 0.01"):
         suite(tmp_path, dict(name="apex", terms={"apex": 0.001}), trained=dribble)
+
+
+def test_a_start_that_a_task_cannot_have_is_left_out_of_its_suite(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A ball that balances would start within the paddle; displaced sideways, it starts on it."""
+    sideways = {"from": ["-strength", "-strength", 0], "to": ["strength", "strength", 0]}
+    deep = {"from": [0, 0, "-strength"], "to": [0, 0, "strength"]}
+    moved = {"unit": "cm", "strengths": [5]}
+    path = suite_file(
+        tmp_path,
+        {"name": "sideways", "terms": {"ball_start": sideways}, **moved},
+        {"name": "height", "terms": {"ball_start": deep}, **moved},
+    )
+    names = {}
+    for task in ("balance", "bounce"):
+        conditions = load_suite(path, find_task(task).Config())
+        names[task] = [condition.label for condition in conditions]
+    assert names == {
+        "balance": ["nominal", "sideways 5 cm"],
+        "bounce": ["nominal", "sideways 5 cm", "height 5 cm"],
+    }
+    assert "height 5 cm is left out: randomization.ball_start" in capsys.readouterr().err
+    # The program of the conditions that are left starts only where they do.
+    config = robustness._spanning_config(load_suite(path, find_task("balance").Config()), "config")
+    assert config.randomization.ball_start == ((-0.05, -0.05, 0.0), (0.05, 0.05, 0.0))
+    Env(config)

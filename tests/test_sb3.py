@@ -4,6 +4,10 @@ algorithms train on it."""
 import gymnasium
 import numpy as np
 import pytest
+
+pytest.importorskip("torch")
+pytest.importorskip("stable_baselines3")
+
 import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env

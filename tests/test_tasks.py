@@ -32,7 +32,7 @@ from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
 from bounce_mjx.runs.files import seal
 from bounce_mjx.runs.folders import create_run, find_checkpoint
 from bounce_mjx.runs.settings import read_preset
-from bounce_mjx.task import registry
+from bounce_mjx.task import paths, registry
 from bounce_mjx.task.registry import find_task, task_name
 from bounce_mjx.training.command import read_command
 from bounce_mjx.world.observation import ObservationLayout, Part
@@ -504,6 +504,41 @@ def test_tasks_have_the_geometry_of_the_model(large: Path) -> None:
         Env(find_task("bounce").Config(mjcf=large, ball_init_pos=(0.59, 0.0, 0.07)))
 
 
+@pytest.mark.parametrize("name", ["juggle", "track"])
+def test_no_height_that_may_be_commanded_ends_the_episode_at_a_hit(name: str) -> None:
+    """A ball exactly in its column or under its point is not lost where the paddle hits it, at the
+    greatest height that a flag or a slider may set; 5 cm more would end the episode."""
+    kind = find_task(name)
+    flown = kind(kind.Config())
+    command = flown.config.commands["target_height"]
+    # The point rises from the lowest place of its sway to the highest one.
+    rise = 2.0 * paths.SWAY if name == "track" else 0.0
+    rest = jnp.zeros(6)
+
+    def is_ended(height: float) -> bool:
+        tops = jnp.array([flown.config.home])
+        if name == "juggle":
+            tops = jnp.array(flown.config.columns(height))
+        balls = tops.at[:, 2].set(flown._ground())
+        if name == "track":
+            balls = balls[0]
+        truth = task.Kinematics(rest, balls, None, rest, 0.0 * balls, None, jnp.array(tops[0]))
+        middle = {name: jnp.float32(each.low) for name, each in flown.config.commands.items()}
+        x, y, _ = flown.config.home
+        commands = middle | {"target_x": x, "target_y": y, "target_height": jnp.float32(height)}
+        state = flown.reset(task.Start(truth, commands, jnp.zeros(0)))
+        return bool(flown.step(state, task.Step(truth, commands, rest, rest)).ended)
+
+    assert not is_ended(command.greatest + rise) and is_ended(command.greatest + rise + 0.05)
+    lowest, highest = command.span or (command.low, command.high)
+    assert command.least <= lowest and highest <= command.greatest
+    for height in (command.least - 1e-3, command.greatest + 1e-3):
+        with pytest.raises(UserError, match="target_height is .* but must be a finite number >= "):
+            command.checked(height, "target_height")
+    with pytest.raises(ValueError, match="height_range goes up to 0.75 m over home, but max_dist"):
+        kind.Config(height_range=(0.72, 0.75))
+
+
 @pytest.mark.parametrize("name", ["balance", "catch", "juggle", "track"])
 def test_every_task_shows_the_balls_rotation_if_asked(name: str) -> None:
     config = find_task(name).Config()
@@ -514,7 +549,6 @@ def test_every_task_shows_the_balls_rotation_if_asked(name: str) -> None:
 
 def test_libraries_take_another_task() -> None:
     """Those whose own tests have no other task: the shape of the first observation."""
-    pytest.importorskip("brax")
     import brax.envs
 
     import bounce_mjx.adapters.brax  # noqa: F401

@@ -13,6 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 import onnxruntime
 import pytest
+
+pytest.importorskip("torch")
+pytest.importorskip("rsl_rl")
+pytest.importorskip("skrl")
+
 import torch
 from tensordict import TensorDict
 from torch import nn
@@ -327,10 +332,10 @@ def test_the_run_of_a_library_acts_like_its_network(trained):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("trained", ["rsl_rl"], indirect=True)
 def test_rsl_rl_exports_the_policy(trained):
     """TorchScript and ONNX give the actions of the trained network."""
-    if not (folder := trained.out / "rsl_rl").exists():
-        pytest.skip("skrl exports nothing")
+    folder = trained.out / "rsl_rl"
     observation = torch.randn(8, 29)
     with torch.no_grad():
         expected = trained.act(observation)

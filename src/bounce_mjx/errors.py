@@ -51,7 +51,7 @@ def install_command(*words: str) -> str:
     """The command that installs a package where this process runs.
 
     Args:
-      words: options, and its name on the package index or an extra such as "bounce_mjx[brax]".
+      words: options, and its name on the package index or an extra such as "bounce_mjx[sb3]".
     """
     # `uv run` sets the variable, and its environment has no pip.
     uv = "uv " if "UV_RUN_RECURSION_DEPTH" in os.environ else ""

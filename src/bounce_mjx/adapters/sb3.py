@@ -35,8 +35,7 @@ class Sb3VecEnv(VecEnv):
             episode_seconds=30. Of pictures, the first four environments are tiled.
 
         Raises:
-          UserError: an argument is wrong, or there is no OpenGL library for rendering; an unknown
-            argument is a TypeError too.
+          UserError: an argument is wrong; an unknown argument is a TypeError too.
         """
         same_step = AutoresetMode.SAME_STEP
         self._envs = TaskVectorEnv(num_envs=num_envs, autoreset_mode=same_step, **settings)

@@ -16,7 +16,6 @@ from bounce_mjx.config.settings import merged
 from bounce_mjx.config.user_code import is_file, is_same_code
 from bounce_mjx.config.validation import validate
 from bounce_mjx.deploy.interface import check_interface, interface_of
-from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, shorten, suggest
 from bounce_mjx.resources import POLICIES, policy_folder
 from bounce_mjx.robot.config import is_packaged
@@ -33,17 +32,6 @@ NOMINAL = "nominal"
 """World of a policy: the model's own."""
 TRAINING = "training"
 """World of a policy: each that its training sampled."""
-
-# Wrappers of Gymnasium and SB3 after which the numbers are no longer the environment's own.
-_CHANGING = {
-    "ObservationWrapper",
-    "VectorObservationWrapper",
-    "ActionWrapper",
-    "VectorActionWrapper",
-    "VecNormalize",
-    "VecFrameStack",
-    "VecTransposeImage",
-}
 
 
 def environment_config(
@@ -181,40 +169,6 @@ def policy_path(policy: str | os.PathLike) -> Path:
     """The path of a policy that a user names: that of one of the package, unless there is a folder
     of its name."""
     return policy_folder(policy) or Path(policy)
-
-
-def environment_of(env: Any) -> Env:
-    """The environment on JAX in one of any library, also within its wrappers.
-
-    Raises:
-      UserError: it is none of this package, or a wrapper changes its observations or actions.
-    """
-    inner = env
-    while not isinstance(inner, Env):
-        kinds = {kind.__name__ for kind in type(inner).__mro__}
-        if kinds & _CHANGING:
-            raise UserError(
-                f"{type(inner).__name__} changes the observations or the actions, and a policy "
-                "takes the environment's own; give the environment within it"
-            )
-        attributes = vars(inner) if hasattr(inner, "__dict__") else {}
-        # The environment for brax holds it as its task.
-        task = getattr(type(inner), "task", None) or attributes.get("task")
-        if isinstance(task, property):
-            task = inner.task
-        held = [task]
-        for name in ("env", "venv", "_env", "envs"):
-            held.append(attributes.get(name))
-        held = [part for part in held if part is not None]
-        if not held:
-            raise UserError(
-                f"{type(env).__name__} holds no environment of bounce_mjx; give one that its "
-                "adapters made, such as gymnasium.make('bounce_mjx/Task-v0', policy=...)"
-            )
-        inner = held[0]
-        if isinstance(inner, list | tuple):
-            inner = inner[0]
-    return inner
 
 
 def in_library(act: Callable[[jax.Array], jax.Array], size: int) -> Callable[[Any], Any]:

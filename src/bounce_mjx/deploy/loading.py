@@ -62,12 +62,16 @@ def _use_environment(policy: DeployedPolicy, name: str, env: Any) -> None:
     Raises:
       UserError: the environment is not the policy's.
     """
-    from bounce_mjx.deploy.environments import environment_of
     from bounce_mjx.deploy.interface import check_interface, interface_in, interface_of
+    from bounce_mjx.deploy.wrappers import environments_in
 
-    config = environment_of(env).config
     advice = f"make the environment with policy={name!r}"
-    check_interface(interface_in(policy.metadata), interface_of(config), name, advice)
+    environments = environments_in(env)
+    for environment in environments:
+        interface = interface_of(environment.config)
+        check_interface(interface_in(policy.metadata), interface, name, advice)
+    # Any one, as they have the policy's observation.
+    config = environments[0].config
     places = {}
     for part in config.layout.parts:
         first = config.layout[part.name].start

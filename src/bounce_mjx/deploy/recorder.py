@@ -29,24 +29,25 @@ class Recorder(contextlib.AbstractContextManager):
         path: str | os.PathLike,
         joint_names: Iterable[str],
         commands: Mapping[str, str] | None = None,
+        num_balls: int | None = None,
     ):
-        """Makes the file. Its header names each column and, in brackets, its unit.
+        """Makes the file. The first row makes its header, which names each column and, in brackets,
+        its unit.
 
         Args:
           joint_names: order of the joints in every array, such as `policy.metadata.joint_names`.
           commands: unit of each command by its name.
+          num_balls: how many balls a picture shows, such as `policy.metadata.num_balls`; by default
+            as many as the first row has. The columns of several are `ball_position.1.x [m]` and so
+            on.
 
         Raises:
           UserError: the file exists, or cannot be made.
         """
-        joints = tuple(joint_names)
-        columns = {"time": ["time [s]"]}
-        for name, unit in _OF_JOINTS.items():
-            columns[name] = [f"{name}.{joint} [{unit}]" for joint in joints]
-        columns["ball_position"] = [f"ball_position.{axis} [m]" for axis in "xyz"]
-        columns["ball_time"] = ["ball_time [s]"]
-        columns |= {name: [f"{name} [{unit}]"] for name, unit in (commands or {}).items()}
-        self._sizes = {name: len(titles) for name, titles in columns.items()}
+        self._joints = tuple(joint_names)
+        self._commands = dict(commands or {})
+        self._num_balls = num_balls
+        self._sizes: dict[str, int] | None = None
         try:
             # A row reaches the file at once, as a robot's program may end at any time.
             self._file = Path(path).open("x", buffering=1, newline="", encoding="utf-8")
@@ -57,7 +58,6 @@ class Recorder(contextlib.AbstractContextManager):
                 f"the log {path} cannot be created ({error.strerror}); choose another folder"
             ) from error
         self._rows = csv.writer(self._file, lineterminator="\n")
-        self._rows.writerow(itertools.chain(*columns.values()))
         self._last: tuple[float, Any] = -np.inf, None
 
     def step(self, measurements: Mapping[str, Any], servo_targets: Any) -> None:
@@ -65,9 +65,9 @@ class Recorder(contextlib.AbstractContextManager):
 
         Args:
           measurements: as for `DeployedPolicy.step`, with `time`. Any other that is missing, or
-            not finite, leaves its cells empty. `ball_position` counts as a new picture if it was
-            taken (`time` - `ball_age`) at another time than the last one; without `ball_age`, if
-            it differs.
+            not finite, leaves its cells empty. `ball_position` ([3], of several balls [N, 3])
+            counts as a new picture if it was taken (`time` - `ball_age`) at another time than the
+            last one; without `ball_age`, if it differs.
           servo_targets: sent in this step [J], rad.
 
         Raises:
@@ -83,7 +83,7 @@ class Recorder(contextlib.AbstractContextManager):
 
         Args:
           time: of its arrival, s.
-          position: of the ball [3], m.
+          position: of the ball [3], or of each [N, 3], m.
           taken: time at which it was taken, s; by default, that of its arrival.
         """
         self._last = (time if taken is None else taken), np.array(position, float)
@@ -107,20 +107,44 @@ class Recorder(contextlib.AbstractContextManager):
         is_old = (
             np.array_equal(position, seen) if age is None else abs(taken - last) < _SAME_PICTURE
         )
-        if is_old or not np.all(np.isfinite([*np.ravel(position), taken])):
+        if is_old or not np.isfinite(taken) or not np.any(np.isfinite(position)):
             return {"ball_position": None}
         self._last = taken, position
         return {"ball_position": position, "ball_time": taken}
 
     def _write(self, values: Mapping[str, Any]) -> None:
-        """Writes a row; the cells of what is missing or not finite are empty."""
+        """Writes a row; the cells of what is missing or not finite are empty, ball by ball."""
+        if self._sizes is None:
+            self._write_header(values.get("ball_position"))
         row = []
         for name, size in self._sizes.items():
             numbers = np.ravel(np.array(values.get(name, np.nan), float))
             if len(numbers) != size and values.get(name) is not None:
+                balls = " (num_balls)" if name == "ball_position" else ""
                 raise UserError(
-                    f"{name} has {len(numbers)} numbers, and the log has {size} cells for it"
+                    f"{name} has {len(numbers)} numbers, and the log has {size} cells for it{balls}"
                 )
-            is_given = np.all(np.isfinite(numbers))
-            row += [repr(x) for x in numbers.tolist()] if is_given else [""] * size
+            if values.get(name) is None:
+                numbers = np.full(size, np.nan)
+            groups = numbers.reshape(-1, 3) if name == "ball_position" else [numbers]
+            for group in groups:
+                is_given = np.all(np.isfinite(group))
+                row += [repr(x) for x in group.tolist()] if is_given else [""] * len(group)
         self._rows.writerow(row)
+
+    def _write_header(self, ball_position: Any) -> None:
+        """Writes the titles, for as many balls as were told, or as a position has."""
+        if self._num_balls is None:
+            shown = 3 if ball_position is None else np.size(ball_position)
+            self._num_balls = max(shown // 3, 1)
+        columns = {"time": ["time [s]"]}
+        for name, unit in _OF_JOINTS.items():
+            columns[name] = [f"{name}.{joint} [{unit}]" for joint in self._joints]
+        balls = [f"ball_position.{i}" for i in range(1, self._num_balls + 1)]
+        if self._num_balls == 1:
+            balls = ["ball_position"]
+        columns["ball_position"] = [f"{ball}.{axis} [m]" for ball in balls for axis in "xyz"]
+        columns["ball_time"] = ["ball_time [s]"]
+        columns |= {name: [f"{name} [{unit}]"] for name, unit in self._commands.items()}
+        self._sizes = {name: len(titles) for name, titles in columns.items()}
+        self._rows.writerow(itertools.chain(*columns.values()))

@@ -3,7 +3,7 @@ have, and what a task's code returns that an environment cannot use. Each check 
 of one sentence. None is part of a compiled program: they read names, shapes and types alone."""
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -12,11 +12,13 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.errors import UserError, shorten
+from bounce_mjx.physics import PhysicsParameters
 from bounce_mjx.robot.model import Addresses, joint_names, joint_ranges
 from bounce_mjx.task.rewards import check_names
 from bounce_mjx.task.task import Curve, Tally, Task, TaskStep
 from bounce_mjx.world.config import Command, WorldConfig
 from bounce_mjx.world.randomization import TERMS
+from bounce_mjx.world.sampling import check_overlap
 
 ENDS = ("non_finite", "too_fast")
 """Metrics of the ends of an episode that are no task's; an environment of another kind may lack
@@ -48,6 +50,8 @@ _MAX_ANGLE = 4.0 * np.pi
 _ROUNDING = 1e-3
 # A ball that starts farther beside the paddle falls before the paddle is under it, m.
 _FARTHEST_BESIDE = 0.3
+# Throws by which the starts of a task's balls are known.
+_SAMPLED_THROWS = 32
 
 
 def check_has_task(config: WorldConfig) -> None:
@@ -233,8 +237,7 @@ def check_start(config: WorldConfig, task: Task) -> None:
                 f"{name} has the height {height:g} m, which is not over the paddle at "
                 f"{paddle_height:.4g} m, where default_joint_angles hold it; change one of the two"
             )
-    throws = type(task).throw is not Task.throw
-    if throws:
+    if _throws(task):
         return
     ball_x, ball_y, ball_height = config.ball_init_pos
     beside = np.hypot(ball_x - paddle_x, ball_y - paddle_y)
@@ -249,6 +252,115 @@ def check_start(config: WorldConfig, task: Task) -> None:
             f"ball_init_pos has the height {ball_height:g} m, but a ball of the radius "
             f"{geometry.ball_radius:g} m rests on the paddle at {rest_height:.4g} m; raise it"
         )
+
+
+def check_starts(
+    config: WorldConfig, mj_model: mujoco.MjModel, addresses: Addresses, task: Task
+) -> None:
+    """Refuses displacements of the start (`joint_start`, `ball_start`) with which the arm starts
+    outside of its joints' ranges, or a ball within, under or far beside the paddle, or under the
+    floor. It needs `task.geometry`."""
+    if config.randomization.joint_start is not None:
+        _check_joint_start(config, mj_model, addresses)
+    if config.randomization.ball_start is not None:
+        _check_ball_start(config, task)
+
+
+def _check_joint_start(config: WorldConfig, mj_model: mujoco.MjModel, addresses: Addresses) -> None:
+    """Refuses a displacement of the joints beyond a joint's range, with the noise of the reset."""
+    joints = joint_names(mj_model, addresses)
+    low, high = _entrywise(config.randomization.joint_start, len(joints))
+    noise = config.reset.joint_angles
+    angles = np.array(config.default_joint_angles)
+    lows, highs = joint_ranges(mj_model, addresses)
+    lowest = angles + low - noise
+    highest = angles + high + noise
+    for i, joint in enumerate(joints):
+        if not lows[i] - _ROUNDING <= lowest[i] <= highest[i] <= highs[i] + _ROUNDING:
+            raise UserError(
+                f"randomization.joint_start ({low[i]:g}, {high[i]:g}) starts {joint} from "
+                f"{lowest[i]:.4g} to {highest[i]:.4g} with the noise of env.reset, but its range "
+                f"is {lows[i]:.4g} to {highs[i]:.4g}; give a narrower one"
+            )
+
+
+def _check_ball_start(config: WorldConfig, task: Task) -> None:
+    """Refuses a displacement of the ball with which it starts within or under the paddle, under the
+    floor, or, if it is not thrown, far beside the paddle."""
+    geometry = task.geometry
+    paddle_x, paddle_y, paddle_height = geometry.paddle_home
+    low, high = _entrywise(config.randomization.ball_start, 3)
+    noise = config.reset.ball_position
+    term = f"randomization.ball_start {config.randomization.ball_start}"
+    for start in _ball_starts(config, task):
+        lowest = start + low - noise
+        highest = start + high + noise
+        corners = np.array([lowest, highest]) - geometry.paddle_home
+        farthest = np.hypot(*np.max(np.abs(corners), axis=0)[:2])
+        nearest_x = np.clip(paddle_x, lowest[0], highest[0]) - paddle_x
+        nearest_y = np.clip(paddle_y, lowest[1], highest[1]) - paddle_y
+        if farthest > _FARTHEST_BESIDE and not _throws(task):
+            raise UserError(
+                f"{term} starts a ball up to {farthest:.3g} m beside the paddle, where none is "
+                "reached; give a narrower one"
+            )
+        rests_on = "floor"
+        rest_height = geometry.ball_radius
+        if np.hypot(nearest_x, nearest_y) <= _FARTHEST_BESIDE:
+            rests_on = "paddle"
+            rest_height = paddle_height + geometry.rest_height
+        if lowest[2] < rest_height - _ROUNDING:
+            raise UserError(
+                f"{term} starts a ball at the height {lowest[2]:.4g} m, but it rests on the "
+                f"{rests_on} at {rest_height:.4g} m; give a higher one"
+            )
+
+
+def _throws(task: Task) -> bool:
+    """Whether the task has its own start of the balls."""
+    return type(task).throw is not Task.throw
+
+
+def _ball_starts(config: WorldConfig, task: Task) -> np.ndarray:
+    """Starts of the balls without noise [N, 3]; of a task that throws them, some of them."""
+    at_rest = np.array([config.ball_init_pos])
+    if not _throws(task):
+        return at_rest
+    draws = np.random.default_rng(0).uniform(size=(_SAMPLED_THROWS, task.num_draws))
+    places = np.linspace(0.0, 1.0, _SAMPLED_THROWS)
+    commands = {}
+    for name, command in config.commands.items():
+        commands[name] = command.low + (command.high - command.low) * places
+
+    def positions(draws: jax.Array, command: Mapping[str, jax.Array]) -> Any:
+        thrown = task.throw(draws, command)
+        check_throw(thrown, config.num_balls, task)
+        return jnp.asarray(at_rest[0] if thrown is None else thrown[0])
+
+    # Also within the trace of a reset, whose ranges are known.
+    with jax.ensure_compile_time_eval():
+        return np.asarray(jax.vmap(positions)(draws, commands)).reshape(-1, 3)
+
+
+def _entrywise(ends: Any, count: int) -> np.ndarray:
+    """Both ends of a range for each of `count` entries [2, count]."""
+    return np.stack([np.broadcast_to(np.asarray(end, float), (count,)) for end in ends])
+
+
+def check_randomize(
+    randomize: Callable[[jax.Array], PhysicsParameters],
+    config: WorldConfig,
+    mj_model: mujoco.MjModel,
+    addresses: Addresses,
+) -> None:
+    """Refuses a `randomize` that returns something else than parameters, or parameters that a term
+    of the config samples too."""
+    returned = jax.eval_shape(randomize, jax.random.PRNGKey(0))
+    if not isinstance(returned, PhysicsParameters):
+        raise UserError(
+            f"randomize returns {_described(returned)}; return a physics.PhysicsParameters"
+        )
+    check_overlap(mj_model, addresses, config.randomization.terms, returned)
 
 
 def check_throw(thrown: Any, num_balls: int, task: Task) -> None:

@@ -14,12 +14,15 @@ from bounce_mjx.env.checks import (
     check_commands,
     check_has_task,
     check_joint_angles,
+    check_randomize,
     check_start,
+    check_starts,
     check_tags,
     check_task,
     check_task_step,
     check_throw,
 )
+from bounce_mjx.env.ranges import check_ranges, within_queues
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState
 from bounce_mjx.physics.engine import Engine, make_engine
@@ -162,9 +165,12 @@ class Env:
             self.mj_model, self.addresses, config.default_joint_angles
         )
         check_start(config, self.task)
+        check_starts(config, self.mj_model, self.addresses, self.task)
         self._actuators = Actuators(config, self.mj_model, self.addresses)
         self._sensors = Sensors(config, self.mj_model, self.addresses, self.engine, self.task)
         self._randomize = randomize
+        if randomize is not None:
+            check_randomize(randomize, config, self.mj_model, self.addresses)
         self.nominals = nominal_values(self.mj_model, config.randomization.terms, self.addresses)
         """Values of the terms of the randomisation in an episode that does not sample them."""
         self._fingerprint = robot_model.fingerprint(self.mj_model)
@@ -211,22 +217,28 @@ class Env:
 
         Args:
           rng: key; consumed.
-          ranges: ranges for all active terms and, if they differ from the config's, for commands,
-            within the config's ranges, which are the default. The queues of delayed actions and
-            pictures are only as long as the config's ranges need.
+          ranges: ranges for all active terms and, if they differ from the config's, for commands;
+            by default, the config's. The queues of delayed actions and pictures are only as long as
+            the config's ranges need: longer delays are refused or, of traced ends, cut to them,
+            in the world too.
           share: probability that each term is sampled, in place of the config's `share` and
             `shares`.
 
         Raises:
-          UserError: the ranges lack a term, or have an unknown one; the task's code returns wrong
-            names, or arrays where one number is expected; the model lacks what a term changes, or
-            was edited; or the engine does not support what a term changes.
+          UserError: the ranges are none of the environment's (`ranges.check_ranges`), or with them
+            the arm or the ball cannot start; the task's code returns wrong names, or arrays where
+            one number is expected; the model lacks what a term changes, or was edited; or the
+            engine does not support what a term changes.
         """
         robot_model.check_unedited(self.mj_model, self._fingerprint)
-        if ranges is None:
+        are_given = ranges is not None
+        if are_given:
+            self._check_ranges(ranges)
+        else:
             ranges = self.ranges()
-        self._check_ranges(ranges)
         rng, world, clock = self._sample_world(rng, ranges, share)
+        if are_given:
+            world = within_queues(self.config.randomization, world)
         rng, randomized = self._sample_parameters(rng)
         parameters = physics_parameters(world, self.mj_model)._replace(**_given(randomized))
         draws = self._draw(rng)
@@ -354,12 +366,10 @@ class Env:
         )
 
     def _check_ranges(self, ranges: Ranges) -> None:
-        """Refuses ranges that lack a term or have an unknown one; those of commands may be left
-        out."""
-        terms = self.config.randomization.terms
-        commands = self.config.commands
-        # The commands are on both sides, as none needs a range and each may have one.
-        check_names("a reset", "range", {*ranges, *commands}, {*terms, *commands})
+        """Refuses ranges that the environment cannot act on, and starts that it cannot have."""
+        randomization = check_ranges(self.config, ranges, self.nominals)
+        config = self.config.model_copy(update={"randomization": randomization})
+        check_starts(config, self.mj_model, self.addresses, self.task)
 
     def _sample_world(
         self, rng: jax.Array, ranges: Ranges, share: float | None
@@ -566,7 +576,8 @@ class Env:
 
     def with_world(self, state: EnvState, world: World) -> EnvState:
         """The state with other values of the terms of its world; the parameters that `randomize`
-        sampled stay."""
+        sampled stay. Delays are cut to the queues of the config (`ranges.within_queues`)."""
+        world = within_queues(self.config.randomization, world)
         parameters = physics_parameters(world, self.mj_model)
         if self._randomize is not None:
             # The shapes alone say which parameters it gives.

@@ -250,11 +250,16 @@ def _spanning_config(conditions: Sequence[Condition], physics: Physics) -> World
     spans = {}
     for name in sorted(perturbed):
         lows, highs = zip(*(condition.range(name) for condition in conditions), strict=True)
-        spans[name] = float(np.min(lows)), float(np.max(highs))
+        spans[name] = _end(np.min(lows, axis=0)), _end(np.max(highs, axis=0))
     # Not validated: a neutral value, such as an interval of 1e9 s, may lie beyond a term's limits.
     sampled = RandomizationConfig().model_copy(update=spans)
     world = conditions[0].env.model_copy(update={"randomization": sampled})
     return on_engine(world, physics)
+
+
+def _end(numbers: np.ndarray) -> float | tuple[float, ...]:
+    """An end of a term's range as a config has it."""
+    return tuple(numbers.tolist()) if numbers.ndim else float(numbers)
 
 
 def _stack_ranges(names: Sequence[str], conditions: Sequence[Condition]) -> Ranges | None:

@@ -3,23 +3,27 @@
 `configs/robustness.yaml` explains the format.
 """
 
+import functools
 import math
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
+import mujoco
 import numpy as np
 from pydantic import Field
 
 from bounce_mjx.config.files import differing_keys, read_mapping
 from bounce_mjx.config.settings import Finite, StrictModel, merged, nested
 from bounce_mjx.config.validation import validate
-from bounce_mjx.errors import UserError, shorten
+from bounce_mjx.env.checks import check_starts
+from bounce_mjx.errors import UserError, shorten, warn_once
 from bounce_mjx.evaluation.config import command_ranges
 from bounce_mjx.physics.edited import NO_PAIR
+from bounce_mjx.robot.model import Addresses, find_addresses
 from bounce_mjx.task.registry import find_task
 from bounce_mjx.world.actuation import DEFAULT_PUSH_INTERVAL
 from bounce_mjx.world.config import WorldConfig
-from bounce_mjx.world.model import model_nominals
+from bounce_mjx.world.model import model_nominals, world_model
 from bounce_mjx.world.randomization import MODEL, TERMS, RandomizationConfig
 
 _CONFIG_UNITS = "factor", "s", "Hz", "m", "m/s", "1/m", "rad", "rad/s", "kg", "N m", "N m s/rad"
@@ -180,8 +184,31 @@ def load_suite(
             place = source
             if strength is not None:
                 place += f" at {strength_text(strength, perturbation.unit)}"
-            conditions.append(_condition(perturbation, strength, training, world, place))
+            condition = _condition(perturbation, strength, training, world, place)
+            if _can_start(condition):
+                conditions.append(condition)
     return conditions
+
+
+def _can_start(condition: Condition) -> bool:
+    """Whether the arm and the balls can start as a condition has it; one that no episode could have
+    is left out, with a warning."""
+    if not {"joint_start", "ball_start"} & condition.ranges.keys():
+        return True
+    mj_model, addresses = _model(condition.env)
+    try:
+        check_starts(condition.config, mj_model, addresses, condition.config.task(condition.config))
+    except UserError as error:
+        warn_once(f"the condition {condition.label} is left out: {error}")
+        return False
+    return True
+
+
+@functools.lru_cache(maxsize=8)
+def _model(env: WorldConfig) -> tuple[mujoco.MjModel, Addresses]:
+    """The compiled model of an environment without its randomisation."""
+    mj_model = world_model(env, visual=False)
+    return mj_model, find_addresses(mj_model)
 
 
 def _check_content(perturbation: Perturbation, source: str) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from bounce_mjx.identify.log import Log, find_gaps
+from bounce_mjx.identify.response import commanded
 
 SETTLING = 0.3
 """Time after the start of a log, or a gap, until the arm has forgotten the unknown commands before
@@ -65,11 +66,6 @@ def does_move(log: Log) -> bool:
     begins = [first for _, first in find_gaps(log.target_times)]
     stretches = np.split(log.servo_targets, np.searchsorted(log.target_times, begins))
     return any(np.max(np.ptp(targets, axis=0)) > _STILL for targets in stretches)
-
-
-def commanded(log: Log, times: np.ndarray) -> np.ndarray:
-    """The commands [T, n] at times [T], interpolated between those that were sent."""
-    return np.stack([np.interp(times, log.target_times, c) for c in log.servo_targets.T], axis=1)
 
 
 def follow(log: Log, rows: np.ndarray, shortest: float = -0.05, longest: float = 0.4) -> Following:

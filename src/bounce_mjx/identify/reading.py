@@ -94,7 +94,9 @@ def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
 
     angle_columns = [f"joint_angles.{joint}" for joint in joint_names]
     target_columns = [f"servo_targets.{joint}" for joint in joint_names]
-    ball_columns = [f"ball_position.{axis}" for axis in "xyz"]
+    has_several_balls = "ball_position.1.x" in columns
+    ball = "ball_position.1" if has_several_balls else "ball_position"
+    ball_columns = [f"{ball}.{axis}" for axis in "xyz"]
     angles = group("joint angles", angle_columns, "rad")
     targets = group("servo targets", target_columns, "rad")
     if any(name in columns for name in (*ball_columns, "ball_time")):
@@ -109,7 +111,11 @@ def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
             arrivals=np.zeros(0),
             values=np.zeros((0, 3)),
         )
-    return make_log(str(path), angles, targets, balls)
+    log = make_log(str(path), angles, targets, balls)
+    if has_several_balls:
+        note = f"{path} shows several balls; the flights and bounces of the first one count"
+        log = log._replace(notes=(*log.notes, note))
+    return log
 
 
 def _read_columns(path: Path) -> tuple[dict[str, tuple[str, np.ndarray]], np.ndarray]:

@@ -36,8 +36,9 @@ from bounce_mjx.identify.following import (
     shows_set_points,
 )
 from bounce_mjx.identify.log import Log, least_age
+from bounce_mjx.identify.servos import Servos, servos_of
 from bounce_mjx.identify.simulation import Simulate, make_simulator
-from bounce_mjx.identify.unknowns import Layout
+from bounce_mjx.identify.unknowns import ARM, Layout
 from bounce_mjx.identify.windows import BEFORE_BOUNCE, GUESSED_DRAG, Windows, cut
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.world.config import WorldConfig
@@ -627,8 +628,9 @@ def _search_arm(
     windows = problem.windows
     rough = np.hypot(problem.sensors.angles, following.errors)
     problem = problem._replace(noise=problem.noise._replace(angles=rough))
-    of_model = _own_servos(layout, config, delay)
-    vectors = np.concatenate([of_model, _late_servos(layout, config, delay)])
+    servos = servos_of(world_model(config, visual=False))
+    of_model = _own_servos(layout, servos, delay)
+    vectors = np.concatenate([of_model, _late_servos(layout, servos, delay)])
     few = problem.weights(0.0, _sample(problem, np.any(windows.angle_weights > 0.0, axis=1)))
     used = np.any(few > 0.0, axis=1)
     starts = np.repeat(windows.starts[None], len(vectors), axis=0)
@@ -664,9 +666,9 @@ def _with_offsets(problem: Problem, fit: Fit, windows: np.ndarray | float = 1.0)
     return fit._replace(vector=vector)
 
 
-def _own_servos(layout: Layout, config: WorldConfig, delay: float) -> np.ndarray:
+def _own_servos(layout: Layout, servos: Servos, delay: float) -> np.ndarray:
     """Candidates [C, P] with the model's own servos, late as measured (s) by latency and lag."""
-    rest = max(delay - float(np.mean(_servo_delays(config))), 0.0)
+    rest = max(delay - float(np.mean(servos.delays())), 0.0)
     return np.stack(
         [
             layout.vector({"action_latency": (1.0 - share) * rest, "servo_lag": share * rest})
@@ -675,27 +677,20 @@ def _own_servos(layout: Layout, config: WorldConfig, delay: float) -> np.ndarray
     )
 
 
-def _servo_delays(config: WorldConfig) -> np.ndarray:
-    """Damping divided by stiffness of each servo of the model [n], s."""
-    model = world_model(config, visual=False)
-    servos = list(find_addresses(model).actuators)
-    stiffness = model.actuator_gainprm[servos, 0]
-    damping = -model.actuator_biasprm[servos, 2]
-    return np.maximum(damping / stiffness, 1e-6)
-
-
-def _late_servos(layout: Layout, config: WorldConfig, delay: float) -> np.ndarray:
+def _late_servos(layout: Layout, servos: Servos, delay: float) -> np.ndarray:
     """Candidates [C, P] whose joints follow their commands as late as measured (s)."""
-    own_delay = _servo_delays(config)
     total = max(delay, 2e-3)
     vectors = []
     for gain, servo_share, lag_share in itertools.product(_GAINS, _SERVO_SHARES, _LAG_SHARES):
-        of_servo = servo_share * total
-        lag = lag_share * (total - of_servo)
+        damping = servos.damping_for(servo_share * total, gain, ARM["servo_damping"].limits)
+        # The joints' own damping may make them later than that share.
+        rest = max(total - float(np.mean(servos.delays(gain, damping))), 0.0)
+        # A share of what the servo was to leave.
+        lag = min(lag_share * (1.0 - servo_share) * total, rest)
         world = {
             "servo_gain": np.full(layout.num_joints, gain),
-            "servo_damping": gain * of_servo / own_delay,
-            "action_latency": total - of_servo - lag,
+            "servo_damping": damping,
+            "action_latency": rest - lag,
             "servo_lag": lag,
         }
         vectors.append(layout.clip(layout.vector(world)))
@@ -710,17 +705,18 @@ def _stiff_follower(
     layout = problem.layout
     windows = problem.windows
     # A servo answers the mean command of a physics step, that of its middle, at the step's end: the
-    # sum of latency and damping / stiffness counts half a step too much.
+    # sum of latency and the servo's delay counts half a step too much.
     total = max(delay + 0.5 * config.physics_dt, 0.0)
-    own_delay = _servo_delays(config)
+    servos = servos_of(world_model(config, visual=False))
     vectors = []
     for gain, longest in itertools.product(_STIFF_GAINS, _STIFF_DELAYS):
         of_servo = max(min(longest, total), _STIFF_DELAYS[0])
+        damping = servos.damping_for(of_servo, gain, ARM["servo_damping"].limits)
         world = {
             "servo_gain": np.full(layout.num_joints, gain),
-            "servo_damping": gain * of_servo / own_delay,
+            "servo_damping": damping,
             "servo_offset": following.offsets,
-            "action_latency": max(total - of_servo, 0.0),
+            "action_latency": max(total - float(np.mean(servos.delays(gain, damping))), 0.0),
             "servo_lag": 0.0,
             "joint_frictionloss": np.zeros(layout.num_joints),
         }

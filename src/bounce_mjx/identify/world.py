@@ -8,9 +8,9 @@ import numpy as np
 import yaml
 
 from bounce_mjx.identify.log import Log
+from bounce_mjx.identify.servos import servos_of
 from bounce_mjx.identify.stages import Identified
 from bounce_mjx.identify.unknowns import BALL, CAMERA_ROTATION, MOTIONS
-from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.world.named import NamedWorld
 from bounce_mjx.world.randomization import TERMS
 
@@ -258,21 +258,19 @@ def total_delay(found: Identified, model: mujoco.MjModel) -> str:
     """The delay from a command to the angle, which a log shows however it is shared.
 
     It is the action's latency, the mean delay of the lag's steps (shorter than the lag by half a
-    step at most), and the delay of the servos themselves: damping divided by stiffness, which is
-    the mean of a servo's answer to a step, less the half step by which a simulated servo answers
-    earlier. Of commands that are held until the next, the delay that an inspection shows is longer
-    by half a control step, the mean time of holding.
+    step at most), and the delay of the servos themselves, which the joints' own damping makes
+    longer, less the half step by which a simulated servo answers earlier. Of commands that are held
+    until the next, the delay that an inspection shows is longer by half a control step, the mean
+    time of holding.
     """
     layout = found.layout
-    servos = list(find_addresses(model).actuators)
-    own = -model.actuator_biasprm[servos, 2] / model.actuator_gainprm[servos, 0]
-
+    servos = servos_of(model)
     delay = layout.slices["delay"].start
 
     def total(vector: np.ndarray) -> float:
         world = layout.world(vector)
-        of_servos = np.mean(own * world["servo_damping"] / world["servo_gain"])
-        return float(vector[delay] + of_servos) - 0.5 * layout.physics_dt
+        of_servos = servos.delays(world["servo_gain"], world["servo_damping"])
+        return float(vector[delay] + np.mean(of_servos)) - 0.5 * layout.physics_dt
 
     vector = found.fit.vector
     steps = 1e-3 * layout.deviation

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from bounce_mjx.identify.inspection import Checkup, Joint
+from bounce_mjx.identify.inspection import Checkup
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.stages import Identified
 from bounce_mjx.identify.world import Estimate, estimates, misfit, sentences
@@ -178,7 +178,8 @@ def following_figure(log: Log, checkup: Checkup) -> Figure:
     rows = _drawn_rows(log)
     for j, (axes, joint) in enumerate(zip(panels, checkup.joints, strict=False)):
         times = log.times[rows]
-        axes.plot(times, _late_command(log, j, joint, rows), lw=4, color="C1", alpha=0.5)
+        late = checkup.response.late_command(log, j, times)
+        axes.plot(times, late, lw=4, color="C1", alpha=0.5)
         axes.plot(times, log.joint_angles[rows, j], lw=1, color="C0")
         axes.set_title(f"{joint.name}, rad")
         axes.set_xlabel("time, s")
@@ -192,7 +193,8 @@ def difference_figure(log: Log, checkup: Checkup) -> Figure:
     figure, panels = make_panels(len(checkup.joints), 3, height=1.6)
     rows = _drawn_rows(log)
     for j, (axes, joint) in enumerate(zip(panels, checkup.joints, strict=False)):
-        off = log.joint_angles[rows, j] - _late_command(log, j, joint, rows)
+        late = checkup.response.late_command(log, j, log.times[rows])
+        off = log.joint_angles[rows, j] - late
         axes.plot(log.times[rows], 1e3 * off, lw=1, color="C0")
         axes.set_title(f"{joint.name}, mrad")
         axes.set_xlabel("time, s")
@@ -202,11 +204,6 @@ def difference_figure(log: Log, checkup: Checkup) -> Figure:
 def _drawn_rows(log: Log) -> slice:
     """The rows of a log that a figure draws."""
     return slice(None, None, max(math.ceil(len(log.times) / _DRAWN), 1))
-
-
-def _late_command(log: Log, j: int, joint: Joint, rows: slice) -> np.ndarray:
-    """The command of joint j in some rows, later by its delay, rad."""
-    return np.interp(log.times[rows] - joint.delay, log.target_times, log.servo_targets[:, j])
 
 
 @style()

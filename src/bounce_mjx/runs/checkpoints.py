@@ -9,12 +9,15 @@ would choose by a file of its own, would not open a folder in which one such fil
 would take a checkpoint for written whose save failed.
 """
 
+import asyncio
 import contextlib
 import errno
 import functools
 import logging
 import os
+import re
 import shutil
+import sys
 import types
 from collections.abc import Callable
 from pathlib import Path
@@ -59,6 +62,8 @@ NETWORK_KEYS = ("hidden_layers", "critic_layers", "shared_critic", "activation")
 
 # Room for the metadata of a checkpoint.
 _MARGIN = 2**20
+# What a thread of tensorstore calls once a file is written, or cannot be.
+_CALL = asyncio.BaseEventLoop.call_soon_threadsafe
 # Folder of what is being written or removed; a killed process leaves it.
 _UNFINISHED = ".unfinished"
 
@@ -361,11 +366,19 @@ def save_checkpoint(
                     other.folder.rename(unfinished / other.folder.name)
     # Orbax and tensorstore raise exceptions of many types, also where the disk is full.
     except Exception as error:
-        reason = getattr(error, "strerror", None) or shorten(reason_of(error), 200)
-        raise NotSavedError(run, reason) from error
+        raise NotSavedError(run, _reason_of(error)) from error
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
     return number
+
+
+def _reason_of(error: Exception) -> str:
+    """Why a checkpoint could not be written: the system's own words, which tensorstore gives by
+    their number."""
+    number = re.search(r"os_error_code='(\d+)'", str(error))
+    if number is not None:
+        return os.strerror(int(number[1]))
+    return getattr(error, "strerror", None) or shorten(reason_of(error), 200)
 
 
 def _check_room(folder: Path, items: dict[str, Any]) -> None:
@@ -399,12 +412,24 @@ def _write(folder: Path, items: dict[str, Any], record: Record) -> None:
 
 @functools.cache
 def _orbax() -> types.ModuleType:
-    """The package. Its import takes half a second, and its threads log a traceback of each error,
+    """The package. Its import takes half a second, and its threads report each error of a save,
     which is raised as well."""
     import orbax.checkpoint
 
     logging.getLogger("absl").addFilter(lambda record: "orbax" not in record.pathname)
+    sys.unraisablehook = functools.partial(_report, sys.unraisablehook)
     return orbax.checkpoint
+
+
+def _report(report: Callable[[Any], Any], unraisable: Any) -> None:
+    """Reports what a thread cannot raise as before, but for a file of a save that has failed
+    already: orbax has closed the event loop to which tensorstore's thread gives its result."""
+    is_closed = str(unraisable.exc_value) == "Event loop is closed"
+    # A program's own mistake with a loop has its own line first.
+    trace = unraisable.exc_traceback
+    is_of_thread = trace is not None and trace.tb_frame.f_code is _CALL.__code__
+    if not (is_closed and is_of_thread):
+        report(unraisable)
 
 
 def _alone() -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
+import pydantic
 from pydantic import Field
 
 from bounce_mjx import task
@@ -86,6 +87,17 @@ class Config(task.WorldConfig):
     reward: Rewards = Rewards()
     """The reward terms."""
 
+    @pydantic.model_validator(mode="after")
+    def _check_heights(self):
+        """A ball that is hit is not yet lost."""
+        if self.height_range[1] > self.max_distance:
+            raise ValueError(
+                f"height_range goes up to {self.height_range[1]:g} m over home, but max_distance "
+                f"is {self.max_distance:g} m, so that a ball which is hit there ends the episode; "
+                "change one of the two"
+            )
+        return self
+
     @classmethod
     def settings_at(cls, paddle: tuple[float, float, float]) -> dict[str, Any]:
         return super().settings_at(paddle) | {"home": paddle}
@@ -106,6 +118,7 @@ class Config(task.WorldConfig):
                 home_height + highest,
                 "m",
                 least=home_height + MIN_TARGET_HEIGHT,
+                greatest=home_height + self.max_distance,
             )
         }
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Annotated, Any, NamedTuple
 
+import pydantic
 from pydantic import Field
 
 from bounce_mjx import task
@@ -50,7 +51,9 @@ JUMP_ACCELERATION = 3.0
 and fast paths have a higher limit."""
 APEX_FACTORS = (1.0, 1.0, 0.3)
 """Factors of an apex's error along x, y and z: 0.1 m of height count as 0.03 m."""
-Height = Annotated[Finite, Field(ge=0.1, le=10.0)]
+MIN_TARGET_HEIGHT = 0.1
+"""Least height of the point over home, m."""
+Height = Annotated[Finite, Field(ge=MIN_TARGET_HEIGHT, le=10.0)]
 """Over home, m; the point sways around it, and stays above a resting ball."""
 PointSpeed = Annotated[Finite, Field(ge=0.0, le=MAX_POINT_SPEED)]
 
@@ -101,6 +104,24 @@ class Config(task.WorldConfig):
     reward: Rewards = Rewards()
     """The reward terms."""
 
+    @pydantic.model_validator(mode="after")
+    def _check_heights(self):
+        """A ball that is hit under the point is not yet lost."""
+        if self.height_range[1] > self.max_height:
+            raise ValueError(
+                f"height_range goes up to {self.height_range[1]:g} m over home, but max_distance "
+                f"is {self.max_distance:g} m and the point sways, so that a ball which is hit "
+                f"under it ends the episode; give at most {self.max_height:g} m, or change "
+                "max_distance"
+            )
+        return self
+
+    @property
+    def max_height(self) -> float:
+        """Greatest height of the point over home, m: set at the lowest place of its sway, it rises
+        by both amplitudes, and the ball under it may fall to home."""
+        return round(self.max_distance - 2.0 * paths.SWAY, 9)
+
     @classmethod
     def settings_at(cls, paddle: tuple[float, float, float]) -> dict[str, Any]:
         return super().settings_at(paddle) | {"home": paddle}
@@ -119,7 +140,14 @@ class Config(task.WorldConfig):
         commands = {
             "target_x": task.Command(x - 0.02, x + 0.02, "m", span=(x - 0.15, x + 0.15), step=0.01),
             "target_y": task.Command(y - 0.02, y + 0.02, "m", span=(y - 0.15, y + 0.15), step=0.01),
-            "target_height": task.Command(z + lowest, z + highest, "m", span=(z + 0.3, z + 0.7)),
+            "target_height": task.Command(
+                z + lowest,
+                z + highest,
+                "m",
+                least=z + MIN_TARGET_HEIGHT,
+                greatest=z + self.max_height,
+                span=(z + min(0.3, self.max_height), z + min(0.7, self.max_height)),
+            ),
             "point_speed": task.Command(
                 slowest, fastest, "m/s", least=0.0, span=(0.0, 0.3), hidden=True
             ),

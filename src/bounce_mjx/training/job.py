@@ -6,7 +6,7 @@ From a signal to its checkpoint: `StopRequest` notes the signal, the block goes 
 (`train_block`), an evaluation that is due is left out (on several hosts it is done, as a process
 that stopped alone would keep the others waiting), `is_stopping` ends the loop, and `finish` saves
 the state, waits until it is written, and raises `TrainingStopped` with the command that resumes
-the run.
+the run. An exception in a callback takes the same way, and is raised at its end.
 """
 
 import concurrent.futures
@@ -201,6 +201,8 @@ class Job:
     """Whether no save of the current state has been started."""
     is_ended: bool = False
     """Whether a callback has ended the training."""
+    failure: BaseException | None = None
+    """What a callback raised: it stops the training, as a signal does."""
     state: Any = None
     """State from which the resumed run starts."""
     snapshot: Snapshot | None = None
@@ -374,8 +376,8 @@ class Job:
         self.clock.lap("save")
 
     def is_stopping(self) -> bool:
-        """Whether a signal has come to any process."""
-        return hosts.any_of(self.stop.requested)
+        """Whether a signal has come to any process, or a callback has failed."""
+        return hosts.any_of(self.stop.requested or self.failure is not None)
 
     def is_finished(self) -> bool:
         """Whether the training ends here: at its last step, by a callback, or by its results."""
@@ -433,6 +435,7 @@ class Job:
           TrainingStopped: a stop was requested.
           Interrupted: it was requested before there was anything to save.
           UserError: the state could not be saved.
+          BaseException: what a callback raised.
         """
         stopping = self.is_stopping()
         where = ""
@@ -442,7 +445,7 @@ class Job:
         has_nothing = self.is_new and self.steps == 0 and not self.is_evaluated()
         if stopping and has_nothing:
             jax.distributed.shutdown()
-            raise Interrupted
+            raise self.failure or Interrupted
         if self.needs_save:
             self.save()
         self.end_last_save("the end of the training is lost")
@@ -450,6 +453,9 @@ class Job:
             stopping = True
             where = ", before the final evaluation"
         jax.distributed.shutdown()
+        if self.failure is not None:
+            self.say(f"a callback failed after {self.steps:,} steps; {self.go_on}")
+            raise self.failure
         if stopping:
             raise TrainingStopped(f"stopped after {self.steps:,} steps{where}; {self.go_on}")
 
@@ -484,7 +490,7 @@ class Job:
         if problem:
             raise UserError(
                 f"{self.run} cannot be written ({problem}), so {loss}; make room, and {self.advice}"
-            )
+            ) from self.failure
 
     # What is known of the training
 
@@ -566,7 +572,12 @@ class Job:
         whether a callback has ended the training."""
         for event in told:
             for callback in self.callbacks:
-                answer = callback(event)
+                try:
+                    answer = callback(event)
+                # Raised once the others know the event, and the state is saved (`finish`).
+                except BaseException as failure:  # noqa: BLE001
+                    self.failure = self.failure or failure
+                    continue
                 # A comparison of NumPy's numbers has its own False.
                 if isinstance(answer, bool | np.bool_) and not answer:
                     self.is_ended = True

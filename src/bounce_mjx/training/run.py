@@ -13,13 +13,9 @@ from rich.console import Console
 
 from bounce_mjx.config.command_line import stdout
 from bounce_mjx.config.validation import validate
-from bounce_mjx.deploy.environments import (
-    environment_config,
-    environment_of,
-    in_library,
-    policy_path,
-)
+from bounce_mjx.deploy.environments import environment_config, in_library, policy_path
 from bounce_mjx.deploy.interface import check_interface, interface_of
+from bounce_mjx.deploy.wrappers import environments_in
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import reason_of, shorten
 from bounce_mjx.evaluation.config import EvaluationOptions
@@ -111,9 +107,8 @@ class Run:
         name = next((x for x in POLICIES if policy_path(x) == self.folder), str(self.folder))
         config = self.config.env
         advice = f"make the environment with policy={name!r}, or take Run({name!r}).env()"
-        check_interface(
-            interface_of(config), interface_of(environment_of(env).config), name, advice
-        )
+        for environment in environments_in(env):
+            check_interface(interface_of(config), interface_of(environment.config), name, advice)
         return in_library(jax.jit(self.policy), config.layout.size)
 
     def evaluate(self, **options: Any) -> Report:

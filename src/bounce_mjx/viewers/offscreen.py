@@ -1,5 +1,6 @@
 """Rendering without a screen."""
 
+import atexit
 import contextlib
 import functools
 import importlib
@@ -72,7 +73,11 @@ def choose_opengl() -> None:
 
 
 class Renderer(contextlib.AbstractContextManager):
-    """Renders one environment. A context manager, which frees the GPU's memory."""
+    """Renders one environment. A context manager, which frees the GPU's memory.
+
+    The first picture opens OpenGL: a program that draws none needs no library for it, and loads
+    none beside its own, such as Mesa's LLVM beside triton's, which end the process together.
+    """
 
     def __init__(
         self,
@@ -91,7 +96,7 @@ class Renderer(contextlib.AbstractContextManager):
           zoom: see `camera_pose`.
 
         Raises:
-          UserError: the model has no such camera, or no OpenGL library works.
+          UserError: the model has no such camera.
         """
         self._display = Display(env)
         model = self._display.model
@@ -109,18 +114,22 @@ class Renderer(contextlib.AbstractContextManager):
         shadows, samples = (0, 0) if plain else (2048, 4)
         model.vis.quality.shadowsize = min(model.vis.quality.shadowsize, shadows)
         model.vis.quality.offsamples = min(model.vis.quality.offsamples, samples)
-        choose_opengl()
-        self._renderer = mujoco.Renderer(model, height, width)
-        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = not plain
+        self._size = height, width
+        self._has_shadows = not plain
+        self._opened: mujoco.Renderer | None = None
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
         """Frees the GPU's memory."""
+        if self._opened is None:
+            return
         # Otherwise this would free objects of the renderer that drew last.
-        self._renderer._gl_context.make_current()
-        self._renderer.close()
+        self._opened._gl_context.make_current()
+        self._opened.close()
+        self._opened = None
+        atexit.unregister(self.close)
 
     def render(
         self,
@@ -135,12 +144,25 @@ class Renderer(contextlib.AbstractContextManager):
           qpos: generalised positions [nq].
           command: the commands, which place the markers, as do the last step's metrics.
           trail: positions of each ball [P, B, 3] to connect by a line, oldest first, m.
+
+        Raises:
+          UserError: no OpenGL library works.
         """
+        renderer = self._renderer()
         self._display.pose(qpos, command, metrics)
-        self._renderer.update_scene(self._display.data, self._camera)
+        renderer.update_scene(self._display.data, self._camera)
         if trail is not None:
-            draw_trail(self._renderer.scene, trail)
-        return self._renderer.render()
+            draw_trail(renderer.scene, trail)
+        return renderer.render()
+
+    def _renderer(self) -> mujoco.Renderer:
+        if self._opened is None:
+            choose_opengl()
+            self._opened = mujoco.Renderer(self._display.model, *self._size)
+            self._opened.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self._has_shadows
+            # Before MuJoCo ends OpenGL, which it has asked of `atexit` when it was loaded.
+            atexit.register(self.close)
+        return self._opened
 
 
 def page_camera(env: Env, aspect: float, zoom: float = 1.0) -> mujoco.MjvCamera:

@@ -289,7 +289,7 @@ class RandomizationConfig(StrictModel):
         """Each range has the shape and the bounds of its term."""
         for name in self.terms:
             self._check_shape(name)
-            self._check_bounds(name)
+            check_bounds(name, getattr(self, name))
         return self
 
     def _check_shape(self, name: str) -> None:
@@ -301,18 +301,6 @@ class RandomizationConfig(StrictModel):
         fits_term = size is EACH_JOINT or shapes <= {NUMBER, size}
         if len(shapes) != 1 or not fits_term or (0,) in shapes:
             raise ValueError(f"{name} {_is_no_range(name, ends)}")
-
-    def _check_bounds(self, name: str) -> None:
-        """Refuses a range that is empty or not within the term's bounds."""
-        least, greatest = TERMS[name].bounds
-        unit = unit_of(type(self).model_fields[name].description)
-        for low, high in entries(getattr(self, name)):
-            if not least <= low <= high <= greatest:
-                within = f"{least:g} to {greatest:g} {unit}".rstrip()
-                raise ValueError(
-                    f"{name} ({low}, {high}) is not a range within {within}; give the lower end "
-                    "first"
-                )
 
     @property
     def terms(self) -> tuple[str, ...]:
@@ -340,6 +328,31 @@ class RandomizationConfig(StrictModel):
                 ends = tuple(start + (end - start) * progress for end in ends)
             ranges[name] = tuple(jnp.asarray(end, jnp.float32) for end in ends)
         return ranges
+
+
+def check_bounds(name: str, ends: Range, nominal: np.ndarray | None = None) -> None:
+    """Refuses a range that is empty or not within its term's bounds.
+
+    Args:
+      name: of the term.
+      ends: of its range.
+      nominal: its value without randomisation, from which a range may grow, so that it is within
+        the bounds too; None leaves it out.
+
+    Raises:
+      ValueError: the range is none of the term.
+    """
+    least, greatest = TERMS[name].bounds
+    if nominal is not None:
+        least = min(least, float(np.min(nominal)))
+        greatest = max(greatest, float(np.max(nominal)))
+    unit = unit_of(RandomizationConfig.model_fields[name].description)
+    for low, high in entries(ends):
+        if not least <= low <= high <= greatest:
+            within = f"{least:g} to {greatest:g} {unit}".rstrip()
+            raise ValueError(
+                f"{name} ({low}, {high}) is not a range within {within}; give the lower end first"
+            )
 
 
 def _is_no_range(name: str, ends: Any) -> str:

@@ -12,10 +12,11 @@ import numpy as np
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics import PhysicsParameters
-from bounce_mjx.physics.edited import NO_PAIR, own_parameters
+from bounce_mjx.physics.edited import INSEPARABLE, NO_PAIR, edits, own_parameters
 from bounce_mjx.physics.scalars import Quaternion, quaternion_matrix, quaternion_product
 from bounce_mjx.robot.contact import damping_of_restitution, restitution_of_damping
 from bounce_mjx.robot.model import Addresses, contact_pairs
+from bounce_mjx.robot.numbers import field_of
 from bounce_mjx.world.randomization import MODEL, TERMS, Operation, Ranges, Term, World
 
 # The fields that the terms of the contact change.
@@ -43,6 +44,74 @@ def check_contacts(mj_model: mujoco.MjModel, terms: Iterable[str], addresses: Ad
                     f"randomization.{term} makes one for all; give them the same in the MJCF, or "
                     f"leave {term} out"
                 )
+
+
+def check_overlap(
+    mj_model: mujoco.MjModel,
+    addresses: Addresses,
+    terms: Iterable[str],
+    randomized: PhysicsParameters,
+) -> None:
+    """Refuses parameters of a `randomize` that change what a term changes: the world would say one
+    value, and the physics have the other.
+
+    Args:
+      mj_model: the model.
+      addresses: of its parts.
+      terms: names of the active terms.
+      randomized: what `randomize` returns; of its arrays, none is read.
+
+    Raises:
+      UserError: a term and `randomize` change the same number of the model.
+    """
+    given = {name: value for name, value in randomized._asdict().items() if value is not None}
+    places: dict[tuple[str, int], str] = {}
+    for name in given:
+        places |= dict.fromkeys(_places_of_parameter(mj_model, addresses, name), name)
+    for name in given.get("entries", {}):
+        places |= dict.fromkeys(_places_of_entry(mj_model, name), name)
+    for term in terms:
+        parameter = TERMS[term].parameter
+        if parameter is None:
+            continue
+        shared = _places_of_parameter(mj_model, addresses, parameter) & places.keys()
+        if parameter in given or shared:
+            name = parameter if parameter in given else places[min(shared)]
+            raise UserError(
+                f"randomize returns {name}, which is sampled by randomization.{term} too, so that "
+                "an episode's world would not be its physics; leave one of the two out"
+            )
+
+
+def _places_of_parameter(
+    mj_model: mujoco.MjModel, addresses: Addresses, parameter: str
+) -> set[tuple[str, int]]:
+    """The numbers of the model that a field of `PhysicsParameters` changes."""
+    places: set[tuple[str, int]] = set()
+    for edit in edits(mj_model, addresses):
+        if edit.parameter == parameter:
+            places |= _places(mj_model, edit.field, edit.index)
+    return places
+
+
+def _places_of_entry(mj_model: mujoco.MjModel, name: str) -> set[tuple[str, int]]:
+    """The number of the model with a name of `PhysicsParameters.entries`; none of an unknown name,
+    which the physics refuses."""
+    field, _, index = name.removesuffix("]").partition("[")
+    try:
+        return _places(mj_model, field, tuple(int(number) for number in index.split(",")))
+    except (AttributeError, ValueError, IndexError):
+        return set()
+
+
+def _places(mj_model: mujoco.MjModel, field: str, index: Any) -> set[tuple[str, int]]:
+    """A field's numbers at an index, by their places in the flat field; of a field whose numbers
+    change together, its rows."""
+    values = field_of(mj_model, field)
+    places = np.arange(values.size).reshape(values.shape)
+    if field in INSEPARABLE:
+        places = np.broadcast_to(np.arange(len(values))[:, None], values.shape)
+    return {(field, place) for place in np.ravel(places[index]).tolist()}
 
 
 def nominal_values(

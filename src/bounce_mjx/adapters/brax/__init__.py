@@ -2,13 +2,13 @@
 
 Then `brax.envs.get_environment("bounce_ball", control_dt=0.02)` returns a
 `BraxBounceBall` with these settings. brax's wrappers and trainers accept it, and also every
-`Env`. Needs the extra `brax`.
+`Env`.
 """
 
 from bounce_mjx.errors import needed
 from bounce_mjx.lazy import import_mjx
 
-with needed("brax", "bounce_mjx[brax]"):
+with needed("brax", "bounce_mjx"):
     import_mjx()
     import brax.envs
 

@@ -72,8 +72,7 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
           settings: fields of the task's config, such as episode_seconds=30.
 
         Raises:
-          UserError: an argument is wrong, or there is no OpenGL library for rendering; an unknown
-            argument is a TypeError too.
+          UserError: an argument is wrong; an unknown argument is a TypeError too.
         """
         self._batch = Batch(task, policy, world, 1, max_episode_steps, settings)
         self._has_ended = False

@@ -17,7 +17,7 @@ class Pictures:
     def __init__(
         self, batch: Batch, render_mode: str | None, width: int, height: int, camera: str | None
     ):
-        """Opens the renderer, if there is a mode.
+        """Makes the renderer, if there is a mode; its first picture opens OpenGL.
 
         Args:
           render_mode: "rgb_array", or None for no pictures.
@@ -25,7 +25,7 @@ class Pictures:
           camera: name of a camera of the model; None for the overview.
 
         Raises:
-          UserError: the mode, the size or the camera is wrong, or there is no OpenGL library.
+          UserError: the mode, the size or the camera is wrong.
         """
         if render_mode not in (None, "rgb_array"):
             raise UserError(f'render_mode is {render_mode!r}; choose "rgb_array" or omit it')
@@ -35,10 +35,14 @@ class Pictures:
         self._height = whole_number("height", height)
         self._camera = camera
         if self._is_on:
-            _ = self._renderer  # which a missing camera or library makes fail
+            _ = self._renderer  # which a missing camera makes fail
 
     def draw(self, index: int) -> np.ndarray | None:
-        """The picture [height, width, 3], uint8, of one environment; None without a mode."""
+        """The picture [height, width, 3], uint8, of one environment; None without a mode.
+
+        Raises:
+          UserError: no OpenGL library works.
+        """
         return self._renderer.render(*self._batch.pose(index)) if self._is_on else None
 
     def close(self) -> None:
@@ -50,8 +54,9 @@ class Pictures:
     def _renderer(self) -> Renderer:
         task = self._batch.programs.task
         renderer = Renderer(task, self._width, self._height, self._camera, plain=True)
-        # Also closed at exit, where OpenGL would be unloaded before the renderer.
         self._close_renderer = weakref.finalize(self, renderer.close)
+        # The renderer closes itself.
+        self._close_renderer.atexit = False
         return renderer
 
     def __getstate__(self) -> dict[str, Any]:

@@ -1,0 +1,160 @@
+"""The environment of this package in one of any library, below wrappers that change nothing of what
+a policy relies on: its observations, its actions and its control step."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from bounce_mjx.env.env import Env
+from bounce_mjx.errors import UserError
+
+# By the package that defines them. A class that is not here is refused, since the next release of a
+# library, or a user, may write any.
+_CHANGE_NOTHING = {
+    "gymnasium": {
+        "Wrapper",
+        "VectorWrapper",
+        "RewardWrapper",
+        "VectorRewardWrapper",
+        "ArrayConversion",
+        "AsyncVectorEnv",
+        "Autoreset",
+        "ClipAction",
+        "ClipReward",
+        "DictInfoToList",
+        "DtypeObservation",
+        "HumanRendering",
+        "JaxToNumpy",
+        "JaxToTorch",
+        "NormalizeReward",
+        "NumpyToTorch",
+        "OrderEnforcing",
+        "PassiveEnvChecker",
+        "RecordEpisodeStatistics",
+        "RecordVideo",
+        "RenderCollection",
+        "SyncVectorEnv",
+        "TimeLimit",
+    },
+    "stable_baselines3": {
+        "DummyVecEnv",
+        "Monitor",
+        "SubprocVecEnv",
+        "VecCheckNan",
+        "VecEnvWrapper",
+        "VecMonitor",
+        "VecVideoRecorder",
+    },
+    "brax": {
+        "AutoResetWrapper",
+        "DomainRandomizationVmapWrapper",
+        "EpisodeWrapper",
+        "EvalWrapper",
+        "VmapWrapper",
+        "Wrapper",
+    },
+    "mujoco_playground": {
+        "BraxAutoResetWrapper",
+        "BraxDomainRandomizationVmapWrapper",
+        "RSLRLBraxWrapper",
+        "Wrapper",
+    },
+    "gymnax": {"GymnaxWrapper", "GymnaxToGymWrapper", "GymnaxToVectorGymWrapper", "LogWrapper"},
+    "torchrl": {
+        "BraxEnv",
+        "BraxWrapper",
+        "GymEnv",
+        "GymWrapper",
+        "MujocoPlaygroundEnv",
+        "MujocoPlaygroundWrapper",
+    },
+}
+# Attributes that say for how many control steps one of these applies an action.
+_REPEATS = ("action_repeat", "frame_skip", "wrapper_frame_skip")
+# What the acting of an environment consists of, in these libraries.
+_ACTING = ("reset", "step", "step_async", "step_wait", "action", "actions")
+_ACTING += ("observation", "observations")
+_IN_OTHER_PROCESSES = {"AsyncVectorEnv", "SubprocVecEnv"}
+
+
+def environments_in(env: Any) -> list[Env]:
+    """The environments on JAX in one of any library, also within its wrappers: one, or each of a
+    vector that differs from those before it.
+
+    Raises:
+      UserError: it holds none of this package, or is not known to leave the observations, the
+        actions and the control step as they are.
+    """
+    environments: list[Env] = []
+    for found in _below(env, type(env).__name__):
+        if not any(found is other for other in environments):
+            environments.append(found)
+    return environments
+
+
+def _below(env: Any, outermost: str) -> Iterator[Env]:
+    """The environments in this one.
+
+    Args:
+      outermost: the class of what the user gave, for errors.
+    """
+    name = type(env).__name__
+    if name in _IN_OTHER_PROCESSES:
+        raise UserError(
+            f"the environments of {name} are in other processes, where a policy cannot look at "
+            "them; give one that is made in the same way, or make_vec(...), which has one process"
+        )
+    held = _held(env)
+    if not held and not isinstance(env, Env):
+        raise UserError(
+            f"{outermost} holds no environment of bounce_mjx; give one that its adapters made, "
+            "such as gymnasium.make('bounce_mjx/Task-v0', policy=...)"
+        )
+    if not _changes_nothing(env):
+        raise UserError(
+            f"{name} may change the observations, the actions or the control step, and a policy "
+            "takes the environment's own; give the environment within it"
+        )
+    if isinstance(env, Env):
+        yield env
+        return
+    for inner in held:
+        yield from _below(inner, outermost)
+
+
+def _held(env: Any) -> list[Any]:
+    """What an environment or a wrapper holds directly; empty if that is unknown."""
+    if isinstance(env, Env):
+        return []
+    attributes = getattr(env, "__dict__", {})
+    held = [attributes.get(name) for name in ("env", "venv", "_env", "envs")]
+    # The adapters hold the environment as their task, some as a property.
+    task = getattr(type(env), "task", attributes.get("task"))
+    held.append(env.task if isinstance(task, property) else task)
+    for part in held:
+        if isinstance(part, list | tuple):
+            return list(part)
+        if part is not None:
+            return [part]
+    return []
+
+
+def _changes_nothing(env: Any) -> bool:
+    """Whether the acting of an environment is that of a class that is known to change nothing."""
+    attributes = getattr(env, "__dict__", {})
+    if any(attributes.get(name, 1) != 1 for name in _REPEATS):
+        return False
+    for kind in type(env).__mro__:
+        package = kind.__module__.partition(".")[0]
+        if package == "bounce_mjx" or kind.__name__ in _CHANGE_NOTHING.get(package, ()):
+            return kind.__name__ != "DtypeObservation" or _has_numbers_of_a_policy(env)
+        if any(name in vars(kind) for name in _ACTING):
+            return False
+    return False
+
+
+def _has_numbers_of_a_policy(env: Any) -> bool:
+    """Whether a DtypeObservation keeps float32's precision."""
+    dtype = np.dtype(env.observation_space.dtype)
+    return dtype.kind == "f" and dtype.itemsize >= 4
