@@ -29,8 +29,8 @@ def bouncing(time: float, apex: float = 0.4) -> tuple[float, float]:
     return apex - 0.5 * 9.81 * since_apex**2, -9.81 * since_apex
 
 
-def ball_over(paddle: np.ndarray, time: float, apex: float = 0.4, **others: Any) -> dict[str, Any]:
+def ball_over(paddle: np.ndarray, now: float, apex: float = 0.4, **others: Any) -> dict[str, Any]:
     """Measurements of a ball that bounces on a paddle at rest."""
-    height, speed = bouncing(time, apex)
+    height, speed = bouncing(now, apex)
     ball = {"ball_position": paddle + [0.0, 0.0, 0.03 + height]}
     return ball | {"ball_velocity": np.array([0.0, 0.0, speed])} | others

@@ -1,5 +1,6 @@
-"""A policy as a function: `step(memory, measured) -> memory, action`. The memory is a value, so that
-a refused sample changes nothing, and two programs with a memory each do not disturb each other."""
+"""A policy as a function: `step(memory, measured) -> memory, action`. The memory is a value, so
+that a refused sample changes nothing, and two programs with a memory each do not disturb each
+other."""
 
 from typing import NamedTuple
 

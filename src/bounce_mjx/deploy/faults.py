@@ -191,8 +191,8 @@ class Watch:
         commanded = np.ptp(followed.commands[:, joint])
         raise Fault(
             "joint_astray",
-            f"{name}: its angle went over {moved:.2g} rad in {_COMPARED:g} s, and its commands over "
-            f"{commanded:.2g} rad",
+            f"{name}: its angle went over {moved:.2g} rad in {_COMPARED:g} s, and its commands "
+            f"over {commanded:.2g} rad",
         )
 
     def _allowed_motion(self, followed: Followed) -> np.ndarray:

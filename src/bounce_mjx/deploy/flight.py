@@ -48,8 +48,8 @@ class Flight(NamedTuple):
     is_over: bool
     """Whether the last one was over the paddle."""
     near_since: float | None
-    """Time of the first of the last pictures in a row in which the ball may have touched the
-    paddle, s; None in flight."""
+    """Time from which the ball was near the paddle and was not seen to fall, s; None of one that
+    was."""
 
 
 class FlightBounds(NamedTuple):
@@ -169,7 +169,9 @@ def follow(
     if fit.ratio > 1.0:
         seconds = times[-1] - times[0]
         return flight, f"has not fallen as a ball does for {1e3 * seconds:.0f} ms"
-    return Flight(times, places, height, is_over, None), None
+    # A ball at which the paddle swings comes and goes, and has left when it is seen to fall.
+    near_since = None if fit.is_known else flight.near_since
+    return Flight(times, places, height, is_over, near_since), None
 
 
 def _touching(

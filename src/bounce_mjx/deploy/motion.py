@@ -135,7 +135,7 @@ def paddle_position(metadata: Metadata, joint_angles: np.ndarray) -> np.ndarray:
 
 
 def paddle_normal(metadata: Metadata, joint_angles: np.ndarray) -> np.ndarray:
-    """Unit normal [..., 3] of the paddle's upper face in the world at joint angles [..., J], rad."""
+    """Unit normal [..., 3] of the paddle's upper face at joint angles [..., J] (rad)."""
     tip = tuple(np.add(metadata.paddle, metadata.paddle_normal).tolist())
     above = paddle_position(metadata._replace(paddle=tip), joint_angles)
     return above - paddle_position(metadata, joint_angles)

@@ -1,5 +1,5 @@
-"""An arm at rest is where its controller's target is: what is measured of it has to agree with that,
-and the tool's place by the controller's own kinematics with that of the policy's arm."""
+"""An arm at rest is where its controller's target is: what is measured of it has to agree with
+that, and the tool's place by the controller's own kinematics with that of the policy's arm."""
 
 from typing import NamedTuple
 

@@ -37,8 +37,8 @@ _BRIDGED_PICTURES = 4.0
 # Pictures of the same position are two if they are farther apart than this share of a control step:
 # the newest ones of two steps are half of it apart or more, whatever the camera's rate.
 _APART = 0.4
-# Time in which velocities and angles are compared, s; the least way that counts, rad, how much later
-# the velocities may be, s, and their errors as a share of the way.
+# Time in which velocities and angles are compared, s; the least way that counts, rad, how much
+# later the velocities may be, s, and their errors as a share of the way.
 _COMPARED = 0.1
 _LEAST_WAY = 0.01
 _VELOCITY_LAG = 0.02
@@ -290,7 +290,9 @@ class Samples:
         fastest = np.max([one.speeds for one in moved], axis=0)
         largest_way = np.maximum(np.abs(by_angles), fastest * duration)
         # One velocity may be wrong, and all a little late.
-        allowed = _LEAST_WAY + self._noise + (self._velocity_noise + self._velocity_bias) * duration
+        # The integral of a noise grows with the root of the time.
+        noise = self._velocity_noise * math.sqrt(duration * self._dt)
+        allowed = _LEAST_WAY + self._noise + noise + self._velocity_bias * duration
         allowed = allowed + fastest * (_VELOCITY_LAG + self._dt) + _OF_WAY * largest_way
         beyond = np.abs(by_angles - by_velocities) - allowed
         if beyond.max() <= 0.0:
