@@ -7,7 +7,7 @@ trainer brax's. The differences of the hyperparameters from ours:
 |--------------------------------------|----------------------------------------------------------|
 | settings not listed below            | the same                                                 |
 | compute_dtype                        | float32 (configs/default.yaml: bfloat16)                 |
-| min_noise_std                        | none (configs/default.yaml: 0.1)                         |
+| mean_noise_bound                     | none (configs/default.yaml: 0.1)                         |
 | value_cost                           | the same; passed doubled, as brax halves it              |
 | learning_rate, its limits, target_kl | the same; adapted by a factor of 1.5 (ours 1.1)          |
 | final_max_learning_rate, decay_steps | none: max_learning_rate stays                            |
@@ -34,7 +34,7 @@ from brax.envs.base import State, Wrapper
 from brax.training.agents.ppo.networks import PPONetworks
 from brax.training.distribution import NormalDistribution
 from brax.training.networks import FeedForwardNetwork
-from trainers import OnBlock, TrainingEnded, block_iterations
+from trainer_interface import OnBlock, TrainingEnded, block_iterations
 
 from bounce_mjx.adapters.brax import device_put_replicated
 from bounce_mjx.adapters.brax.ppo import ppo_settings

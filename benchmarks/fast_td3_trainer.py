@@ -24,7 +24,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import torch
-from trainers import OnBlock, TrainingEnded, use_source
+from trainer_interface import OnBlock, TrainingEnded, use_source
 
 from bounce_mjx.adapters.torch import TorchVectorEnv
 from bounce_mjx.env.bounce_ball import BounceBall

@@ -35,6 +35,7 @@ import numpy as np
 from bounce_mjx import load_policy
 from bounce_mjx.deploy.motion import paddle_position
 from bounce_mjx.errors import UserError
+from bounce_mjx.physics import CEngine
 from bounce_mjx.resources import POLICIES, resource_path
 from bounce_mjx.robot.model import BALLS_APART, find_addresses
 from bounce_mjx.runs.config import load_run_config
@@ -104,7 +105,8 @@ class Robot:
     def __init__(self, name: str, seed: int = 0):
         shared_model, env = _model(name)
         self.name = name
-        self.model = copy.copy(shared_model)
+        self.engine = CEngine(shared_model)
+        self.model = self.engine.model
         self.data = mujoco.MjData(self.model)
         self.random = np.random.default_rng(seed)
         self.sensors = REAL if env.randomization.ball_latency else PERFECT
@@ -184,7 +186,7 @@ class Robot:
                 self.data.ctrl[self.servos] = np.where(self.is_dead, self.angles, self.command)
                 if self.is_held:
                     self.hold()
-                mujoco.mj_step(self.model, self.data)
+                self.engine.step(self.data)
                 self._look()
 
     def _look(self) -> None:

@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box
 from gymnasium.vector.utils import batch_space
-from trainers import OnBlock, TrainingEnded, use_source
+from trainer_interface import OnBlock, TrainingEnded, use_source
 
 from bounce_mjx.adapters.torch import TorchVectorEnv
 from bounce_mjx.env.bounce_ball import BounceBall

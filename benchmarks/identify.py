@@ -23,7 +23,7 @@ from bounce_mjx.identify.excitation import excite
 from bounce_mjx.identify.reading import read_csv
 from bounce_mjx.identify.stages import Identified, identify
 from bounce_mjx.identify.world import estimates, to_yaml
-from bounce_mjx.physics import edited_model
+from bounce_mjx.physics import CEngine, edited_model
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import find_addresses, joint_names
 from bounce_mjx.runs.settings import read_preset
@@ -103,7 +103,8 @@ class _Robot:
 
     def __init__(self, config: WorldConfig, hidden: Hidden, seed: int):
         plain = world_model(config, visual=False)
-        self.model = edited_model(plain, physics_parameters(hidden.world, plain))
+        self.engine = CEngine(edited_model(plain, physics_parameters(hidden.world, plain)))
+        self.model = self.engine.model
         world = {name: np.asarray(value, float) for name, value in hidden.world.items()}
         self.data = mujoco.MjData(self.model)
         self.addresses = find_addresses(self.model)
@@ -176,7 +177,7 @@ class _Robot:
         force = -world.get("air_drag", 0.0) * np.linalg.norm(speed) * speed
         d.xfrc_applied[body, :3] = m.body_mass[body] * force
         before = self.ball()
-        mujoco.mj_step(m, d)
+        self.engine.step(d)
         if not self.has_ball:
             self.hold_ball()
         elif d.time >= self.due:

@@ -54,7 +54,7 @@ from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Actor, make_networks, untrained_policy
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.settings import read_preset
-from bounce_mjx.task.bounce import BounceConfig as EnvConfig
+from bounce_mjx.task.bounce import Config as EnvConfig
 from bounce_mjx.training.setup import compiler_options
 
 METHODS: tuple[Method, ...] = typing.get_args(Method)

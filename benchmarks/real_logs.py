@@ -44,7 +44,7 @@ from bounce_mjx.identify.reading import read_csv
 from bounce_mjx.identify.simulation import compensated, make_targets
 from bounce_mjx.identify.stages import identify
 from bounce_mjx.identify.world import describe_doubts, total_delay
-from bounce_mjx.physics import edited_model
+from bounce_mjx.physics import CEngine, edited_model
 from bounce_mjx.robot.model import find_addresses, joint_names
 from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.training.setup import set_up_jax
@@ -385,7 +385,8 @@ def speed_ratio(config: WorldConfig, world: dict[str, np.ndarray], speed: float)
       speed: at which the ball comes down, m/s.
     """
     plain = world_model(config, visual=False)
-    model = edited_model(plain, physics_parameters(world, plain))
+    engine = CEngine(edited_model(plain, physics_parameters(world, plain)))
+    model = engine.model
     addresses = find_addresses(model)
     ball = addresses.balls[0]
     paddle = addresses.paddle_geom
@@ -403,7 +404,7 @@ def speed_ratio(config: WorldConfig, world: dict[str, np.ndarray], speed: float)
         data.qpos[place] = [*data.geom_xpos[paddle][:2], top + fall]
         data.qvel[motion] = [0.0, 0.0, -np.sqrt(speed**2 - 2.0 * 9.81 * fall)]
         while data.qvel[motion][2] <= 0.0 or data.qpos[place][2] < top:
-            mujoco.mj_step(model, data)
+            engine.step(data)
         rise = data.qpos[place][2] - top
         ratios.append(np.sqrt(data.qvel[motion][2] ** 2 + 2.0 * 9.81 * rise) / speed)
     return float(np.mean(ratios))

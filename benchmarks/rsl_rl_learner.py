@@ -5,7 +5,7 @@ normalisation.
 |--------------------------------------|---------------------------------------------------------|
 | settings not listed below            | the same                                                |
 | compute_dtype                        | float32 (configs/default.yaml: bfloat16)                |
-| min_noise_std                        | none (configs/default.yaml: 0.1)                        |
+| mean_noise_bound                     | none (configs/default.yaml: 0.1)                        |
 | learning_rate                        | the same start; steered by a factor of 1.5 (here 1.1)   |
 | min_learning_rate, max_learning_rate | 1e-5 and 1e-2: fixed in rsl_rl                          |
 | final_max_learning_rate, decay_steps | none                                                    |

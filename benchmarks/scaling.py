@@ -32,7 +32,7 @@ from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.settings import read_preset
-from bounce_mjx.training.ppo_trainer import PPOTrainer, iterations_per_block
+from bounce_mjx.training.ppo_trainer import PPOTrainer
 from bounce_mjx.training.setup import set_up_jax
 
 Count = Annotated[int, Field(ge=1)]
@@ -167,7 +167,7 @@ def measure(command: Command) -> list[dict]:
 
 def steps_of(config: TrainConfig) -> int:
     """Steps of all seeds in one block."""
-    return config.num_seeds * iterations_per_block(config) * config.ppo.batch_steps
+    return config.num_seeds * config.steps_per_block
 
 
 def table(records: list[dict]) -> str:

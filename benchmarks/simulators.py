@@ -9,13 +9,14 @@ The last line records the logs from which `bounce-mjx identify` finds that simul
 
 The arm is rebuilt, link by link, from the environment's compiled model, as a URDF file: masses,
 inertias, hinges, torques and the paddle's box, but not the joints' own limits, damping and
-friction, nor a gravity compensation. Two numbers of a simulator are set before any policy acts, and
-printed: the coefficient of restitution, such that a ball that drops onto the paddle of the arm at
-rest rebounds with the world's restitution; and the time constant of the motors, such that a step of
-0.05 rad takes as long to 63% as MuJoCo's servos take. (`physx` has servos of the same stiffness and
-damping, and needs none.) The policy acts through `load_policy`, as on a robot: it sees the joints
-and the newest picture of the ball. The environment's own functions measure the results, and the
-supervisor's alarms but lost balls are counted. `mujoco` is the C engine, as a comparison.
+friction, nor a gravity compensation. The balls have the model's mass, radius, inertia and friction.
+Two numbers of a simulator are set before any policy acts, and printed: the coefficient of
+restitution, such that a ball that drops onto the paddle of the arm at rest rebounds with the
+world's restitution; and the time constant of the motors, such that a step of 0.05 rad takes as long
+to 63% as MuJoCo's servos take. (`physx` has servos of the same stiffness and damping, and needs
+none.) The policy acts through `load_policy`, as on a robot: it sees the joints and the newest
+picture of the ball. The environment's own functions measure the results, and the supervisor's
+alarms but lost balls are counted. `mujoco` is the C engine, as a comparison.
 """
 
 import argparse
@@ -44,6 +45,7 @@ from bounce_mjx.evaluation.episodes import reset_episodes
 from bounce_mjx.evaluation.results import Report, judge
 from bounce_mjx.evaluation.statistics import Statistics, accumulate, empty_statistics
 from bounce_mjx.identify.excitation import excite
+from bounce_mjx.physics import CEngine
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import choose_checkpoint
@@ -136,6 +138,8 @@ class Parts(NamedTuple):
     """Of the balls, m."""
     mass: float
     """Of a ball, kg."""
+    inertia: float
+    """Of a ball, kg m^2."""
     balls: int
 
 
@@ -229,6 +233,7 @@ def make_parts(model: mujoco.MjModel) -> Parts:
         armature=model.dof_armature[dofs],
         radius=float(model.geom_size[model.body_geomadr[balls[0]], 0]),
         mass=float(model.body_mass[balls[0]]),
+        inertia=float(model.body_inertia[balls[0], 0]),
         balls=len(balls),
     )
 
@@ -269,6 +274,9 @@ def bullet(parts: Parts, world: World, tuning: Tuning) -> Simulator:
     free = {"linearDamping": 0.0, "angularDamping": 0.0, "rollingFriction": 0.0}
     for body, link in [(arm, i) for i in joints] + [(ball, -1) for ball in balls]:
         p.changeDynamics(body, link, jointDamping=0.0, **touching, **free, physicsClientId=client)
+    for ball in balls:
+        # Bullet's own inertia is that of a solid ball.
+        p.changeDynamics(ball, -1, localInertiaDiagonal=[parts.inertia] * 3, physicsClientId=client)
     targets = np.zeros(len(joints))
 
     def reset(angles, positions, velocities):
@@ -351,6 +359,8 @@ def physx(parts: Parts, world: World, tuning: Tuning) -> Simulator:
         ball = builder.build().find_component_by_type(sapien.physx.PhysxRigidDynamicComponent)
         ball.set_linear_damping(0.0)
         ball.set_angular_damping(0.0)
+        # The builder's own inertia is that of a solid ball.
+        ball.set_inertia(np.full(3, parts.inertia))
         balls.append(ball)
 
     def reset(angles, positions, velocities):
@@ -401,8 +411,8 @@ def dart(parts: Parts, world: World, tuning: Tuning) -> Simulator:
         node = body.createShapeNode(dartpy.dynamics.SphereShape(parts.radius))
         node.createCollisionAspect()
         node.createDynamicsAspect()
-        moment = 0.4 * parts.mass * parts.radius**2
-        body.setInertia(dartpy.dynamics.Inertia(parts.mass, np.zeros(3), np.diag([moment] * 3)))
+        moments = np.diag([parts.inertia] * 3)
+        body.setInertia(dartpy.dynamics.Inertia(parts.mass, np.zeros(3), moments))
         balls.append(ball)
     for skeleton in (arm, *balls):
         for k in range(skeleton.getNumBodyNodes()):
@@ -447,6 +457,8 @@ def dart(parts: Parts, world: World, tuning: Tuning) -> Simulator:
 
 def own_engine(model: mujoco.MjModel) -> Simulator:
     """MuJoCo itself, in whose servos' time a step is measured for the others."""
+    engine = CEngine(model)
+    model = engine.model
     addresses = find_addresses(model)
     data = mujoco.MjData(model)
     qpos = list(addresses.arm_qpos)
@@ -478,7 +490,7 @@ def own_engine(model: mujoco.MjModel) -> Simulator:
         lambda: (data.qpos[qpos], data.qvel[qvel]),
         ball_state,
         servo_targets,
-        lambda: mujoco.mj_step(model, data),
+        functools.partial(engine.step, data),
         lambda: None,
     )
 

@@ -5,7 +5,7 @@ normalisation.
 |------------------------------|---------------------------------------------------------------|
 | settings not listed below    | the same                                                      |
 | compute_dtype                | float32 (configs/default.yaml: bfloat16)                      |
-| min_noise_std                | none (configs/default.yaml: 0.1)                              |
+| mean_noise_bound             | none (configs/default.yaml: 0.1)                              |
 | target_kl                    | adapts once per epoch by 1.5 (here once per minibatch by 1.1) |
 | optimizer                    | Adam's epsilon is 1e-8 (here 1e-5)                            |
 | advantages                   | normalised over the whole rollout (here in each minibatch)    |

@@ -12,44 +12,21 @@ library that it measures.
 
 import concurrent.futures
 import functools
-import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Literal, Protocol
 
 import jax
 import jax.numpy as jnp
+from trainer_interface import OnBlock, block_iterations
 
 from bounce_mjx.env.bounce_ball import BounceBall
-from bounce_mjx.errors import UserError
-from bounce_mjx.learning.policy import Actor, Policy
+from bounce_mjx.learning.policy import Policy
 from bounce_mjx.learning.ppo import PPO, policy_of
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training.setup import compiler_options
 
 Method = Literal["ours", "brax", "brax_mjx", "rsl_rl", "skrl", "fast_td3", "flash_sac"]
-
-
-class TrainingEnded(Exception):
-    """Ends the training of a library that offers no other way to stop."""
-
-
-class OnBlock(Protocol):
-    """Callbacks of a trainer."""
-
-    def prepare(self, actor: Actor | None = None, policy: Any = None) -> None:
-        """Called once before the first block: starts to compile the evaluation, in a thread. Ours
-        calls it after its own tracing; the tracing of brax, and the setup of the others, share
-        Python's lock with that of the evaluation.
-
-        Args:
-          actor: what acts with the policies of the blocks; None for this project's networks.
-          policy: a policy of that actor.
-        """
-
-    def __call__(self, steps: int, seconds: float, policy: Policy | Any) -> bool:
-        """Called after every block; returns whether the training may end."""
 
 
 def train_ours(config: TrainConfig, on_block: OnBlock) -> None:
@@ -148,22 +125,6 @@ def train_flash_sac(config: TrainConfig, on_block: OnBlock) -> None:
     import flash_sac_trainer
 
     flash_sac_trainer.train(config, on_block)
-
-
-def use_source(folder: Path) -> None:
-    """Makes the modules of a cloned repository importable.
-
-    Raises:
-      UserError: it was not cloned.
-    """
-    if not folder.is_dir():
-        raise UserError(f"{folder} is missing; clone it as the head of its trainer says")
-    sys.path.insert(0, str(folder))
-
-
-def block_iterations(config: TrainConfig) -> int:
-    """Iterations between two evaluations."""
-    return max(1, round(config.eval_every / config.ppo.batch_steps))
 
 
 TRAINERS: dict[Method, Callable[[TrainConfig, OnBlock], None]] = {

@@ -1,6 +1,8 @@
-"""Prints the reference of the public names, generated from their docstrings and signatures:
+"""Prints the index of the public names, generated from their docstrings:
 
 python docs/api_reference.py > docs/api.md
+
+The site has `reference` in its place: the whole docstrings, with the signatures (`site_hooks.py`).
 """
 
 import logging
@@ -12,24 +14,30 @@ import griffe
 
 SOURCE = Path(__file__).resolve().parent.parent / "src"
 
-_HEAD = """# API reference
+_INDEX_HEAD = """# API reference
 
-Look up any public name: its arguments, fields, shapes, units and errors. Arrays have the shapes in
-square brackets: `[B, 29]` is a batch of B observations. The settings are in the [config
-reference](config.md). `BounceBall`, `EnvConfig` (`BounceConfig`), `train`, `Run` and `load_policy`
-are also names of `bounce_mjx` itself.
+Look up where a public name is and what it is. Its arguments, fields, shapes, units and errors are
+in its docstring: `help(Env.step)`, or this page on the site (`uv run mkdocs serve`). {shared}
 
 `python docs/api_reference.py > docs/api.md` writes this page.
 """
+_HEAD = """# API reference
+
+Look up any public name: its arguments, fields, shapes, units and errors. {shared}
+"""
+_SHARED = """Arrays have the
+shapes in square brackets: `[B, 29]` is a batch of B observations. The settings are in the [config
+reference](config.md). `BounceBall`, `EnvConfig` (`Bounce.Config`), `train`, `Run` and `load_policy`
+are also names of `bounce_mjx` itself."""
 
 # The title of a section, a sentence about it, and its names; of a module, all public ones.
 _SECTIONS = (
     (
         "The environment",
         "",
-        "env.env.Env env.bounce_ball.BounceBall task.bounce.BounceConfig env.env.State "
+        "env.env.Env env.bounce_ball.BounceBall task.bounce.Config env.env.State "
         "world.observation.ObservationLayout world.observation.Kinematics "
-        "physics.parameters.PhysicsParameters",
+        "physics.parameters.PhysicsParameters physics.c_engine.CEngine",
     ),
     ("Batches of environments", "", "env.vector"),
     (
@@ -37,7 +45,7 @@ _SECTIONS = (
         "All but `find_task` are names of `bounce_mjx.task`. "
         "[Write a task](tasks.md#write-a-task) shows their use.",
         "task.task world.config.WorldConfig world.config.Command world.observation.Quantity "
-        "task.results task.registry.find_task",
+        "world.limits task.results task.registry.find_task",
     ),
     (
         "Policies on a robot",
@@ -54,7 +62,7 @@ _SECTIONS = (
         "learning.policy.make_networks learning.policy.networks_of learning.policy.Networks "
         "baselines.mirror.MirrorLaw",
     ),
-    ("Rewards", "", "task.rewards task.bounce_rewards.RewardInputs"),
+    ("Rewards", "", "task.rewards task.flights task.bounce_rewards.RewardInputs"),
     ("Robots", "", "robot.config.RobotConfig robot.adopt.adopt"),
     (
         "Evaluation",
@@ -94,33 +102,61 @@ _SECTIONS = (
 
 
 def main() -> None:
-    """Prints the page."""
-    print(reference(), end="")
+    """Prints the index."""
+    print(index(), end="")
+
+
+def index() -> str:
+    """The page with a line for each name, Markdown."""
+    parts = [_INDEX_HEAD.format(shared=_SHARED).rstrip()]
+    for heading, members in _sections():
+        rows = [
+            f"| [`{member.parent.path}.{member.name}`]({_source(member)}) | {_summary(member)} |"
+            for member in members
+        ]
+        parts.append(heading)
+        parts.append("\n".join(["| name | what it is |", "|---|---|", *rows]))
+    return "\n\n".join(parts) + "\n"
 
 
 def reference() -> str:
-    """The whole page, Markdown."""
-    logging.getLogger("griffe").setLevel(logging.ERROR)  # of arguments without a type
-    package = griffe.load("bounce_mjx", search_paths=[str(SOURCE)], docstring_parser="google")
-    return _HEAD + "".join(
-        _section(package, title, sentence, names.split()) for title, sentence, names in _SECTIONS
-    )
-
-
-def _section(package: griffe.Object, title: str, sentence: str, names: list[str]) -> str:
-    """A section with an entry for each name; a module has one for each of its public names."""
-    parts = [f"## {title}", sentence] if sentence else [f"## {title}"]
-    for name in names:
-        documented = package[name]
-        if documented.is_module:
-            members = [x for _, x in _public(documented) if x.is_class or x.is_function]
-        else:
-            members = [documented]
+    """The page with the signatures and the whole docstrings, Markdown."""
+    parts = [_HEAD.format(shared=_SHARED).rstrip()]
+    for heading, members in _sections():
+        parts.append(heading)
         for member in members:
             parts.append(f"### {member.name}")
             parts.append(f"`from {member.parent.path} import {member.name}`")
             parts += _class(member) if member.is_class else _entry(member)
-    return "\n" + "\n\n".join(parts) + "\n"
+    return "\n\n".join(parts) + "\n"
+
+
+def _sections() -> Iterator[tuple[str, list[griffe.Object]]]:
+    """The heading of each section and its objects: of a module, all its public ones."""
+    logging.getLogger("griffe").setLevel(logging.ERROR)  # of arguments without a type
+    package = griffe.load("bounce_mjx", search_paths=[str(SOURCE)], docstring_parser="google")
+    for title, sentence, names in _SECTIONS:
+        members = []
+        for name in names.split():
+            documented = package[name]
+            if documented.is_module:
+                public = [member for _, member in _public(documented)]
+                members += [x for x in public if x.is_class or x.is_function]
+            else:
+                members.append(documented)
+        yield (f"## {title}\n\n{sentence}" if sentence else f"## {title}"), members
+
+
+def _source(documented: griffe.Object) -> str:
+    """The link from the page to the file."""
+    return f"../src/{documented.relative_package_filepath.as_posix()}"
+
+
+def _summary(documented: griffe.Object) -> str:
+    """The first sentence of the docstring, in a cell of a table."""
+    paragraph, *_ = documented.docstring.value.split("\n\n")
+    sentence, end, _ = (" ".join(paragraph.split()) + " ").partition(". ")
+    return f"{sentence}{end.strip()}".strip().replace("|", "\\|")
 
 
 def _class(documented: griffe.Class) -> Iterator[str]:

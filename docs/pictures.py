@@ -186,7 +186,7 @@ def rollout(observation=None, randomization=None, seconds=3.0, target=0.5):
     from bounce_mjx.runs.checkpoints import read_policy
     from bounce_mjx.runs.config import load_run_config
     from bounce_mjx.runs.folders import pretrained_checkpoint
-    from bounce_mjx.task.bounce import BounceConfig as EnvConfig
+    from bounce_mjx.task.bounce import Config as EnvConfig
 
     checkpoint = pretrained_checkpoint()
     config = load_run_config(checkpoint.run)

@@ -9,7 +9,7 @@ import re
 from pathlib import Path
 
 from bounce_mjx.task import RewardTerm, term_names
-from bounce_mjx.task.bounce_rewards import BounceReward
+from bounce_mjx.task.bounce_rewards import Rewards
 
 PAGE = Path(__file__).parent / "task.md"
 _TABLE = re.compile(r"(?<=<!-- reward terms -->\n)(\|.*\n)+")
@@ -27,9 +27,9 @@ def with_table(page: str) -> str:
 
 def table() -> str:
     """The table, Markdown."""
-    defaults = BounceReward()
+    defaults = Rewards()
     rows = ["| term | weight | formula |", "|---|---|---|"]
-    for name in term_names(BounceReward):
+    for name in term_names(Rewards):
         term = getattr(defaults, name)
         weight = repr(term.weight).replace("e-0", "e-")
         rows.append(f"| `{name}` | {weight} | `{formula(term)}` |")

@@ -1,7 +1,9 @@
-"""Puts the files outside this folder to which the pages link on the site (`mkdocs.yml`)."""
+"""Puts the files outside this folder to which the pages link on the site (`mkdocs.yml`), and the
+whole API reference."""
 
 import re
 from pathlib import Path
+from runpy import run_path
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.plugins import event_priority
@@ -26,7 +28,10 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Links between pages of this folder and files outside it, from the places on the site."""
+    """Links between pages of this folder and files outside it, from the places on the site; in
+    place of the index of the public names, their whole reference."""
+    if page.file.src_uri == "api.md":
+        return run_path(str(CHECKOUT / "docs/api_reference.py"))["reference"]()
     if page.file.generated_by:
         return re.sub(r"\]\((\.\./)?docs/", r"](\1", markdown)
     return markdown.replace("](../", "](")

@@ -137,6 +137,8 @@ def simulate(
 
         for command in commands:
             data.ctrl[:] = command
+            # The contact has no friction. Of one that has, `mj_step` would compute MuJoCo's own, in
+            # place of the package's: `bounce_mjx.physics.CEngine` has that, but needs JAX.
             mujoco.mj_step(model, data)
             if arm.state not in ("running", "braking"):
                 # Somebody holds the ball until the arm is ready.

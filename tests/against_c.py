@@ -1,5 +1,9 @@
-"""The physics against MuJoCo's C engine: random states, steps of both, and their differences."""
+"""The physics against MuJoCo's C engine: random states, steps of both, and their differences.
 
+The friction of a ball is Coulomb's impulse after each of C's steps (`Coulomb`), written here anew.
+"""
+
+import copy
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -19,7 +23,7 @@ from bounce_mjx.physics import (
 )
 from bounce_mjx.physics.fused import dynamics
 from bounce_mjx.resources import resource_path
-from bounce_mjx.robot.model import find_addresses
+from bounce_mjx.robot.model import BallAddresses, find_addresses, load_model
 
 HOME = np.deg2rad([0.0, 40.0, 110.0, 0.0, -60.0, 0.0])
 HALF_SIZE = np.array([0.05, 0.065, 0.0035])
@@ -127,6 +131,41 @@ def touching_states(model: mujoco.MjModel, count: int, seed: int) -> States:
     return states
 
 
+def balls_model(num_balls: int, friction: float | None = None) -> mujoco.MjModel:
+    """Shipped model with several balls, and a C solver that converges to rounding error."""
+    model = load_model(None, 0.001, num_balls=num_balls)
+    if friction is not None:
+        model.pair_dim[:], model.pair_friction[:, :2] = 3, friction
+    return converged(model)
+
+
+def hostile_states(model: mujoco.MjModel, count: int, seed: int) -> States:
+    """The first ball as in `random_states`. Each further ball is close to one before it, in a
+    random direction or along a face of the paddle, which both then touch, or overlaps with it
+    deeply; some of the balls are fast."""
+    rng = np.random.default_rng(seed)
+    num_balls = (model.nq - 6) // 7
+    first, _ = random_states(load_model(None, 0.001), count, seed)
+    qpos, qvel = np.zeros((count, model.nq)), np.zeros((count, model.nv))
+    qpos[:, :13], qvel[:, :12] = first.qpos, first.qvel
+    for i in range(count):
+        _, axes = paddle_frame(model, qpos[i, :6])
+        for ball in range(1, num_balls):
+            direction = rng.normal(size=3)
+            if rng.uniform() < 0.6:
+                direction = axes @ (direction * [1.0, 1.0, 0.1])
+            direction /= np.linalg.norm(direction)
+            other = 6 + 7 * rng.integers(ball)
+            distance = 2.0 * RADIUS * (1.0 + rng.choice([rng.uniform(-0.03, 0.01), -0.6]))
+            at, speeds = 6 + 7 * ball, 6 + 6 * ball
+            qpos[i, at : at + 3] = qpos[i, other : other + 3] + distance * direction
+            quaternion = rng.normal(size=4)
+            qpos[i, at + 3 : at + 7] = quaternion / np.linalg.norm(quaternion)
+            qvel[i, speeds : speeds + 3] = rng.uniform(-3.0, 3.0, 3) * rng.choice([1.0, 10.0])
+            qvel[i, speeds + 3 : speeds + 6] = rng.uniform(-30.0, 30.0, 3)
+    return States(qpos, qvel, first.ctrl)
+
+
 def bouncing_states(mj_model: mujoco.MjModel, rng: np.random.Generator) -> PhysicsState:
     """BATCH states with the arm near home and a spinning ball just above the paddle."""
     qpos, qvel = np.zeros((BATCH, mj_model.nq)), np.zeros((BATCH, mj_model.nv))
@@ -153,28 +192,166 @@ def drop_ball(
     qvel[at.balls[i].qvel,] = [*velocity, *rng.uniform(-30.0, 30.0, 3)]
 
 
+def frictionless(model: mujoco.MjModel) -> mujoco.MjModel:
+    """Copy of the model in which no contact pair has friction."""
+    copied = copy.copy(model)
+    copied.pair_dim[:] = 1
+    return copied
+
+
+class Coulomb:
+    """C's step of a model whose pairs have no friction, and then the impulse of each of them.
+
+    Written without `physics.friction`: in the world, with the arm's full mass matrix, and with the
+    mass, the inertia and the radius of each ball.
+    """
+
+    def __init__(self, model: mujoco.MjModel):
+        """
+        Args:
+          model: with friction where a pair has `condim="3"`.
+        """
+        self.balls = find_addresses(model).balls
+        self.pairs = []
+        for pair in np.flatnonzero(model.pair_dim > 1):
+            geoms = {int(model.pair_geom1[pair]), int(model.pair_geom2[pair])}
+            touching = [i for i, ball in enumerate(self.balls) if ball.geom in geoms]
+            self.pairs.append((len(touching), touching, geoms, float(model.pair_friction[pair, 0])))
+        # Those with the paddle first.
+        self.pairs.sort(key=lambda pair: pair[:2])
+        self.model = frictionless(model) if self.pairs else model
+        of_balls = {dof for ball in self.balls for dof in ball.qvel}
+        self.arm = [dof for dof in range(model.nv) if dof not in of_balls]
+
+    def step(self, data: mujoco.MjData) -> np.ndarray:
+        """Advances data of `model` in place; returns the force of the first contact [3] along its
+        normal and its tangents, N, NaN without a contact."""
+        mujoco.mj_step(self.model, data)
+        first = np.full(3, np.nan)
+        if not data.ncon:
+            return first
+        normal_forces = []
+        for i in range(data.ncon):
+            wrench = np.zeros(6)
+            mujoco.mj_contactForce(self.model, data, i, wrench)
+            normal_forces.append(wrench[0])
+        first[:] = normal_forces[0], 0.0, 0.0
+        for _, balls, geoms, coefficient in self.pairs:
+            for i, contact in enumerate(data.contact):
+                if set(contact.geom.tolist()) != geoms:
+                    continue
+                largest = coefficient * normal_forces[i] * self.model.opt.timestep
+                impulse = self._impulse(data, balls, contact, largest)
+                if i == 0:
+                    along_axes = contact.frame.reshape(3, 3) @ impulse
+                    first[1:] = along_axes[1:] / self.model.opt.timestep
+        return first
+
+    def _impulse(
+        self, data: mujoco.MjData, balls: list[int], contact: mujoco.MjContact, largest: float
+    ) -> np.ndarray:
+        """Impulse [3] on the last ball of a contact, of at most `largest`; changes the velocities.
+
+        Positions, normals and the mass matrix of the data are those of the step's start."""
+        *others, last = (self.balls[i] for i in balls)
+        normal = contact.frame[:3] if contact.geom[1] == last.geom else -contact.frame[:3]
+        slip, mobility = self._surface(data, last, -normal)
+        if others:
+            velocity, of_other = self._surface(data, others[0], normal)
+        else:
+            point = data.xpos[last.body] - self.model.geom_size[last.geom, 0] * normal
+            velocity, of_other, arm_change = self._paddle(data, point)
+        slip = slip - velocity
+        slip -= normal * (normal @ slip)
+        speed = np.linalg.norm(slip)
+        if speed == 0.0:
+            return np.zeros(3)
+        to_stop = speed**2 / (slip @ (mobility + of_other) @ slip)
+        impulse = -min(to_stop, largest / speed) * slip
+        self._push(data, last, -normal, impulse)
+        if others:
+            self._push(data, others[0], normal, -impulse)
+        else:
+            data.qvel[self.arm] -= arm_change @ impulse
+        return impulse
+
+    def _surface(
+        self, data: mujoco.MjData, ball: BallAddresses, towards: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Velocity [3] of a ball's surface, and what an impulse there changes of it [3, 3]."""
+        radius = self.model.geom_size[ball.geom, 0]
+        spin = ball_rotation(data, ball) @ data.qvel[list(ball.qvel[3:])]
+        velocity = data.qvel[list(ball.qvel[:3])] + radius * np.cross(spin, towards)
+        tangential = np.eye(3) - np.outer(towards, towards)
+        by_mass = np.eye(3) / self.model.body_mass[ball.body]
+        by_inertia = radius**2 / self.model.body_inertia[ball.body, 0] * tangential
+        return velocity, by_mass + by_inertia
+
+    def _paddle(
+        self, data: mujoco.MjData, point: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The same of a point of the paddle, and the joints' velocities per impulse [n, 3]."""
+        model = self.model
+        jacobian, mass_matrix = np.zeros((3, model.nv)), np.zeros((model.nv, model.nv))
+        paddle = model.geom_bodyid[find_addresses(model).paddle_geom]
+        mujoco.mj_jac(model, data, jacobian, None, point, paddle)
+        mujoco.mj_fullM(model, data, mass_matrix)
+        of_arm = jacobian[:, self.arm]
+        arm_change = np.linalg.solve(mass_matrix[np.ix_(self.arm, self.arm)], of_arm.T)
+        return of_arm @ data.qvel[self.arm], of_arm @ arm_change, arm_change
+
+    def _push(
+        self, data: mujoco.MjData, ball: BallAddresses, towards: np.ndarray, impulse: np.ndarray
+    ) -> None:
+        """Gives a ball an impulse on its surface."""
+        lever = self.model.geom_size[ball.geom, 0] * towards
+        spin_change = np.cross(lever, impulse) / self.model.body_inertia[ball.body, 0]
+        data.qvel[list(ball.qvel[:3])] += impulse / self.model.body_mass[ball.body]
+        data.qvel[list(ball.qvel[3:])] += ball_rotation(data, ball).T @ spin_change
+
+
+def ball_rotation(data: mujoco.MjData, ball: BallAddresses) -> np.ndarray:
+    """Rotation [3, 3] from the frame of a ball to the world."""
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, data.qpos[list(ball.qpos[3:])])
+    return rotation.reshape(3, 3)
+
+
 def c_steps(
     models: mujoco.MjModel | list[mujoco.MjModel], states: States
 ) -> tuple[PhysicsState, np.ndarray]:
-    """One mj_step from each state in its own model or in the same, and the force of the first
-    contact [N, 3] in its own frame; NaN without a contact."""
-    models = models if isinstance(models, list) else [models] * len(states.qpos)
+    """One step of C (`Coulomb`) from each state in its own model or in the same, and the force of
+    the first contact [N, 3] along its normal and its tangents; NaN without a contact."""
+    if isinstance(models, list):
+        laws = [Coulomb(model) for model in models]
+    else:
+        laws = [Coulomb(models)] * len(states.qpos)
     after, forces = [], []
-    for model, *start in zip(models, *states, strict=True):
-        data = mujoco.MjData(model)
+    for law, *start in zip(laws, *states, strict=True):
+        data = mujoco.MjData(law.model)
         data.qpos[:], data.qvel[:], data.ctrl[:] = start
-        mujoco.mj_step(model, data)
-        wrench = np.full(6, np.nan)
-        if data.ncon:
-            mujoco.mj_contactForce(model, data, 0, wrench)
+        forces.append(law.step(data))
         after.append((data.qpos.copy(), data.qvel.copy()))
-        forces.append(wrench[:3])
     return PhysicsState(*map(np.array, zip(*after, strict=True))), np.array(forces)
 
 
 def num_contacts(forces: np.ndarray) -> int:
     """Number of states with a contact, from the forces of `c_steps`."""
     return int(np.sum(~np.isnan(forces[:, 0])))
+
+
+def num_pressed(model: mujoco.MjModel, states: States) -> np.ndarray:
+    """Number of contacts with a force in each state."""
+    model = frictionless(model)
+    data, pressed = mujoco.MjData(model), []
+    for data.qpos[:], data.qvel[:], data.ctrl[:] in zip(*states, strict=True):
+        mujoco.mj_forward(model, data)
+        force, forces = np.zeros(6), 0
+        for contact in range(data.ncon):
+            mujoco.mj_contactForce(model, data, contact, force)
+            forces += force[0] > 0.0
+        pressed.append(forces)
+    return np.array(pressed)
 
 
 def world(parameters: PhysicsParameters, i: int | slice) -> PhysicsParameters:
@@ -201,22 +378,25 @@ def fused_steps(model: mujoco.MjModel, parameters: PhysicsParameters, states: St
         )
 
 
-class CEngine:
+class CBatch:
     """Batch of MuJoCo simulations with their own states, and their own models or the same."""
 
     def __init__(self, models: mujoco.MjModel | list[mujoco.MjModel], start: PhysicsState):
-        self.models = models if isinstance(models, list) else [models] * len(start.qpos)
-        self.data = [mujoco.MjData(model) for model in self.models]
+        if isinstance(models, list):
+            self.laws = [Coulomb(model) for model in models]
+        else:
+            self.laws = [Coulomb(models)] * len(start.qpos)
+        self.data = [mujoco.MjData(law.model) for law in self.laws]
         for data, qpos, qvel in zip(self.data, *start[:2], strict=True):
             data.qpos[:], data.qvel[:] = qpos, qvel
 
     def step(self, ctrl: np.ndarray, num_substeps: int) -> int:
         """Advances all simulations; returns the number of steps with a contact."""
         contacts = 0
-        for model, data, targets in zip(self.models, self.data, ctrl, strict=True):
+        for law, data, targets in zip(self.laws, self.data, ctrl, strict=True):
             data.ctrl[:] = targets
             for _ in range(num_substeps):
-                mujoco.mj_step(model, data)
+                law.step(data)
                 contacts += data.ncon
         return contacts
 
@@ -263,7 +443,7 @@ def free_run(
     step = jax.jit(
         jax.vmap(lambda p, s, u: engine.step(p, s, Control(u), 10), in_axes=(axes, 0, 0))
     )
-    state, c, shifted = start, CEngine(models, start), CEngine(models, start)
+    state, c, shifted = start, CBatch(models, start), CBatch(models, start)
     contacts, errors, apart, seen = 0, np.zeros(count), np.zeros(count), []
     for i in range(200):
         state = PhysicsState(*(np.array(x) for x in state[:2]))

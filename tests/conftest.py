@@ -29,7 +29,7 @@ from bounce_mjx import BounceBall
 from bounce_mjx.commands.main import main
 from bounce_mjx.errors import UserError
 from bounce_mjx.robot.model import load_model
-from bounce_mjx.task.bounce import BounceConfig as EnvConfig
+from bounce_mjx.task.bounce import Config as EnvConfig
 from bounce_mjx.training.setup import JOINED_LOOPS
 from bounce_mjx.viewers.offscreen import choose_opengl
 

@@ -18,6 +18,7 @@ def own_parameters(mj_model: mujoco.MjModel) -> PhysicsParameters:
     return PhysicsParameters(
         ball_mass=mj_model.body_mass[at.balls[0].body],
         ball_radius=mj_model.geom_size[at.balls[0].geom, 0],
+        ball_inertia=np.float64(0.4),
         contact_stiffness=np.float64(stiffness),
         contact_damping=np.float64(damping),
         servo_gain=mj_model.actuator_gainprm[at.actuators, 0],

@@ -11,15 +11,15 @@ import pytest
 from against_c import (
     HOME,
     MODEL,
-    RADIUS,
     States,
     assert_same_step,
+    balls_model,
     c_models,
     c_steps,
-    converged,
+    differences,
     free_run,
-    paddle_frame,
-    random_states,
+    hostile_states,
+    num_pressed,
 )
 from bounce_mjx import task
 from bounce_mjx.env.env import Env
@@ -29,50 +29,12 @@ from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, make_en
 from bounce_mjx.physics.edited import edited_model
 from bounce_mjx.physics.support import unsupported_feature
 from bounce_mjx.resources import resource_path
-from bounce_mjx.robot.model import add_balls, find_addresses, load_model
+from bounce_mjx.robot.model import add_balls, find_addresses
 from bounce_mjx.world.randomization import RandomizationConfig
 from bounce_mjx.world.sampling import nominal_values, physics_parameters
 from random_worlds import random_parameters
 from rest_task import Rest
-from test_friction import sticking_and_sliding
-
-
-def balls_model(
-    num_balls: int, friction: float | tuple[float, float] | None = None
-) -> mujoco.MjModel:
-    """Shipped model with several balls, and a C solver that converges to rounding error; `friction`
-    is that along both tangents, or along each."""
-    model = load_model(None, 0.001, num_balls=num_balls)
-    if friction is not None:
-        model.pair_dim[:], model.pair_friction[:, :2] = 3, friction
-    return converged(model)
-
-
-def hostile_states(model: mujoco.MjModel, count: int, seed: int) -> States:
-    """The first ball as in `random_states`. Each further ball is close to one before it, in a
-    random direction or along a face of the paddle, which both then touch, or overlaps with it
-    deeply; some of the balls are fast."""
-    rng = np.random.default_rng(seed)
-    num_balls = (model.nq - 6) // 7
-    first, _ = random_states(load_model(None, 0.001), count, seed)
-    qpos, qvel = np.zeros((count, model.nq)), np.zeros((count, model.nv))
-    qpos[:, :13], qvel[:, :12] = first.qpos, first.qvel
-    for i in range(count):
-        _, axes = paddle_frame(model, qpos[i, :6])
-        for ball in range(1, num_balls):
-            direction = rng.normal(size=3)
-            if rng.uniform() < 0.6:
-                direction = axes @ (direction * [1.0, 1.0, 0.1])
-            direction /= np.linalg.norm(direction)
-            other = 6 + 7 * rng.integers(ball)
-            distance = 2.0 * RADIUS * (1.0 + rng.choice([rng.uniform(-0.03, 0.01), -0.6]))
-            at, speeds = 6 + 7 * ball, 6 + 6 * ball
-            qpos[i, at : at + 3] = qpos[i, other : other + 3] + distance * direction
-            quaternion = rng.normal(size=4)
-            qpos[i, at + 3 : at + 7] = quaternion / np.linalg.norm(quaternion)
-            qvel[i, speeds : speeds + 3] = rng.uniform(-3.0, 3.0, 3) * rng.choice([1.0, 10.0])
-            qvel[i, speeds + 3 : speeds + 6] = rng.uniform(-30.0, 30.0, 3)
-    return States(qpos, qvel, first.ctrl)
+from test_friction import c_engine_steps, sticking_and_sliding
 
 
 def compiled_steps(model: mujoco.MjModel, parameters: PhysicsParameters, states: States):
@@ -82,27 +44,10 @@ def compiled_steps(model: mujoco.MjModel, parameters: PhysicsParameters, states:
     return steps(parameters, PhysicsState(*states[:2]), states.ctrl)
 
 
-def num_pressed(model: mujoco.MjModel, states: States) -> np.ndarray:
-    """Number of contacts with a force in each state."""
-    data, pressed = mujoco.MjData(model), []
-    for data.qpos[:], data.qvel[:], data.ctrl[:] in zip(*states, strict=True):
-        mujoco.mj_forward(model, data)
-        force, forces = np.zeros(6), 0
-        for contact in range(data.ncon):
-            mujoco.mj_contactForce(model, data, contact, force)
-            forces += force[0] > 0.0
-        pressed.append(forces)
-    return np.array(pressed)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("num_balls", "friction"),
-    # Newton's method is slow for the last one.
-    [(2, None), (3, None), (2, 0.3), (2, (0.02, 0.2))],
-)
+@pytest.mark.parametrize(("num_balls", "friction"), [(2, None), (3, None), (2, 0.3), (3, 0.05)])
 def test_one_step_of_several_balls_is_mujocos(num_balls, friction, float64):
-    """From states with one to all contacts at once."""
+    """From states with one to all contacts at once; the impulses of friction follow in order."""
     model = balls_model(num_balls, friction)
     assert unsupported_feature(model, "fused") is None
     count = 1000
@@ -111,6 +56,8 @@ def test_one_step_of_several_balls_is_mujocos(num_balls, friction, float64):
     assert min(np.sum(pressed == n) for n in range(1, num_balls + 2)) >= 20
     expected, _ = c_steps(model, states)
     assert_same_step(compiled_steps(model, MODEL, states), expected)
+    if friction is not None:
+        assert_same_step(c_engine_steps(model, states), expected)
 
 
 def test_terms_are_of_each_ball_or_refused_where_the_balls_differ(tmp_path, float64):
@@ -213,15 +160,20 @@ def test_the_gradient_of_touching_balls_is_that_of_finite_differences(float64):
 @pytest.mark.slow
 @pytest.mark.separate_loops
 def test_mjx_agrees_on_several_balls(float64):
-    model, count = balls_model(2), 8
+    """With friction, between the balls too."""
+    model, count = balls_model(2, 0.3), 8
     states = hostile_states(model, 64, seed=4)
     some = np.flatnonzero(num_pressed(model, states) >= 2)[:count]
-    expected, _ = c_steps(model, States(*(x[some] for x in states)))
+    states = States(*(x[some] for x in states))
+    expected, _ = c_steps(model, states)
     step = jax.jit(jax.vmap(lambda s, u: make_engine(model, "mjx").step(MODEL, s, Control(u), 1)))
-    after = step(PhysicsState(*(x[some] for x in states[:2])), states.ctrl[some])
-    fastest = np.max(np.abs(expected.qvel), axis=1, keepdims=True)
-    # MJX's solver stops at errors up to 2e-5.
-    assert np.max(np.abs(np.asarray(after.qvel) - expected.qvel) / fastest) < 1e-4
+    after = step(PhysicsState(*states[:2]), states.ctrl)
+    error = differences(PhysicsState(*map(np.asarray, after[:2])), expected)
+    error /= np.max(np.abs(expected.qvel), axis=1)
+    assert np.sum(error < 1e-11) >= 6
+    # From some states of three contacts MJX's solver stops at errors up to 2e-5, without friction
+    # too, and the small inertia of a ball magnifies them.
+    assert np.max(error) < 1e-2
 
 
 class Two(Rest):

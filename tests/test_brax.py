@@ -29,7 +29,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.task import term_names
-from bounce_mjx.task.bounce_rewards import BounceReward
+from bounce_mjx.task.bounce_rewards import Rewards
 
 
 def all_finite(tree) -> bool:
@@ -149,7 +149,7 @@ def train(trainer, env, networks, **settings):
 
 def assert_evaluated(metrics):
     """The evaluation reports the return and its terms, and the terms sum to the return."""
-    terms = [float(metrics[f"eval/episode_reward/{name}"]) for name in term_names(BounceReward)]
+    terms = [float(metrics[f"eval/episode_reward/{name}"]) for name in term_names(Rewards)]
     np.testing.assert_allclose(metrics["eval/episode_reward"], sum(terms), rtol=1e-4)
     assert 0.0 < metrics["eval/avg_episode_length"] <= 20.0
     assert all_finite(list(metrics.values()))

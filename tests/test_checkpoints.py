@@ -34,7 +34,7 @@ from bounce_mjx.runs.folders import (
 )
 from bounce_mjx.runs.records import verify
 from bounce_mjx.runs.settings import read_preset
-from bounce_mjx.task.bounce import BounceConfig
+from bounce_mjx.task.bounce import Config as BounceConfig
 
 OBSERVATION = BounceConfig().layout
 
@@ -120,7 +120,7 @@ def report_of(mean_return: float) -> Report:
 def test_the_newest_checkpoint_and_the_one_that_is_named_are_kept(tmp_path: Path, state) -> None:
     run, items = create_run(CONFIG.model_copy(update={"log_dir": tmp_path})), items_of(state)
     stored = []
-    for steps, kept in ((10, None), (20, 10), (20, 10), (30, 21), (40, None)):
+    for steps, kept in ((10, ()), (20, [10]), (20, [10]), (30, [21]), (40, ())):
         number = save_checkpoint(run, CONFIG, steps, items, kept=kept)
         stored.append(sorted(checkpoint.number for checkpoint in stored_checkpoints(run)))
         newest = latest_checkpoint(run)
@@ -172,7 +172,7 @@ def two(tmp_path_factory: pytest.TempPathFactory, state: TrainingState) -> Path:
     run = create_run(CONFIG.model_copy(update={"log_dir": tmp_path_factory.mktemp("two")}))
     items = items_of(state)
     save_checkpoint(run, CONFIG, 64, items, report=report_of(2.0))
-    save_checkpoint(run, CONFIG, 128, items, report=report_of(1.0), kept=64)
+    save_checkpoint(run, CONFIG, 128, items, report=report_of(1.0), kept=(64,))
     return run
 
 

@@ -56,7 +56,7 @@ MISTAKES = (
     ("train --config nope", "no preset is named nope", "cpu, default, finetune"),
     ("train --robot nope", "no robot is named nope", "iiwa, panda, peitian, ur5e"),
     ("train --mjcf a.xml", "a.xml", "does not exist", "give the path"),
-    ("eval --target-height -1", "--target-height is '-1'", ">= 0.001"),
+    ("eval --target-height -1", "--target-height is '-1'", ">= 0.05"),
     ("eval --json nowhere/a.json", "nowhere/a.json", "make it"),
     ("evl", "unknown command evl", "did you mean eval?", "bounce-mjx --help"),
     ("--num-envs 3", "unknown command --num-envs", "choose train, eval"),

@@ -35,7 +35,7 @@ from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.settings import Choice, read_preset, stack
 from bounce_mjx.task import registry, term_names, weighted_terms
 from bounce_mjx.task.bounce import Bounce
-from bounce_mjx.task.bounce_rewards import BounceReward, RewardInputs
+from bounce_mjx.task.bounce_rewards import RewardInputs, Rewards
 from bounce_mjx.task.registry import find_task
 from bounce_mjx.training import hosts
 from bounce_mjx.training.command import fields_of_command
@@ -45,6 +45,7 @@ from tiny_runs import shared_run
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 REFERENCE = runpy.run_path(str(CHECKOUT / "docs/config_reference.py"))["reference"]()
+API = CHECKOUT / "docs/api_reference.py"
 PAGES = [
     CHECKOUT / "README.md",
     CHECKOUT / "CONTRIBUTING.md",
@@ -202,9 +203,9 @@ def test_config_reference_is_fresh() -> None:
     assert page == REFERENCE, "docs/config.md is stale; it names the command that prints it"
 
 
-def test_api_reference_is_fresh() -> None:
+def test_api_index_is_fresh() -> None:
     pytest.importorskip("griffe")
-    written = runpy.run_path(str(CHECKOUT / "docs/api_reference.py"))["reference"]()
+    written = runpy.run_path(str(API))["index"]()
     assert content("api.md") == written, "docs/api.md is stale; it names the command that prints it"
 
 
@@ -223,7 +224,7 @@ IMPORTS = sorted(
 def test_what_a_page_imports_is_in_a_reference(imported: tuple[str, str]) -> None:
     """In the API; settings are in the config reference, and the tasks have a page."""
     module, name = imported
-    documented = set(re.findall(r"^### (\w+)$", content("api.md"), re.MULTILINE))
+    documented = set(re.findall(r"^\| \[`\S+\.(\w+)`\]", content("api.md"), re.MULTILINE))
     try:
         member = getattr(importlib.import_module(module), name, None)
     except MissingPackage as missing:
@@ -234,8 +235,17 @@ def test_what_a_page_imports_is_in_a_reference(imported: tuple[str, str]) -> Non
     assert is_elsewhere or name in documented
 
 
-def test_api_reference_has_arguments_shapes_and_errors() -> None:
-    page = content("api.md")
+def test_the_site_has_the_arguments_shapes_and_errors_of_the_api(need) -> None:
+    """Its page has the headings of the index, to which pages link, and the whole docstrings."""
+    need("griffe")
+    hooks = runpy.run_path(str(CHECKOUT / "docs/site_hooks.py"))
+    config = need("mkdocs.config").load_config(str(CHECKOUT / "mkdocs.yml"))
+    files = need("mkdocs.structure.files")
+    file = files.File("api.md", config.docs_dir, config.site_dir, use_directory_urls=False)
+    site_page = need("mkdocs.structure.pages").Page(None, file, config)
+    page = hooks["on_page_markdown"](content("api.md"), site_page, config, files.Files([file]))
+    heads = re.compile(r"^## .+$", re.MULTILINE)
+    assert heads.findall(page) == heads.findall(content("api.md"))
     entry = page.split("\n### Env\n")[1].split("\n### ")[0]
     assert "`from bounce_mjx.env.env import Env`" in entry
     assert "Env.step(state: State, action: jax.Array) -> State" in entry
@@ -310,21 +320,49 @@ def test_troubleshooting_quotes_the_reason_for_mjx(tmp_path: Path) -> None:
     assert f"    physics: {engine.name} ({engine.reason})\n" in page
 
 
+def imported_modules(path: Path) -> set[str]:
+    """The modules that a file imports, also within its functions; of `from bounce_mjx import name`,
+    `bounce_mjx.name`."""
+    modules = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            modules |= {name.name for name in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            is_root = node.module == "bounce_mjx"
+            modules |= {f"bounce_mjx.{x.name}" for x in node.names} if is_root else {node.module}
+    return modules
+
+
 def test_packages_import_in_the_order_of_the_map():
-    """The map's promise: each folder of the package imports only from the rows above it."""
+    """The map's promise: each folder of the package imports only from the rows above it and from
+    the modules below them all, never the public names of the package itself."""
     text = (CHECKOUT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     section = text.split("## Where things are\n")[1]
     order = re.findall(r"^\| `src/bounce_mjx/(\w+)/`", section, re.MULTILINE)
+    (below,) = re.findall(r"from the modules `(.+?)`;", " ".join(section.split()))
+    below = below.replace("`", "").replace(" and ", ", ").split(", ")
     package = CHECKOUT / "src" / "bounce_mjx"
-    against = []
+    files = [(path, below) for path in package.glob("*.py") if path.stem in below]
     for i, folder in enumerate(order):
-        for path in (package / folder).rglob("*.py"):
-            tree = ast.parse(path.read_text(encoding="utf-8"))
-            modules = [n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)]
-            imported = {m.split(".")[1] for m in modules if m and m.startswith("bounce_mjx.")}
-            if wrong := imported & set(order[i + 1 :]):
-                against.append(f"{path.relative_to(package)} imports {wrong}")
-    assert order and not against
+        known = [*below, *order[: i + 1]]
+        files += [(path, known) for path in (package / folder).rglob("*.py")]
+    against = []
+    for path, known in files:
+        for module in imported_modules(path):
+            root, _, rest = module.partition(".")
+            if root == "bounce_mjx" and rest.split(".")[0] not in known:
+                against.append(f"{path.relative_to(package)} imports {module}")
+    assert len(files) > len(order) and not against
+
+
+def test_benchmarks_do_not_import_in_a_circle() -> None:
+    folder = CHECKOUT / "benchmarks"
+    left = {path.stem: imported_modules(path) for path in folder.glob("*.py")}
+    while left:
+        free = [name for name, modules in left.items() if not modules & left.keys() - {name}]
+        assert free, f"these import one another: {', '.join(sorted(left))}"
+        for name in free:
+            del left[name]
 
 
 def test_the_site_has_the_files_that_its_pages_link_to(need) -> None:
@@ -380,7 +418,7 @@ def test_new_term_of_the_rewards_page_is_a_term(tmp_path: Path) -> None:
         inputs["ball_position"] = np.array([0.0, 0.0, height])
         terms = weighted_terms(config, RewardInputs(**inputs, reward=config))
         assert float(terms["sideways_velocity"]) == pytest.approx(expected)
-    assert terms.keys() == {*term_names(BounceReward), "sideways_velocity"}
+    assert terms.keys() == {*term_names(Rewards), "sideways_velocity"}
 
 
 def short_training(folder: Path) -> Callable:

@@ -12,7 +12,7 @@ import pytest
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.resources import resource_path
 from bounce_mjx.task import Kinematics, Step, term_names
-from bounce_mjx.task.bounce import Bounce, BounceReward, BounceState
+from bounce_mjx.task.bounce import Bounce, Rewards, State
 from bounce_mjx.world.config import PADDLE_HOME
 from reward_reference import REFERENCE_WEIGHTS, reference_terms
 
@@ -266,7 +266,7 @@ def episodes(reset, step):
 
 
 def test_a_step_reports_the_terms_of_its_reward_and_the_metrics(episodes, reset):
-    names = {f"reward/{name}" for name in term_names(BounceReward)}
+    names = {f"reward/{name}" for name in term_names(Rewards)}
     others = {"bounced", "n_bounces", "ball_xy_error", "apex_error", "apex_offset"}
     assert set(reset(jax.random.key(0)).metrics) == names | others | {"non_finite", "too_fast"}
     for _, action, after in episodes:
@@ -318,7 +318,7 @@ def drive(steps, start_height=0.45, target=0.5, config=None):
       bounced and n_bounces after each step, and the last state of the task.
     """
     detect = jax.jit(Bounce(config or EnvConfig()).detect)
-    state = BounceState(
+    state = State(
         rising=jnp.asarray(False), n_bounces=jnp.float32(0), apex=jnp.float32(start_height)
     )
     bounced, counts = [], []

@@ -13,7 +13,7 @@ from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.files import check_output, new_file, write_atomically, write_output
 from bounce_mjx.runs.presets import default_preset
 from bounce_mjx.runs.settings import read_preset
-from bounce_mjx.task.bounce import BounceConfig as EnvConfig
+from bounce_mjx.task.bounce import Config as EnvConfig
 from bounce_mjx.training.setup import JOINED_LOOPS, cache_compilations, join_loops
 
 
@@ -103,7 +103,7 @@ def rk4(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def elliptic(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The shipped model with elliptic cones of friction, which its frictionless contact ignores."""
+    """The shipped model with elliptic cones, which MuJoCo's own friction has alone."""
     path = tmp_path_factory.mktemp("model") / "elliptic.xml"
     return shipped_model(path, 'cone="pyramidal"', 'cone="elliptic"')
 
@@ -131,12 +131,10 @@ def test_the_engine_decides_unless_the_user_does(
     fused, chosen = EnvConfig(), EnvConfig(physics="fused")
     mjx, falls_to_mjx = EnvConfig(physics="mjx"), EnvConfig(mjcf=rk4)
     without, with_friction = EnvConfig(mjcf=elliptic), EnvConfig(mjcf=elliptic, friction=0.3)
-    for configs in ((fused,), (chosen,), (fused, chosen), (without,)):
+    for configs in ((fused,), (chosen,), (fused, chosen), (without,), (without, with_friction)):
         assert flags(*configs) == joined
     for configs in ((mjx,), (falls_to_mjx,), (fused, mjx), (chosen, falls_to_mjx)):
         assert flags(*configs) == user
-    # The fused physics has no elliptic cone of friction.
-    assert flags(with_friction) == flags(without, with_friction) == user
 
 
 def test_the_presets_of_all_machines_have_one_task() -> None:

@@ -9,7 +9,7 @@ from viser.infra import StateSerializer
 from bounce_mjx import BounceBall
 from bounce_mjx.env.env import State
 from bounce_mjx.task import term_names
-from bounce_mjx.task.bounce_rewards import BounceReward
+from bounce_mjx.task.bounce_rewards import Rewards
 from bounce_mjx.viewers.browser import reward_bars
 from bounce_mjx.viewers.display import TRAIL_SECONDS, Display, Trail, body_scenes
 from bounce_mjx.viewers.page import replay
@@ -149,7 +149,7 @@ def test_random_actions_are_uniform(env: BounceBall) -> None:
 
 
 def test_reward_bars_show_every_term() -> None:
-    terms = dict.fromkeys(term_names(BounceReward), 0.0) | {"position": 2.0, "alignment": -1.25}
+    terms = dict.fromkeys(term_names(Rewards), 0.0) | {"position": 2.0, "alignment": -1.25}
     terms["my_term"] = 0.5
     text = reward_bars(terms)
     for name in terms:

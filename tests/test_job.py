@@ -231,12 +231,42 @@ def test_a_state_is_saved_between_evaluations_where_save_every_asks_for_it(
     assert evaluated_steps(run) == [3 * BLOCK, 6 * BLOCK]
 
 
+def test_a_history_of_checkpoints_stays_where_it_is_asked_for(tmp_path: Path) -> None:
+    """In addition to the best one; what was trained after one that is resumed counts no more."""
+
+    def stored(run: Path) -> list[int]:
+        return sorted(checkpoint.number // BLOCK for checkpoint in stored_checkpoints(run))
+
+    returns = {1: 9.0, 2: 5.0, 3: 5.0, 4: 5.0}
+    assert stored(train(tmp_path / "one", returns)) == [1, 4]
+    assert stored(train(tmp_path / "two", returns, keep_checkpoints=2)) == [1, 3, 4]
+    run = train(tmp_path / "all", returns, keep_checkpoints="all")
+    assert stored(run) == [1, 2, 3, 4]
+    assert iterations_of(find_checkpoint(run / f"checkpoints/{3 * BLOCK}")) == 3
+    third = run / f"checkpoints/{2 * BLOCK}"
+    returns = {1: 9.0, 3: 6.0, 4: 7.0, 5: 8.0}
+    train(tmp_path / "all", returns, third, keep_checkpoints="all")
+    again = stored_checkpoints(run)
+    assert sorted(read_record(checkpoint).steps // BLOCK for checkpoint in again) == [1, 2, 3, 4, 5]
+    # Of several seeds, it is the state of all.
+    seeds = train(tmp_path / "seeds", RETURNS, num_seeds=SEEDS, keep_checkpoints=3)
+    assert (stored(seeds), stored(seeds / "seed_001")) == ([2, 3, 4], [2])
+
+
+def test_the_state_of_all_seeds_is_no_policy_and_no_damage(tmp_path: Path) -> None:
+    run = train(tmp_path, RETURNS, num_seeds=SEEDS)
+    state = find_checkpoint(run / "checkpoints")
+    with pytest.raises(UserError, match="holds the state of all 3 seeds, with which .*; give"):
+        read_policy(state, load_run_config(run))
+
+
 @pytest.mark.parametrize(("given", "trained"), [(170, 192), (80, 64)])
 def test_a_training_ends_at_the_whole_block_nearest_to_its_steps(
     tmp_path: Path, given: int, trained: int
 ) -> None:
     run = train(tmp_path, RETURNS, total_steps=given, said=(said := io.StringIO()))
-    assert f"steps: {trained}, in blocks of 64\n" in said.getvalue()
+    line = f"steps: {trained}, in blocks of 64; evaluated and saved every 64\n"
+    assert line in said.getvalue()
     assert results_of(run)["trained_steps"] == trained
 
 

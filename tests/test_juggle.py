@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from bounce_mjx import task
+from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.robot.model import find_addresses, load_model
 from bounce_mjx.task.juggle import Config, Juggle, Rewards
@@ -85,6 +86,41 @@ def test_an_episode_ends_with_a_lost_ball_or_a_touch(height: float) -> None:
     assert ends([x, y, HOME[2] - 0.01])
     assert ends([x + 0.8, y, height])
     assert ends([x, columns[1, 1] - 0.03, height])
+
+
+def unlike(second: float) -> Juggle:
+    """The task with two balls of which the second has another radius, m."""
+    juggle = Juggle(Config())
+    first = juggle.geometry.ball_radius
+    juggle.geometry = juggle.geometry._replace(ball_radii=(first, second))
+    return juggle
+
+
+@pytest.mark.parametrize("factor", [None, 0.5])
+def test_balls_of_unlike_radii_touch_where_their_surfaces_do(factor: float | None) -> None:
+    """In an episode with other radii, both in proportion."""
+    juggle = unlike(0.04)
+    radius = None if factor is None else factor * 0.019
+    touch = (0.019 + 0.04) * (factor or 1.0)
+    for distance, touches in ((touch - 1e-3, True), (touch + 1e-3, False)):
+        balls = jnp.array([[0.6, 0.0, 0.5], [0.6, distance, 0.5]])
+        truth = task.Kinematics(None, balls, None, None, jnp.zeros((2, 3)), None, None)
+        step = task.Step(truth, {}, None, None, radius)
+        assert bool(juggle._touched(step)) == touches
+
+
+def test_columns_in_which_the_balls_touch_are_refused() -> None:
+    with pytest.raises(
+        UserError, match="spacing is 0.01 m, but balls of the radii 0.019 and 0.019"
+    ):
+        Env(Config(spacing=0.01))
+    with pytest.raises(
+        UserError, match="radii 0.038 and 0.038 m touch in columns that are 0.065 m"
+    ):
+        Env(Config(randomization={"ball_radius": (1.0, 2.0)}))
+    with pytest.raises(UserError, match="balls of the radii 0.019 and 0.05 m touch in columns"):
+        unlike(0.05).check()
+    unlike(0.04).check()
 
 
 def test_balls_touch_as_in_mujoco() -> None:

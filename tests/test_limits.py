@@ -17,9 +17,9 @@ from bounce_mjx.robot.config import LimitsConfig
 from bounce_mjx.robot.setpoints import (
     JointLimits,
     Setpoint,
-    command,
     joint_limits,
     next_setpoint,
+    position_at,
 )
 from bounce_mjx.task.task import Recording
 
@@ -123,7 +123,7 @@ def test_commands_are_those_of_a_simulation(world: tuple) -> None:
         base = np.clip(start.position, angle - 0.15, angle + 0.15)
         target = np.clip(base + 0.04 * action, *ranges.T)
         after = next_setpoint(limits, start, target, 0.01, np)
-        rows.append(command(start, after.acceleration, times, np, smoothing))
+        rows.append(position_at(start, after.acceleration, times, np, smoothing))
         start = after
     late = round(1e3 * given.get("action_latency", (0.0,))[0]) * fine
     expected = np.concatenate([np.tile(first, (late, 1)), *rows])[: len(rows) * len(times)]

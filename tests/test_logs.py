@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -12,12 +13,14 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.contacts import ContactChecker
 from bounce_mjx.identify import Topics
 from bounce_mjx.identify.excitation import excite
+from bounce_mjx.identify.following import find_settled, follow
 from bounce_mjx.identify.inspection import describe, examine
 from bounce_mjx.identify.log import Log, align_clocks, check
 from bounce_mjx.identify.reading import read_bag, read_csv, read_log
 from bounce_mjx.identify.world import measure_camera
 from bounce_mjx.robot.model import find_addresses, load_model
 from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.world.model import world_model
 
 JOINTS = ("left", "right")
 RANGES = np.array([[-1.0, 1.0], [0.0, 0.0]])
@@ -877,6 +880,121 @@ def test_a_quick_answer_to_a_step_of_the_command_is_no_spike(
             recorder.step({"time": 0.01 * k, "joint_angles": angles + noise}, step)
     (note,) = read_csv(path, names).notes
     assert "1 of the 200 joint angles" in note and "row 97 is a spike" in note
+
+
+def arm_csv(path: Path, times: np.ndarray, angles: np.ndarray, targets: np.ndarray) -> Path:
+    with Recorder(path, ARM) as recorder:
+        for time, angle, target in zip(times, angles, targets, strict=True):
+            recorder.step({"time": time, "joint_angles": angle}, target)
+    return path
+
+
+@pytest.mark.parametrize("share", [0.0, 1 / 60, 1 / 45, 0.3])
+def test_lost_rows_are_filled_whatever_their_share(share: float, tmp_path: Path) -> None:
+    """Their targets are on the line between their neighbours, and no other row is left out."""
+    log = sound_log(10.0)
+    kept = np.random.default_rng(1).random(len(log.times)) >= share
+    kept[[0, -1]] = True
+    path = tmp_path / "log.csv"
+    read = read_csv(
+        arm_csv(path, log.times[kept], log.joint_angles[kept], log.servo_targets[kept]), ARM
+    )
+    assert len(read.times) == np.sum(kept)
+    longest = np.max(np.diff(np.flatnonzero(kept))) - 1
+    if longest <= 4:
+        np.testing.assert_allclose(read.target_times, log.times, atol=1e-6)
+    assert np.all(np.diff(read.target_times) < 0.0101) or longest > 4
+    expected = np.stack(
+        [np.interp(read.target_times, log.times, x) for x in log.servo_targets.T], axis=1
+    )
+    np.testing.assert_allclose(read.servo_targets, expected, atol=3e-3)
+    counted = [note for note in read.notes if "were lost" in note]
+    assert len(counted) == (share > 0.0)
+    assert np.mean(find_settled(read)) > 0.8
+    assert follow(read, find_settled(read)).delay == pytest.approx(0.025, abs=5e-4)
+
+
+@pytest.mark.parametrize("joints, held", [(slice(None), 5), (slice(2, 3), 10)])
+def test_angles_that_rows_hold_are_no_later(joints: slice, held: int, tmp_path: Path) -> None:
+    """Of an encoder that is slower than the rows, those of its own time count."""
+    log = sound_log(20.0)
+    angles = log.joint_angles.copy()
+    rows = np.arange(len(angles)) // held * held
+    angles[:, joints] = log.joint_angles[rows][:, joints]
+    read = read_csv(arm_csv(tmp_path / "log.csv", log.times, angles, log.servo_targets), ARM)
+    assert len(read.times) == pytest.approx(len(log.times) / held, abs=2)
+    assert follow(read, find_settled(read)).delay == pytest.approx(0.025, abs=5e-4)
+    assert any("a slower sensor in rows of the control step" in note for note in read.notes)
+    # Nor is a coarse encoder, or an arm at rest, one that is held.
+    coarse = np.round(log.joint_angles, 3)
+    coarse[800:1200] = coarse[800]
+    read = read_csv(arm_csv(tmp_path / "coarse.csv", log.times, coarse, log.servo_targets), ARM)
+    assert len(read.times) == len(log.times)
+
+
+def test_a_file_of_several_recordings_is_split_where_its_time_restarts(tmp_path: Path) -> None:
+    log = sound_log(6.0)
+    times = np.where(log.times < 4.0, log.times, log.times - 4.0)
+    path = arm_csv(tmp_path / "log.csv", times, log.joint_angles, log.servo_targets)
+    with pytest.raises(UserError, match="go back at row 402: split the log there, and give"):
+        read_csv(path, ARM)
+
+
+def test_remedies_say_what_to_write(tmp_path: Path) -> None:
+    """For decimal commas between commas, one foreign title, a missing encoder, a whole turn."""
+    log, path = sound_log(3.0), tmp_path / "log.csv"
+    good = arm_csv(tmp_path / "good.csv", log.times, log.joint_angles, log.servo_targets)
+    text = good.read_text()
+    head, _, rows = text.partition("\n")
+    # Without the cells that the recorder leaves empty.
+    titles = [x for x in head.split(",") if not x.startswith(("joint_velocities", "ball"))]
+    columns = np.column_stack([log.times, log.joint_angles, log.servo_targets])
+    lines = ["\n".join(",".join(f"{x:.6f}".replace(".", ",") for x in row) for row in columns)]
+    path.write_text("\n".join([",".join(titles), *lines]))
+    with pytest.raises(UserError, match="decimal commas, and commas between them too"):
+        read_csv(path, ARM)
+    path.write_text(text.replace("time [s]", "Zeit [s]", 1))
+    with pytest.raises(UserError, match=r"has no column time \[s\]; write time for Zeit"):
+        read_csv(path, ARM)
+    path.write_text(text.replace("servo_targets.Joint3", "Soll.Joint3", 1))
+    with pytest.raises(UserError, match=r"write servo_targets\.Joint3 for Soll\.Joint3"):
+        read_csv(path, ARM)
+    angles = log.joint_angles.copy()
+    angles[:, 2] = np.nan
+    rows = np.column_stack([log.times, angles, log.servo_targets])
+    cells = [",".join("" if np.isnan(x) else repr(x) for x in row) for row in rows.tolist()]
+    path.write_text("\n".join([",".join(titles), *cells]))
+    with pytest.raises(UserError, match="number 3 of each row of the joint angles"):
+        read_csv(path, ARM)
+    turned = log._replace(joint_angles=log.joint_angles + [0, 0, 0, 2 * np.pi, 0, 0])
+    ranges = np.tile([-2.0, 2.0], (6, 1))
+    with pytest.raises(UserError, match=r"1 whole turn off: subtract 6\.28319 rad from its angles"):
+        check(turned, ARM, ranges)
+
+
+def test_an_excitation_needs_no_more_torque_than_the_servos_have() -> None:
+    """By MuJoCo's inverse dynamics; and a largest acceleration is kept."""
+    config = read_preset(Path("default")).env
+    most = np.array([60.0, 60.0, 60.0, 12.0, 9.0, 5.0])
+    limits = config.robot.limits.model_copy(update={"torque": tuple(most)})
+    weak = config.model_copy(update={"robot": config.robot.model_copy(update={"limits": limits})})
+    motion = excite(weak, 20.0, 6.0)
+    model = world_model(weak, visual=False)
+    addresses, data = find_addresses(model), mujoco.MjData(model)
+    dofs, dt = list(addresses.arm_qvel), config.control_dt
+    rates = np.gradient(motion.targets, dt, axis=0)
+    accelerations = np.gradient(rates, dt, axis=0)
+    for flag in (mujoco.mjtDisableBit.mjDSBL_ACTUATION, mujoco.mjtDisableBit.mjDSBL_CONTACT):
+        model.opt.disableflags |= flag
+    needed = np.zeros(6)
+    for q, v, a in zip(motion.targets, rates, accelerations, strict=True):
+        data.qpos[list(addresses.arm_qpos)], data.qvel[dofs], data.qacc[dofs] = q, v, a
+        mujoco.mj_inverse(model, data)
+        needed = np.maximum(needed, np.abs(data.qfrc_inverse[dofs]))
+    assert np.all(needed <= most)
+    assert np.all(np.ptp(motion.targets, axis=0) > 0.01)
+    slow = excite(config, 20.0, 1.0, max_acceleration=2.0)
+    assert np.max(np.abs(np.diff(slow.targets, 2, axis=0))) / dt**2 <= 2.0 + 1e-9
 
 
 def test_a_far_ball_beside_a_repeated_one_is_left_out(tmp_path: Path) -> None:

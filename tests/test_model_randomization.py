@@ -69,13 +69,13 @@ DERIVED = "body_inertia body_invweight0 body_subtreemass dof_M0 geom_rbound".spl
 @pytest.mark.slow
 def test_models_of_parameters_are_read_back(mj_model, base):
     """The numbers of `edited_model`, given as a randomised model, give the same model again, one
-    parameter at a time and all together."""
+    parameter at a time and all together; an inertia of the ball's own is refused there."""
     drawn = random_parameters(mj_model, BATCH, seed=1)._replace(
         contact_friction=np.array([0.1, 0.2, 0.3]),
         frictionloss=np.full((BATCH, 6), 0.5),
         force_limit=np.full((BATCH, 6), 30.0),
     )
-    names = [name for name in PhysicsParameters._fields if name != "entries"]
+    names = [name for name in PhysicsParameters._fields if name not in ("entries", "ball_inertia")]
     for given in (*((name,) for name in names), names):
         parameters = PhysicsParameters(**{name: getattr(drawn, name) for name in given})
         models = [edited_model(mj_model, world(parameters, i)) for i in range(BATCH)]
@@ -137,6 +137,22 @@ def test_terms_of_a_randomization_fn_have_their_shares(mj_model, base):
     grows = RandomizationConfig(**terms, warmup_steps=100)
     with pytest.raises(UserError, match="the ranges of a randomization_fn do not grow"):
         domain_randomize(mj_model, base, jax.random.split(jax.random.key(0), 8), grows)
+    hollow = RandomizationConfig(**terms, ball_inertia=(0.4, 0.6))
+    with pytest.raises(UserError, match="a randomization_fn has no inertia of a ball"):
+        domain_randomize(mj_model, base, jax.random.split(jax.random.key(0), 8), hollow)
+
+
+def test_a_pair_has_one_coefficient_of_friction(mj_model, base):
+    """A randomised model has it along both tangents; another one along the second is refused."""
+    friction = np.tile(mj_model.pair_friction, (BATCH, 1, 1))
+    friction[:, 0, :2] = np.array([0.2, 0.5, 1.0])[:, None]
+    friction[:, 0, 2] *= [1.0, 2.0, 3.0]  # without effect, as in MuJoCo
+    given = read(mj_model, base, pair_friction=friction)
+    assert list(given.entries) == ["pair_friction[0, 0]"]
+    np.testing.assert_allclose(given.entries["pair_friction[0, 0]"], friction[:, 0, 0], rtol=1e-6)
+    friction[0, 0, 1] = 0.3
+    with pytest.raises(UserError, match=r"pair_friction\[0, 1\] would be another friction"):
+        read(mj_model, base, pair_friction=friction)
 
 
 @pytest.mark.slow
@@ -154,7 +170,7 @@ def test_entries_act_as_in_mujoco(mj_model, float64):
     changed |= {f"geom_size[{paddle}, {i}]": mj_model.geom_size[paddle, i] for i in range(3)}
     changed |= {f"geom_pos[{paddle}, {i}]": 0.02 for i in range(3)}
     changed |= {f"pair_solref[0, {i}]": x for i, x in enumerate((0.01, 0.3))}
-    changed |= {f"pair_friction[0, {i}]": x for i, x in enumerate((0.2, 0.5))}
+    changed |= {"pair_friction[0, 0]": 0.2}
     changed |= {f"opt.gravity[{i}]": x for i, x in enumerate((1.0, -1.0, -9.0))}
     for joint in range(6):
         changed |= {f"dof_damping[{joint}]": 3.0, f"dof_armature[{joint}]": 0.1}

@@ -12,6 +12,7 @@ import pytest
 from mujoco import rollout
 
 from against_c import (
+    Coulomb,
     States,
     assert_same_step,
     bouncing_states,
@@ -32,7 +33,7 @@ from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.robot.numbers import field_of
 from random_worlds import own_parameters, random_parameters
 
-# Parameters of the shipped model; test_friction.py and test_joint_friction.py cover friction.
+# Parameters of the shipped model; test_friction.py covers friction.
 _NOT_IN_THE_MODEL = ("contact_friction", "force_limit", "frictionloss", "entries")
 FIELDS = [f for f in PhysicsParameters._fields if f not in _NOT_IN_THE_MODEL]
 
@@ -85,8 +86,8 @@ def test_mjx_carries_worlds(mj_model, float64):
     )
     data = []
     for i in range(count):
-        c_model = edited_model(mj_model, world(parameters, i))
-        data.append((c_model, mujoco.MjData(c_model)))
+        law = Coulomb(edited_model(mj_model, world(parameters, i)))
+        data.append((law, mujoco.MjData(law.model)))
         data[i][1].qpos[:], data[i][1].qvel[:] = (x[i] for x in state)
     engine = make_engine(mj_model, "mjx")
     control = partial(Control, air_drag=air_drag)
@@ -95,11 +96,11 @@ def test_mjx_carries_worlds(mj_model, float64):
     for i in range(6):
         ctrl = np.asarray(state.qpos[:, :6]) + 0.02 * (-1.0) ** i
         state = step(parameters, state, jnp.asarray(ctrl))
-        for j, (c_model, d) in enumerate(data):
+        for j, (law, d) in enumerate(data):
             d.ctrl[:] = ctrl[j]
             for _ in range(num_substeps):
-                push_by_air(c_model, d, air_drag)
-                mujoco.mj_step(c_model, d)
+                push_by_air(law.model, d, air_drag)
+                law.step(d)
                 contacts += d.ncon
                 touched |= {j} if d.ncon else set()
             if j not in touched:
@@ -109,6 +110,36 @@ def test_mjx_carries_worlds(mj_model, float64):
     assert contacts >= 20 and error < 1e-6
     # MJX's solver is not exact in a contact.
     assert flight and max(flight) < 1e-9, flight
+
+
+def test_the_inertia_of_a_ball_is_the_compilers(mj_model):
+    """A given one, with the mass and the radius of the same world, is all that MuJoCo's compiler
+    derives from a ball of that inertia in the MJCF."""
+    mass, radius, per_mass = 0.0035, 0.021, 2.0 / 3.0
+    given = PhysicsParameters(*map(np.float64, (mass, radius, per_mass)))
+    model = edited_model(mj_model, given)
+    inertia = per_mass * mass * radius**2
+    written = edited(
+        '<geom name="ball" type="sphere" size="0.019" mass="0.0027"',
+        f'<inertial pos="0 0 0" mass="{mass}" diaginertia="{inertia} {inertia} {inertia}"/>'
+        f'<geom name="ball" type="sphere" size="{radius}"',
+    )
+    for field in "body_mass body_inertia body_invweight0 dof_M0 geom_size geom_rbound".split():
+        np.testing.assert_allclose(
+            field_of(model, field), field_of(written, field), rtol=1e-9, atol=1e-12, err_msg=field
+        )
+    own = edited_model(mj_model, PhysicsParameters(ball_mass=np.float64(mass)))
+    assert own.body_inertia[-1, 0] == pytest.approx(0.4 * mass * 0.019**2)
+
+
+def test_without_friction_the_inertia_changes_no_bit(mj_model):
+    """Of a bounce of the fused engine, in float32 as shipped."""
+    states, _ = random_states(mj_model, 32, seed=7)
+    before = fused_steps(mj_model, PhysicsParameters(), states)
+    after = fused_steps(mj_model, PhysicsParameters(ball_inertia=np.full(32, 0.6)), states)
+    for x, y in zip(before, after, strict=True):
+        assert x.dtype == jnp.float32
+        np.testing.assert_array_equal(x, y)
 
 
 def test_a_parameter_of_another_shape_is_refused(mj_model):
@@ -180,7 +211,10 @@ def test_each_number_alone_acts_as_in_mujoco(mj_model, float64):
     assert_same_step(fused_steps(mj_model, own, states), expected)
     shipped, _ = c_steps(mj_model, states)
     change = np.abs(expected.qvel - shipped.qvel).max(axis=1).reshape(len(FIELDS), count)
-    assert np.all(change.max(axis=1) > 1e-4), dict(zip(FIELDS, change.max(axis=1), strict=True))
+    changes = dict(zip(FIELDS, change.max(axis=1), strict=True))
+    # Without friction nothing turns the ball.
+    assert changes.pop("ball_inertia") < 1e-12
+    assert min(changes.values()) > 1e-4, changes
 
 
 def test_c_evaluation_carries_the_whole_state(mj_model):

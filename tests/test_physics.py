@@ -14,7 +14,7 @@ from against_c import (
     HALF_SIZE,
     MODEL,
     XML,
-    CEngine,
+    CBatch,
     States,
     assert_same_step,
     bouncing_states,
@@ -92,7 +92,7 @@ def test_float32_drifts_by_less_than_a_millimetre_in_2_s(mj_model, fused_step):
     rng = np.random.default_rng(3)
     start = bouncing_states(mj_model, rng)
     start.qpos[1::2, 6] += 1.0
-    reference = CEngine(mj_model, start)
+    reference = CBatch(mj_model, start)
     state = PhysicsState(*(x.astype(np.float32) for x in start[:2]))
     contacts = 0
     for _ in range(200):
@@ -378,7 +378,7 @@ UNSUPPORTED = {
 UNSUPPORTED_BY_BOTH = (
     *("implicit", "discrete", "density", "viscosity", "wind", "actuator group", "noslip"),
     *("override", "sleep", "diagexact", "adhesion", "mixed solref", "solref with a zero"),
-    *("solimp width", "flex", "surface velocity"),
+    *("solimp width", "flex", "surface velocity", "condim 4", "condim 6"),
     *("stiffness polynomial", "damping polynomial", "ellipsoid ball"),
     *("actuator delay", "actuator damping", "actuator armature", "no damper"),
 )
@@ -405,7 +405,7 @@ def test_auto_takes_fused_unless_it_lacks_a_feature_which_it_names(mj_model):
     assert [make_engine(mj_model, x).name for x in ("auto", "fused", "mjx")] == [
         *("fused", "fused", "mjx")
     ]
-    for name in ("RK4", "limited", "condim 4"):
+    for name in ("RK4", "limited", "margin"):
         old, new, feature = UNSUPPORTED[name]
         engine = make_engine(edited(old, new), "auto")
         assert engine.name == "mjx" and feature in engine.reason
@@ -491,6 +491,6 @@ def test_ten_substeps_are_mujocos(mj_model, fused_step, float64):
     state = bouncing_states(mj_model, np.random.default_rng(0))
     state.qpos[:, 8] -= 0.03  # many of the ten steps are then in contact
     ctrl = state.qpos[:, :6] + 0.01
-    reference = CEngine(mj_model, state)
+    reference = CBatch(mj_model, state)
     assert reference.step(ctrl, 10) > 20
     assert np.max(differences(fused_step(state, ctrl, 10), reference.state)) < 1e-10

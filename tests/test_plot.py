@@ -48,7 +48,8 @@ from bounce_mjx.runs.folders import save_config
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.task import Curve, term_names
-from bounce_mjx.task.bounce import Bounce, BounceConfig, BounceReward
+from bounce_mjx.task.bounce import Bounce, Rewards
+from bounce_mjx.task.bounce import Config as BounceConfig
 from bounce_mjx.task.registry import find_task
 from bounce_mjx.task.results import Result
 from bounce_mjx.task.task import Hits
@@ -58,7 +59,7 @@ from bounce_mjx.training.log import TensorBoardLog
 from tiny_runs import TINY
 
 CHECKOUT = Path(__file__).parents[1]
-TERMS = term_names(BounceReward)
+TERMS = term_names(Rewards)
 CURVES = (
     Curve("episode/return", "", title="return of an episode"),
     *(curve for curve in Bounce.curves if curve.title),
@@ -377,6 +378,13 @@ def test_a_missed_bound_is_not_printed_as_its_value(value, bound, passed, text: 
     assert result_cells(result)[2] == text
     if not passed:
         assert f"stable {text} ({bound})" in unsolved_line(Report((result,), {}))
+
+
+def test_the_advice_after_several_seeds_is_not_to_train_several() -> None:
+    report = Report((Result("stable", "episodes, %", 90.0, ">= 99", False),), {})
+    assert "--num-seeds" in unsolved_line(report)
+    assert "each of the 2 seeds is in a local optimum" in unsolved_line(report, num_seeds=2)
+    assert "--num-seeds" not in unsolved_line(report, num_seeds=2)
 
 
 def as_shown(value: float | None) -> str:

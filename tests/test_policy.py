@@ -22,7 +22,7 @@ from bounce_mjx.learning.statistics import (
     normalize,
     update,
 )
-from bounce_mjx.task.bounce import BounceConfig
+from bounce_mjx.task.bounce import Config as BounceConfig
 
 OBSERVATION = BounceConfig().layout
 

@@ -22,7 +22,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.resources import POLICIES
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import pretrained_checkpoint
-from bounce_mjx.task.bounce import BounceConfig
+from bounce_mjx.task.bounce import Config as BounceConfig
 from bounce_mjx.world.randomization import RandomizationConfig
 
 STEPS = 600

@@ -220,9 +220,9 @@ class Precise(TwoStates):
 
 @pytest.mark.slow
 def test_the_noise_shrinks_to_its_bound():
-    """The bounds of the environments have the mean `min_noise_std`; the policy is as precise."""
+    """The bounds of the environments have the mean `mean_noise_bound`; the policy is as precise."""
     config = two_state_config(
-        num_envs=64, min_noise_std=0.2, reward_scale=10.0, learning_rate=1e-2, discount=0.0,
+        num_envs=64, mean_noise_bound=0.2, reward_scale=10.0, learning_rate=1e-2, discount=0.0,
         max_learning_rate=1e-2,
     )  # fmt: skip
     trainer = ppo.PPO(config, Precise(1.0), episode_steps=2)

@@ -12,7 +12,7 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from against_c import XML, converged, differences, push_by_air
+from against_c import XML, Coulomb, converged, differences, push_by_air
 from bounce_mjx import BounceBall, EnvConfig
 from bounce_mjx.config.validation import validate
 from bounce_mjx.env.env import Env
@@ -245,11 +245,18 @@ def test_a_wrong_range_is_one_sentence(values: dict, words: str) -> None:
     assert words in str(error.value) and "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("restitution", [None, 0.08, 0.2, 0.4, 0.6, 0.72, 0.9, 0.96])
-def test_drops_bounce_as_asked(mj_model, restitution: float | None) -> None:
-    """On MuJoCo's C engine: ratio of the speeds after and before an impact on the held paddle,
-    without gravity, at several phases of the time step. The model's own restitution is 0.85."""
-    drawn = {} if restitution is None else {"restitution": jnp.asarray(restitution)}
+class Drops(NamedTuple):
+    """Impacts on the held paddle without gravity, on MuJoCo's C engine."""
+
+    restitution: float
+    """Mean ratio of the speeds after and before."""
+    duration: float
+    """Mean time in which the ball is pressed, s."""
+
+
+def drops(mj_model: mujoco.MjModel, terms: dict[str, float]) -> Drops:
+    """Means over speeds and phases of the time step, with some terms of the randomisation."""
+    drawn = {name: jnp.asarray(value) for name, value in terms.items()}
     parameters = physics_parameters(drawn, mj_model)
     model = edited_model(mj_model, jax.tree.map(np.asarray, parameters))
     model.opt.gravity[:] = 0.0
@@ -259,18 +266,51 @@ def test_drops_bounce_as_asked(mj_model, restitution: float | None) -> None:
     paddle, ball = data.geom("blocker"), model.geom("ball").size[0]
     home, normal = paddle.xpos.copy(), paddle.xmat.reshape(3, 3)[:, 2].copy()
     gap = model.geom("blocker").size[2] + ball
-    measured = []
+    restitutions, durations = [], []
     for speed in (1.0, 2.0, 3.0, 4.0):
         for phase in np.linspace(0.0, 1.0, 8, endpoint=False):
             mujoco.mj_resetData(model, data)
             data.qpos[:6] = data.ctrl[:6] = EnvConfig().default_joint_angles
             data.qpos[6:9] = home + (gap + 1e-3 * (1.0 + phase * speed)) * normal
             data.qvel[6:9] = -speed * normal
-            mujoco.mj_step(model, data, nstep=60)
+            pressed = 0
+            for _ in range(60):
+                mujoco.mj_step(model, data)
+                pressed += bool(np.any(data.efc_force > 0.0))
             assert np.dot(data.qpos[6:9] - home, normal) > gap, "it has left the paddle"
-            measured.append(np.dot(data.qvel[6:9], normal) / speed)
+            restitutions.append(np.dot(data.qvel[6:9], normal) / speed)
+            durations.append(pressed * model.opt.timestep)
+    return Drops(float(np.mean(restitutions)), float(np.mean(durations)))
+
+
+@pytest.mark.parametrize("restitution", [None, 0.08, 0.2, 0.4, 0.6, 0.72, 0.9, 0.96])
+def test_drops_bounce_as_asked(mj_model, restitution: float | None) -> None:
+    """The model's own restitution is 0.85."""
+    terms = {} if restitution is None else {"restitution": restitution}
     expected, error = (restitution, 0.015) if restitution else (0.85, 0.01)
-    assert np.mean(measured) == pytest.approx(expected, abs=error)
+    assert drops(mj_model, terms).restitution == pytest.approx(expected, abs=error)
+
+
+@pytest.mark.parametrize("restitution", [None, 0.7, 0.93])
+@pytest.mark.parametrize("duration", [0.004, 0.006, 0.01, 0.015])
+def test_a_contact_lasts_as_asked(mj_model, duration: float, restitution: float | None) -> None:
+    """With the restitution of the model, or a sampled one. The damping ends it a little before half
+    a period of the spring."""
+    terms = {"contact_duration": duration}
+    terms |= {} if restitution is None else {"restitution": restitution}
+    measured = drops(mj_model, terms)
+    assert 0.9 * duration - 0.0005 < measured.duration < duration + 0.0005
+    assert measured.restitution == pytest.approx(restitution or 0.85, abs=0.015)
+
+
+def test_a_contact_shorter_than_four_steps_is_refused() -> None:
+    with pytest.raises(UserError) as error:
+        validate(EnvConfig, {"randomization": {"contact_duration": (0.003, 0.01)}}, "my.yaml")
+    words = "contact_duration begins at 0.003 s, but a contact needs four physics steps, which are "
+    assert words + "0.004 s with physics_dt 0.001" in str(error.value)
+    assert "\n" not in str(error.value)
+    fine = EnvConfig(physics_dt=0.0005, randomization={"contact_duration": (0.002, 0.01)})
+    assert BounceBall(fine).config.randomization.contact_duration == (0.002, 0.01)
 
 
 JOINTS = np.linspace(0.8, 1.3, 6)
@@ -296,7 +336,7 @@ def drawn_model(float64):
 
 def test_terms_are_factors_sums_and_values_of_the_model(drawn_model) -> None:
     drawn, model = drawn_model(
-        ball_mass=1.2, ball_radius=0.9, contact_friction=0.4, servo_gain=JOINTS,
+        ball_mass=1.2, ball_radius=0.9, ball_inertia=0.6, contact_friction=0.4, servo_gain=JOINTS,
         servo_damping=JOINTS[::-1], torque_limit=10.0 * JOINTS, joint_damping=JOINTS,
         joint_frictionloss=5.0 * JOINTS, armature=2.0 * JOINTS, link_mass=JOINTS,
     )  # fmt: skip
@@ -307,7 +347,7 @@ def test_terms_are_factors_sums_and_values_of_the_model(drawn_model) -> None:
     for new, old in (
         (drawn.body_mass[ball], 1.2 * model.body_mass[ball]),
         (drawn.geom("ball").size[0], 0.9 * model.geom("ball").size[0]),
-        (drawn.body_inertia[ball], 1.2 * 0.9**2 * model.body_inertia[ball]),
+        (drawn.body_inertia[ball], 0.6 / 0.4 * 1.2 * 0.9**2 * model.body_inertia[ball]),
         (drawn.pair_friction[0, :2], [0.4, 0.4]),
         (drawn.pair_dim, [3]),
         (drawn.actuator_gainprm[:, 0], JOINTS * model.actuator_gainprm[:, 0]),
@@ -335,11 +375,14 @@ def test_the_nominal_of_a_term_is_the_models(float64) -> None:
     # The drop test's inverse: twice the damping is a lower restitution.
     assert nominals["restitution"] == pytest.approx(0.736, abs=0.005)
     np.testing.assert_allclose(nominals["contact_friction"], 0.3)
+    np.testing.assert_allclose(nominals["contact_duration"], 0.01, rtol=1e-4)
+    np.testing.assert_allclose(nominals["ball_inertia"], 0.4)
     np.testing.assert_allclose(nominals["joint_frictionloss"], [0.3] * 6)
     world = {name: jnp.asarray(value) for name, value in nominals.items()}
     same = edited_model(model, physics_parameters(world, model))
     for field in (
         "pair_solref pair_friction pair_dim dof_frictionloss dof_damping dof_armature body_mass "
+        "body_inertia "
         "geom_size geom_pos geom_quat actuator_gainprm actuator_biasprm actuator_forcerange"
     ).split():
         np.testing.assert_allclose(getattr(same, field), getattr(model, field), rtol=1e-12)
@@ -479,10 +522,11 @@ def run(moves: bool) -> Run:
         "ball_start": (-0.02, 0.02), "joint_start": (-0.02, 0.02),
     }  # fmt: skip
     terms |= {} if not moves else {
-        "restitution": (0.75, 0.95),
-        "contact_friction": (0.1, 0.4), "ball_mass": (0.7, 1.3), "ball_radius": (0.9, 1.1),
-        "air_drag": (0.0, 0.3), "servo_gain": (0.8, 1.2), "servo_damping": (0.8, 1.2),
-        "servo_lag": (0.0, 0.02), "joint_damping": (0.0, 5.0), "armature": (0.7, 1.3),
+        "restitution": (0.75, 0.95), "contact_duration": (0.006, 0.012),
+        "contact_friction": (0.1, 0.4), "ball_inertia": (0.4, 0.667),
+        "ball_mass": (0.7, 1.3), "ball_radius": (0.9, 1.1), "air_drag": (0.0, 0.3),
+        "servo_gain": (0.8, 1.2), "servo_damping": (0.8, 1.2), "servo_lag": (0.0, 0.02),
+        "joint_damping": (0.0, 5.0), "armature": (0.7, 1.3),
         "joint_frictionloss": (0.0, 10.0), "link_mass": (0.7, 1.3), "torque_limit": (20.0, 100.0),
         "paddle_offset": (-0.01, 0.01), "paddle_tilt": (-0.02, 0.02),
         "gravity_tilt": (-0.02, 0.02), "action_latency": (0.0, 0.035),
@@ -545,8 +589,8 @@ def c_run(free_run: Run, w: int, shift: float = 0.0) -> tuple[PhysicsState, int]
     world = {name: np.asarray(value)[..., w] for name, value in start.world.items()}
     of_world = jax.tree.map(lambda x: np.asarray(x)[..., w : w + 1], start.parameters)
     (model,) = episode_models(free_run.env, of_world)
-    converged(model, 20)
-    data = mujoco.MjData(model)
+    law = Coulomb(converged(model, 20))
+    data = mujoco.MjData(law.model)
     data.qpos[:], data.qvel[:] = (x[..., w] for x in start.physics[:2])
     data.qpos[8] += shift
     low, high = model.jnt_range[:6].T
@@ -561,7 +605,7 @@ def c_run(free_run: Run, w: int, shift: float = 0.0) -> tuple[PhysicsState, int]
             filtered = arrived + (filtered - arrived) * np.exp(-1.0 / max(lag, 1e-3))
             data.ctrl[:] = filtered
             push_by_air(model, data, world["air_drag"])
-            mujoco.mj_step(model, data)
+            law.step(data)
             contacts += data.ncon
         after.append((data.qpos.copy(), data.qvel.copy()))
     return PhysicsState(*(np.array(x) for x in zip(*after, strict=True))), contacts
@@ -727,7 +771,7 @@ def test_traced_ranges_beyond_the_queues_are_cut_in_the_world_too(delayed: Env) 
             {"joint_start": (-1.0, 1.0)},
             "starts Joint3 from 0.8199 to 3.02 with the noise",
         ),
-        ("bounce", {"ball_start": ((0, 0, -0.9), (0, 0, -0.8))}, "rests on the paddle at 0.072"),
+        ("bounce", {"ball_start": ((0, 0, -0.9), (0, 0, -0.8))}, "an episode ends where it"),
         ("bounce", {"ball_start": (0.0, 0.3)}, "up to 0.435 m beside the paddle, where none is"),
         ("balance", {"ball_start": (-0.03, 0.03)}, "rests on the paddle at 0.0723 m; give a high"),
         ("catch", {"ball_start": ((0, 0, -0.2), (0, 0, 0))}, "rests on the floor at 0.019 m"),
@@ -738,6 +782,13 @@ def test_a_start_that_no_arm_or_ball_can_have_is_refused(
 ) -> None:
     with pytest.raises(UserError, match=words):
         Env(find_task(task).Config(randomization=terms))
+
+
+def test_a_noise_that_no_ball_can_have_is_refused() -> None:
+    with pytest.raises(UserError, match="env.reset.ball_position 0.5 starts a ball up to 0.71. m"):
+        Env(EnvConfig(reset={"ball_position": 0.5}))
+    with pytest.raises(UserError, match="min_ball_height is .* with env.reset.ball_position 0.1"):
+        Env(EnvConfig(reset={"ball_position": 0.1}, ball_init_pos=(0.59, 0.0, 0.12)))
 
 
 def test_displaced_throws_are_taken() -> None:

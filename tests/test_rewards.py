@@ -9,7 +9,7 @@ import pytest
 
 from bounce_mjx import EnvConfig
 from bounce_mjx.task import term_names, weighted_terms
-from bounce_mjx.task.bounce_rewards import BounceReward, RewardInputs
+from bounce_mjx.task.bounce_rewards import RewardInputs, Rewards
 from reward_reference import REFERENCE_WEIGHTS, reference_terms
 
 SPEC_NAMES = tuple(REFERENCE_WEIGHTS)
@@ -17,11 +17,11 @@ N_STATES = 10_000
 X_TARGET = 0.58856
 
 
-def terms_of(config: BounceReward, inputs: dict[str, jax.Array]) -> dict[str, jax.Array]:
+def terms_of(config: Rewards, inputs: dict[str, jax.Array]) -> dict[str, jax.Array]:
     return weighted_terms(config, RewardInputs(**inputs, reward=config))
 
 
-def evaluate(config: BounceReward, states: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def evaluate(config: Rewards, states: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the package's weighted terms `[N]` of a batch of states, in float64."""
     with jax.enable_x64(True):
         terms = jax.jit(jax.vmap(partial(terms_of, config)))(states)
@@ -98,7 +98,7 @@ def test_terms_equal_the_reference():
     package, reference = evaluate(EnvConfig().reward, states), reference_terms(**states)
     assert reference.keys() == set(SPEC_NAMES)
     # Further terms may follow those of the specification.
-    assert term_names(BounceReward)[: len(SPEC_NAMES)] == SPEC_NAMES
+    assert term_names(Rewards)[: len(SPEC_NAMES)] == SPEC_NAMES
     for name, term in reference.items():
         assert package[name].dtype == np.float64
         # atol only excuses Gaussian tails, 1e-12 and less of a term of order one.
@@ -192,14 +192,14 @@ PINNED = [
 
 def test_terms_and_reference_equal_values_by_hand():
     assert {name for name, _, _ in PINNED} == set(SPEC_NAMES)
-    terms = evaluate(BounceReward(), stack([inputs for _, inputs, _ in PINNED]))
+    terms = evaluate(Rewards(), stack([inputs for _, inputs, _ in PINNED]))
     for row, (name, inputs, expected) in enumerate(PINNED):
         reference = REFERENCE_WEIGHTS[name] * reference_terms(**inputs)[name][0]
         assert reference == pytest.approx(expected, rel=1e-9, abs=1e-12), (name, row)
         assert terms[name][row] == pytest.approx(expected, rel=1e-9, abs=1e-12), (name, row)
 
 
-def reward(config: BounceReward, inputs: dict[str, jax.Array]):
+def reward(config: Rewards, inputs: dict[str, jax.Array]):
     return sum(terms_of(config, inputs).values())
 
 
@@ -210,7 +210,7 @@ def directional_derivatives(inputs: dict[str, jax.Array], direction: dict[str, j
     """Derivatives [N] of the reward along a direction, by JAX and by central differences of the
     fourth order."""
     step = 3e-6
-    evaluate = jax.jit(jax.vmap(partial(reward, BounceReward())))
+    evaluate = jax.jit(jax.vmap(partial(reward, Rewards())))
 
     def reward_after(steps: float):
         moved = {n: inputs[n] + steps * step * direction[n] for n in VARIED}
@@ -221,7 +221,7 @@ def directional_derivatives(inputs: dict[str, jax.Array], direction: dict[str, j
     ) / (12.0 * step)
 
     def along(inputs, direction):
-        gradient = jax.grad(lambda varied: reward(BounceReward(), inputs | varied))(
+        gradient = jax.grad(lambda varied: reward(Rewards(), inputs | varied))(
             {name: inputs[name] for name in VARIED}
         )
         return sum(jax.numpy.vdot(gradient[name], direction[name]) for name in VARIED)
@@ -252,6 +252,6 @@ def test_gradient_is_finite_everywhere():
     places += [state(z=0.05, paddle_z=0.05)]
     with jax.enable_x64(True):
         inputs = {name: jax.numpy.asarray(x, float) for name, x in stack(places).items()}
-        gradient = jax.vmap(jax.grad(lambda inputs: reward(BounceReward(), inputs)))(inputs)
+        gradient = jax.vmap(jax.grad(lambda inputs: reward(Rewards(), inputs)))(inputs)
     for name, value in gradient.items():
         assert np.isfinite(value).all(), name

@@ -563,8 +563,8 @@ def test_adopt_prints_each_servo_and_each_change_of_the_world(tmp_path, capsys) 
 def test_adopted_servos_follow_within_the_control_steps_of_the_task(tmp_path) -> None:
     (tmp_path / "arm.xml").write_text(mjcf(arm(), motors(ARM_JOINTS)))
     (tmp_path / "slow.py").write_text(
-        "from bounce_mjx.task.bounce import Bounce, BounceConfig\n"
-        "class Config(BounceConfig):\n    control_dt: float = 0.02\n"
+        "from bounce_mjx.task.bounce import Bounce\n"
+        "class Config(Bounce.Config):\n    control_dt: float = 0.02\n"
         "class Slow(Bounce):\n    Config = Config\n"
     )
     flat = "--paddle.position 0 0 0.03 --paddle.quaternion 1 0 0 0"

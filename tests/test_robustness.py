@@ -171,11 +171,11 @@ MISTAKES = {
     ),
     "limit of a command": (
         [LATE | {"terms": {"target_height": {"from": 0, "to": "strength"}}}],
-        "'late' at 0.01: target_height is 0, but must be a finite number >= 0.001",
+        "'late' at 0.01: target_height is 0, but must be a finite number >= 0.05",
     ),
     "order of a command": (
-        [LATE | {"terms": {"target_height": {"from": 0.5, "to": "strength"}}}],
-        "'late' at 0.01: target_height is from 0.5 to 0.01; exchange the two",
+        [LATE | {"strengths": [0.4], "terms": {"target_height": {"from": 0.5, "to": "strength"}}}],
+        "'late' at 0.4: target_height is from 0.5 to 0.4; exchange the two",
     ),
     "unused strengths": ([LATE | {"terms": {"action_latency": 0.01}}], "with the word strength"),
     "nothing": ([dict(name="late")], "give terms or settings"),

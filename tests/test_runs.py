@@ -102,9 +102,12 @@ def test_a_config_of_0_1_0_has_settings_that_ended_or_moved(tmp_path: Path) -> N
     path = tmp_path / "config.yaml"
     path.write_text(
         "env: {estimator: {restitution: 0.8}, observation: {position: measured}, "
-        "randomization: {air_lift: null}, joint_angle_noise: 0.25}"
+        "randomization: {air_lift: null}, joint_angle_noise: 0.25}\n"
+        "ppo: {min_noise_std: 0.3}"
     )
-    env = load_run_config(tmp_path).env
+    config = load_run_config(tmp_path)
+    assert config.ppo.mean_noise_bound == 0.3
+    env = config.env
     assert env.reset.joint_angles == 0.25
     changed = env.reset.model_copy(update={"joint_angles": TrainConfig().env.reset.joint_angles})
     assert env.model_copy(update={"reset": changed}) == TrainConfig().env

@@ -1,11 +1,14 @@
 """Several seeds in one program, several devices, several hosts: each gives the same training as one
 alone."""
 
+import concurrent.futures
 import contextlib
+import itertools
 import json
 import re
 import shutil
 import socket
+import threading
 from pathlib import Path
 
 import jax
@@ -211,6 +214,57 @@ def test_the_setting_in_which_hosts_differ_is_named(
     )
     with expected:
         hosts.agree(TrainConfig().model_copy(update=changes), resume)
+
+
+def test_what_hosts_exchange_is_deleted_once_all_have_read_it(monkeypatch) -> None:
+    """A long training would fill the memory of its leader."""
+    stored: dict[str, str] = {}
+    left: list[int] = []
+    lock = threading.Condition()
+
+    class Client:
+        def key_value_set(self, key: str, value: str) -> None:
+            with lock:
+                stored[key] = value
+                lock.notify_all()
+
+        def blocking_key_value_get(self, key: str, _: int) -> str:
+            with lock:
+                assert lock.wait_for(lambda: key in stored, timeout=10)
+                return stored[key]
+
+        def key_value_delete(self, key: str) -> None:
+            with lock:
+                del stored[key]
+
+    number = threading.local()
+
+    class Processes:
+        client = Client()
+        num_processes = 2
+
+        @property
+        def process_id(self) -> int:
+            return number.process
+
+    def process(i: int) -> None:
+        number.process = i
+        for k in range(20):
+            number.exchanges = itertools.count(k)
+            assert hosts.exchange([i, k]) == [[0, k], [1, k]]
+            left.append(len(stored))
+
+    class Exchanges:
+        """Each of the two processes has its own count."""
+
+        def __next__(self) -> int:
+            return next(number.exchanges)
+
+    monkeypatch.setattr(hosts.distributed, "global_state", Processes())
+    monkeypatch.setattr(hosts, "_exchanges", Exchanges())
+    with concurrent.futures.ThreadPoolExecutor() as pool:
+        list(pool.map(process, range(2)))
+    assert max(left) <= 4 and len(stored) == 2
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ from bounce_mjx.runs.folders import create_run, pretrained_checkpoint
 from bounce_mjx.runs.settings import Choice, read_preset, stack
 from bounce_mjx.training import job
 from bounce_mjx.training.command import read_command
-from bounce_mjx.training.run import notes_on_starts, notes_on_worlds
+from bounce_mjx.training.run import notes_on_intervals, notes_on_starts, notes_on_worlds
 from test_keys import KEYS, NEEDED, WITH, other, settings
 
 OWN = """
@@ -413,6 +413,28 @@ def test_the_printed_config_is_a_config_and_says_its_sources(folder: Path) -> No
     (folder / "again.yaml").write_text(said.getvalue())
     again = read_command(["--config", "again.yaml"]).config
     assert again == read_command(said_by_user).config
+
+
+def test_the_real_intervals_are_printed_where_they_differ(folder: Path, capsys) -> None:
+    """A block is never divided: --save-every 1e5 saved each million steps without a word."""
+    line = "train --config default --save-every 1e5 --eval-every 2097152 --print-config"
+    main(line.split())
+    lines = {x.partition(":")[0].strip(): x for x in capsys.readouterr().out.splitlines()}
+    assert lines["save_every"].split("# ")[1] == "flags; in whole blocks 1,048,576"
+    assert lines["eval_every"].split("# ")[1] == "flags"
+    config = read_command("--config default --save-every 1e5".split()).config
+    (note,) = notes_on_intervals(config)
+    assert note.startswith("save_every 100,000 is shorter than a block, so it is done every 1,048,")
+
+
+def test_what_a_file_cannot_say_is_told(folder: Path, refused) -> None:
+    (folder / "my.yaml").write_text("robot: ur5e")
+    line = "train --config my.yaml --print-config"
+    refused(line, "my.yaml: robot is no setting; leave it out, and give --robot or train(robot=")
+    (folder / "my.yaml").write_text("task: null")
+    refused(line, "my.yaml: task is None, but must be a name")
+    (folder / "run").mkdir()
+    refused("train --resume run --log-dir typo", "log_dir is where the newest run is looked for")
 
 
 def test_no_setting_of_a_task_takes_a_flag_of_the_algorithms(folder: Path) -> None:

@@ -17,8 +17,8 @@ from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.checkpoints import read_policy
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import pretrained_checkpoint
-from bounce_mjx.task.bounce import BounceConfig
-from bounce_mjx.task.bounce_rewards import BounceReward
+from bounce_mjx.task.bounce import Config as BounceConfig
+from bounce_mjx.task.bounce_rewards import Rewards
 from bounce_mjx.viewers import page, show
 from bounce_mjx.viewers.controls import direction
 from bounce_mjx.viewers.display import Display, camera_pose, marker_body
@@ -213,7 +213,7 @@ def marker_position(display: Display, name: str) -> np.ndarray:
 
 
 def test_markers_are_at_the_positions_of_the_task() -> None:
-    config = EnvConfig(reward=BounceReward(paddle_home_height=0.15))
+    config = EnvConfig(reward=Rewards(paddle_home_height=0.15))
     display = Display(env := BounceBall(config))
     display.pose(env.mj_model.qpos0, at_height(0.61))
     x, y = config.reward.target_x, config.reward.target_y

@@ -22,10 +22,10 @@ from bounce_mjx.commands.main import main
 from bounce_mjx.commands.play import PlayCommand
 from bounce_mjx.commands.task_commands import parse_with_commands
 from bounce_mjx.config.files import dump_config
+from bounce_mjx.config.validation import validate
 from bounce_mjx.env.env import Env, EnvState
 from bounce_mjx.env.vector import VectorStep
 from bounce_mjx.errors import UserError
-from bounce_mjx.evaluation.statistics import empty_statistics
 from bounce_mjx.learning.metrics import rollout_metrics, step_metrics
 from bounce_mjx.runs import checkpoints
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
@@ -195,14 +195,16 @@ TWO_BOOLS = jnp.zeros(2, bool)
     [
         (
             {"reward": {"still": jnp.ones(3)}},
-            r"reward term still .* _Wrong is float32 of .* \(3,\)",
+            r"step of the task _Wrong \(test_tasks.py, line \d+\) returns float32 of the shape "
+            r"\(3,\) for reward\['still'\]; return one number",
         ),
-        ({"reward": {"still": None}}, "reward term still .* _Wrong is None; return one number"),
-        ({"reward": jnp.ones(())}, "the reward of .* _Wrong is float32 of .*; return a dictionary"),
-        ({"metrics": {"drop": jnp.ones((1,))}}, r"the metric drop .* is float32 of .* \(1,\)"),
-        ({"ended": jnp.zeros(())}, "ended of .* _Wrong is float32 of .*; return one bool"),
-        ({"ended": TWO_BOOLS}, r"ended of .* _Wrong is bool of the shape \(2,\); return one bool"),
-        ({"state": jnp.zeros(())}, r"state of .* is a tuple at a reset and float32 .* structure"),
+        ({"reward": {"still": None}}, r"returns None for reward\['still'\]; return one number"),
+        ({"reward": jnp.ones(())}, "returns float32 of .* for reward; return a dictionary"),
+        ({"metrics": {"drop": jnp.ones((1,))}}, r"float32 of .* \(1,\) for metrics\['drop'\]"),
+        ({"ended": jnp.zeros(())}, "_Wrong .* returns float32 of .* for ended; return one bool"),
+        ({"ended": TWO_BOOLS}, r"returns bool of the shape \(2,\) for ended; return one bool"),
+        ({"state": jnp.zeros(())}, r"float32 of .* for state; return a tuple of the same struct"),
+        ({"metrics": {"drop": "low"}}, "returns something that is no array .*; return arrays and"),
     ],
 )
 def test_a_step_that_returns_something_else_is_refused(
@@ -218,20 +220,20 @@ def test_a_step_that_returns_something_else_is_refused(
         jax.eval_shape(lambda key: wrong.reset(key), jax.random.key(0))
 
 
-COMMAND = "of the task _Wrong returns"
+COMMAND = r"of the task _Wrong \(test_tasks.py, line \d+\) returns"
 
 
 @pytest.mark.parametrize(
     ("method", "returned", "words"),
     [
-        ("step", None, "step of the task _Wrong returns None; return a task.TaskStep"),
-        ("reset", {"rose": False}, "state of the task _Wrong is a dict at a reset and a tuple"),
+        ("step", None, "step of the task _Wrong .* returns None; return a task.TaskStep"),
+        ("reset", {"rose": False}, "returns a tuple for state; return a dict of the same struct"),
         ("first_command", None, f"first_command {COMMAND} None; return a dictionary"),
-        ("first_command", {"height": jnp.ones(1)}, r"float32 of the shape \(1,\) for the command"),
-        ("next_command", {"height": jnp.ones(1)}, rf"next_command {COMMAND} .* command height;"),
-        ("next_command", {"height": 1}, f"next_command {COMMAND} a int for the command height"),
+        ("first_command", {"height": jnp.ones(1)}, r"float32 of the shape \(1,\) for \['height'\]"),
+        ("next_command", {"height": jnp.ones(1)}, rf"next_command {COMMAND} .* for \['height'\];"),
+        ("next_command", {"height": 1}, rf"next_command {COMMAND} a int for \['height'\]; return"),
         ("next_command", {"height": jnp.int32(1)}, f"{COMMAND} int32 .* of a floating-point type"),
-        ("throw", np.zeros(3), r"throw of the task _Wrong returns float64 of the shape \(3,\)"),
+        ("throw", np.zeros(3), rf"throw {COMMAND} float64 of the shape \(3,\); return the pos"),
         ("throw", (np.zeros(2), np.zeros(3)), r"a tuple of the shapes \(2,\), \(3,\); return"),
     ],
 )
@@ -253,26 +255,157 @@ def test_a_state_that_changes_its_type_is_refused(
 
     monkeypatch.setattr(_Wrong, "step", step)
     monkeypatch.setattr(_Wrong, "reset", lambda *_: {"rose": False})
-    with pytest.raises(UserError, match=r"state\['rose'\] of .* is bool .* reset and float32 of"):
+    words = r"returns float32 .* for state\['rose'\]; return bool of the shape \(\), as at a reset"
+    with pytest.raises(UserError, match=words):
         jax.eval_shape(lambda key: wrong.reset(key), jax.random.key(0))
 
 
 @pytest.mark.parametrize(
     ("tally", "words"),
     [
-        ({"speed": 1.0}, "tally of the task _Wrong returns a dict; return a task.Tally"),
-        (task.Tally({"p": jnp.ones(3)}), r"the sum p in .* _Wrong is float32 of the shape \(3,\)"),
-        (task.Tally({}, {"p": jnp.ones(3)}), "the maximum p in the maxima of the tally of .* _Wr"),
+        ({"speed": 1.0}, "tally of the task _Wrong .* returns a dict; return a task.Tally"),
+        (task.Tally({"p": jnp.ones(3)}), r"returns float32 of the shape \(3,\) for sums\['p'\]"),
+        (task.Tally({}, {"p": jnp.ones(3)}), r"returns float32 of .* for maxima\['p'\]; return o"),
     ],
 )
 def test_a_tally_that_is_not_numbers_is_refused(
     tally: object, words: str, wrong: Env, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """At the first reset, as everything that a task returns."""
     monkeypatch.setattr(_Wrong, "tally", lambda *_: tally)
-    keys = jax.random.split(jax.random.key(0), 2)
-    states = jax.eval_shape(jax.vmap(wrong.reset, out_axes=-1), keys)
     with pytest.raises(UserError, match=words):
-        jax.eval_shape(lambda states: empty_statistics(wrong, states), states)
+        jax.eval_shape(lambda key: wrong.reset(key), jax.random.key(0))
+
+
+@pytest.mark.parametrize(
+    ("method", "body", "words"),
+    [
+        (
+            "step",
+            lambda task, state, step: step.comand,
+            r"ends in AttributeError: .*comand.* mean",
+        ),
+        (
+            "step",
+            lambda task, state, step: step.command["hieght"],
+            r"_Wrong \(test_tasks.py, line \d+\) ends in KeyError: 'hieght' \(did you mean",
+        ),
+        (
+            "step",
+            lambda task, state, step: 1 if step.truth.ball_position[2] > 0 else 0,
+            "ends in TracerBoolConversionError, as Python's if, .*; write jnp.where",
+        ),
+        (
+            "step",
+            lambda task, state, step: step.action + step.truth.ball_position,
+            "ends in TypeError: add got incompatible shapes",
+        ),
+        ("results", lambda task, episodes: episodes.sums["rest"], "results of .* KeyError: 'rest'"),
+        (
+            "results",
+            lambda task, episodes: None,
+            "results .* returns None; return a tuple of task.R",
+        ),
+        (
+            "results",
+            lambda task, episodes: 1.0 / len(episodes.maxima),
+            "ends in ZeroDivisionError: ",
+        ),
+    ],
+)
+def test_an_error_in_a_task_is_one_sentence_with_its_line(
+    method: str, body: object, words: str, wrong: Env, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before anything is compiled, also of the results of an evaluation."""
+    monkeypatch.setattr(_Wrong, method, body)
+    with pytest.raises(UserError, match=words):
+        jax.eval_shape(lambda key: wrong.reset(key), jax.random.key(0))
+
+
+COMMON_MISTAKES = {
+    "a field": (
+        "step.truth.ball_velocity[2]",
+        "step.truth.ball_velocty[2]",
+        "AttributeError: .* mean ball_velocity",
+    ),
+    "a name": ('step.command["apex"]', 'step.command["apx"]', "KeyError: 'apx' .did you mean apex"),
+    "an if": (
+        "is_low = ",
+        "low = 1 if height > 0 else 0\n        is_low = ",
+        "Python's if, .*where",
+    ),
+    "no return": ("return task.TaskStep(", "task.TaskStep(", "step .*None; return a task.TaskStep"),
+    "a vector": ("height < -0.03", "ball_position < -0.03", "bool of the shape .3,. for ended"),
+    "an end": ("ended=is_lost", "ended=height", "float32 of the shape .. for ended; return one b"),
+    "a state": (
+        "state=velocity_z > 0.0",
+        "state=velocity_z",
+        "returns float32 of the shape .. for state; return bool of the shape .., as at a reset",
+    ),
+    "a shape": (
+        "reach = height + ",
+        "reach = step.action + ball_position + ",
+        "TypeError: add got",
+    ),
+    "a curve": ('"apex_error", "apexes"', '"apex_eror", "apexes"', "a metric that .* apex_eror"),
+    "an order": ("Command(low, high", "Command(high, low", "from 0.085 to 0.065; give two finite"),
+    "a group": (
+        ', "command")] = 1',
+        ")] = 1",
+        "the name of a quantity of the task; .* the group com",
+    ),
+    "an unseen": (
+        "apex: Annotated[",
+        "apx: Annotated[",
+        "policy does not see the command apex, wh",
+    ),
+    "a tally": ("return task.Tally(sums)", "return sums", "tally .* a dict; return a task.Tally"),
+    "a sum": (
+        'sums["apexes"]',
+        'sums["apexs"]',
+        "results .*KeyError: 'apexs' .did you mean apexes",
+    ),
+    "a share": (
+        "low_apexes, apexes, 0.95",
+        "low_apexes, apexes, 95",
+        "least share 95; give one fro",
+    ),
+    "a class": (
+        "class Dribble(task.Task):",
+        "class Drible(task.Task):",
+        "no subclass 'Dribble' of",
+    ),
+    "a config": ("    Config = Config\n", "", "Dribble has no Config of its own"),
+    "an import": (
+        "import jax.numpy as jnp",
+        "import jax.numpi as jnp",
+        "ModuleNotFoundError in line 7",
+    ),
+    "a weight": (
+        "weight: float = 4.0",
+        'weight: float = "high"',
+        "in line 53: weight is high, but must be a valid number",
+    ),
+}
+
+
+@pytest.mark.parametrize("mistake", COMMON_MISTAKES)
+def test_a_common_mistake_in_a_task_is_one_sentence(mistake: str, tmp_path: Path) -> None:
+    """In a file like the page's: before anything is compiled, with its line where it has one."""
+    right, wrong, words = COMMON_MISTAKES[mistake]
+    text = Path(DRIBBLE.rpartition(":")[0]).read_text(encoding="utf-8")
+    assert right in text
+    path = tmp_path / "mine.py"
+    path.write_text(text.replace(right, wrong, 1), encoding="utf-8")
+
+    def trace() -> None:
+        env = Env(validate(find_task(f"{path}:Dribble").Config, {}, "mine.yaml"))
+        jax.eval_shape(lambda key: env.step(env.reset(key), jnp.zeros(6)), jax.random.key(0))
+
+    with pytest.raises(UserError, match=words) as refused:
+        trace()
+    about_a_value = ("a curve", "a group", "an unseen", "a class", "a config")
+    assert ("line " in str(refused.value)) == (mistake not in about_a_value)
 
 
 @pytest.mark.parametrize("method", ["reset", "step", "results"])
@@ -331,16 +464,38 @@ def test_an_attribute_of_another_type_is_refused(
 
 
 @pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"low": 0.5, "high": 0.4}, "is sampled from 0.5 to 0.4; give two finite numbers, the low"),
+        ({"low": np.nan, "high": 0.4}, "is sampled from nan to 0.4; give two finite numbers"),
+        ({"low": 0.4, "high": np.inf}, "is sampled from 0.4 to inf; give two finite numbers"),
+        ({"low": "0.4", "high": 0.5}, "is sampled from '0.4' to 0.5; give two finite numbers"),
+        ({"low": True, "high": 1.5}, "is sampled from True to 1.5; give two finite numbers"),
+        (
+            {"low": 0.1, "high": 2.0, "greatest": 1.0, "unit": "m", "reason": "as it ends there"},
+            r"is sampled from 0.1 to 2, but must be <= 1 \(m\), as it ends there",
+        ),
+        ({"low": 0.1, "high": 2.0, "least": 0.2}, "is sampled from 0.1 to 2, but must be >= 0.2"),
+        ({"low": 0.0, "high": 1.0, "span": (1.0, 0.0)}, r"is offered as \(1.0, 0.0\); give two"),
+        ({"low": 0.0, "high": 1.0, "step": 0.0}, "has the step 0.0; give a number above 0"),
+        ({"low": 0.0, "high": 1.0, "names": "ab"}, "has the names 'ab'; give a tuple of names"),
+        ({"low": 0.0, "high": 1.0, "names": ("1",)}, "the names .'1',.; give a tuple of names, of"),
+    ],
+)
+def test_a_command_from_which_nothing_can_be_sampled_is_refused(settings: dict, words: str) -> None:
+    """Where it is written, with its line."""
+    with pytest.raises(UserError, match=rf"a command( \(test_tasks.py, line \d+\))?:? .*{words}"):
+        task.Command(**settings)
+
+
+@pytest.mark.parametrize(
     ("commands", "words"),
     [
-        ({"height": task.Command(0.5, 0.4)}, "the command height .* sampled from 0.5 to 0.4; give"),
-        ({"height": task.Command(np.nan, 0.4)}, "the command height .* sampled from nan to 0.4"),
-        ({"height": task.Command(0.4, np.inf)}, "the command height .* two finite numbers"),
         ({"height": (0.4, 0.5)}, r"the command height .* is \(0.4, 0.5\); give a task.Command"),
         ([task.Command(0.4, 0.5)], "the commands of .* _Wrong are .*; return a dictionary of a"),
     ],
 )
-def test_a_command_from_which_nothing_can_be_sampled_is_refused(
+def test_commands_of_another_type_are_refused(
     commands: object, words: str, wrong: Env, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(_Wrong.Config, "commands", commands)
@@ -349,25 +504,45 @@ def test_a_command_from_which_nothing_can_be_sampled_is_refused(
 
 
 @pytest.mark.parametrize(
-    ("quantity", "words"),
+    ("settings", "words"),
     [
-        (
-            task.Quantity(2, "m", "command"),
-            r"height as Quantity\(size=2, .* number; give it task.Quantity\(1, 'm', ",
-        ),
-        (task.Quantity(None, "", "command"), "shows the command height as .* is one number"),
-        (task.Quantity(1, "m", "command", per_ball=True), "shows the command height as .* is one"),
-        (task.Quantity(1, "m", "commands"), "the quantity height of Seen has the group 'commands'"),
+        ((2, "m", "command"), r"shows a command, which is one number; give task.Quantity\(1, 'm'"),
+        ((None, "", "command"), "shows a command, which is one number"),
+        ((1, "m", "command", True), "shows a command, which is one number"),
+        ((1, "m", "commands"), "has the group 'commands'; choose from state, command, past, task"),
+        ((0, "m"), "has the size 0; give a number of entries, or None for one of each joint"),
+        ((1.5, "m"), "has the size 1.5; give a number of entries"),
     ],
 )
-def test_a_command_is_shown_as_one_number(quantity: task.Quantity, words: str, wrong: Env) -> None:
-    """Of a larger size, the observation would repeat it."""
+def test_a_quantity_that_cannot_be_is_refused(settings: tuple, words: str) -> None:
+    """Where it is written. Of a larger size, the observation would repeat a command."""
+    with pytest.raises(
+        UserError, match=rf"Quantity\(size=.*\) \(test_tasks.py, line \d+\) {words}"
+    ):
+        task.Quantity(*settings)
 
+
+def test_a_command_is_not_shown_by_a_quantity_of_another_group(wrong: Env) -> None:
     class Seen(task.ObservationConfig):
-        height: Annotated[int, quantity] = 1
+        height: Annotated[int, task.Quantity(1, "m")] = 1
 
-    with pytest.raises(UserError, match=words):
+    with pytest.raises(UserError, match="height has the name of a quantity of the task; .* group"):
         Env(wrong.config.model_copy(update={"observation": Seen()}))
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (("", "error"), "the tag of a task.Curve .* is ''; give a name"),
+        (("task/error", None), "the metric of a task.Curve .* is None; give a name"),
+        (("task/error", "error", 3), "the over of a task.Curve .* is 3; give a name"),
+        (("a", "b", "steps", 100.0), "the title of the curve a .* is 100.0; give words"),
+        (("a", "b", "steps", "", "cm"), "the scale of the curve a .* is 'cm'; give a finite num"),
+    ],
+)
+def test_a_curve_that_cannot_be_is_refused(settings: tuple, words: str) -> None:
+    with pytest.raises(UserError, match=words):
+        task.Curve(*settings)
 
 
 def test_a_command_that_is_shown_but_not_there_is_refused(wrong: Env) -> None:
@@ -499,9 +674,50 @@ def test_tasks_have_the_geometry_of_the_model(large: Path) -> None:
     assert touched(0.039, 0.02) and not touched(0.041, 0.02)
     for flown in (juggle, track):
         height = flown.config.home[2] + RADIUS + HALF_HEIGHT
-        assert flown._ground() == pytest.approx(height)
+        assert flown.ground == pytest.approx(height)
     with pytest.raises(UserError, match=r"a ball of the radius 0.03 m rests on .* 0.0898 m"):
         Env(find_task("bounce").Config(mjcf=large, ball_init_pos=(0.59, 0.0, 0.07)))
+
+
+@pytest.mark.parametrize(
+    ("task_name", "settings", "words"),
+    [
+        (
+            "catch",
+            {"randomization": {"command_interval": (1.0, 2.0)}},
+            "randomization.command_interval is given, but the task Catch has no commands; leave",
+        ),
+        (
+            "catch",
+            {"randomization": {"first_command_range": 0.5, "warmup_steps": 10}},
+            "randomization.first_command_range is given, but the task Catch has no commands",
+        ),
+        ("bounce", {"target_height_range": 0.5}, "0.5 is not a range; give two numbers"),
+        ("track", {"speed_range": (0.1,)}, r"\(0.1,\) is not a range; give two numbers"),
+        ("juggle", {"height_range": (0.5, 0.4)}, r"\(0.5, 0.4\) is not a range; give the lower"),
+        ("bounce", {"randomization": {"restitution": 0.9}}, "0.9 is not a range; give two numbers"),
+        (
+            "bounce",
+            {"max_height_above_target": 0.01},
+            "target_height_range: .* >= 0.44 .*max_height_above_target .* a ball starts at 0.45 m",
+        ),
+        (
+            "bounce",
+            {"min_ball_height": 0.5},
+            "target_height_range: .* >= 0.5 .* with a ball lower than min_ball_height .0.5 m.",
+        ),
+        (
+            "bounce",
+            {"max_horizontal_distance": 0.5},
+            "max_horizontal_distance is 0.5 m, so an episode ends where it starts, at the ball_in",
+        ),
+    ],
+)
+def test_a_setting_that_a_task_cannot_have_is_refused(
+    task_name: str, settings: dict, words: str
+) -> None:
+    with pytest.raises(ValueError, match=words):
+        find_task(task_name).Config.model_validate(settings)
 
 
 @pytest.mark.parametrize("name", ["juggle", "track"])
@@ -519,7 +735,7 @@ def test_no_height_that_may_be_commanded_ends_the_episode_at_a_hit(name: str) ->
         tops = jnp.array([flown.config.home])
         if name == "juggle":
             tops = jnp.array(flown.config.columns(height))
-        balls = tops.at[:, 2].set(flown._ground())
+        balls = tops.at[:, 2].set(flown.ground)
         if name == "track":
             balls = balls[0]
         truth = task.Kinematics(rest, balls, None, rest, 0.0 * balls, None, jnp.array(tops[0]))
@@ -530,12 +746,12 @@ def test_no_height_that_may_be_commanded_ends_the_episode_at_a_hit(name: str) ->
         return bool(flown.step(state, task.Step(truth, commands, rest, rest)).ended)
 
     assert not is_ended(command.greatest + rise) and is_ended(command.greatest + rise + 0.05)
-    lowest, highest = command.span or (command.low, command.high)
+    lowest, highest = command.offered
     assert command.least <= lowest and highest <= command.greatest
     for height in (command.least - 1e-3, command.greatest + 1e-3):
         with pytest.raises(UserError, match="target_height is .* but must be a finite number >= "):
             command.checked(height, "target_height")
-    with pytest.raises(ValueError, match="height_range goes up to 0.75 m over home, but max_dist"):
+    with pytest.raises(ValueError, match="height_range: a command .* farther than max_distance"):
         kind.Config(height_range=(0.72, 0.75))
 
 
@@ -832,3 +1048,34 @@ def test_a_task_moves_its_commands() -> None:
     for count in range(3):
         np.testing.assert_allclose(state.pipeline_state.command["height"], 0.41 + 0.01 * count)
         state = step(state, jnp.zeros(6))
+
+
+class _Timed(rest_task.Rest):
+    """It ends after 25 ms, and tells the time."""
+
+    class Config(rest_task.Rest.Config):
+        pass
+
+    def step(self, state: tuple, step: task.Step) -> task.TaskStep:
+        result = super().step(state, step)
+        metrics = result.metrics | {"time": step.seconds}
+        return result._replace(ended=step.seconds > 0.025, metrics=metrics)
+
+
+def test_a_step_has_its_time() -> None:
+    """The environment counts its steps only for a task that reads it: the state of the others is
+    what it was."""
+    env = Env(_Timed.Config())
+    reset, step = jax.jit(env.reset), jax.jit(env.step)
+    state = reset(jax.random.key(0))
+    times = []
+    ends = []
+    for _ in range(4):
+        state = step(state, jnp.zeros(6))
+        times.append(float(state.metrics["time"]))
+        ends.append(bool(state.done))
+    np.testing.assert_allclose(times, [0.01, 0.02, 0.03, 0.04], rtol=1e-6)
+    assert ends == [False, False, True, True]
+    assert float(reset(jax.random.key(1)).pipeline_state.steps) == 0
+    untimed = jax.eval_shape(Env(rest_task.Config()).reset, jax.random.key(0))
+    assert untimed.pipeline_state.steps is None

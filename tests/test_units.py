@@ -255,8 +255,8 @@ class Mistyped(task.Task):
     "wrong, reason",
     {
         "curve": "the curve task/error names a metric that there is not, eror; there are: error",
-        "key given": "next_command of the task Mistyped names a command that there is not, hieght",
-        "key left out": "Mistyped lacks the command height; there are: height",
+        "key given": "next_command of the task Mistyped .* names a command that .* not, hieght",
+        "key left out": "Mistyped .* lacks the command height; there are: height",
         "term": "names a term of the reward that there is not, slwo; there are: low, slow",
         "term left out": "weighted_terms lacks the term of the reward slow; there are: low, slow",
     }.items(),

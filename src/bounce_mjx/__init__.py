@@ -4,19 +4,19 @@ import importlib
 import sys
 from typing import TYPE_CHECKING, Any
 
+from bounce_mjx.resources import VERSION as __version__
+
 if TYPE_CHECKING:
     from bounce_mjx.deploy.loading import load_policy
     from bounce_mjx.env.bounce_ball import BounceBall
-    from bounce_mjx.task.bounce import BounceConfig as EnvConfig
+    from bounce_mjx.task.bounce import Config as EnvConfig
     from bounce_mjx.training.run import Run, train
-
-__version__ = "0.1.0"
 
 __all__ = ["BounceBall", "EnvConfig", "Run", "__version__", "load_policy", "train"]
 
 _PUBLIC = {
     "BounceBall": ("bounce_mjx.env.bounce_ball", "BounceBall"),
-    "EnvConfig": ("bounce_mjx.task.bounce", "BounceConfig"),
+    "EnvConfig": ("bounce_mjx.task.bounce", "Config"),
     "Run": ("bounce_mjx.training.run", "Run"),
     "load_policy": ("bounce_mjx.deploy.loading", "load_policy"),
     "train": ("bounce_mjx.training.run", "train"),

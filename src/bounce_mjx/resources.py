@@ -1,7 +1,9 @@
-"""The data files that come with the package: `mjcf/`, `configs/` and `pretrained/`."""
+"""The package's version, and its data files: `mjcf/`, `configs/` and `pretrained/`."""
 
 import os
 from pathlib import Path
+
+VERSION = "0.1.0"
 
 PRETRAINED = "pretrained"
 TASK_POLICIES = ("balance", "catch", "juggle", "track")

@@ -70,6 +70,11 @@ def domain_randomize(
             "the randomisation has warmup_steps, but the ranges of a randomization_fn do not grow; "
             "set warmup_steps to 0"
         )
+    if config.ball_inertia is not None:
+        raise UserError(
+            "the randomisation has ball_inertia, but a randomization_fn has no inertia of a ball, "
+            "which this project's environments derive; leave it out, or set env.ball_inertia"
+        )
     masses = np.asarray(model.body_mass)
     if masses.shape != mj_model.body_mass.shape or not np.allclose(masses, mj_model.body_mass):
         raise UserError(
@@ -129,6 +134,11 @@ def parameters_of(base: Any, model: Any) -> PhysicsParameters:
         varied = np.any(batch != np.asarray(before[name]), axis=0)
         if name in INSEPARABLE:
             varied |= varied.any(axis=1, keepdims=True)
+        if name == "pair_friction":
+            # The second tangent's number follows from the first one's (`physics.friction`), and the
+            # rest has no effect on a pair without torsional friction.
+            varied[:, 1] &= np.any(batch[:, :, 1] != batch[:, :, 0], axis=0)
+            varied[:, 2:] = False
         for index in np.argwhere(varied).tolist():
             entries[f"{name}[{', '.join(map(str, index))}]"] = changed[name][tuple(index)]
     return PhysicsParameters(entries=entries or None)

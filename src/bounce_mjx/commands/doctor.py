@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
 from pathlib import Path
 
-import bounce_mjx
 from bounce_mjx.errors import UserError, install_command, reason_of
+from bounce_mjx.resources import VERSION
 
 _DISTRIBUTION = "bounce_mjx"
 # Versions on which the results of simulation and training depend.
@@ -36,7 +36,7 @@ def main(args: Sequence[str]) -> None:
 
 def describe() -> Iterator[tuple[str, str]]:
     """The lines, each a name and a text."""
-    yield "bounce_mjx", f"{bounce_mjx.__version__} in {Path(bounce_mjx.__file__).parent}"
+    yield "bounce_mjx", f"{VERSION} in {Path(__file__).parents[1]}"
     yield "python", f"{platform.python_version()} ({sys.executable}) on {platform.platform()}"
     yield "packages", ", ".join(f"{name} {version_of(name) or 'missing'}" for name in _PACKAGES)
     chosen = {name: value for name, value in os.environ.items() if name.startswith(_VARIABLES)}

@@ -21,6 +21,9 @@ class ExciteCommand(StrictModel):
     """Length, s."""
     max_velocity: Positive = 1.0
     """Largest speed of a joint's target, rad/s; give less than the robot's own limit."""
+    max_acceleration: Positive | None = None
+    """Largest acceleration of a joint's target, rad/s^2; by default as much as the servos' torques
+    and the robot's own limits allow."""
     table_height: Finite | None = None
     """Height of a table that the arm must not touch, m; the floor is at 0."""
 
@@ -32,7 +35,13 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.runs.files import write_output
 
     config = read_preset(Path("default"), command.robot).env
-    motion = excite(config, command.seconds, command.max_velocity, command.table_height)
+    motion = excite(
+        config,
+        command.seconds,
+        command.max_velocity,
+        command.table_height,
+        command.max_acceleration or float("inf"),
+    )
     write_output(command.out, to_csv(motion))
     for name, amplitude in zip(motion.joint_names, motion.amplitudes, strict=True):
         print(f"  {name}: up to {amplitude:.3f} rad from the start pose")

@@ -9,9 +9,9 @@ import os
 import sys
 from collections.abc import Sequence
 
-import bounce_mjx
 from bounce_mjx.errors import UserError, exit_on_user_error, needed, suggest
 from bounce_mjx.interrupt import end_on_ctrl_c
+from bounce_mjx.resources import VERSION
 
 COMMANDS = {
     "train": "train a policy",
@@ -57,7 +57,7 @@ def main(args: Sequence[str] | None = None) -> None:
             print(_HELP.format(commands="\n".join(lines)), end="")
             return
         if name == "--version":
-            print(f"bounce_mjx {bounce_mjx.__version__}")
+            print(f"bounce_mjx {VERSION}")
             return
         if name not in COMMANDS:
             advice = suggest(name, COMMANDS) or f"choose {', '.join(COMMANDS)}"

@@ -24,7 +24,11 @@ def main(args: Sequence[str]) -> None:
         # is seen only as it starts.
         config.ppo.check_rollout(config.training_episode_steps)
         config.check_eval_seed()
-        print(dump_with_sources(config.model_dump(mode="json"), config.sources), end="")
+        remarks = dict(config.sources)
+        for key, steps in config.intervals.items():
+            if steps != getattr(config, key):
+                remarks[key] += f"; in whole blocks {steps:,}"
+        print(dump_with_sources(config.model_dump(mode="json"), remarks), end="")
         return
     import jax
 

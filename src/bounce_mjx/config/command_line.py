@@ -323,6 +323,8 @@ def _form(kind: Any) -> str:
             choices.append(part)
         elif isinstance(part, type) and part not in hidden:
             names.append(part.__name__.upper())
+    if choices and names:
+        return "|".join([*names, *choices])
     return f"{{{','.join(choices)}}}" if choices else " ".join(names)
 
 

@@ -93,7 +93,7 @@ def dump_with_sources(plain: dict[str, Any], sources: Mapping[str, str], prefix:
     """Nested settings as YAML, each with a comment that names its source.
 
     Args:
-      sources: by dotted key.
+      sources: by dotted key, with what else the comment says.
       prefix: dotted key of the group, with a dot.
     """
     lines = []

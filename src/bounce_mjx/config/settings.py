@@ -5,15 +5,19 @@ gives its unit; it is also the help text of the command line. The bounds of a qu
 are wide, and refuse the same quantity in another unit: millimetres, degrees or milliseconds.
 """
 
+import math
+import numbers
 import re
 import typing
 from collections.abc import Iterator
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import pydantic
 from pydantic import Field
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticKnownError
+
+from bounce_mjx.errors import shorten
 
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
@@ -44,6 +48,18 @@ Duration = Annotated[Positive, Field(le=3600.0)]
 Friction = Annotated[NonNegative, Field(le=10.0)]
 """Coefficient of sliding friction."""
 
+BallInertia = Annotated[Positive, Field(le=0.67)]
+"""Moment of inertia of a ball per mass and squared radius."""
+
+HOLLOW = 2.0 / 3.0
+"""That of a thin shell, as a table-tennis ball is."""
+
+
+def _check_pair(ends: Any) -> Any:
+    if not isinstance(ends, list | tuple) or len(ends) != 2:
+        raise ValueError(f"{shorten(str(ends))} is not a range; give two numbers")
+    return ends
+
 
 def _check_order(ends: tuple[float, float]) -> tuple[float, float]:
     if not ends[0] <= ends[1]:
@@ -51,8 +67,14 @@ def _check_order(ends: tuple[float, float]) -> tuple[float, float]:
     return ends
 
 
-Ascending = pydantic.AfterValidator(_check_order)
-"""Mark of a range: its lower end comes first."""
+Number = TypeVar("Number")
+
+Range = Annotated[
+    tuple[Number, Number],
+    pydantic.BeforeValidator(_check_pair),
+    pydantic.AfterValidator(_check_order),
+]
+"""Two ends of a type, such as `Range[Length]`, the lower one first; equal ends are one value."""
 
 
 def whole_number(value: Any) -> Any:
@@ -71,6 +93,12 @@ NonNegativeInt = Annotated[int, _WholeNumber, Field(ge=0, lt=2**31)]
 Count = Annotated[int, _WholeNumber, Field(ge=1, lt=2**31)]
 
 Steps = Annotated[int, _WholeNumber, Field(ge=1, le=10**12)]
+
+
+def is_finite(value: Any) -> bool:
+    """Whether a value is a finite number, which a truth value is not."""
+    is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
+    return is_number and math.isfinite(value)
 
 
 class StrictModel(pydantic.BaseModel):

@@ -11,6 +11,9 @@ import types
 from pathlib import Path
 from typing import TypeVar
 
+import pydantic
+
+from bounce_mjx.config.validation import describe
 from bounce_mjx.errors import UserError, reason_of, shorten
 
 Kind = TypeVar("Kind")
@@ -98,6 +101,8 @@ def _run(source: bytes, path: Path) -> types.ModuleType:
     sys.modules[module.__name__] = module
     try:
         exec(compile(source, str(path), "exec"), vars(module))
+    except UserError as error:
+        raise UserError(f"{path} cannot be imported: {error}") from error
     except Exception as error:
         line = 1
         for frame in traceback.extract_tb(error.__traceback__):
@@ -105,9 +110,12 @@ def _run(source: bytes, path: Path) -> types.ModuleType:
                 line = frame.lineno
         # A SyntaxError has its own.
         line = getattr(error, "lineno", None) or line
+        reason = reason_of(error)
+        if isinstance(error, pydantic.ValidationError):
+            reason = describe(error, {})
         raise UserError(
             f"{path} cannot be imported ({type(error).__name__} in line {line}: "
-            f"{shorten(str(error), 300)}); correct it"
+            f"{shorten(reason, 300)}); correct it"
         ) from error
     return module
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bounce_mjx.deploy.metadata import Metadata, joint_ends
-from bounce_mjx.robot.setpoints import Setpoint, command, joint_limits, next_setpoint
+from bounce_mjx.robot.setpoints import Setpoint, joint_limits, next_setpoint, position_at
 
 
 class Course(NamedTuple):
@@ -100,7 +100,7 @@ class Motion:
             return np.tile(course.end.position, (len(times), 1))
         since_start = np.asarray(times)[:, None]
         acceleration = course.end.acceleration
-        return command(course.start, acceleration, since_start, np, self._limits.smoothing)
+        return position_at(course.start, acceleration, since_start, np, self._limits.smoothing)
 
     def target(self, course: Course) -> np.ndarray:
         """The command [J] at the end of the control step, rad."""

@@ -4,12 +4,12 @@ does not import JAX."""
 from typing import Any
 
 from bounce_mjx.env.env import Env
-from bounce_mjx.task.bounce import BounceConfig
+from bounce_mjx.task.bounce import Config
 
 
 class BounceBall(Env):
     """The environment of the original specification."""
 
-    def __init__(self, config: BounceConfig | None = None, randomize: Any = None):
+    def __init__(self, config: Config | None = None, randomize: Any = None):
         """See `Env`; without a config, the specification's."""
-        super().__init__(config or BounceConfig(), randomize)
+        super().__init__(config or Config(), randomize)

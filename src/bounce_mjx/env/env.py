@@ -9,29 +9,23 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from bounce_mjx.env.checks import (
+from bounce_mjx.env.contract import (
     ENDS,
-    check_commands,
+    CheckedTask,
+    Outline,
+    check_declared,
     check_has_task,
-    check_joint_angles,
-    check_randomize,
-    check_start,
-    check_starts,
-    check_tags,
-    check_task,
-    check_task_step,
-    check_throw,
 )
 from bounce_mjx.env.ranges import check_ranges, within_queues
+from bounce_mjx.env.starts import check_joint_angles, check_start, check_starts
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState
 from bounce_mjx.physics.engine import Engine, make_engine
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
 from bounce_mjx.robot import model as robot_model
-from bounce_mjx.task.rewards import check_names
 from bounce_mjx.task.task import Start, Step, Task, TaskStep
 from bounce_mjx.world import noise
-from bounce_mjx.world.actuation import Actuation, Actuators
+from bounce_mjx.world.actuation import ActuationMemory, Actuators
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.model import world_model
 from bounce_mjx.world.noise import Clock
@@ -39,6 +33,7 @@ from bounce_mjx.world.observation import Kinematics
 from bounce_mjx.world.randomization import TERMS, Ranges, World
 from bounce_mjx.world.sampling import (
     check_contacts,
+    check_overlap,
     nominal_values,
     physics_parameters,
     sample_world,
@@ -101,7 +96,9 @@ class EnvState(NamedTuple):
     """For a randomised world, or where there is `sensing`."""
     redraw: Redraw | None = None
     """For commands that are sampled again within an episode."""
-    actuation: Actuation = Actuation()
+    actuation: ActuationMemory = ActuationMemory()
+    steps: jax.Array | None = None
+    """Control steps since the reset [], int32, for a task whose step reads the time."""
     sensing: Sensing | None = None
     """For an observation that differs from the true state of one instant."""
 
@@ -154,7 +151,7 @@ class Env:
         check_has_task(config)
         self.config = config
         self.task: Task = config.task(config)
-        check_task(config, self.task)
+        check_declared(config, self.task)
         self.mj_model: mujoco.MjModel = world_model(config)
         self.addresses = robot_model.find_addresses(self.mj_model)
         self.engine: Engine = make_engine(self.mj_model, config.physics, self.addresses)
@@ -167,10 +164,14 @@ class Env:
         check_start(config, self.task)
         check_starts(config, self.mj_model, self.addresses, self.task)
         self._actuators = Actuators(config, self.mj_model, self.addresses)
-        self._sensors = Sensors(config, self.mj_model, self.addresses, self.engine, self.task)
+        self._checked_task = CheckedTask(self.task, config)
+        self._sensors = Sensors(
+            config, self.mj_model, self.addresses, self.engine, self._checked_task
+        )
         self._randomize = randomize
         if randomize is not None:
-            check_randomize(randomize, config, self.mj_model, self.addresses)
+            terms = config.randomization.terms
+            check_overlap(self.mj_model, self.addresses, terms, randomize)
         self.nominals = nominal_values(self.mj_model, config.randomization.terms, self.addresses)
         """Values of the terms of the randomisation in an episode that does not sample them."""
         self._fingerprint = robot_model.fingerprint(self.mj_model)
@@ -245,13 +246,12 @@ class Env:
 
         command_ranges = self._command_ranges(ranges)
         sampled = sample_commands(command_ranges, draws.commands)
-        thrown = self.task.throw(draws.task, sampled)
-        check_throw(thrown, self.config.num_balls, self.task)
+        thrown = self._checked_task.throw(draws.task, sampled)
         physics = self._first_physics(draws, world, thrown)
         truth = self._kinematics(physics, parameters)
-        first_command = self._task_command(sampled)
-        task = self.task.reset(Start(truth, first_command, draws.task))
-        command = self._checked_next_command(task, first_command)
+        first_command = self._checked_task.first_command(sampled)
+        task = self._checked_task.reset(Start(truth, first_command, draws.task))
+        command = self._checked_task.next_command(task, first_command)
 
         state = EnvState(
             physics=physics,
@@ -266,12 +266,15 @@ class Env:
         )
         if self._sensors.are_needed:
             state = state._replace(sensing=self._sensors.first(_instant(state, truth)))
+        outline = self._outline(state, truth)
+        if outline.reads_time:
+            state = state._replace(steps=jnp.zeros((), jnp.int32))
         return State(
             pipeline_state=state,
             obs=self.observe(state, truth),
             reward=jnp.zeros((), physics.qpos.dtype),
             done=jnp.zeros((), physics.qpos.dtype),
-            metrics=self._first_metrics(state, truth),
+            metrics=self._first_metrics(state, truth, outline),
         )
 
     def step(self, state: State, action: jax.Array) -> State:
@@ -297,7 +300,7 @@ class Env:
         physics = self.engine.step(before.parameters, before.physics, control, num_substeps)
         return self.finish_step(state, action, actuation, physics)
 
-    def control(self, before: EnvState, action: jax.Array) -> tuple[Control, Actuation]:
+    def control(self, before: EnvState, action: jax.Array) -> tuple[Control, ActuationMemory]:
         """The part of a step before the physics: the inputs of the physics under the action [n] of
         `step`, late by the world's latency and lag, and the memory of the actuation after the
         step."""
@@ -307,7 +310,7 @@ class Env:
         )
 
     def finish_step(
-        self, state: State, action: jax.Array, actuation: Actuation, physics: PhysicsState
+        self, state: State, action: jax.Array, actuation: ActuationMemory, physics: PhysicsState
     ) -> State:
         """The part of a step after the physics: the task's, and the observation.
 
@@ -328,12 +331,15 @@ class Env:
         after = before._replace(physics=physics, last_action=action, actuation=actuation)
         truth = self.kinematics(after)
 
+        if before.steps is not None:
+            after = after._replace(steps=before.steps + 1)
         task_step = Step(
             truth=truth,
             command=before.command,
             action=action,
             last_action=before.last_action,
             ball_radius=before.parameters.ball_radius,
+            seconds=0.0 if after.steps is None else after.steps * self.dt,
         )
         result = self.task.step(before.task, task_step)
         ends = {
@@ -342,7 +348,7 @@ class Env:
         }
 
         after = self._redraw_commands(after)
-        # Its names and shapes were checked at the reset.
+        # The reset has compared what it returns.
         command = self.task.next_command(result.state, after.command)
         after = after._replace(task=result.state, command=command)
         if after.clock is not None:
@@ -457,22 +463,6 @@ class Env:
             for name, command in self.config.commands.items()
         }
 
-    def _task_command(self, sampled: dict[str, jax.Array]) -> dict[str, jax.Array]:
-        """The task's commands from their samples, at a reset and at each redraw, each []."""
-        command = self.task.first_command(sampled)
-        named = f"first_command of the task {type(self.task).__name__}"
-        check_commands(named, command, sampled)
-        return command
-
-    def _checked_next_command(
-        self, task: Any, command: dict[str, jax.Array]
-    ) -> dict[str, jax.Array]:
-        """The commands of a reset from now on, each []; `task` is the task's state."""
-        following = self.task.next_command(task, command)
-        named = f"next_command of the task {type(self.task).__name__}"
-        check_commands(named, following, command)
-        return following
-
     def _first_redraw(self, world: World, ranges: Ranges, dtype: jnp.dtype) -> Redraw | None:
         """What later samples of the commands need; None if they are not sampled again."""
         if "command_interval" not in world:
@@ -497,37 +487,31 @@ class Env:
         draws = noise.uniform(counter, noise.COMMAND, (len(ranges),), age.dtype)
         # JAX has sorted the keys of the state's dictionary.
         in_order = {name: ranges[name] for name in self.config.commands}
-        new_command = self._task_command(sample_commands(in_order, draws))
+        new_command = self.task.first_command(sample_commands(in_order, draws))
         command = {}
         for name, last_value in state.command.items():
             command[name] = jnp.where(is_due, new_command[name], last_value)
         redraw = Redraw(age=jnp.where(is_due, 0.0, age + self.dt), ranges=ranges)
         return state._replace(command=command, redraw=redraw)
 
-    def _first_metrics(self, state: EnvState, truth: Kinematics) -> dict[str, jax.Array]:
-        """The metrics of a reset, which are zero except for the privileged ones."""
-        zero = jnp.zeros((), truth.joint_angles.dtype)
-        # A step of the task is traced for its names, shapes and types, and not computed.
+    def _outline(self, state: EnvState, truth: Kinematics) -> Outline:
+        """What the task's step returns, traced from the state of a reset."""
         step = Step(
             truth=truth,
             command=state.command,
             action=state.last_action,
             last_action=state.last_action,
         )
-        result = jax.eval_shape(lambda: self.task.step(state.task, step))
-        check_task_step(result, jax.eval_shape(lambda: state.task), self.task)
-        rewards = [f"reward/{name}" for name in result.reward]
-        metrics = dict.fromkeys([*rewards, *result.metrics, *ENDS], zero)
-        metrics |= self._privileged_metrics(state.world, truth)
-        for curve in self.task.curves:
-            named = {curve.metric}
-            if curve.over not in ("steps", "episodes"):
-                named.add(curve.over)
-            # A curve may not name an unknown metric, and need not name them all.
-            check_names(f"the curve {curve.tag}", "metric", metrics.keys() | named, metrics)
-        # After the names, as a mistyped metric leaves another one without its curve.
-        check_tags(self.task, result.metrics)
-        return metrics
+        own = [*ENDS, *self._privileged_metrics(state.world, truth)]
+        return self._checked_task.outline(state.task, step, own)
+
+    def _first_metrics(
+        self, state: EnvState, truth: Kinematics, outline: Outline
+    ) -> dict[str, jax.Array]:
+        """The metrics of a reset, which are zero except for the privileged ones."""
+        zero = jnp.zeros((), truth.joint_angles.dtype)
+        metrics = dict.fromkeys([*outline.metrics, *ENDS], zero)
+        return metrics | self._privileged_metrics(state.world, truth)
 
     def kinematics(self, state: EnvState) -> Kinematics:
         """True positions and velocities of one environment's state, read from its physics."""

@@ -1,4 +1,5 @@
-"""Evaluation on MuJoCo's C engine: the same task and policy, with the physics in threads."""
+"""Evaluation on MuJoCo's C engine: the same task and policy. The physics is in threads, except
+where a ball has friction: there each step of each episode is one of `physics.CEngine`."""
 
 import copy
 import os
@@ -13,8 +14,15 @@ from bounce_mjx.env.env import Env, EnvState, State
 from bounce_mjx.evaluation.episodes import Batch, Evaluator, add_step, begin, reset_episodes
 from bounce_mjx.evaluation.statistics import Measured
 from bounce_mjx.learning.policy import Actor, Policy
-from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState, edited_model, servo_targets
-from bounce_mjx.world.actuation import Actuation
+from bounce_mjx.physics import (
+    CEngine,
+    Control,
+    PhysicsParameters,
+    PhysicsState,
+    edited_model,
+    servo_targets,
+)
+from bounce_mjx.world.actuation import ActuationMemory
 from bounce_mjx.world.model import world_model
 from bounce_mjx.world.randomization import Ranges
 
@@ -36,7 +44,9 @@ def make_mujoco_evaluator(env: Env, actor: Actor, episodes: int, recorded: int =
         return begin(env, reset_episodes(env, key, episodes, ranges), recorded)
 
     @jax.jit
-    def decide(policy: Policy, states: State) -> tuple[jax.Array, Actuation, Control, jax.Array]:
+    def decide(
+        policy: Policy, states: State
+    ) -> tuple[jax.Array, ActuationMemory, Control, jax.Array]:
         now = states.pipeline_state
         actions = actor.act(policy, states.obs.T).T
         control, actuation = jax.vmap(env.control, in_axes=-1, out_axes=-1)(now, actions)
@@ -45,7 +55,7 @@ def make_mujoco_evaluator(env: Env, actor: Actor, episodes: int, recorded: int =
 
     @jax.jit
     def finish(
-        now: Batch, actions: jax.Array, actuation: Actuation, physics: PhysicsState
+        now: Batch, actions: jax.Array, actuation: ActuationMemory, physics: PhysicsState
     ) -> Batch:
         finish_step = jax.vmap(env.finish_step, in_axes=-1, out_axes=-1)
         return add_step(env, now, finish_step(now.states, actions, actuation, physics))
@@ -67,7 +77,7 @@ def make_mujoco_evaluator(env: Env, actor: Actor, episodes: int, recorded: int =
 
 
 class _Physics:
-    """The physics of N episodes on MuJoCo's C engine, in threads."""
+    """The physics of N episodes on MuJoCo's C engine."""
 
     def __init__(self, env: Env, now: EnvState, pool: rollout.Rollout):
         """
@@ -76,7 +86,9 @@ class _Physics:
         """
         self._mj_model = env.mj_model
         self._pool = pool
-        self._models = episode_models(env, now.parameters)
+        self._engines = [CEngine(model) for model in episode_models(env, now.parameters)]
+        self._has_friction = any(engine.has_friction for engine in self._engines)
+        self._models = [engine.model for engine in self._engines]
         self._data = [mujoco.MjData(self._models[0]) for _ in range(_NUM_THREADS)]
         self._states = full_states(env.mj_model, now.physics)
         balls = env.addresses.balls
@@ -109,10 +121,25 @@ class _Physics:
 
     def _advance(self, controls: np.ndarray, kind: mujoco.mjtState) -> None:
         """Advances by physics steps with controls [N, steps, size] of a kind."""
+        if self._has_friction:
+            self._advance_each(controls, kind)
+            return
         trajectory, _ = self._pool.rollout(
             self._models, self._data, self._states, controls, control_spec=kind
         )
         self._states = trajectory[:, -1]
+
+    def _advance_each(self, controls: np.ndarray, kind: mujoco.mjtState) -> None:
+        """The same, one episode after another."""
+        data = self._data[0]
+        for i, state in enumerate(self._states):
+            engine = self._engines[i % len(self._engines)]
+            mujoco.mj_resetData(engine.model, data)
+            mujoco.mj_setState(engine.model, data, state, _FULL_PHYSICS)
+            for control in controls[i]:
+                mujoco.mj_setState(engine.model, data, control, kind)
+                engine.step(data)
+            mujoco.mj_getState(engine.model, data, state, _FULL_PHYSICS)
 
     def _drag_forces(self, drag: np.ndarray) -> np.ndarray:
         """Forces and torques [N, bodies, 6] on the balls, from `Control.air_drag` [N]."""

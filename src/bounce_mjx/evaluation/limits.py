@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bounce_mjx.robot.setpoints import Setpoint, command, joint_limits
+from bounce_mjx.robot.setpoints import Setpoint, joint_limits, position_at
 from bounce_mjx.task.task import Recording
 from bounce_mjx.world.config import WorldConfig
 
@@ -56,7 +56,7 @@ def limit_shares(config: WorldConfig, recording: Recording, rate: float = 1000) 
     largest = {name: still for name in bounds}
     for after, is_running in zip(velocities, running, strict=True):
         acceleration = (after - start.velocity) / duration
-        sent = [command(start, acceleration, time, np, smoothing) for time in times]
+        sent = [position_at(start, acceleration, time, np, smoothing) for time in times]
         sent = [*earlier, *sent]
         change = np.array(sent)
         for name, bound in bounds.items():

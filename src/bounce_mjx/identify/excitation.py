@@ -1,6 +1,7 @@
 """Motions of the arm without a ball that show its servos: each joint alone, slow and fast, then all
 together, without contacts."""
 
+import copy
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,6 +11,7 @@ import numpy as np
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.contacts import ContactChecker
+from bounce_mjx.robot.actuators import largest_torques
 from bounce_mjx.robot.model import find_addresses, joint_names, joint_ranges
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.model import world_model
@@ -34,6 +36,11 @@ _BELOW_LIMIT = 0.9
 _TOGETHER = (0.53, 0.71, 0.89, 1.13, 1.37, 1.61, 1.83, 2.11)
 # Time between two poses that are checked for contacts, s.
 _CHECKED = 0.02
+# Poses whose torques are computed; share of its largest acceleration from which a joint moves in
+# one, and acceleration below which it rests, rad/s^2.
+_POSES = 2000
+_MOVES = 0.2
+_AT_REST = 0.05
 
 
 class Excitation(NamedTuple):
@@ -53,19 +60,23 @@ def excite(
     seconds: float,
     max_velocity: float | Sequence[float],
     table_height: float | None = None,
+    max_acceleration: float | Sequence[float] = np.inf,
 ) -> Excitation:
     """Plans an excitation that starts and ends at `config.default_joint_angles`.
 
     The arm first lifts the paddle, for room above the floor. The amplitude of the joint that is
-    farthest out is halved until no pose has a contact. Of a robot with `robot.limits`, all targets
-    keep to them.
+    farthest out is halved until no pose has a contact; and the accelerations of the joints that
+    move are, until no joint needs more than `_BELOW_LIMIT` of its servo's torque. Of a robot with
+    `robot.limits`, all targets keep to them.
 
     Args:
       max_velocity: largest speed of a target, of each joint or of all, rad/s.
       table_height: height of a table under the arm, m; None for the floor alone.
+      max_acceleration: largest acceleration of a target, of each joint or of all, rad/s^2.
 
     Raises:
-      UserError: the start pose has a contact with the floor or the table, or a joint cannot move.
+      UserError: the start pose has a contact with the floor or the table, a joint cannot move, or
+        its servo cannot hold it.
     """
     model = world_model(config, visual=False)
     n = config.num_joints
@@ -76,6 +87,7 @@ def excite(
     given = limits.velocity, limits.acceleration, limits.jerk
     bounds = _BELOW_LIMIT * np.array([[np.inf] * n if x is None else x for x in given])
     bounds[0] = np.minimum(bounds[0], max_velocity)
+    bounds[1] = np.minimum(bounds[1], max_acceleration)
     low, high = joint_ranges(model, find_addresses(model))
     # Lifted, each joint has room to both sides, or as much as in the start pose.
     reach = _FROM_END + _ROOM
@@ -119,6 +131,10 @@ def excite(
             (t, pair) for t in checked for pair in sorted(contacts.touching(targets[t]) - allowed)
         )
         if (hit := next(poses, None)) is None:
+            slower = _within_torques(model, targets, dt, bounds, names)
+            if slower is not None:
+                bounds = slower
+                continue
             return Excitation(names, times, targets, np.max(np.abs(targets - home), axis=0))
         step, pair = hit
         joint = int(np.argmax(np.abs(targets[step] - rests[step])))
@@ -130,6 +146,55 @@ def excite(
                 f"{mover} cannot move around the start pose without {_contact(contacts, pair)}; "
                 "change default_joint_angles or --table-height"
             )
+
+
+def _within_torques(
+    model: mujoco.MjModel,
+    targets: np.ndarray,
+    dt: float,
+    bounds: np.ndarray,
+    names: Sequence[str],
+) -> np.ndarray | None:
+    """Bounds [3, n] of a motion that is slower where one along the targets [T, n] needs more torque
+    than the servos have; None if it needs no more.
+
+    Raises:
+      UserError: a servo is too weak to hold its joint at rest.
+    """
+    addresses = find_addresses(model)
+    joints = list(addresses.arm_joints)
+    most = _BELOW_LIMIT * largest_torques(model, joints, list(addresses.actuators))
+    if not np.any(np.isfinite(most)):
+        return None
+    rates = np.gradient(targets, dt, axis=0)
+    accelerations = np.gradient(rates, dt, axis=0)
+    data = mujoco.MjData(model)
+    dofs = list(addresses.arm_qvel)
+    # Without contacts and servos: what a motion needs.
+    model = copy.copy(model)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
+    fastest = np.max(np.abs(accelerations), axis=0)
+    every = range(0, len(targets), max(len(targets) // _POSES, 1))
+    slower = bounds.copy()
+    for t in every:
+        data.qpos[list(addresses.arm_qpos)] = targets[t]
+        data.qvel[dofs] = rates[t]
+        data.qacc[dofs] = accelerations[t]
+        mujoco.mj_inverse(model, data)
+        over = np.flatnonzero(np.abs(data.qfrc_inverse[dofs]) > most)
+        if not len(over):
+            continue
+        moving = np.abs(accelerations[t]) > _MOVES * fastest
+        if np.max(fastest) < _AT_REST or not np.any(moving):
+            joint = int(over[0])
+            raise UserError(
+                f"{names[joint]} needs {abs(data.qfrc_inverse[dofs[joint]]):.3g} N m at rest, and "
+                f"its servo has {most[joint] / _BELOW_LIMIT:.3g} N m; change its force limit or "
+                "default_joint_angles"
+            )
+        slower[1, moving] = 0.5 * fastest[moving]
+    return None if np.array_equal(slower, bounds) else np.minimum(slower, bounds)
 
 
 def _contact(contacts: ContactChecker, pair: tuple[int, int]) -> str:

@@ -12,6 +12,7 @@ from bounce_mjx.errors import UserError
 # A joint angle this far beyond the joint's range is not a measurement of it, rad.
 _BEYOND_RANGE = 0.5
 _LARGEST_ANGLE = 4.0 * np.pi
+_TURN = 2.0 * np.pi
 _FARTHEST_BALL = 20.0
 _LONGEST_STEP = 0.2
 # A control step, s, by which the unit of longer ones is guessed.
@@ -19,6 +20,8 @@ _USUAL_STEP = 0.005
 _MIN_ROWS = 100
 # Share of a measurement's rows from which their times, or balls far away, are no slips.
 _WRONG_ROWS = 0.05
+# Times that go back so often are those of several recordings in one file.
+_MOST_RESTARTS = 30
 # Time without a row, s and in typical steps, on whose other side are times of another clock.
 _FAR_IN_TIME = 3600.0
 _FAR_STEPS = 100.0
@@ -47,14 +50,21 @@ _NO_CLOCK = 0.1
 # Change of the youngest pictures' age over a log that is worth a note, s.
 _GROWING_AGE = 0.01
 
-# Time between two rows, s and in typical steps, beyond which a log has a gap.
+# Rows of an even log that may be lost one after another and are filled.
+_MOST_LOST = 4
+# Share of the steps of an even log that are near whole multiples of the typical one, and how near.
+_EVEN = 0.95
+_NEAR_WHOLE = 0.3
+# Time between two rows, s and in typical steps, beyond which a log whose steps are uneven has a
+# gap.
 _GAP = 0.1
 _GAP_STEPS = 5.0
-# The same of a log whose steps are even, in typical steps, as a lost row is plain in it; and the
-# quantile of its steps that is at most so many typical ones.
-_LOST_ROWS = 1.9
-_EVEN = 0.98
-_EVEN_STEPS = 1.4
+# Rows that show whether a joint's angle is held; share of repeated angles, while its command moves
+# by more than two counts of its encoder a row, from which it may be; and share of the times between
+# two new angles that are then alike.
+_FEWEST_MOVING = 50
+_HELD = 0.4
+_ALIKE = 0.8
 
 
 class Log(NamedTuple):
@@ -147,6 +157,13 @@ def make_log(source: str, angles: Rows, targets: Rows, balls: Rows) -> Log:
     angles = angles.without(
         _find_spikes(angles, targets), "is a spike: the joint is elsewhere before and after", notes
     )
+    angles = angles.without(
+        _find_held(angles, targets),
+        "holds the angle before it while the joint moves: a slower sensor in rows of the control "
+        "step",
+        notes,
+    )
+    targets = _fill_lost(targets, notes)
     # An arm may have been recorded alone, with a tracker that saw no ball. Trackers, and logs of
     # control steps, hold the last picture until the next, at times under a new stamp, which may be
     # later than that of the next.
@@ -185,6 +202,13 @@ def _clean(
       refused: share of rows with gaps from which the log is refused.
     """
     numbers = np.column_stack([rows.times, rows.arrivals, rows.values])
+    empty = np.all(np.isnan(rows.values), axis=0)
+    if np.any(empty) and len(rows.values) and not np.all(empty):
+        raise UserError(
+            f"number {np.argmax(empty) + 1} of each row of the {rows.name} is missing everywhere, "
+            "as of a joint without an encoder; identify needs the angle and the target of every "
+            "joint: log what the controller reports, or measure that robot by hand"
+        )
     wrong = ~np.isfinite(numbers).all(axis=1)
     lack = f"lacks its time or one of its {rows.values.shape[1]} numbers"
     rows = rows.without(wrong, lack, notes, refused)
@@ -217,6 +241,14 @@ def _in_order(rows: Rows, notes: list[str]) -> Rows:
     late[:-1] = rows.times[:-1] >= earliest[1:]
     # A time that is too late makes all that follow early, and one too early all before it late.
     wrong = min(early, late, key=np.sum)
+    restarts = np.flatnonzero(np.diff(rows.times) < 0.0)
+    if np.sum(wrong) >= max(_WRONG_ROWS * len(wrong), 2.0) and len(restarts) <= _MOST_RESTARTS:
+        place = rows.place.format(rows.numbers[restarts[0] + 1])
+        more = f" and {len(restarts) - 1} more times" if len(restarts) > 1 else ""
+        raise UserError(
+            f"the times of the {rows.name} go back at {place}{more}: split the log there, and give "
+            "the parts as logs of their own"
+        )
     return rows.without(wrong, "has a time out of order", notes, _WRONG_ROWS, _ONE_CLOCK)
 
 
@@ -291,6 +323,71 @@ def _find_spikes(angles: Rows, targets: Rows) -> np.ndarray:
     return spikes
 
 
+def _find_held(angles: Rows, targets: Rows) -> np.ndarray:
+    """Which rows [R] hold an earlier angle of a joint whose sensor is slower than the rows: as a
+    measurement of its own time, each would count as later than it is.
+
+    A joint is held if it repeats its angle to the last digit again and again, for as many rows each
+    time, while its command moves by more than its encoder's counts.
+    """
+    values = angles.values
+    held = np.zeros(len(values), bool)
+    if len(values) < _MIN_ROWS:
+        return held
+    for joint, column in enumerate(values.T):
+        steps = np.abs(np.diff(column))
+        if not np.any(steps > 0.0):
+            continue
+        sent = np.abs(np.diff(np.interp(angles.times, targets.times, targets.values[:, joint])))
+        moving = sent > 2.0 * np.min(steps[steps > 0.0])
+        if np.sum(moving) < _FEWEST_MOVING or np.mean(steps[moving] == 0.0) < _HELD:
+            continue
+        new = np.flatnonzero(np.append(True, steps > 0.0))
+        between = np.diff(new)
+        both = moving[new[1:] - 1]
+        length = int(np.median(between[both])) if np.any(both) else 1
+        if length > 1 and np.mean(np.abs(between[both] - length) <= 1) > _ALIKE:
+            # At rest, each angle is the same as the one before it.
+            since = (
+                np.arange(len(column))
+                - new[np.searchsorted(new, np.arange(len(column)), "right") - 1]
+            )
+            held |= since % length != 0
+    return held
+
+
+def _fill_lost(targets: Rows, notes: list[str]) -> Rows:
+    """The targets of an even log with those of up to `_MOST_LOST` lost rows in a row, on the line
+    between their neighbours: the one before them was not held in their place."""
+    steps = np.diff(targets.times)
+    if not _is_even(targets.times):
+        return targets
+    counts = np.round(steps / np.median(steps)).astype(int) - 1
+    lost = np.flatnonzero((counts > 0) & (counts <= _MOST_LOST))
+    if not len(lost):
+        return targets
+    added = [np.linspace(targets.times[i], targets.times[i + 1], counts[i] + 2)[1:-1] for i in lost]
+    times = np.sort(np.concatenate([targets.times, *added]))
+    source = np.searchsorted(targets.times, times, side="right") - 1
+    values = [np.interp(times, targets.times, column) for column in targets.values.T]
+    notes.append(
+        f"{np.sum(counts[lost])} of the {targets.name} were lost, up to {np.max(counts[lost])} in "
+        "a row: they count as on the line between their neighbours"
+    )
+    return targets.chosen(source)._replace(times=times, values=np.stack(values, axis=1))
+
+
+def _is_even(times: np.ndarray) -> bool:
+    """Whether rows come at even times, of which some may be lost: steps are whole multiples of the
+    typical one."""
+    steps = np.diff(times)
+    if not len(steps):
+        return False
+    share = steps / max(float(np.median(steps)), 1e-9)
+    near = np.abs(share - np.maximum(np.round(share), 1.0)) < _NEAR_WHOLE
+    return bool(np.mean(near) > _EVEN)
+
+
 def _height_beyond_neighbours(values: np.ndarray, rows: np.ndarray) -> float:
     """The least distance by which all of successive rows of values [R] lie above, or below, both
     the row before and the row after them; negative if some lies between."""
@@ -363,12 +460,13 @@ def align_clocks(log: Log) -> Log:
 def find_gaps(times: np.ndarray) -> list[tuple[float, float]]:
     """The last time before each gap of a measurement's times [T], and the first one after it, s.
 
-    Where the steps are even, each lost row is a gap: the arm had a target in it that the log lacks.
+    Of an even log, a gap is more lost rows than are filled: the arm had targets in it that the log
+    lacks.
     """
     steps = np.diff(times)
     typical = float(np.median(steps))
-    if np.quantile(steps, _EVEN) <= _EVEN_STEPS * typical:
-        longest = _LOST_ROWS * typical
+    if _is_even(times):
+        longest = (_MOST_LOST + 1.5) * typical
     else:
         longest = max(_GAP, _GAP_STEPS * typical)
     return [(float(times[i]), float(times[i + 1])) for i in np.flatnonzero(steps > longest)]
@@ -405,10 +503,18 @@ def check(log: Log, joint_names: Sequence[str], joint_ranges: np.ndarray) -> Non
         if np.any(outside := (values < low) | (values > high)):
             row, joint = np.argwhere(outside)[0]
             column = f"{name.replace(' ', '_')}.{joint_names[joint]}"
+            remedy = f"if these are degrees, write {column} [deg]"
+            turns = round(float(np.median(values[:, joint]) - np.mean(joint_ranges[joint])) / _TURN)
+            turned = values[:, joint] - turns * _TURN
+            if limited[joint] and turns and np.all((turned > low[joint]) & (turned < high[joint])):
+                remedy = (
+                    f"it is {turns} whole turn{'s' if abs(turns) > 1 else ''} off: subtract "
+                    f"{turns * _TURN:.6g} rad from its angles and targets"
+                )
             raise UserError(
                 f"{column} in {log.source} is {values[row, joint]:.4g} rad at the time "
                 f"{times[row]:.6g} s, and {low[joint]:.3g} to {high[joint]:.3g} rad is expected; "
-                f"if these are degrees, write {column} [deg]"
+                f"{remedy}"
             )
     begins = log.times[0], log.target_times[0]
     ends = log.times[-1], log.target_times[-1]

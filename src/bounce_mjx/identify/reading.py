@@ -3,7 +3,7 @@ files, by `rosbags` (the extra `identify`)."""
 
 import csv
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -64,6 +64,8 @@ def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
         if name not in columns:
             if (near := name.replace(".", "_")) in columns:
                 raise UserError(f"{path} has the column {near}; write {name} for {near}")
+            if (other := _foreign(columns, name)) is not None:
+                raise UserError(f"{path} has no column {name} [{unit}]; write {name} for {other}")
             raise UserError(
                 f"{path} has no column {name} [{unit}]; its columns are "
                 f"{', '.join(map(shorten, list(columns)[:30]))}; if the joints have other names, "
@@ -118,6 +120,18 @@ def read_csv(path: Path, joint_names: Sequence[str]) -> Log:
     return log
 
 
+def _foreign(columns: Mapping[str, Any], name: str) -> str | None:
+    """The column of a log that is likely one of another name: the first, for the time, and another
+    one of the same joint or axis."""
+    known = ("time", "joint_angles.", "joint_velocities.", "servo_targets.", "ball_")
+    of_part = "." + name.rpartition(".")[2]
+    for i, other in enumerate(columns):
+        is_alike = i == 0 if name == "time" else other.endswith(of_part)
+        if is_alike and not other.startswith(known):
+            return shorten(other)
+    return None
+
+
 def _read_columns(path: Path) -> tuple[dict[str, tuple[str, np.ndarray]], np.ndarray]:
     """The stated unit and the numbers [R] of each column of a CSV file, by its name, NaN for a cell
     that holds none; and the line [R] of the file that each row is."""
@@ -140,6 +154,11 @@ def _read_columns(path: Path) -> tuple[dict[str, tuple[str, np.ndarray]], np.nda
         raise UserError(
             f"the log {path} cannot be read ({shorten(reason_of(error))}); {remedy}"
         ) from error
+    if delimiter == "," and cells.size and cells.shape[1] == 2 * len(titles):
+        raise UserError(
+            f"the numbers of {path} have decimal commas, and commas between them too; separate "
+            "them by semicolons, or write decimal points"
+        )
     if cells.shape[1] != len(titles) or not cells.size:
         raise UserError(
             f"the log {path} has {len(cells)} rows of {cells.shape[1]} cells, and its header has "

@@ -8,5 +8,5 @@
     registry.py    how an algorithm is found by its name
 
 It knows an environment by the interface `env.vector.AnyEnv` and by the names of metrics in
-`env.checks` alone.
+`env.contract` alone.
 """

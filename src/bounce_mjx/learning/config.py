@@ -55,7 +55,7 @@ class PPOConfig(settings.StrictModel):
     """Factor by which the trainer scales the reward."""
     init_noise_std: settings.Positive = 0.4
     """Standard deviation of the action noise at the start."""
-    min_noise_std: settings.NonNegative = 0.0
+    mean_noise_bound: settings.NonNegative = 0.0
     """Mean lower bound of that standard deviation: each environment has a bound of its own, evenly
     from 0 to twice this; 0 for none. Without it a long training forgets how to recover."""
     hidden_layers: Annotated[tuple[settings.Count, ...], Field(min_length=1)] = (128, 128)

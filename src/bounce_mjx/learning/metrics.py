@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from bounce_mjx.env import vector
-from bounce_mjx.env.checks import ENDS, WORLD_PREFIXES, unnamed_metrics
+from bounce_mjx.env.contract import ENDS, WORLD_PREFIXES, unnamed_metrics
 from bounce_mjx.errors import UserError
 from bounce_mjx.task import Curve
 

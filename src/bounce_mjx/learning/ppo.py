@@ -355,14 +355,14 @@ class PPO:
 
     def noise_bounds(self) -> jax.Array:
         """Lower bounds of the action noise of each environment [B, 1]: evenly from 0 to twice
-        min_noise_std.
+        mean_noise_bound.
 
         With one bound for all, either no environment visits the states from which a policy must
         recover, or none those in which it must be precise. Different noise for each actor is that
         of Horgan et al. (2018), Distributed prioritized experience replay.
         """
         share = (jnp.arange(self.config.num_envs) + 0.5) / self.config.num_envs
-        return 2.0 * self.config.min_noise_std * share[:, None]
+        return 2.0 * self.config.mean_noise_bound * share[:, None]
 
     def network_inputs(self, observation: jax.Array, metrics: Metrics) -> jax.Array:
         """Inputs of the networks before normalisation [B, N + K].

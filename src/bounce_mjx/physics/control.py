@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from bounce_mjx.robot.setpoints import Setpoint, command
+from bounce_mjx.robot.setpoints import Setpoint, position_at
 
 Scalar = float | jax.Array
 
@@ -25,7 +25,7 @@ class Moving(NamedTuple):
     older_acceleration: Any = None
     """Accelerations [nu] two control steps before, for targets that are late and smoothed: their
     mean reaches back that far."""
-    control_steps: Any = None
+    num_substeps: Any = None
     """Physics steps [] in a control step, with `older_acceleration`."""
 
 
@@ -97,13 +97,13 @@ def _moving_target(control: Control, moving: Moving, step: Scalar) -> Scalar:
     start = Setpoint(control.ctrl, moving.velocity, moving.last_acceleration)
     earlier = None
     if moving.older_acceleration is not None:
-        earlier = (moving.control_steps, moving.older_acceleration)
+        earlier = (moving.num_substeps, moving.older_acceleration)
     time = step + 1.0
     # A late target is the setpoint of an earlier time, before the control step if negative.
     setpoint_time = time if control.switch is None else time - control.switch
 
     def position(setpoint_time: Scalar, lag: Scalar | None = None) -> Scalar:
-        return command(
+        return position_at(
             start,
             moving.acceleration,
             setpoint_time,

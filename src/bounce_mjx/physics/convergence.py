@@ -8,6 +8,7 @@ from collections.abc import Iterable
 import mujoco
 import numpy as np
 
+from bounce_mjx.physics.friction import solver_model
 from bounce_mjx.robot.model import find_addresses
 
 _SETTINGS = ("solver", "iterations", "tolerance", "ls_iterations", "ls_tolerance")
@@ -24,6 +25,7 @@ def solver_warning(mj_model: mujoco.MjModel) -> str | None:
     Several bounces are simulated with `mj_step`, each step also with MuJoCo's default settings,
     which converge for the contact of a ball.
     """
+    mj_model = solver_model(mj_model, find_addresses(mj_model))
     default = mujoco.MjOption()
     changed = [name for name in _SETTINGS if getattr(mj_model.opt, name) != getattr(default, name)]
     if not changed:

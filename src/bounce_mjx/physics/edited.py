@@ -30,8 +30,6 @@ from bounce_mjx.robot.model import (
 )
 from bounce_mjx.robot.numbers import field_of
 
-# MuJoCo's mjMINMU: its C engine computes with no smaller coefficient of friction.
-MIN_FRICTION = 1e-5
 NO_PAIR = (
     "the MJCF has no contact pair of the ball and the paddle, which contact_stiffness, "
     "contact_damping and contact_friction change; add <pair> to <contact>"
@@ -170,7 +168,7 @@ def edits(mj_model: mujoco.MjModel, addresses: Addresses) -> tuple[Edit, ...]:
         Edit("ball_radius", "geom_size", (ball_geoms, 0), radii / radii[0]),
         Edit("contact_stiffness", "pair_solref", (pairs, 0), -1.0),
         Edit("contact_damping", "pair_solref", (pairs, 1), -1.0),
-        Edit("contact_friction", "pair_friction", (pairs, slice(0, 2))),
+        Edit("contact_friction", "pair_friction", (pairs, 0)),
         Edit("servo_gain", "actuator_gainprm", (servos, 0)),
         Edit("servo_gain", "actuator_biasprm", (servos, 1), -1.0),
         Edit("servo_damping", "actuator_biasprm", (servos, 2), -1.0),
@@ -231,7 +229,7 @@ def edited(
     for name, value in (parameters.entries or {}).items():
         _put_entry(model, name, value)
     _set_flags(model)
-    _derive(model)
+    _derive(model, parameters.ball_inertia)
     return model
 
 
@@ -272,6 +270,14 @@ def _set_flags(model: EditedModel) -> None:
     makes its pair frictional, and a force limit its servo limited."""
     for pair in model.rows("pair_friction"):
         model.follow("pair_dim", pair, [max(3, int(model.mj_model.pair_dim[pair]))])
+        # One coefficient for both tangents.
+        model.follow("pair_friction", (pair, 1), [model["pair_friction", pair, 0]])
+    for name in model.edited_beside([("pair_friction", (slice(None), 0))]):
+        if name.startswith("pair_friction["):
+            raise UserError(
+                f"{name} would be another friction than the one of its pair, which has one along "
+                "both tangents; give the entry with the index 0"
+            )
     for servo in model.rows("actuator_forcerange"):
         model.follow("actuator_forcelimited", servo, [True])
     # MuJoCo skips the transformation of a geom flagged as sharing its body's frame.
@@ -279,16 +285,22 @@ def _set_flags(model: EditedModel) -> None:
         model.follow("geom_sameframe", geom, [int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE)])
 
 
-def _derive(model: EditedModel) -> None:
+def _derive(model: EditedModel, ball_inertia: Scalar | None) -> None:
     """Sets the entries that MuJoCo's compiler derives from edited ones, except the arm's inverse
     weights (`body_invweight0`, `dof_invweight0`). An inertia follows the mass, and a ball's also
-    the square of the radius."""
+    the square of the radius, with `PhysicsParameters.ball_inertia` as the factor if it is given."""
     ball_of_body = {ball.body: ball for ball in model.addresses.balls}
     edited_sizes = model.rows("geom_size")
     edited_masses = model.rows("body_mass")
     resized = [body for body, ball in ball_of_body.items() if ball.geom in edited_sizes]
     for body in {*edited_masses, *resized}:
-        _derive_inertia(model, body, ball_of_body.get(body), body in resized)
+        if body in ball_of_body:
+            _derive_ball(model, ball_of_body[body], body in resized)
+        else:
+            _scale_inertia(model, body, _mass_factor(model, body))
+    if ball_inertia is not None:
+        for ball in model.addresses.balls:
+            _derive_ball_inertia(model, ball, ball_inertia)
     if edited_masses:
         _derive_subtree_masses(model)
     for dof in model.addresses.arm_qvel:
@@ -298,37 +310,50 @@ def _derive(model: EditedModel) -> None:
             _derive_simple_inertia(model, dof)
 
 
-def _derive_inertia(
-    model: EditedModel, body: int, ball: BallAddresses | None, is_resized: bool
-) -> None:
-    """Sets what follows from the mass of a body and from the radius of a ball.
+def _mass_factor(model: EditedModel, body: int) -> Scalar:
+    """Mass of a body divided by the model's own."""
+    model_mass = model.mj_model.body_mass[body].item()
+    return mul(model["body_mass", body], 1.0 / model_mass) if model_mass else 1.0
 
-    Args:
-      model: the model with its edits.
-      body: index of the body.
-      ball: the ball that it is; None for another body.
-      is_resized: whether it is a ball with an edited radius.
-    """
-    mj_model = model.mj_model
-    mass = model["body_mass", body]
-    model_mass = mj_model.body_mass[body].item()
-    factor = mul(mass, 1.0 / model_mass) if model_mass else 1.0
+
+def _scale_inertia(model: EditedModel, body: int, factor: Scalar) -> None:
+    """Sets the inertia of a body to a multiple of the model's own."""
+    model.follow("body_inertia", body, Vec(model.mj_model.body_inertia[body].tolist()) * factor)
+
+
+def _derive_ball(model: EditedModel, ball: BallAddresses, is_resized: bool) -> None:
+    """Sets what follows from the mass and the radius of a ball."""
+    factor = _mass_factor(model, ball.body)
     if is_resized:
         radius = model["geom_size", ball.geom, 0]
-        growth = mul(radius, 1.0 / mj_model.geom_size[ball.geom, 0].item())
+        growth = mul(radius, 1.0 / model.mj_model.geom_size[ball.geom, 0].item())
         factor = mul(factor, mul(growth, growth))
         model.follow("geom_rbound", ball.geom, [radius])
         model.follow("geom_aabb", (ball.geom, slice(3, 6)), [radius] * 3)
-    model.follow("body_inertia", body, Vec(mj_model.body_inertia[body].tolist()) * factor)
-    if ball is not None:
-        inertia = model["body_inertia", body]
-        # Inverses of the mass and of the inertia.
-        inverse_mass, inverse_inertia = mj_model.body_invweight0[body].tolist()
-        moving = inverse_mass * model_mass / mass
-        turning = inverse_inertia * mj_model.body_inertia[body, 0].item() / inertia[0]
-        model.follow("body_invweight0", body, [moving, turning])
-        # MuJoCo stores the constant inertia matrix of a free body in the model.
-        model.follow("dof_M0", np.array(ball.qvel), (mass, mass, mass, *inertia))
+    _scale_inertia(model, ball.body, factor)
+    _derive_ball_weights(model, ball)
+
+
+def _derive_ball_inertia(model: EditedModel, ball: BallAddresses, per_mass: Scalar) -> None:
+    """Sets the inertia of a ball from `PhysicsParameters.ball_inertia`."""
+    radius = model["geom_size", ball.geom, 0]
+    inertia = mul(per_mass, mul(model["body_mass", ball.body], mul(radius, radius)))
+    model.follow("body_inertia", ball.body, [inertia] * 3)
+    _derive_ball_weights(model, ball)
+
+
+def _derive_ball_weights(model: EditedModel, ball: BallAddresses) -> None:
+    """Sets what MuJoCo stores of the mass and the inertia of a ball beside them."""
+    mj_model = model.mj_model
+    mass = model["body_mass", ball.body]
+    inertia = model["body_inertia", ball.body]
+    # Inverses of the mass and of the inertia.
+    inverse_mass, inverse_inertia = mj_model.body_invweight0[ball.body].tolist()
+    moving = inverse_mass * mj_model.body_mass[ball.body].item() / mass
+    turning = inverse_inertia * mj_model.body_inertia[ball.body, 0].item() / inertia[0]
+    model.follow("body_invweight0", ball.body, [moving, turning])
+    # MuJoCo stores the constant inertia matrix of a free body in the model.
+    model.follow("dof_M0", np.array(ball.qvel), (mass, mass, mass, *inertia))
 
 
 def _derive_simple_inertia(model: EditedModel, dof: int) -> None:
@@ -393,6 +418,8 @@ def own_parameters(
         numbers.setdefault(edit.parameter, entries)
     numbers["ball_mass"] = numbers["ball_mass"][0]
     numbers["ball_radius"] = numbers["ball_radius"][0]
+    first_ball = mj_model.body_inertia[addresses.balls[0].body, 0]
+    numbers["ball_inertia"] = first_ball / (numbers["ball_mass"] * numbers["ball_radius"] ** 2)
     torques = torque_ranges(mj_model, addresses.arm_joints, addresses.actuators)
     numbers["force_limit"] = np.max(np.abs(torques), axis=0)
     numbers["link_mass"] = _link_masses(mj_model, addresses)

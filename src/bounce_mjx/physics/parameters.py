@@ -22,7 +22,7 @@ class PhysicsState(NamedTuple):
 class PhysicsParameters(NamedTuple):
     """Physics parameters of one environment; None keeps the model's own value.
 
-    Every engine replaces the model's value by the given one; the reference is `mj_step` on the
+    Every engine replaces the model's value by the given one; the reference is `CEngine` of the
     model returned by `edited_model`. Quantities of the n acting joints and their links are in the
     order of `Addresses.arm_joints`. `jax.vmap` batches the arrays.
     """
@@ -33,13 +33,16 @@ class PhysicsParameters(NamedTuple):
     ball_radius: Array | None = None
     """Radius [] of the ball, m, and of the first of several, to which the others stay in
     proportion; the mass stays the same, the inertia scales with the square."""
+    ball_inertia: Array | None = None
+    """Moment of inertia [] of the balls per mass and squared radius: 2/5 of a solid ball, 2/3 of a
+    hollow one. It acts only where a ball has friction."""
     contact_stiffness: Array | None = None
     """Stiffness [] of the contacts, 1/s^2: k of MuJoCo's direct `solref="-k -b"`."""
     contact_damping: Array | None = None
     """Damping [] of the contacts, 1/s: b of `solref="-k -b"`."""
     contact_friction: Array | None = None
-    """Coefficient [] of sliding friction between ball and paddle, and between balls; it turns a
-    frictionless pair into one with `condim="3"`."""
+    """Coefficient [] of sliding friction between ball and paddle, and between balls
+    (`physics.friction`); it turns a frictionless pair into one with `condim="3"`."""
     servo_gain: Array | None = None
     """Stiffness [n] of the position servos at their actuators, N m/rad: `kp`."""
     servo_damping: Array | None = None

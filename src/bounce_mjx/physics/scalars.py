@@ -22,6 +22,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
 
@@ -85,6 +86,18 @@ def maximum(a: Scalar, b: Scalar) -> Scalar:
 def minimum(a: Scalar, b: Scalar) -> Scalar:
     """The smaller one."""
     return min(a, b) if is_constant(a) and is_constant(b) else jnp.minimum(a, b)
+
+
+def select(condition: bool | jax.Array, a: Scalar, b: Scalar) -> Scalar:
+    """a where the condition holds, else b."""
+    if isinstance(condition, bool | np.bool_):
+        return a if condition else b
+    return jnp.where(condition, a, b)
+
+
+def inverse_root(a: Scalar) -> Scalar:
+    """1 / sqrt(a) of a positive number."""
+    return 1.0 / math.sqrt(a) if is_constant(a) else lax.rsqrt(a)
 
 
 def dot(a: Sequence[Scalar], b: Sequence[Scalar]) -> Scalar:

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.lazy import import_mjx
+from bounce_mjx.physics.friction import unsupported_friction
 from bounce_mjx.robot.contact import unsupported_constraints
 from bounce_mjx.robot.model import Addresses, BallAddresses, find_addresses
 from bounce_mjx.robot.numbers import field_of
@@ -60,24 +61,13 @@ def unsupported_feature(
 def _features(
     mj_model: mujoco.MjModel, engine: str, addresses: Addresses | None
 ) -> Iterator[Feature]:
+    addresses = addresses or find_addresses(mj_model)
     yield from _common(mj_model, engine)
+    yield from unsupported_friction(mj_model, addresses)
     if engine == "fused":
-        yield from _fused(mj_model, addresses or find_addresses(mj_model))
+        yield from _fused(mj_model, addresses)
     else:
         yield from _mjx(mj_model)
-
-
-def unsupported_friction(mj_model: mujoco.MjModel, pair_dim: Sequence[int]) -> str | None:
-    """Name of a feature of the contacts that the fused engine lacks, if they have these `condim`s;
-    None if it has them all."""
-    dims = set(map(int, pair_dim))
-    if not dims <= {1, 3}:
-        return f"torsional or rolling friction (condim {max(dims)}; only condim 1 and 3)"
-    if dims == {1, 3}:
-        return "sliding friction of some contact pairs only"
-    if 3 in dims and mj_model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
-        return 'sliding friction (contact_friction) with cone="elliptic"'
-    return None
 
 
 def _flags(m: mujoco.MjModel) -> set[str]:
@@ -141,9 +131,6 @@ def _fused(m: mujoco.MjModel, addresses: Addresses) -> Iterator[Feature]:
         "contact pairs other than one of the paddle and each ball, and of two balls",
         not _has_known_pairs(m, addresses),
     )
-    friction = unsupported_friction(m, m.pair_dim)
-    if friction is not None:
-        yield friction, True
 
 
 def _is_branched(m: mujoco.MjModel, joints: Sequence[int]) -> bool:

@@ -100,17 +100,28 @@ def result_cells(result: Result) -> list[str]:
     return [result.name, result.measured, result_text(result), result.bound, verdict]
 
 
-def unsolved_line(report: Report) -> str:
-    """What a policy misses, and what may help; empty if it meets all results."""
+def unsolved_line(report: Report, num_seeds: int = 1) -> str:
+    """What the best policy of a training misses, and what may help; empty if it meets all
+    results.
+
+    Args:
+      num_seeds: seeds of the training.
+    """
     missed = []
     for result in report.results:
         if result.passed is False:
             missed.append(f"{result.name} {result_text(result)} ({result.bound})")
     if not missed:
         return ""
+    stuck = "the seed is in a local optimum: try --seed or --num-seeds 8"
+    if num_seeds > 1:
+        stuck = (
+            f"each of the {num_seeds} seeds is in a local optimum: try others (--seed), or change "
+            "the reward"
+        )
     return (
         f"not solved: {', '.join(missed)}; if the return still rises (bounce-mjx plot), train "
-        "longer; if not, the seed is in a local optimum: try --seed or --num-seeds 8"
+        f"longer; if not, {stuck}"
     )
 
 

@@ -20,7 +20,6 @@ from bounce_mjx.errors import UserError
 PAIR_SETTINGS = "condim solref solreffriction solimp margin gap adhesion friction".split()
 """Attributes of a contact pair in an `MjSpec` that say how its geoms touch."""
 
-# With fewer physics steps in half a period of a contact, the ball can gain energy in a rebound.
 _STEPS_OF_A_CONTACT = 4
 # Fields of an MjModel with a solref or a solimp, which `{}` stands for.
 _FIELDS = "pair_{} geom_{} jnt_{} dof_{} eq_{} tendon_{}_lim tendon_{}_fri".split()
@@ -38,13 +37,13 @@ _DROPS = (
 )  # fmt: skip
 
 
-def damping_of_restitution(restitution: jax.Array, stiffness: float) -> jax.Array:
+def damping_of_restitution(restitution: jax.Array, stiffness: float | jax.Array) -> jax.Array:
     """Damping [] of a contact, 1/s, that gives a restitution [] at a stiffness (1/s^2):
     2 zeta sqrt(stiffness), with the damping ratio zeta interpolated between drop tests. The
     restitution is clipped to those of the table, 0 to 0.993."""
     ratios, restitutions = np.array(_DROPS[::-1]).T
     zeta = jnp.interp(restitution, restitutions, ratios)
-    return (2.0 * np.sqrt(stiffness) * zeta).astype(jnp.asarray(restitution).dtype)
+    return (2.0 * jnp.sqrt(stiffness) * zeta).astype(jnp.asarray(restitution).dtype)
 
 
 def restitution_of_damping(damping: float, stiffness: float) -> np.ndarray:
@@ -52,6 +51,23 @@ def restitution_of_damping(damping: float, stiffness: float) -> np.ndarray:
     `damping_of_restitution`, clipped to the same."""
     ratios, restitutions = np.array(_DROPS).T
     return np.interp(damping / (2.0 * np.sqrt(stiffness)), ratios, restitutions)
+
+
+def stiffness_of_duration(duration: jax.Array) -> jax.Array:
+    """Stiffness [] of a contact, 1/s^2, with which a bounce lasts as long (s): half a period of its
+    spring."""
+    return (math.pi / duration) ** 2
+
+
+def duration_of_stiffness(stiffness: float) -> float:
+    """How long a bounce lasts, s: the inverse of `stiffness_of_duration`."""
+    return math.pi / math.sqrt(max(stiffness, 1e-9))
+
+
+def least_duration(timestep: float) -> float:
+    """Shortest contact, s, that physics steps of a length (s) can simulate: with fewer of them, the
+    ball can gain energy in a rebound."""
+    return _STEPS_OF_A_CONTACT * timestep
 
 
 def stiffness_and_damping(solref: Any, timestep: float) -> tuple[Any, Any]:
@@ -89,7 +105,7 @@ def check_step(mj_model: mujoco.MjModel) -> None:
     step = mj_model.opt.timestep
     # The engines refuse a mixed format (`unsupported_constraints`).
     for solref in mj_model.pair_solref[~_is_mixed(mj_model.pair_solref)]:
-        if step <= _half_period(solref, step) / _STEPS_OF_A_CONTACT * (1.0 + 1e-3):
+        if least_duration(step) <= _half_period(solref, step) * (1.0 + 1e-3):
             continue
         # A long step lengthens the half period, as it limits the time constant; a short one does
         # not.
@@ -104,7 +120,7 @@ def check_step(mj_model: mujoco.MjModel) -> None:
 def _half_period(solref: np.ndarray, timestep: float) -> float:
     """Half a period of a contact's undamped oscillation, s."""
     stiffness, _ = stiffness_and_damping(solref, timestep)
-    return math.pi / math.sqrt(max(stiffness, 1e-9))
+    return duration_of_stiffness(stiffness)
 
 
 def unsupported_constraints(mj_model: mujoco.MjModel) -> Iterator[tuple[str, bool]]:

@@ -70,11 +70,13 @@ class Geometry(NamedTuple):
     """What a task needs of the ball and the paddle, which a model may have in any size."""
 
     ball_radius: float
-    """Radius of the balls, m."""
+    """Radius of the first ball, m."""
     rest_height: float
     """Height of a ball's centre over the paddle's while they touch, m."""
     paddle_home: tuple[float, float, float]
     """Centre of the paddle at a reset without noise, m; the function `paddle_home` rounds it."""
+    ball_radii: tuple[float, ...]
+    """Radius of each ball, m."""
 
 
 def scene_spec(mjcf: Path | None, robot: RobotConfig) -> tuple[mujoco.MjSpec, Path]:
@@ -134,7 +136,7 @@ def load_model(
         _check_balls(addresses, num_balls)
     if robot.limits.torque is not None:
         # A wrong number of torques, or of joints, is refused where the config is known
-        # (`WorldConfig`, `env.checks.check_joint_angles`).
+        # (`WorldConfig`, `env.starts.check_joint_angles`).
         torques = robot.limits.torque[: len(addresses.actuators)]
         limit_torques(mj_model, addresses.actuators[: len(torques)], torques)
     mj_model.opt.timestep = physics_dt
@@ -246,11 +248,12 @@ def read_geometry(
     mj_model: mujoco.MjModel, addresses: Addresses, joint_angles: Sequence[float]
 ) -> Geometry:
     """The geometry of a model whose arm starts at joint angles [n], rad."""
-    ball_radius = float(mj_model.geom_size[addresses.balls[0].geom, 0])
+    ball_radii = tuple(float(mj_model.geom_size[ball.geom, 0]) for ball in addresses.balls)
     _, face_height = upper_face(mj_model, addresses, joint_angles)
     data = data_at(mj_model, addresses, joint_angles)
     paddle_home = tuple(data.geom_xpos[addresses.paddle_geom].tolist())
-    return Geometry(ball_radius, ball_radius + face_height, paddle_home)
+    rest_height = ball_radii[0] + face_height
+    return Geometry(ball_radii[0], rest_height, paddle_home, ball_radii)
 
 
 def upper_face(

@@ -1,7 +1,7 @@
 """Setpoints between two actions, within an arm's limits of velocity, acceleration and jerk.
 
-The simulation computes them with JAX's arrays (`world.actuation`, and `command` within a step in
-`physics.control`), and a deployed policy with NumPy's (`deploy.motion`).
+The simulation computes them with JAX's arrays (`world.actuation`, and `position_at` within a step
+in `physics.control`), and a deployed policy with NumPy's (`deploy.motion`).
 
 **Velocity and acceleration.** An action asks for a position. The command's velocity changes
 linearly from v0 to v1 within the control step, of the duration T. v1 is the distance divided by T,
@@ -125,7 +125,7 @@ def _stopping_velocity(
     return xp.maximum(in_one, in_several)
 
 
-def command(
+def position_at(
     start: Setpoint,
     acceleration: Number,
     time: Number,
@@ -134,8 +134,9 @@ def command(
     lag: Number | None = None,
     earlier: tuple[Number, Number] | None = None,
 ) -> Number:
-    """The command of a control step, rad. Its times, velocities and accelerations may be in seconds
-    or in another unit of time, such as the physics step, if all are in the same one.
+    """The position of a setpoint that moves in a control step, rad. Its times, velocities and
+    accelerations may be in seconds or in another unit of time, such as the physics step, if all are
+    in the same one.
 
     Args:
       start: the setpoint at the step's start.

@@ -19,7 +19,7 @@ import re
 import shutil
 import sys
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +80,12 @@ def read_policy(checkpoint: Checkpoint, config: TrainConfig) -> Policy:
     """Restores the policy of a checkpoint."""
     # Refuses a damaged one.
     read_record(checkpoint)
+    seeds = folders.runs_of_seeds(checkpoint.run)
+    if seeds != [checkpoint.run] and not (checkpoint.folder / POLICY).is_dir():
+        raise UserError(
+            f"{checkpoint.folder} holds the state of all {len(seeds)} seeds, with which a training "
+            f"resumes; give {checkpoint.run} for its best policy, or a seed such as {seeds[0]}"
+        )
     policy = _read_arrays(checkpoint, POLICY, policy_shapes(config))
     for path, array in jax.tree_util.tree_leaves_with_path(policy):
         if not np.all(np.isfinite(array)):
@@ -320,7 +326,7 @@ def save_checkpoint(
     items: dict[str, Any],
     progress: dict[str, Any] | None = None,
     report: Report | None = None,
-    kept: int | None = None,
+    kept: Collection[int] = (),
 ) -> int:
     """Writes a checkpoint, and then removes the others of the run but for `kept`. A process that is
     killed at any moment leaves a complete one.
@@ -332,7 +338,7 @@ def save_checkpoint(
       items: pytrees of arrays by their names above.
       progress: the evaluations so far, plain data.
       report: the evaluation of the policy; None if it was not evaluated.
-      kept: number of another checkpoint that is kept.
+      kept: numbers of other checkpoints that are kept.
 
     Returns:
       Its number, see `Checkpoint`.
@@ -361,7 +367,7 @@ def save_checkpoint(
         with contextlib.suppress(OSError):
             # It is saved: what cannot be removed stays until the next save.
             for other in others:
-                if other.number != kept:
+                if other.number not in kept:
                     # First out of the way, so that no reader finds a part of it.
                     other.folder.rename(unfinished / other.folder.name)
     # Orbax and tensorstore raise exceptions of many types, also where the disk is full.

@@ -3,7 +3,7 @@
 import shlex
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pydantic
 import yaml
@@ -28,7 +28,7 @@ CONFIG_FILE = "config.yaml"
 ROBOT = "robot"
 """Folder of a run with a copy of its robot."""
 RESUMABLE_KEYS = frozenset(
-    "total_steps eval_every save_every eval_episodes screening_episodes eval_seed "
+    "total_steps eval_every save_every keep_checkpoints eval_episodes screening_episodes eval_seed "
     "stop_when_solved log_dir num_devices".split()
 )
 """Keys that do not affect what a training learns in a number of steps: they may differ between a
@@ -80,6 +80,8 @@ class TrainConfig(StrictModel):
     save_every: Steps | None = None
     """Environment steps between two saved states, rounded to whole blocks, in addition to those
     after each evaluation; null for these alone."""
+    keep_checkpoints: Count | Literal["all"] = 1
+    """Newest checkpoints that stay, or all, in addition to the one of the best evaluation."""
     eval_episodes: Count = 1024
     """Episodes of an evaluation of the results."""
     screening_episodes: NonNegativeInt = 0
@@ -128,6 +130,30 @@ class TrainConfig(StrictModel):
         """Control steps after which the training truncates an episode."""
         limit = self.ppo.training_episode_seconds or self.env.episode_seconds
         return min(self.env.episode_steps, max(1, round(limit / self.env.control_dt)))
+
+    @property
+    def iterations_per_block(self) -> int:
+        """Iterations of the algorithm in one block."""
+        return max(1, round(self.block_steps / self.ppo.batch_steps))
+
+    @property
+    def steps_per_block(self) -> int:
+        """Environment steps of a block, which is never divided."""
+        return self.iterations_per_block * self.ppo.batch_steps
+
+    def in_whole_blocks(self, steps: int) -> int:
+        """The number of steps, of whole blocks, that is nearest to a number; at least one block."""
+        return self.steps_per_block * max(1, round(steps / self.steps_per_block))
+
+    @property
+    def intervals(self) -> dict[str, int]:
+        """The settings that are numbers of steps, by key, in the whole blocks that are trained."""
+        numbers = {}
+        for key in ("total_steps", "block_steps", "eval_every", "save_every"):
+            steps = getattr(self, key)
+            if steps is not None:
+                numbers[key] = self.in_whole_blocks(steps)
+        return numbers
 
     @property
     def starts_with_learning_rate(self) -> bool:

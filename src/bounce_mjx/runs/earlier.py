@@ -28,6 +28,7 @@ _MOVED = {
     "env.joint_angle_noise": "env.reset.joint_angles",
     "env.joint_velocity_noise": "env.reset.joint_velocities",
     "env.ball_position_noise": "env.reset.ball_position",
+    "ppo.min_noise_std": "ppo.mean_noise_bound",
 }
 """Settings that moved, with their present keys."""
 

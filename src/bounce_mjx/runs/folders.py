@@ -34,7 +34,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import bounce_mjx
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.config.user_code import is_file, read_source, source_file
 from bounce_mjx.errors import UserError, suggest, warn_once
@@ -43,6 +42,7 @@ from bounce_mjx.resources import (
     POLICIES,
     PRETRAINED,
     TASK_POLICIES,
+    VERSION,
     policy_folder,
     resource_path,
 )
@@ -156,7 +156,7 @@ def _files_of(mjcf: Path) -> list[Path]:
 
 def write_config(run: Path, config: TrainConfig) -> None:
     """Writes the run's config as it is, without copies."""
-    head = f"# bounce_mjx {bounce_mjx.__version__}\n{BASE}: null\n"
+    head = f"# bounce_mjx {VERSION}\n{BASE}: null\n"
     write_atomically(run / CONFIG_FILE, head + dump_config(config) + dump_sources(config))
 
 

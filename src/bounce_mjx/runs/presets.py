@@ -123,15 +123,20 @@ def read_config_file(
     path: Path, kind: str = "config file", example: str = _EXAMPLE
 ) -> dict[str, Any]:
     """The values of a config file (`read_mapping`). The files of the task and the algorithm have
-    absolute paths; the MJCF file starts, as they do, at the folder of the file."""
+    absolute paths; the MJCF file starts, as they do, at the folder of the file.
+
+    Raises:
+      UserError: the file is missing, is no mapping, or names a task or an algorithm by no text.
+    """
     values = present_settings(read_mapping(path, kind, example))
     for key in {"task", "algorithm"} & values.keys():
-        name = str(values[key])
+        name = values[key]
+        if not isinstance(name, str):
+            raise UserError(f"{shown_file(path)}: {key} is {name}, but must be a name")
         if is_file(name):
             file, _, class_name = name.rpartition(":")
             absolute = os.path.abspath(path.parent / Path(file).expanduser())
-            name = f"{absolute}:{class_name}"
-        values = values | {key: name}
+            values = values | {key: f"{absolute}:{class_name}"}
     env = values.get("env")
     mjcf = env.get("mjcf") if isinstance(env, dict) else None
     if isinstance(mjcf, str) and not mjcf.startswith("~") and not is_packaged(Path(mjcf)):

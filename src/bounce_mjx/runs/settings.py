@@ -141,7 +141,7 @@ def stack(
 
 def _stack_of_run(choice: Choice, whole_config: TrainConfig | None) -> "Stack":
     """The layer of a run that is resumed."""
-    from bounce_mjx.runs.folders import find_run, named_run
+    from bounce_mjx.runs.folders import find_run, is_newest, named_run
 
     excluded = {
         "config": choice.config or whole_config is not None,
@@ -151,6 +151,11 @@ def _stack_of_run(choice: Choice, whole_config: TrainConfig | None) -> "Stack":
     for name, is_given in excluded.items():
         if is_given:
             raise UserError(f"{name} and resume cannot be combined; leave one out")
+    if choice.log_dir is not None and not is_newest(choice.resume):
+        raise UserError(
+            f"log_dir is where the newest run is looked for, and {choice.resume} is named; omit "
+            "one of them"
+        )
     log_dir = choice.log_dir or runs_folder(find_task(choice.task or DEFAULT))
     resume = named_run(choice.resume, log_dir)
     run = find_run(resume)
@@ -427,6 +432,9 @@ class Stack:
                 text = describe(mistake.error, self.fields, flags, mistake.group)
                 raise UserError(f"{text} (see {prog} --help)") from mistake.error
             text = describe(mistake.error, self.fields, group=mistake.group)
+            if source != PYTHON and mistake.path in (["robot"], ["world"], ["resume"]):
+                (name,) = mistake.path
+                text = f"{name} is no setting; leave it out, and give --{name} or train({name}=...)"
             raise UserError(f"{shorten(source)}: {text}") from mistake.error
         if self.resumed is not None:
             _check_resumable(self.resumed, config)

@@ -1,7 +1,8 @@
 """Tasks: what the arm and the ball are to do. Those of the package have a file each, as yours has.
 
     task.py      `Task`, and what an environment, a report and a viewer give it and get from it
-    rewards.py   the terms of a reward, as settings with a formula, and the ball's free flight
+    rewards.py   the terms of a reward, as settings with a formula
+    flights.py   the ball's free flight, its apex and its landing
     results.py   what judges a policy
     registry.py  how a task is found by its name
 
@@ -18,6 +19,7 @@ its step (reward, end, metrics), its quantities of the observation, its results,
 """
 
 from bounce_mjx.config.settings import StrictModel
+from bounce_mjx.task.flights import GRAVITY, Flight, closest, flight
 from bounce_mjx.task.results import (
     Episodes,
     Figure,
@@ -29,14 +31,11 @@ from bounce_mjx.task.results import (
     share_of_events,
 )
 from bounce_mjx.task.rewards import (
-    GRAVITY,
-    Flight,
     Gaussian,
     Near,
     Proportional,
     RewardTerm,
-    closest,
-    flight,
+    changes,
     gaussian,
     horizontal_distance,
     length,
@@ -67,5 +66,6 @@ from bounce_mjx.world.config import (
     ResetConfig,
     WorldConfig,
 )
+from bounce_mjx.world.limits import Limit, Limits, check_within, is_beyond, target_heights
 from bounce_mjx.world.observation import History, Kinematics, ObservationConfig, Quantity
 from bounce_mjx.world.randomization import RandomizationConfig

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 from bounce_mjx import task
-from bounce_mjx.config.settings import Coordinate, Friction
+from bounce_mjx.config.settings import HOLLOW, BallInertia, Coordinate, Friction
 from bounce_mjx.lazy import jax, jnp
 
 REACH = 0.03
@@ -66,6 +66,9 @@ class Config(task.WorldConfig):
     """The noise of a reset."""
     friction: Friction | None = 0.3
     """Coefficient of sliding friction between ball and paddle; null for the MJCF's."""
+    ball_inertia: BallInertia | None = HOLLOW
+    """Moment of inertia of the ball per mass and squared radius: 0.667 of a hollow ball, 0.4 of a
+    solid one; null for the MJCF's."""
     observation: Observation = Observation(ball_quaternion=0, ball_angular_velocity=0)
     """The quantities that the policy sees: what a robot with a camera measures, and the point."""
     randomization: task.RandomizationConfig = task.RandomizationConfig(
@@ -80,6 +83,14 @@ class Config(task.WorldConfig):
         """The ball on the paddle, in place of the world's start over it."""
         x, y, z = paddle
         return {"ball_init_pos": [x, y, round(z + START_HEIGHT, 4)]}
+
+    @property
+    def limits(self) -> task.Limits:
+        """Relative to the paddle's centre."""
+        return (
+            task.Limit("LOST_DEPTH", "below", LOST_DEPTH),
+            task.Limit("LOST_DISTANCE", "distance", LOST_DISTANCE),
+        )
 
     @property
     def commands(self) -> dict[str, task.Command]:
@@ -144,8 +155,6 @@ class Balance(task.Task):
         offset = truth.ball_position - truth.paddle_position
         point_error = task.length(offset[:2] - _point(step.command))
         home = jnp.array(self.geometry.paddle_home)
-        is_low = offset[2] < -LOST_DEPTH
-        is_far = task.length(offset) > LOST_DISTANCE
         return task.TaskStep(
             state=centre,
             reward=task.weighted_terms(
@@ -154,7 +163,7 @@ class Balance(task.Task):
                 home=task.length(truth.paddle_position - home),
                 action_rate=jnp.mean(jnp.square(step.action - step.last_action)),
             ),
-            ended=is_low | is_far,
+            ended=task.is_beyond(self.config.limits, truth.ball_position, truth.paddle_position),
             metrics={"error": point_error},
         )
 

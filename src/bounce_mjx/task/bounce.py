@@ -13,8 +13,9 @@ from pydantic import Field
 
 from bounce_mjx import task
 from bounce_mjx.config import settings
+from bounce_mjx.errors import UserError
 from bounce_mjx.lazy import jax, jnp, np
-from bounce_mjx.task.bounce_rewards import BounceReward, RewardInputs
+from bounce_mjx.task.bounce_rewards import RewardInputs, Rewards
 
 SETTLING_SECONDS = 2.0
 """Time at the start of an episode that does not count for the horizontal position and the height,
@@ -45,11 +46,14 @@ UPWARD_SPEED_TARGETS = (0.4, 0.6)
 OFFERED_TARGETS = (0.3, 0.8)
 """Target heights that a viewer offers, m, for a paddle with the home height `HOME_HEIGHT`."""
 
+MIN_TARGET_HEIGHT = 1e-3
+"""Least target height, m."""
+
 HOME_HEIGHT = 0.05
 """Home height of the original specification, m."""
 
 
-class BounceObservation(task.ObservationConfig):
+class Observation(task.ObservationConfig):
     """The quantities that the policy sees, and how many values of each: 0 for none, 1 for the
     newest, N for the last N, the newest first."""
 
@@ -68,13 +72,10 @@ class BounceObservation(task.ObservationConfig):
     """Measured joint velocities at the lowest points of the last bounces."""
 
 
-class BounceConfig(task.WorldConfig):
+class Config(task.WorldConfig):
     """The world, and the task of bouncing: target heights, bounces, ends and reward."""
 
-    target_height_range: Annotated[tuple[settings.Length, settings.Length], settings.Ascending] = (
-        0.4,
-        0.6,
-    )
+    target_height_range: settings.Range[settings.Length] = (0.4, 0.6)
     """Range of the target height, m; equal ends fix it."""
     bounce_min_velocity: Annotated[settings.NonNegative, Field(le=10.0)] = 0.01
     """Vertical velocity above which the ball counts as rising, m/s."""
@@ -88,27 +89,18 @@ class BounceConfig(task.WorldConfig):
     """The episode ends when the ball is higher than this above the target height, m."""
     max_horizontal_distance: Annotated[settings.Positive, Field(le=20.0)] = 1.5
     """The episode ends when |x| or |y| of the ball exceeds this, m."""
-    observation: BounceObservation = BounceObservation()
+    observation: Observation = Observation()
     """The quantities that the policy sees."""
-    reward: BounceReward = BounceReward()
+    reward: Rewards = Rewards()
     """The reward terms."""
 
     @pydantic.model_validator(mode="after")
     def _check_start(self):
         """An episode does not end where it starts."""
-        x, y, z = self.ball_init_pos
-        lowest_target = self.target_height_range[0]
-        is_within = {
-            "min_ball_height": z > self.min_ball_height,
-            "max_horizontal_distance": max(abs(x), abs(y)) < self.max_horizontal_distance,
-            "max_height_above_target": z < lowest_target + self.max_height_above_target,
-        }
-        for name, holds in is_within.items():
-            if not holds:
-                raise ValueError(
-                    f"{name} is {getattr(self, name):g} m, so an episode ends where it starts, at "
-                    f"the ball_init_pos {self.ball_init_pos}; change one of the two"
-                )
+        try:
+            task.check_within(self.limits, [self.ball_init_pos], self.targets, "ball_init_pos")
+        except UserError as error:
+            raise ValueError(str(error)) from error
         return self
 
     @classmethod
@@ -141,6 +133,20 @@ class BounceConfig(task.WorldConfig):
         return super().heights | {"target_height_range": self.target_height_range[0]}
 
     @property
+    def limits(self) -> task.Limits:
+        return (
+            task.Limit("min_ball_height", "lowest", self.min_ball_height),
+            task.Limit("max_height_above_target", "above", self.max_height_above_target),
+            task.Limit("max_horizontal_distance", "aside", self.max_horizontal_distance),
+        )
+
+    @property
+    def targets(self) -> tuple[tuple[float, float, float], ...]:
+        x, y, _ = self.ball_init_pos
+        lowest, highest = self.target_height_range
+        return (x, y, lowest), (x, y, highest)
+
+    @property
     def ball_bounds(self) -> tuple[float, float]:
         """What an exported policy takes for possible: where an episode ends, and twice the speed of
         a fall from its greatest height."""
@@ -154,13 +160,22 @@ class BounceConfig(task.WorldConfig):
     def commands(self) -> dict[str, task.Command]:
         """The target height."""
         lowest, highest = self.target_height_range
-        least = 1e-3
         lowest_offered, highest_offered = OFFERED_TARGETS
-        span = (
-            max(least, round(lowest_offered + self.home_lift, 4)),
-            max(least, round(highest_offered + self.home_lift, 4)),
-        )
-        return {"target_height": task.Command(lowest, highest, "m", least=least, span=span)}
+        heights = task.target_heights(self.limits, start=self.ball_init_pos[2])
+        return {
+            "target_height": task.Command(
+                lowest,
+                highest,
+                "m",
+                least=max(MIN_TARGET_HEIGHT, heights.least),
+                span=(
+                    round(lowest_offered + self.home_lift, 4),
+                    round(highest_offered + self.home_lift, 4),
+                ),
+                setting="target_height_range",
+                reason=heights.reason,
+            )
+        }
 
     @property
     def home_lift(self) -> float:
@@ -168,7 +183,7 @@ class BounceConfig(task.WorldConfig):
         return self.reward.paddle_home_height - HOME_HEIGHT
 
 
-class BounceState(NamedTuple):
+class State(NamedTuple):
     """What the task keeps of an episode."""
 
     rising: jax.Array
@@ -195,8 +210,8 @@ class MeasuredFlight(NamedTuple):
 class Bounce(task.Task):
     """The ball bounces on the paddle at the commanded height."""
 
-    Config = BounceConfig
-    config: BounceConfig
+    Config = Config
+    config: Config
     folder = "bounce_ball"
     ball_rests = False
     ball_thrown = False
@@ -212,16 +227,16 @@ class Bounce(task.Task):
 
     # The start, and a control step: bounce, reward, ends, metrics.
 
-    def reset(self, start: task.Start) -> BounceState:
+    def reset(self, start: task.Start) -> State:
         """No bounce yet; the first apex is the height at which the ball starts."""
         height = start.truth.ball_position[2]
-        return BounceState(
+        return State(
             rising=jnp.zeros((), bool),
             n_bounces=jnp.zeros_like(height),
             apex=height,
         )
 
-    def step(self, state: BounceState, step: task.Step) -> task.TaskStep:
+    def step(self, state: State, step: task.Step) -> task.TaskStep:
         """A bounce or none, the specification's reward, and whether the ball fell, flew too high or
         too far."""
         config = self.config
@@ -242,13 +257,11 @@ class Bounce(task.Task):
             reward=config.reward,
         )
         apex_offset = state.apex - target
-        fell = ball[2] < config.min_ball_height
-        too_high = ball[2] > target + config.max_height_above_target
-        too_far = jnp.any(jnp.abs(ball[:2]) > config.max_horizontal_distance)
+        target_point = jnp.stack([ball[0], ball[1], target])
         return task.TaskStep(
             state=after,
             reward=task.weighted_terms(config.reward, inputs),
-            ended=fell | too_high | too_far,
+            ended=task.is_beyond(config.limits, ball, target_point),
             metrics={
                 "bounced": bounced,
                 "n_bounces": after.n_bounces,
@@ -259,7 +272,7 @@ class Bounce(task.Task):
             },
         )
 
-    def detect(self, state: BounceState, step: task.Step) -> tuple[BounceState, jax.Array]:
+    def detect(self, state: State, step: task.Step) -> tuple[State, jax.Array]:
         """Detects a bounce and counts it.
 
         A bounce is the first step on which the ball rises, near the paddle. It adds to the count if
@@ -277,7 +290,7 @@ class Bounce(task.Task):
         bounced = rising & ~state.rising & near
         continues = state.apex > step.command["target_height"] - config.apex_tolerance
         counted = jnp.where(continues, state.n_bounces + 1.0, 1.0)
-        after = BounceState(
+        after = State(
             rising=rising,
             n_bounces=jnp.where(bounced, counted, state.n_bounces),
             apex=jnp.where(bounced, height, jnp.maximum(state.apex, height)),

@@ -42,7 +42,7 @@ class RewardInputs:
     """Clipped action of the previous step [n]."""
     joint_velocity: jax.Array
     """Arm joint velocities [n], rad/s."""
-    reward: BounceReward
+    reward: Rewards
     """Settings of all terms: the target point, the paddle's home height and gravity."""
 
     @functools.cached_property
@@ -372,7 +372,7 @@ class JointVelocityReward(RewardTerm):
         return -jnp.sum(jnp.square(inputs.joint_velocity))
 
 
-class BounceReward(settings.StrictModel):
+class Rewards(settings.StrictModel):
     """The reward: numbers that several terms use, and the terms, each with a weight and the
     constants of its formula."""
 

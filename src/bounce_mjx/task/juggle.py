@@ -2,34 +2,26 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Annotated, Any
 
-import pydantic
 from pydantic import Field
 
 from bounce_mjx import task
-from bounce_mjx.config.settings import Ascending, Coordinate, Finite, Length, Positive
+from bounce_mjx.config.settings import Coordinate, Finite, Length, Positive, Range
+from bounce_mjx.errors import UserError
 from bounce_mjx.lazy import jax, jnp
+from bounce_mjx.task import flights
 
 FLOWN = 0.125
 """Share of its flight that the ball of the highest number has flown at a reset."""
-SETTLING_SECONDS = 2.0
-"""Time since the height was commanded after which apexes count, s."""
-MAX_HEIGHT_ERROR = 0.1
-"""Largest distance of an accurate apex from the target height, m."""
-MIN_APEX_HEIGHT = 0.1
-"""Height over home above which a ball that turns has an apex, m; a lower one rolls or dribbles."""
-MIN_TARGET_HEIGHT = 0.1
-"""Least target height over home, m: a lower flight has no time."""
-APEX_FACTORS = (1.0, 1.0, 0.3)
-"""Factors of an apex's error along x, y and z: 0.1 m of height count as 0.03 m."""
 MIN_EPISODE_SHARE = 0.99
 """Least share of episodes that keep all balls, and of those in which none touch."""
 MIN_TURN_SHARE = 0.99
 """Least share of hits that alternate."""
 MIN_HEIGHT_SHARE = 0.95
 """Least share of accurate apexes."""
-Height = Annotated[Finite, Field(ge=MIN_TARGET_HEIGHT, le=10.0)]
+Height = Annotated[Finite, Field(ge=flights.MIN_TARGET_HEIGHT, le=10.0)]
 
 
 class NearByBall(task.Near):
@@ -75,7 +67,7 @@ class Config(task.WorldConfig):
     """Home of the paddle, m; the columns stand side by side over it."""
     spacing: Annotated[Positive, Field(le=1.0)] = 0.065
     """Distance between columns, m."""
-    height_range: Annotated[tuple[Height, Height], Ascending] = (0.35, 0.55)
+    height_range: Range[Height] = (0.35, 0.55)
     """Range of the target height over home, m."""
     max_distance: Length = 0.7
     """The episode ends when a ball is this far from the top of its column, m; or when it is lower
@@ -87,17 +79,6 @@ class Config(task.WorldConfig):
     reward: Rewards = Rewards()
     """The reward terms."""
 
-    @pydantic.model_validator(mode="after")
-    def _check_heights(self):
-        """A ball that is hit is not yet lost."""
-        if self.height_range[1] > self.max_distance:
-            raise ValueError(
-                f"height_range goes up to {self.height_range[1]:g} m over home, but max_distance "
-                f"is {self.max_distance:g} m, so that a ball which is hit there ends the episode; "
-                "change one of the two"
-            )
-        return self
-
     @classmethod
     def settings_at(cls, paddle: tuple[float, float, float]) -> dict[str, Any]:
         return super().settings_at(paddle) | {"home": paddle}
@@ -108,17 +89,27 @@ class Config(task.WorldConfig):
         return {"height_range": self.home[2] + self.height_range[0]}
 
     @property
+    def limits(self) -> task.Limits:
+        return (
+            task.Limit("home", "lowest", self.home[2]),
+            task.Limit("max_distance", "distance", self.max_distance),
+        )
+
+    @property
     def commands(self) -> dict[str, task.Command]:
         """The height of the apexes."""
         home_height = self.home[2]
         lowest, highest = self.height_range
+        heights = task.target_heights(self.limits, min_flight=flights.MIN_TARGET_HEIGHT)
         return {
             "target_height": task.Command(
                 home_height + lowest,
                 home_height + highest,
                 "m",
-                least=home_height + MIN_TARGET_HEIGHT,
-                greatest=home_height + self.max_distance,
+                least=heights.least,
+                greatest=heights.greatest,
+                setting="height_range",
+                reason=heights.reason,
             )
         }
 
@@ -147,9 +138,10 @@ class Juggle(task.Task):
 
     # Places and times.
 
-    def _ground(self) -> float:
+    @property
+    def ground(self) -> float:
         """Height of a ball that touches the paddle at home, m."""
-        return self.config.home[2] + self.geometry.rest_height
+        return flights.ground(self.config.home, self.geometry)
 
     def _columns(self, height: jax.Array) -> jax.Array:
         """The tops of the columns [B, 3] at the commanded height [], m."""
@@ -161,9 +153,21 @@ class Juggle(task.Task):
     def _period(self, height: jax.Array) -> jax.Array:
         """Time from one hit of a ball to its next one [], s, with an apex at the height [], m:
         2 sqrt(2 h / g) for an apex h over the ground."""
-        return 2.0 * task.safe_sqrt(2.0 * (height - self._ground()) / task.GRAVITY)
+        return 2.0 * task.safe_sqrt(2.0 * (height - self.ground) / task.GRAVITY)
 
     # The start.
+
+    def check(self) -> None:
+        """Refuses columns in which the balls touch as they pass each other."""
+        _, largest = self.config.randomization.ball_radius or (1.0, 1.0)
+        radii = [radius * largest for radius in self.geometry.ball_radii]
+        for i, j in itertools.combinations(range(len(radii)), 2):
+            apart = (j - i) * self.config.spacing
+            if apart <= radii[i] + radii[j]:
+                raise UserError(
+                    f"spacing is {self.config.spacing:g} m, but balls of the radii {radii[i]:.4g} "
+                    f"and {radii[j]:.4g} m touch in columns that are {apart:g} m apart; give more"
+                )
 
     def throw(self, draws: jax.Array, command: task.Values) -> tuple[jax.Array, jax.Array]:
         """The balls are in their columns and land alternately, in the order of their numbers."""
@@ -193,21 +197,19 @@ class Juggle(task.Task):
         balls = truth.ball_position
         height = step.command["target_height"]
         columns = self._columns(height)
-        flights = task.flight(balls, truth.ball_velocity, self._ground())
+        flight = task.flight(balls, truth.ball_velocity, self.ground)
 
         rising = truth.ball_velocity[:, 2] > 0.0
         hits = rising & ~rose
-        flies = balls[:, 2] > self.config.home[2] + MIN_APEX_HEIGHT
-        apexes = rose & ~rising & flies
+        apexes = flights.is_apex(rose, rising, balls[:, 2], self.config.home)
 
-        is_far = jnp.sum(jnp.square(balls - columns), axis=1) > self.config.max_distance**2
-        is_low = balls[:, 2] < self.config.home[2]
+        is_lost = task.is_beyond(self.config.limits, balls, columns)
         touched = self._touched(step)
 
         ball_numbers = jnp.arange(self.config.num_balls)
         next_in_turn = jnp.mod(last_hit + 1.0, self.config.num_balls)
         height_errors = jnp.abs(balls[:, 2] - height)
-        next_landing = _next(flights.end, flights.fall)
+        next_landing = _next(flight.end, flight.fall)
         return task.TaskStep(
             state=(
                 rising,
@@ -215,18 +217,18 @@ class Juggle(task.Task):
             ),
             reward=task.weighted_terms(
                 self.config.reward,
-                apex=self._apex_errors(flights, columns),
-                landing=self._landing_errors(flights, columns),
-                turn=self._turn_errors(flights, self._period(height)),
+                apex=flights.apex_error(flight, columns),
+                landing=flights.landing_error(flight, columns),
+                turn=self._turn_errors(flight, self._period(height)),
                 home=truth.paddle_position - jnp.array(self.config.home),
-                calm=self._calm_error(step),
+                calm=task.changes(truth.joint_velocities, step.action, step.last_action),
             ),
-            ended=jnp.any(is_far | is_low) | touched,
+            ended=jnp.any(is_lost) | touched,
             metrics={
                 "hits": jnp.sum(hits),
                 "in_turn": jnp.sum(hits & (ball_numbers == next_in_turn)),
                 "apexes": jnp.sum(apexes),
-                "accurate": jnp.sum(apexes & (height_errors <= MAX_HEIGHT_ERROR)),
+                "accurate": jnp.sum(apexes & (height_errors <= flights.MAX_HEIGHT_ERROR)),
                 "height_error": jnp.sum(apexes * height_errors),
                 "touched": touched,
                 # For the marker, and logged as every metric.
@@ -237,55 +239,43 @@ class Juggle(task.Task):
 
     def _touched(self, step: task.Step) -> jax.Array:
         """Whether two balls touched during the step [], bool."""
-        radius = self.geometry.ball_radius if step.ball_radius is None else step.ball_radius
+        geometry = self.geometry
+        first = geometry.ball_radius if step.ball_radius is None else step.ball_radius
+        radii = [first * (radius / geometry.ball_radius) for radius in geometry.ball_radii]
         distance = task.closest(
-            step.truth.ball_position, step.truth.ball_velocity, self.config.control_dt
+            step.truth.ball_position, step.truth.ball_velocity, self.config.control_dt, radii
         )
-        return distance < 2.0 * radius
+        return distance < 0.0
 
-    # The reward: the error of each term, of the balls with a row for each.
+    # The reward: the error of its own term.
 
-    def _apex_errors(self, flights: task.Flight, columns: jax.Array) -> jax.Array:
-        """From the tops of the columns to the flights' apexes [B, 3], m; 0.1 m of height count as
-        0.03 m."""
-        return (flights.top - columns) * jnp.array(APEX_FACTORS)
-
-    def _landing_errors(self, flights: task.Flight, columns: jax.Array) -> jax.Array:
-        """From the columns to the flights' ends [B, 2], m."""
-        return (flights.end - columns)[:, :2]
-
-    def _turn_errors(self, flights: task.Flight, period: jax.Array) -> jax.Array:
+    def _turn_errors(self, flight: task.Flight, period: jax.Array) -> jax.Array:
         """From a turn, `period` / B, to the time from the landing of each ball to that of the ball
         of the next number [B, 1], s.
 
         A ball lands again after a period, so whole periods do not count: of the landings, the error
         is that of the nearest one, within half a period.
         """
-        between = jnp.roll(flights.fall, -1) - flights.fall
+        between = jnp.roll(flight.fall, -1) - flight.fall
         late = between - period / self.config.num_balls
         nearest = jnp.mod(late + 0.5 * period, period) - 0.5 * period
         return nearest[:, None]
-
-    def _calm_error(self, step: task.Step) -> jax.Array:
-        """The joint velocities, and the change of the action, as one vector [2 n]."""
-        action_change = step.action - step.last_action
-        return jnp.concatenate([step.truth.joint_velocities, action_change])
 
     # The observation: the next ball, from the measurements.
 
     def first_quantities(self, measured: task.Values) -> tuple[Any, task.Values]:
         height = measured["target_height"][0]
         velocities = measured["ball_velocity"]
-        flights = task.flight(measured["ball_position"], velocities, self._ground())
+        flight = task.flight(measured["ball_position"], velocities, self.ground)
         quantities = [
-            (flights.end - measured["paddle_position"])[:, :2],
-            (flights.end - self._columns(height))[:, :2],
+            (flight.end - measured["paddle_position"])[:, :2],
+            (flight.end - self._columns(height))[:, :2],
             velocities[:, :2],
-            (flights.top[:, 2] - height)[:, None],
-            flights.fall[:, None],
-            (jnp.mean(flights.fall) - flights.fall)[:, None],
+            (flight.top[:, 2] - height)[:, None],
+            flight.fall[:, None],
+            (jnp.mean(flight.fall) - flight.fall)[:, None],
         ]
-        next_ball = _next(jnp.concatenate(quantities, axis=1), flights.fall)
+        next_ball = _next(jnp.concatenate(quantities, axis=1), flight.fall)
         return (), {"next_ball": next_ball}
 
     def next_quantities(
@@ -298,7 +288,7 @@ class Juggle(task.Task):
 
     def tally(self, moment: task.Moment) -> task.Tally:
         metrics = moment.metrics
-        settled = moment.command_seconds > SETTLING_SECONDS
+        settled = moment.command_seconds > flights.SETTLING_SECONDS
         return task.Tally(
             sums={
                 "hits": metrics["hits"],
@@ -345,7 +335,7 @@ class Juggle(task.Task):
         markers.append(
             task.Marker(
                 "next ball",
-                position=(metrics["landing_x"], metrics["landing_y"], self._ground()),
+                position=(metrics["landing_x"], metrics["landing_y"], self.ground),
                 size=(0.021, 0.021, 0.001),
                 rgba=(1.0, 0.8, 0.1, 0.9),
                 shape="frame",

@@ -1,4 +1,4 @@
-"""Reward terms: settings with a weight, and a formula; and the flight of the ball that they rate.
+"""Reward terms: settings with a weight, and a formula.
 
 `Task.step` returns the weighted terms by name, however it computes them; the metrics
 `reward/<name>`, the log and the report follow. The tasks of the package make them from settings: a
@@ -11,17 +11,13 @@ terms alone: keep their group, and extend `step` by a term that it adds to the r
 
 from __future__ import annotations
 
-import itertools
 import typing
 from collections.abc import Collection
-from typing import Any, NamedTuple
+from typing import Any
 
 from bounce_mjx.config.settings import Finite, Positive, StrictModel
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.lazy import jax, jnp
-
-GRAVITY = 9.81
-"""Gravity in the tasks' ballistic formulas, m/s^2 (the simulated gravity is the MJCF's)."""
 
 
 class RewardTerm(StrictModel):
@@ -191,55 +187,7 @@ def horizontal_distance(a: jax.Array, b: jax.Array) -> jax.Array:
     return safe_sqrt(jnp.square(a[0] - b[0]) + jnp.square(a[1] - b[1]))
 
 
-class Flight(NamedTuple):
-    """A free flight without air, down to the height of its end. Its highest position may be in the
-    past."""
-
-    top: jax.Array
-    """Highest position [..., 3], m."""
-    end: jax.Array
-    """Position at the end [..., 3], m."""
-    rise: jax.Array
-    """Time until the highest position [...], s; negative after it."""
-    fall: jax.Array
-    """Time until the end [...], s."""
-
-
-def flight(ball: jax.Array, velocity: jax.Array, ground: float) -> Flight:
-    """The flight of a ball down to a height; it ends at the highest position if that is lower.
-
-    Args:
-      ball: present position [..., 3], m.
-      velocity: present velocity [..., 3], m/s.
-      ground: height of the end, m.
-    """
-    rise = velocity[..., 2] / GRAVITY
-    top = _position_after(rise, ball, velocity)
-    fall_from_top = safe_sqrt(2.0 * (top[..., 2] - ground) / GRAVITY)
-    fall = rise + fall_from_top
-    return Flight(top=top, end=_position_after(fall, ball, velocity), rise=rise, fall=fall)
-
-
-def _position_after(seconds: jax.Array, ball: jax.Array, velocity: jax.Array) -> jax.Array:
-    """Position [..., 3] in some seconds [...] of a ball in free flight, m: p + v t - g t^2 / 2."""
-    drop = 0.5 * GRAVITY * jnp.square(seconds)
-    drops = jnp.stack([0.0 * drop, 0.0 * drop, drop], axis=-1)
-    return ball + seconds[..., None] * velocity - drops
-
-
-def closest(balls: jax.Array, velocities: jax.Array, seconds: float) -> jax.Array:
-    """Smallest distance of two balls in the last `seconds` [], m. Balls in free flight see each
-    other move straight on; they can pass within a control step.
-
-    Args:
-      balls: present positions [B, 3], m.
-      velocities: present velocities [B, 3], m/s.
-    """
-    distances = []
-    for i, j in itertools.combinations(range(len(balls)), 2):
-        offset = balls[i] - balls[j]
-        velocity = velocities[i] - velocities[j]
-        # Where the distance |offset - ago velocity| is smallest; 1e-6 for balls that move alike.
-        ago = jnp.sum(offset * velocity) / jnp.maximum(jnp.sum(jnp.square(velocity)), 1e-6)
-        distances.append(length(offset - jnp.clip(ago, 0.0, seconds) * velocity))
-    return jnp.min(jnp.stack(distances))
+def changes(joint_velocities: jax.Array, action: jax.Array, last_action: jax.Array) -> jax.Array:
+    """The joint velocities [n], and the change of the action [n], as one vector [2 n]: of a calm
+    arm, both are small."""
+    return jnp.concatenate([joint_velocities, action - last_action])

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
+from bounce_mjx.config.places import where_made
+from bounce_mjx.config.settings import is_finite
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.lazy import jax, jnp, np
 from bounce_mjx.task.results import Episodes, Figure, Result
@@ -45,7 +48,11 @@ class Step(NamedTuple):
     last_action: jax.Array
     """Clipped action of the previous step [n]."""
     ball_radius: jax.Array | float | None = None
-    """Radius [] of the balls in this episode, m; None for that of the task's `geometry`."""
+    """Radius [] of the first ball in this episode, m, to which the others stay in proportion; None
+    for that of the task's `geometry`."""
+    seconds: jax.Array | float = 0.0
+    """Time since the reset [], s, as `Moment.seconds`. An environment counts its steps only for a
+    task whose step reads it."""
 
 
 class TaskStep(NamedTuple):
@@ -125,8 +132,13 @@ class Recording(NamedTuple):
     """Metrics of the step [T, K]."""
 
 
-class Curve(NamedTuple):
-    """A number that the training logs: how a metric adds up over a rollout."""
+@dataclasses.dataclass(frozen=True)
+class Curve:
+    """A number that the training logs: how a metric adds up over a rollout.
+
+    Raises:
+      UserError: it has no tag or metric, or its scale is no number.
+    """
 
     tag: str
     """Name in the log."""
@@ -140,6 +152,27 @@ class Curve(NamedTuple):
     """Title in the report; "" leaves it out there."""
     scale: float = 1.0
     """Factor from the metric's unit to the title's, in the report alone."""
+
+    def __post_init__(self) -> None:
+        for name in ("tag", "metric", "over"):
+            value = getattr(self, name)
+            # A report has curves of no metric.
+            is_name = isinstance(value, str) and (value or name == "metric")
+            if not is_name:
+                raise UserError(
+                    f"the {name} of a task.Curve{where_made()} is {shorten(repr(value))}; give a "
+                    "name"
+                )
+        if not isinstance(self.title, str):
+            raise UserError(
+                f"the title of the curve {self.tag}{where_made()} is {shorten(repr(self.title))}; "
+                "give words"
+            )
+        if not is_finite(self.scale):
+            raise UserError(
+                f"the scale of the curve {self.tag}{where_made()} is {shorten(repr(self.scale))}; "
+                "give a finite number"
+            )
 
 
 class Histogram(NamedTuple):
@@ -176,8 +209,8 @@ class Task:
     folder: ClassVar[str] = ""
     """Name of the folder of its runs in runs/; by default, the class's name in lower case."""
     curves: ClassVar[tuple[Curve, ...]] = ()
-    """What a training logs and a report draws of the metrics; the first is the progress line's. A
-    metric that no curve shows or is over is logged as its mean over the steps."""
+    """What a training logs and prints, and a report draws, of the metrics. A metric that no curve
+    shows or is over is logged as its mean over the steps."""
     num_balls: ClassVar[tuple[int, ...]] = (1,)
     """Numbers of balls (`WorldConfig.num_balls`) that it takes."""
     ball_rests: ClassVar[bool] = True
@@ -227,6 +260,14 @@ class Task:
 
         model = world_model(self.config, visual=False)
         return read_geometry(model, find_addresses(model), self.config.default_joint_angles)
+
+    def check(self) -> None:
+        """Refuses settings that the task cannot have with this `geometry`; called once, before the
+        first episode.
+
+        Raises:
+          UserError: it cannot.
+        """
 
     def throw(self, draws: jax.Array, command: Values) -> tuple[jax.Array, jax.Array] | None:
         """Position [3] (m) and velocity [3] (m/s) of the ball at a reset, before the noise and the

@@ -5,16 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Annotated, Any, NamedTuple
 
-import pydantic
 from pydantic import Field
 
 from bounce_mjx import task
-from bounce_mjx.config.settings import Ascending, Coordinate, Finite, Length, Positive
+from bounce_mjx.config.settings import Coordinate, Finite, Length, Positive, Range
 from bounce_mjx.lazy import jax, jnp
-from bounce_mjx.task import paths
+from bounce_mjx.task import flights, paths
 
-SETTLING_SECONDS = 2.0
-"""Time since a reset or a sample of the commands after which apexes count, s."""
 STEP_SETTLING_SECONDS = 1.0
 """Time since a step of the point after which apexes count for the result after steps, s."""
 
@@ -34,10 +31,6 @@ BANDS = {"slow error": Band(0.0, 0.1, 1.5), "fast error": Band(0.25, 0.3, 3.0)}
 """The judged speeds, by the result's name."""
 MAX_STEP_ERROR = 0.03
 """Largest distance of apex and point after a step, m."""
-MAX_HEIGHT_ERROR = 0.1
-"""Largest distance of an accurate apex from the point's height, m."""
-MIN_APEX_HEIGHT = 0.1
-"""Height over home above which a ball that turns has an apex, m; a lower one rolls or dribbles."""
 MIN_EPISODE_SHARE = 0.99
 """Least share of episodes that last."""
 MIN_APEX_SHARE = 0.95
@@ -49,11 +42,7 @@ JUMP_SPEED = 1.1
 JUMP_ACCELERATION = 3.0
 """A point that seems to accelerate more has jumped, or changed its path or its speed, m/s^2; tight
 and fast paths have a higher limit."""
-APEX_FACTORS = (1.0, 1.0, 0.3)
-"""Factors of an apex's error along x, y and z: 0.1 m of height count as 0.03 m."""
-MIN_TARGET_HEIGHT = 0.1
-"""Least height of the point over home, m."""
-Height = Annotated[Finite, Field(ge=MIN_TARGET_HEIGHT, le=10.0)]
+Height = Annotated[Finite, Field(ge=flights.MIN_TARGET_HEIGHT, le=10.0)]
 """Over home, m; the point sways around it, and stays above a resting ball."""
 PointSpeed = Annotated[Finite, Field(ge=0.0, le=MAX_POINT_SPEED)]
 
@@ -90,9 +79,9 @@ class Config(task.WorldConfig):
     # Not `task.PADDLE_HOME`: the shipped policy was trained here. Move it with the next one.
     home: tuple[Coordinate, Coordinate, Coordinate] = (0.58856, 0.0, 0.05)
     """Home of the paddle, m."""
-    height_range: Annotated[tuple[Height, Height], Ascending] = (0.4, 0.5)
+    height_range: Range[Height] = (0.4, 0.5)
     """Range of the target height over home, around which it sways, m."""
-    speed_range: Annotated[tuple[PointSpeed, PointSpeed], Ascending] = (0.05, 0.3)
+    speed_range: Range[PointSpeed] = (0.05, 0.3)
     """Range of the point's greatest speed, m/s."""
     path_size: Annotated[Positive, Field(le=1.0)] = 0.12
     """Radius of the circle, half the length of the line and of the figure of eight, m."""
@@ -104,24 +93,6 @@ class Config(task.WorldConfig):
     reward: Rewards = Rewards()
     """The reward terms."""
 
-    @pydantic.model_validator(mode="after")
-    def _check_heights(self):
-        """A ball that is hit under the point is not yet lost."""
-        if self.height_range[1] > self.max_height:
-            raise ValueError(
-                f"height_range goes up to {self.height_range[1]:g} m over home, but max_distance "
-                f"is {self.max_distance:g} m and the point sways, so that a ball which is hit "
-                f"under it ends the episode; give at most {self.max_height:g} m, or change "
-                "max_distance"
-            )
-        return self
-
-    @property
-    def max_height(self) -> float:
-        """Greatest height of the point over home, m: set at the lowest place of its sway, it rises
-        by both amplitudes, and the ball under it may fall to home."""
-        return round(self.max_distance - 2.0 * paths.SWAY, 9)
-
     @classmethod
     def settings_at(cls, paddle: tuple[float, float, float]) -> dict[str, Any]:
         return super().settings_at(paddle) | {"home": paddle}
@@ -131,12 +102,28 @@ class Config(task.WorldConfig):
         return super().heights | {"height_range": self.home[2] + self.height_range[0]}
 
     @property
+    def limits(self) -> task.Limits:
+        return (
+            task.Limit("home", "lowest", self.home[2]),
+            task.Limit("max_distance", "distance", self.max_distance),
+        )
+
+    @property
+    def targets(self) -> tuple[tuple[float, float, float], ...]:
+        x, y, z = self.home
+        lowest, highest = self.height_range
+        return (x, y, z + lowest), (x, y, z + highest)
+
+    @property
     def commands(self) -> dict[str, task.Command]:
         """The point, its speed and its path. The ranges of the point are those of the middle of the
         path, which is sampled; the point itself leaves them (`first_command`)."""
         x, y, z = self.home
         lowest, highest = self.height_range
         slowest, fastest = self.speed_range
+        heights = task.target_heights(
+            self.limits, min_flight=flights.MIN_TARGET_HEIGHT, sway=paths.SWAY
+        )
         commands = {
             "target_x": task.Command(x - 0.02, x + 0.02, "m", span=(x - 0.15, x + 0.15), step=0.01),
             "target_y": task.Command(y - 0.02, y + 0.02, "m", span=(y - 0.15, y + 0.15), step=0.01),
@@ -144,9 +131,11 @@ class Config(task.WorldConfig):
                 z + lowest,
                 z + highest,
                 "m",
-                least=z + MIN_TARGET_HEIGHT,
-                greatest=z + self.max_height,
-                span=(z + min(0.3, self.max_height), z + min(0.7, self.max_height)),
+                least=heights.least,
+                greatest=heights.greatest,
+                span=(z + 0.3, z + 0.7),
+                setting="height_range",
+                reason=heights.reason,
             ),
             "point_speed": task.Command(
                 slowest, fastest, "m/s", least=0.0, span=(0.0, 0.3), hidden=True
@@ -167,9 +156,10 @@ class Track(task.Task):
         task.Curve("task/height_error", "height_error", "apexes", "|apex − height|, cm", 100.0),
     )
 
-    def _ground(self) -> float:
+    @property
+    def ground(self) -> float:
         """Height of a ball that touches the paddle at home, m."""
-        return self.config.home[2] + self.geometry.rest_height
+        return flights.ground(self.config.home, self.geometry)
 
     # The point.
 
@@ -206,48 +196,29 @@ class Track(task.Task):
     def step(self, rose: jax.Array, step: task.Step) -> task.TaskStep:
         truth = step.truth
         ball = truth.ball_position
-        vertical_velocity = truth.ball_velocity[2]
-        home_height = self.config.home[2]
-        flight = task.flight(ball, truth.ball_velocity, self._ground())
-
-        flies = ball[2] > home_height + MIN_APEX_HEIGHT
-        is_apex = rose & (vertical_velocity <= 0.0) & flies
-        x_square, y_square, z_square = jnp.square(ball - paths.point(step.command))
-        is_far = x_square + y_square + z_square > self.config.max_distance**2
-        is_low = ball[2] < home_height
+        rises = truth.ball_velocity[2] > 0.0
+        flight = task.flight(ball, truth.ball_velocity, self.ground)
+        is_apex = flights.is_apex(rose, rises, ball[2], self.config.home)
+        point = paths.point(step.command)
+        x_square, y_square, z_square = jnp.square(ball - point)
         return task.TaskStep(
-            state=vertical_velocity > 0.0,
+            state=rises,
             reward=task.weighted_terms(
                 self.config.reward,
-                apex=self._apex_error(flight, step.command),
-                landing=self._landing_error(flight, step.command),
+                # Of an apex before a redraw, it is the point of the new path at that time.
+                apex=flights.apex_error(flight, self._point_in(flight.rise, step.command)),
+                landing=flights.landing_error(flight, self._point_in(flight.fall, step.command)),
                 paddle=(flight.end - truth.paddle_position)[:2],
-                home=truth.paddle_position[2] - home_height,
-                calm=self._calm_error(step),
+                home=truth.paddle_position[2] - self.config.home[2],
+                calm=task.changes(truth.joint_velocities, step.action, step.last_action),
             ),
-            ended=is_low | is_far,
+            ended=task.is_beyond(self.config.limits, ball, point),
             metrics={
                 "apexes": is_apex,
                 "error": jnp.where(is_apex, task.safe_sqrt(x_square + y_square), 0.0),
                 "height_error": jnp.where(is_apex, task.safe_sqrt(z_square), 0.0),
             },
         )
-
-    def _apex_error(self, flight: task.Flight, command: task.Values) -> jax.Array:
-        """From the point at the time of the flight's apex to the apex [3], m; 0.1 m of height count
-        as 0.03 m. Of an apex before a redraw, it is the point of the new path at that time."""
-        point = self._point_in(flight.rise, command)
-        return (flight.top - point) * jnp.array(APEX_FACTORS)
-
-    def _landing_error(self, flight: task.Flight, command: task.Values) -> jax.Array:
-        """From the point at the time of the flight's end to that end [2], m."""
-        point = self._point_in(flight.fall, command)
-        return (flight.end - point)[:2]
-
-    def _calm_error(self, step: task.Step) -> jax.Array:
-        """The joint velocities, and the change of the action, as one vector [2 n]."""
-        action_change = step.action - step.last_action
-        return jnp.concatenate([step.truth.joint_velocities, action_change])
 
     # The observation: where to aim, from the measurements.
 
@@ -281,9 +252,8 @@ class Track(task.Task):
         known_velocity = _unless_longer(velocity, JUMP_SPEED)
         known_acceleration = _unless_longer(acceleration, self._jump_acceleration())
 
-        ground = self._ground()
-        flight = task.flight(measured["ball_position"], measured["ball_velocity"], ground)
-        next_rise = task.safe_sqrt(2.0 * (point[2] - ground) / task.GRAVITY)
+        flight = task.flight(measured["ball_position"], measured["ball_velocity"], self.ground)
+        next_rise = task.safe_sqrt(2.0 * (point[2] - self.ground) / task.GRAVITY)
         seconds = flight.fall + next_rise
         moved = seconds * known_velocity
         point_then = point[:2] + moved + 0.5 * jnp.square(seconds) * known_acceleration
@@ -303,14 +273,14 @@ class Track(task.Task):
         command = moment.command
         error = moment.metrics["error"]
         has_steps = command["path"] == paths.STEPS
-        has_settled = moment.command_seconds > SETTLING_SECONDS
+        has_settled = moment.command_seconds > flights.SETTLING_SECONDS
         has_reached = paths.seconds_at_corner(command) > STEP_SETTLING_SECONDS
 
         apex = (moment.metrics["apexes"] > 0) & has_settled
         after_step = apex & has_steps & has_reached
         sums = {
             "apexes": apex,
-            "accurate": apex & (moment.metrics["height_error"] <= MAX_HEIGHT_ERROR),
+            "accurate": apex & (moment.metrics["height_error"] <= flights.MAX_HEIGHT_ERROR),
             "late": after_step,
             "near": after_step & (error <= MAX_STEP_ERROR),
         }

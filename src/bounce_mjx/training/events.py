@@ -96,7 +96,7 @@ def block_line(
     """
     rate = count_text(points[0]["speed/steps_per_second"])
     line = f"{count_text(steps)} steps  {rate} steps/s"
-    for tag in ("episode/return", *(curve.tag for curve in config.env.task.curves[:1])):
+    for tag in ("episode/return", *(curve.tag for curve in config.env.task.curves)):
         values = [point[tag] for point in points if tag in point]
         form = ".0f" if tag == "episode/return" else ".3g"
         spread = f" +- {np.std(values):{form}}" if len(values) > 1 else ""

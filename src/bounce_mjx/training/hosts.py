@@ -98,12 +98,16 @@ def exchange(value: Any) -> list[Any]:
     processes = distributed.global_state
     if processes.client is None:
         return [value]
-    name = f"bounce_mjx/{next(_exchanges)}"
-    processes.client.key_value_set(f"{name}/{processes.process_id}", json.dumps(value))
+    number = next(_exchanges)
+    own_key = f"bounce_mjx/{number}/{processes.process_id}"
+    processes.client.key_value_set(own_key, json.dumps(value))
     values = []
     for i in range(processes.num_processes):
-        text = processes.client.blocking_key_value_get(f"{name}/{i}", _NO_LIMIT)
+        text = processes.client.blocking_key_value_get(f"bounce_mjx/{number}/{i}", _NO_LIMIT)
         values.append(json.loads(text))
+    if number > 0:
+        # Each process has come here, and so has read all values of the exchange before.
+        processes.client.key_value_delete(f"bounce_mjx/{number - 1}/{processes.process_id}")
     return values
 
 

@@ -24,7 +24,6 @@ import jax
 import numpy as np
 from rich.console import Console
 
-import bounce_mjx
 from bounce_mjx.config.user_code import is_file
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
@@ -32,6 +31,7 @@ from bounce_mjx.evaluation.results import Report
 from bounce_mjx.interrupt import Interrupted, StopRequest
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.physics.convergence import solver_warning
+from bounce_mjx.resources import VERSION
 from bounce_mjx.runs import checkpoints, folders
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.files import writable
@@ -40,7 +40,7 @@ from bounce_mjx.training import events, faults, hosts
 from bounce_mjx.training.clock import Clock
 from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.log import TensorBoardLog
-from bounce_mjx.training.ppo_trainer import PPOTrainer, iterations_per_block
+from bounce_mjx.training.ppo_trainer import PPOTrainer
 from bounce_mjx.training.saving import Saver
 from bounce_mjx.training.seeds import SeedRun
 from bounce_mjx.training.trainer import BlockMetrics, Snapshot, Trainer
@@ -119,7 +119,8 @@ def open_job(
     pool = concurrent.futures.ThreadPoolExecutor()
     stack.callback(pool.shutdown, wait=False, cancel_futures=True)
     clock = Clock()
-    config = in_whole_blocks(config)
+    total_steps = config.in_whole_blocks(config.total_steps)
+    config = config.model_copy(update={"total_steps": total_steps})
     env = Env(config.env)
     trainer = make_trainer(config, env)
     is_warm = config.warm_start is not None and resume is None
@@ -150,18 +151,6 @@ def open_job(
     job.write_configs()
     job.introduce()
     return job
-
-
-def in_whole_blocks(config: TrainConfig) -> TrainConfig:
-    """The config with the number of steps at the whole block nearest to it, at least one."""
-    block_steps = steps_per_block(config)
-    blocks = max(1, round(config.total_steps / block_steps))
-    return config.model_copy(update={"total_steps": blocks * block_steps})
-
-
-def steps_per_block(config: TrainConfig) -> int:
-    """Environment steps of a block."""
-    return iterations_per_block(config) * config.ppo.batch_steps
 
 
 def named_task(config: TrainConfig) -> list[str]:
@@ -214,19 +203,16 @@ class Job:
 
     def __post_init__(self) -> None:
         config = self.config
-        self.block_steps = steps_per_block(config)
-        self.eval_steps = self.whole_blocks(config.eval_every)
-        self.save_steps = config.save_every and self.whole_blocks(config.save_every)
+        intervals = config.intervals
+        self.block_steps = config.steps_per_block
+        self.eval_steps = intervals["eval_every"]
+        self.save_steps = intervals.get("save_every")
         self.seeds = []
         for seed in range(config.seed, config.seed + config.num_seeds):
             folder = self.run / f"seed_{seed:03d}" if config.num_seeds > 1 else self.run
             alone = config.model_copy(update={"seed": seed, "num_seeds": 1})
             self.seeds.append(SeedRun(folder, alone, self.clock.seconds))
         self.saver = Saver(self.run, config, self.seeds, self.pool, self.say)
-
-    def whole_blocks(self, steps: int) -> int:
-        """A number of steps, rounded to whole blocks, at least one."""
-        return self.block_steps * max(1, round(steps / self.block_steps))
 
     # Opening
 
@@ -248,6 +234,8 @@ class Job:
             # With one seed, what was trained after a checkpoint that the user named does not count
             # any more. A seed's own folder has its best policy alone.
             seed.recall_best(newest=checkpoint if seed.run == self.run else None)
+        counted = folders.stored_checkpoints(self.run)
+        self.saver.recall(x.number for x in counted if x.number <= checkpoint.number)
         # Every process has read what the leader renames.
         hosts.wait_for_all()
         self.set_damaged_aside()
@@ -283,7 +271,10 @@ class Job:
         self.say(f"device: {self.device}  run: {self.run}")
         bound = "at most " if self.config.stop_when_solved else ""
         steps = f"{self.config.total_steps:,}, in blocks of {self.block_steps:,}"
-        self.say(f"steps: {bound}{steps}")
+        intervals = f"evaluated and saved every {self.eval_steps:,}"
+        if self.save_steps is not None:
+            intervals += f", saved every {self.save_steps:,} too"
+        self.say(f"steps: {bound}{steps}; {intervals}")
         self.clock.lap("setup")
 
     def compile(self, make_evaluators: MakeEvaluators) -> None:
@@ -548,7 +539,7 @@ class Job:
             "seconds": self.clock.seconds,
             "device": self.device,
             "fresh_resets": fresh_resets,
-            "version": bounce_mjx.__version__,
+            "version": VERSION,
         }
 
     # Telling

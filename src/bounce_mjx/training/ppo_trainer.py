@@ -28,11 +28,6 @@ from bounce_mjx.training.trainer import BlockMetrics, Snapshot
 _AXIS = "devices"
 
 
-def iterations_per_block(config: TrainConfig) -> int:
-    """Iterations I in one block."""
-    return max(1, round(config.block_steps / config.ppo.batch_steps))
-
-
 def each_seed(tree: Any, num_seeds: int) -> list[Any]:
     """The trees of S seeds from one whose arrays are [S, ...]; with one seed, the one tree."""
     if num_seeds == 1:
@@ -71,7 +66,7 @@ class PPOTrainer:
             return init(make_key(seeds))
 
         def train_block(state: ppo.TrainingState) -> tuple[ppo.TrainingState, ppo.Metrics]:
-            return run(state, iterations_per_block(config))
+            return run(state, config.iterations_per_block)
 
         # One object each, not methods, so that JAX traces them only once.
         self._initial_state = initial_state

@@ -218,7 +218,8 @@ def run_training(
     config.check_eval_seed()
     if layers.resume is None:
         say(console, f"config: {layers.title}")
-    for note in (*layers.notes, *notes_on_starts(config), *notes_on_worlds(config)):
+    notes = notes_on_starts(config) + notes_on_worlds(config) + notes_on_intervals(config)
+    for note in (*layers.notes, *notes):
         say(console, f"note: {note}")
     seeds = job.train(config, console, resume=layers.resume, callbacks=callbacks)
     best = print_results(seeds, console)
@@ -260,6 +261,19 @@ def notes_on_worlds(config: TrainConfig) -> list[str]:
     ]
 
 
+def notes_on_intervals(config: TrainConfig) -> list[str]:
+    """A sentence for each interval that is shorter than a block, which nothing interrupts."""
+    notes = []
+    for key in ("eval_every", "save_every"):
+        steps = getattr(config, key)
+        if steps is not None and steps < config.steps_per_block:
+            notes.append(
+                f"{key} {steps:,} is shorter than a block, so it is done every "
+                f"{config.steps_per_block:,} steps; a smaller block_steps makes it more often"
+            )
+    return notes
+
+
 def print_results(seeds: Sequence[job.SeedRun], console: Console) -> job.SeedRun:
     """Prints the results of a training run; returns the best seed."""
     reports = {seed.config.seed: seed.progress.best for seed in seeds}
@@ -271,7 +285,7 @@ def print_results(seeds: Sequence[job.SeedRun], console: Console) -> job.SeedRun
     else:
         console.print(results_table(report, f"best checkpoint, {best.progress.best_steps:,} steps"))
         say(console, details_line(report))
-    if unsolved := unsolved_line(report):
+    if unsolved := unsolved_line(report, len(seeds)):
         say(console, unsolved)
     spent = ", ".join(f"{name} {value:.1f} s" for name, value in best.seconds.items())
     say(console, f"time: {spent}")

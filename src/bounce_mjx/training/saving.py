@@ -2,7 +2,7 @@
 
 import concurrent.futures
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ class Save:
     items: dict[str, Any]
     progress: dict[str, Any]
     report: Report | None = None
-    kept: int | None = None
+    kept: frozenset[int] = frozenset()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,6 +68,12 @@ class Saver:
         self._saving: concurrent.futures.Future[Outcome] | None = None
         self._steps = 0
         self._is_failing = False
+        self._written: list[int] = []
+
+    def recall(self, numbers: Iterable[int]) -> None:
+        """Takes over the checkpoints of a resumed run that count, by number: those that were
+        trained before the one from which it resumes, and this one."""
+        self._written = sorted(numbers)
 
     def start(self, snapshot: Snapshot | None, steps: int, about: dict[str, Any]) -> None:
         """Starts to save; the save before must have ended.
@@ -110,6 +116,8 @@ class Saver:
                 self._say_change(outcome.problem)
         # The leader's, as it alone writes.
         numbers, problem = hosts.exchange([outcome.numbers, outcome.problem])[0]
+        if self._run.name in numbers:
+            self._written.append(numbers[self._run.name])
         for seed in self._seeds:
             number = numbers.get(seed.run.name)
             # The state of all seeds has the evaluations of each.
@@ -137,18 +145,26 @@ class Saver:
         training = {checkpoints.TRAINING: snapshot.state}
         progress = [seed.progress.model_dump() for seed in self._seeds]
         if len(self._seeds) == 1:
-            # The best checkpoint stays beside the newest one, unless this one is the best.
+            # The best checkpoint stays beside the newest ones, unless this one is the best.
             (seed,) = self._seeds
             is_best_kept = seed.saved is not None and not seed.has_unsaved_best
-            kept = seed.saved.number if is_best_kept else None
-            return [self._save_of(0, snapshot, progress[0], training, kept)]
+            best = {seed.saved.number} if is_best_kept else set()
+            return [self._save_of(0, snapshot, progress[0], training, self._earlier() | best)]
         saves = []
         for i, seed in enumerate(self._seeds):
             if seed.has_unsaved_best:
                 saves.append(self._save_of(i, snapshot, progress[i]))
         record = {"seeds": progress}
-        saves.append(Save(self._run, self._config, self._steps, training, record))
-        return saves
+        newest = Save(self._run, self._config, self._steps, training, record, kept=self._earlier())
+        return [*saves, newest]
+
+    def _earlier(self) -> frozenset[int]:
+        """The checkpoints that stay beside the one that is written next, by number."""
+        kept = self._config.keep_checkpoints
+        if kept == "all":
+            return frozenset(self._written)
+        first = max(0, len(self._written) - (kept - 1))
+        return frozenset(self._written[first:])
 
     def _save_of(
         self,
@@ -156,7 +172,7 @@ class Saver:
         snapshot: Snapshot,
         progress: dict[str, Any],
         training: dict[str, Any] | None = None,
-        kept: int | None = None,
+        kept: frozenset[int] = frozenset(),
     ) -> Save:
         """The checkpoint of seed number i, with what a training continues from if it is given."""
         seed = self._seeds[i]

@@ -57,7 +57,7 @@ class Trainer(Protocol):
         """
 
     def run(self) -> BlockMetrics:
-        """Trains for a block of I iterations (`ppo_trainer.iterations_per_block`), each of
+        """Trains for a block of I iterations (`TrainConfig.iterations_per_block`), each of
         `ppo.batch_steps` environment steps.
 
         Returns:

@@ -123,8 +123,8 @@ class Controls:
         given = self._simulation.command.get(name)
         start = 0.5 * (command.low + command.high) if given is None else given
         start = round(float(start), _DECIMALS)
-        # A span widens the slider, and so does a value that is given beyond it.
-        reached = [start, command.low, command.high, *(command.span or ())]
+        # A value that is given beyond what is offered widens the slider.
+        reached = [start, *command.offered]
         lowest = round(float(min(reached)), _DECIMALS)
         highest = round(float(max(reached)), _DECIMALS)
         label = words(name)

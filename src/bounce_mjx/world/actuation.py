@@ -22,7 +22,7 @@ from bounce_mjx.world.randomization import RandomizationConfig, World
 DEFAULT_PUSH_INTERVAL = 2.0
 
 
-class Actuation(NamedTuple):
+class ActuationMemory(NamedTuple):
     """Memory of the actuation; a field is None if no setting needs it."""
 
     setpoint: Setpoint | None = None
@@ -54,7 +54,7 @@ class Actuators:
         self._limits = joint_limits(config.robot.limits, *self._range)
         self._gears = mj_model.actuator_gear[list(self._addresses.actuators), 0]
 
-    def first(self, qpos: jax.Array) -> Actuation:
+    def first(self, qpos: jax.Array) -> ActuationMemory:
         """Memory at a reset, with the servos at rest at qpos [nq]: the controls before the first
         action are without `servo_offset`."""
         zeros = jnp.zeros(self._config.num_joints, qpos.dtype)
@@ -70,12 +70,12 @@ class Actuators:
 
     def next(
         self,
-        before: Actuation,
+        before: ActuationMemory,
         qpos: jax.Array,
         action: jax.Array,
         world: World,
         clock: Clock | None,
-    ) -> tuple[Control, Actuation]:
+    ) -> tuple[Control, ActuationMemory]:
         """The inputs of the physics over a control step, and the memory after it.
 
         Args:
@@ -189,7 +189,9 @@ class Actuators:
         return jnp.stack([x, y, jnp.zeros_like(x)], axis=-1)
 
 
-def start_actuation(config: RandomizationConfig, control_dt: float, control: Control) -> Actuation:
+def start_actuation(
+    config: RandomizationConfig, control_dt: float, control: Control
+) -> ActuationMemory:
     """Memory of latency and lag at a reset.
 
     Args:
@@ -207,7 +209,7 @@ def start_actuation(config: RandomizationConfig, control_dt: float, control: Con
     filtered = None
     if config.servo_lag is not None:
         filtered = control.ctrl
-    return Actuation(queue=queue, filtered=filtered)
+    return ActuationMemory(queue=queue, filtered=filtered)
 
 
 def _varying(control: Control) -> Control:
@@ -218,8 +220,8 @@ def _varying(control: Control) -> Control:
 
 
 def add_delay(
-    world: World, memory: Actuation, control: Control, control_dt: float, num_substeps: int
-) -> tuple[Control, Actuation]:
+    world: World, memory: ActuationMemory, control: Control, control_dt: float, num_substeps: int
+) -> tuple[Control, ActuationMemory]:
     """The control of a control step with latency and lag, and the memory after the step.
 
     The targets arrive late by any number of physics steps, and the servos' first-order lag filters
@@ -273,7 +275,7 @@ def _late_control(
     moving = newer.moving._replace(
         smoothing=control.moving.smoothing,
         older_acceleration=older.moving.last_acceleration,
-        control_steps=jnp.asarray(num_substeps, control.ctrl.dtype),
+        num_substeps=jnp.asarray(num_substeps, control.ctrl.dtype),
     )
     return newer._replace(moving=moving, switch=switch)
 

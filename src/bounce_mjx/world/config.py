@@ -1,16 +1,21 @@
 """Settings of the world, which each task extends with its own."""
 
+import dataclasses
 import math
+import numbers
 import os
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal
 
 import pydantic
 from pydantic import Field
 
 from bounce_mjx.config import settings
+from bounce_mjx.config.places import where_made
+from bounce_mjx.config.settings import is_finite
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.robot.config import NEED_SITE, RobotConfig, Vector, is_packaged
+from bounce_mjx.world.limits import Limits
 from bounce_mjx.world.observation import ObservationConfig, ObservationLayout
 from bounce_mjx.world.randomization import EACH_JOINT, TERMS, RandomizationConfig
 
@@ -23,9 +28,14 @@ NumBalls = Annotated[int, pydantic.BeforeValidator(settings.whole_number), Field
 """Number of balls, up to `robot.model.MAX_BALLS`."""
 
 
-class Command(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Command:
     """A number that the policy has to follow: sampled at a reset and after each interval
-    (`randomization.command_interval`), or set by a user."""
+    (`randomization.command_interval`), or set by a user.
+
+    Raises:
+      UserError: nothing can be sampled from its range, or its limits exclude a part of it.
+    """
 
     low: float
     """Lower end of the range from which it is sampled."""
@@ -38,7 +48,8 @@ class Command(NamedTuple):
     greatest: float = math.inf
     """Greatest value that a user may set."""
     span: tuple[float, float] | None = None
-    """Range that a viewer offers; by default, and at least, the range from which it is sampled."""
+    """Range that a viewer offers within the limits; by default, and at least, the range from which
+    it is sampled."""
     step: float = 0.05
     """Change by a key of a viewer."""
     names: tuple[str, ...] = ()
@@ -46,6 +57,59 @@ class Command(NamedTuple):
     a number, which would be taken for a value."""
     hidden: bool = False
     """Whether the policy need not see it, because it acts through other commands."""
+    setting: str = "a command"
+    """The setting that gives its range, for an error."""
+    reason: str = ""
+    """Why its limits are what they are, for an error, such as "as max_distance is 0.7 m"."""
+
+    def __post_init__(self) -> None:
+        place = where_made()
+        is_range = is_finite(self.low) and is_finite(self.high) and self.low <= self.high
+        if not is_range:
+            raise UserError(
+                f"a command{place} is sampled from {_words(self.low)} to {_words(self.high)}; give "
+                "two finite numbers, the lower one first"
+            )
+        if not self.least <= self.low <= self.high <= self.greatest:
+            raise UserError(
+                f"{self.setting}{place}: a command is sampled from {self.low:.4g} to "
+                f"{self.high:.4g}, but must be {self._limits}"
+            )
+        if self.span is not None and not self._is_span():
+            raise UserError(
+                f"a command{place} is offered as {shorten(repr(self.span))}; give two finite "
+                "numbers, the lower one first"
+            )
+        if not (is_finite(self.step) and self.step > 0.0):
+            raise UserError(
+                f"a command{place} has the step {shorten(repr(self.step))}; give a number above 0"
+            )
+        are_names = isinstance(self.names, tuple) and all(map(_is_name, self.names))
+        if not are_names:
+            raise UserError(
+                f"a command{place} has the names {shorten(repr(self.names))}; give a tuple of "
+                "names, of which none is a number"
+            )
+
+    def _is_span(self) -> bool:
+        """Whether the span is two finite numbers, the lower one first."""
+        is_pair = isinstance(self.span, tuple | list) and len(self.span) == 2
+        return is_pair and all(map(is_finite, self.span)) and self.span[0] <= self.span[1]
+
+    @property
+    def offered(self) -> tuple[float, float]:
+        """The range that a viewer offers: the span and the range from which it is sampled, within
+        the limits."""
+        ends = (self.low, self.high, *(self.span or ()))
+        return max(self.least, min(ends)), min(self.greatest, max(ends))
+
+    @property
+    def _limits(self) -> str:
+        """The limits of a user's value, in words, with their reason."""
+        ends = (">=", self.least), ("<=", self.greatest)
+        limits = " and ".join(f"{sign} {end:.4g}" for sign, end in ends if math.isfinite(end))
+        unit = f" ({self.unit})" if self.unit else ""
+        return f"{limits}{unit}" + (f", {self.reason}" if self.reason else "")
 
     def checked(self, value: Any, label: str) -> float:
         """A user's value as a number.
@@ -64,11 +128,25 @@ class Command(NamedTuple):
             number = math.nan
         if math.isfinite(number) and self.least <= number <= self.greatest:
             return number
-        ends = (">=", self.least), ("<=", self.greatest)
-        limits = " and ".join(f"{sign} {end:g}" for sign, end in ends if math.isfinite(end))
-        wanted = " or ".join([*self.names, f"a finite number {limits}".rstrip()])
-        unit = f" ({self.unit})" if self.unit else ""
-        raise UserError(f"{label} is {shorten(repr(value))}, but must be {wanted}{unit}")
+        wanted = " or ".join([*self.names, f"a finite number {self._limits}".rstrip()])
+        raise UserError(f"{label} is {shorten(repr(value))}, but must be {wanted}")
+
+
+def _is_name(value: Any) -> bool:
+    """Whether a value is a word, and not a number in letters."""
+    if not isinstance(value, str):
+        return False
+    try:
+        float(value)
+    except ValueError:
+        return True
+    return False
+
+
+def _words(value: Any) -> str:
+    """A number, or what stands in its place, for an error."""
+    is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
+    return f"{value:g}" if is_number else shorten(repr(value))
 
 
 class ActionConfig(settings.StrictModel):
@@ -93,7 +171,7 @@ class ResetConfig(settings.StrictModel):
     """Half-width of the uniform noise of each ball coordinate, m."""
 
 
-class RobotSettings(settings.StrictModel):
+class WorldSettings(settings.StrictModel):
     """The settings that a named world may have (`world.named`): those of a robot, its sensors and
     its ball."""
 
@@ -107,6 +185,10 @@ class RobotSettings(settings.StrictModel):
     friction: settings.Friction | None = None
     """Coefficient of sliding friction between ball and paddle; null for the MJCF's, which is 0 for
     the project's own robot. `randomization.contact_friction` replaces it."""
+    ball_inertia: settings.BallInertia | None = None
+    """Moment of inertia of the ball per mass and squared radius: 0.4 of a solid ball, 0.667 of a
+    hollow one, as table-tennis balls are; null for the MJCF's, which is 0.4 for the project's own
+    robot. It acts where the ball has friction. `randomization.ball_inertia` replaces it."""
     action_scale: Annotated[settings.Positive, Field(le=0.5)] = 0.02
     """Change of the servo target for an action of 1, rad."""
     max_joint_velocity: Annotated[settings.Positive, Field(le=50.0)] = 2.0 * math.pi
@@ -115,7 +197,7 @@ class RobotSettings(settings.StrictModel):
     """The world that each episode samples."""
 
 
-class WorldConfig(RobotSettings):
+class WorldConfig(WorldSettings):
     """The world of an environment: the robot, the ball, the time steps, the resets, the sensors
     and the randomisation. The config of a task extends it."""
 
@@ -161,6 +243,19 @@ class WorldConfig(RobotSettings):
         return self
 
     @pydantic.model_validator(mode="after")
+    def _check_contact_duration(self):
+        """A contact is not shorter than its physics steps can simulate."""
+        durations = self.randomization.contact_duration
+        least = 4.0 * self.physics_dt
+        if durations is not None and min(durations) < least * (1.0 - 1e-6):
+            raise ValueError(
+                f"randomization.contact_duration begins at {min(durations):g} s, but a contact "
+                f"needs four physics steps, which are {least:g} s with physics_dt "
+                f"{self.physics_dt:g}; give at least that, or a shorter physics_dt"
+            )
+        return self
+
+    @pydantic.model_validator(mode="after")
     def _check_max_lead(self):
         """An action of 1 has its full effect."""
         if self.action.base == "target" and self.action.max_lead < self.action_scale:
@@ -174,9 +269,9 @@ class WorldConfig(RobotSettings):
     def _check_num_joints(self):
         """What has a number for each acting joint has as many as there are."""
         counts = {}
-        for name, numbers in self.robot.limits:
-            if numbers is not None:
-                counts[f"robot.limits.{name}"] = len(numbers)
+        for name, of_joints in self.robot.limits:
+            if of_joints is not None:
+                counts[f"robot.limits.{name}"] = len(of_joints)
         for name in self.randomization.terms:
             low, _ = getattr(self.randomization, name)
             if TERMS[name].size is EACH_JOINT and isinstance(low, tuple):
@@ -226,6 +321,26 @@ class WorldConfig(RobotSettings):
                 raise ValueError(f"{key} has no effect without {needed}; set that too, or {remedy}")
         return self
 
+    @pydantic.model_validator(mode="after")
+    def _check_commands(self):
+        """The commands are within their limits, and there are some where they are sampled again."""
+        try:
+            commands = self.commands
+        except UserError as error:
+            raise ValueError(str(error)) from error
+        if self.task is None or commands:
+            return self
+        for name, value in (
+            ("command_interval", self.randomization.command_interval is not None),
+            ("first_command_range", self.randomization.first_command_range < 1.0),
+        ):
+            if value:
+                raise ValueError(
+                    f"randomization.{name} is given, but the task {self.task.__name__} has no "
+                    "commands; leave it out"
+                )
+        return self
+
     @pydantic.field_validator("mjcf")
     @classmethod
     def _make_absolute(cls, path: Path | None) -> Path | None:
@@ -269,6 +384,17 @@ class WorldConfig(RobotSettings):
     def commands(self) -> dict[str, Command]:
         """The commands of the policy, by name; a task's config has its own."""
         return {}
+
+    @property
+    def limits(self) -> Limits:
+        """What ends an episode by where a ball is; a task has its own."""
+        return ()
+
+    @property
+    def targets(self) -> tuple[tuple[float, float, float], ...]:
+        """Points to which the `limits` are relative at a reset, m; a task whose ball starts at rest
+        has those of its commands' ranges."""
+        return ()
 
     @property
     def unseen_noise(self) -> tuple[str, ...]:

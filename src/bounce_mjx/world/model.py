@@ -21,9 +21,9 @@ def world_model(config: WorldConfig, visual: bool = True) -> mujoco.MjModel:
         robot=config.robot,
         num_balls=config.num_balls,
     )
-    if config.friction is None:
-        return mj_model
-    return edited_model(mj_model, PhysicsParameters(contact_friction=np.float64(config.friction)))
+    given = {"contact_friction": config.friction, "ball_inertia": config.ball_inertia}
+    numbers = {name: np.float64(value) for name, value in given.items() if value is not None}
+    return edited_model(mj_model, PhysicsParameters(**numbers)) if numbers else mj_model
 
 
 @functools.lru_cache(maxsize=8)

@@ -11,7 +11,7 @@ from bounce_mjx.config.settings import StrictModel, nested
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import shorten
 from bounce_mjx.lazy import np
-from bounce_mjx.world.config import RobotSettings
+from bounce_mjx.world.config import WorldSettings
 from bounce_mjx.world.randomization import TERMS, RandomizationConfig
 
 CURRICULUM = RandomizationConfig.model_fields.keys() - TERMS.keys()
@@ -31,7 +31,7 @@ class NamedWorld(StrictModel):
     robot: str | None = None
     """Name of a robot in configs/robots/, or its file, relative to the world's folder; null for any
     robot. (`env.robot` has settings of an arm: its adoption, its limits.)"""
-    env: RobotSettings = RobotSettings()
+    env: WorldSettings = WorldSettings()
     """Settings of the environment (`runs.worlds` puts them in place of the config's). A term of the
     randomisation that it does not have is as in the task's defaults."""
     sources: dict[str, str] = {}

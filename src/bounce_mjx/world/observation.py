@@ -7,8 +7,9 @@ from typing import Annotated, Literal, NamedTuple, get_args
 
 from pydantic import Field
 
+from bounce_mjx.config.places import where_made
 from bounce_mjx.config.settings import StrictModel
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.lazy import jax, jnp
 
 History = Annotated[int, Field(ge=0, le=100)]
@@ -16,8 +17,13 @@ Group = Literal["state", "command", "past", "task"]
 """Places of quantities in the observation, in their order."""
 
 
-class Quantity(NamedTuple):
-    """The entries of a quantity that an observation may contain: the metadata of its setting."""
+@dataclasses.dataclass(frozen=True)
+class Quantity:
+    """The entries of a quantity that an observation may contain: the metadata of its setting.
+
+    Raises:
+      UserError: there is no such size or group, or a command has not one number.
+    """
 
     size: int | None
     """Number of entries of one value; None for one entry for each acting joint."""
@@ -28,6 +34,25 @@ class Quantity(NamedTuple):
     what the world remembers, task for the task's own quantities."""
     per_ball: bool = False
     """Whether each ball has its entries, one ball after another."""
+
+    def __post_init__(self) -> None:
+        groups = get_args(Group)
+        is_size = self.size is None or (type(self.size) is int and self.size >= 1)
+        if not is_size:
+            raise UserError(
+                f"{self}{where_made()} has the size {shorten(repr(self.size))}; give a number of "
+                "entries, or None for one of each joint"
+            )
+        if self.group not in groups:
+            raise UserError(
+                f"{self}{where_made()} has the group {self.group!r}; choose from "
+                f"{', '.join(groups)}"
+            )
+        if self.group == "command" and (self.size != 1 or self.per_ball):
+            raise UserError(
+                f"{self}{where_made()} shows a command, which is one number; give "
+                f'task.Quantity(1, {self.unit!r}, "command")'
+            )
 
     def entries(self, num_joints: int, num_balls: int) -> int:
         """Number of entries of one value."""
@@ -84,21 +109,12 @@ class ObservationConfig(StrictModel):
 
     @classmethod
     def quantities(cls) -> dict[str, Quantity]:
-        """All quantities by name, in the order of the observation.
-
-        Raises:
-          UserError: a quantity has no such group.
-        """
+        """All quantities by name, in the order of the observation."""
         groups = get_args(Group)
         quantities = {}
         for name, field in cls.model_fields.items():
             for mark in field.metadata:
                 if isinstance(mark, Quantity):
-                    if mark.group not in groups:
-                        raise UserError(
-                            f"the quantity {name} of {cls.__name__} has the group {mark.group!r}; "
-                            f"choose from {', '.join(groups)}"
-                        )
                     quantities[name] = mark
         in_order = sorted(quantities.items(), key=lambda item: groups.index(item[1].group))
         return dict(in_order)

@@ -52,11 +52,14 @@ Ranges = dict[str, tuple["jax.Array", "jax.Array"]]
 shape."""
 
 
-Operation = Literal["scale", "add", "tilt_frame", "tilt_vector", "replace", "restitution", "limit"]
+Operation = Literal[
+    "scale", "add", "tilt_frame", "tilt_vector", "replace", "restitution", "duration", "limit"
+]
 """How a sampled value and the model's own parameter make the episode's parameter
 (`sampling.apply`): the parameter times the value, plus the value, turned by two angles (a frame or
-a vector), the value in its place, the damping that has the value as its restitution, or the value
-as a limit that never raises the model's own limit."""
+a vector), the value in its place, the damping that has the value as its restitution, the stiffness
+with which a contact lasts as long, or the value as a limit that never raises the model's own
+limit."""
 
 MODEL = "model"
 """Nominal value that is the model's own."""
@@ -68,11 +71,11 @@ NOMINALS: dict[Operation, float | Literal["model"] | None] = {
     "tilt_vector": 0.0,
     "replace": MODEL,
     "restitution": MODEL,
+    "duration": MODEL,
     "limit": None,
 }
 """The sampled value that changes nothing, by the operation; None where no number does that, as the
-model may have no limit. (Exception: `contact_friction` turns a frictionless contact into one of the
-friction 1e-5, the least of MuJoCo's, even at its nominal 0.)"""
+model may have no limit."""
 
 NUMBER = ()
 """Size of a term with one number."""
@@ -135,19 +138,32 @@ class RandomizationConfig(StrictModel):
     ] = None
     """Restitution of the ball on the paddle, in place of the model's, which is 0.85 for the
     project's own robot."""
+    contact_duration: Annotated[
+        Sampled, physical("contact_stiffness", "duration", NUMBER, bounds=(1e-4, 0.05))
+    ] = None
+    """Half a period of the contact's spring, which is how long a bounce lasts, in place of the
+    model's, which is 10 ms for the project's own robot, s; a real ball's is 1 ms or less. At least
+    four physics steps, with which the restitution of a single bounce is up to 0.1 off, by its phase
+    within a step; with ten up to 0.03."""
     ball_mass: Annotated[Sampled, physical("ball_mass", "scale", NUMBER, bounds=(0.01, 1e3))] = None
     """Factor of the ball's mass."""
     ball_radius: Annotated[
         Sampled, physical("ball_radius", "scale", NUMBER, bounds=(0.1, 10.0))
     ] = None
     """Factor of the ball's radius."""
+    ball_inertia: Annotated[
+        Sampled, physical("ball_inertia", "replace", NUMBER, bounds=(0.1, 0.67))
+    ] = None
+    """Moment of inertia of the ball per mass and squared radius, in place of the config's: 0.4 of a
+    solid ball, 0.667 of a hollow one."""
     air_drag: Annotated[Sampled, Term(NUMBER, bounds=(0.0, 10.0), nominal=0.0)] = None
     """Deceleration of the ball by the air divided by its squared speed, 1/m; about 0.11 for a
     table-tennis ball."""
     contact_friction: Annotated[
         Sampled, physical("contact_friction", "replace", NUMBER, bounds=(0.0, 10.0))
     ] = None
-    """Coefficient of sliding friction between ball and paddle, in place of the model's."""
+    """Coefficient of sliding friction between ball and paddle, in place of the model's; a dry
+    rubber grips at 0.5 and more, smooth wood slides at 0.2."""
     servo_gain: Annotated[Sampled, physical("servo_gain", "scale", EACH_JOINT, bounds=_FACTOR)] = (
         None
     )
@@ -278,9 +294,10 @@ class RandomizationConfig(StrictModel):
     @pydantic.field_validator("*", mode="before")
     @classmethod
     def _check_ends(cls, ends: Any, info: pydantic.ValidationInfo) -> Any:
-        """A range of each joint is two lists, and not a list of as many ranges."""
-        is_list = isinstance(ends, list | tuple)
-        if info.field_name in TERMS and is_list and len(ends) != 2:
+        """A range is two ends, and not one value; that of each joint is two lists, and not a list
+        of as many ranges."""
+        is_pair = isinstance(ends, list | tuple) and len(ends) == 2
+        if info.field_name in TERMS and ends is not None and not is_pair:
             raise ValueError(_is_no_range(info.field_name, ends))
         return ends
 

@@ -1,7 +1,7 @@
 """From the ranges of the randomisation to an episode's world, and from that to its physics."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -14,7 +14,12 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.physics import PhysicsParameters
 from bounce_mjx.physics.edited import INSEPARABLE, NO_PAIR, edits, own_parameters
 from bounce_mjx.physics.scalars import Quaternion, quaternion_matrix, quaternion_product
-from bounce_mjx.robot.contact import damping_of_restitution, restitution_of_damping
+from bounce_mjx.robot.contact import (
+    damping_of_restitution,
+    duration_of_stiffness,
+    restitution_of_damping,
+    stiffness_of_duration,
+)
 from bounce_mjx.robot.model import Addresses, contact_pairs
 from bounce_mjx.robot.numbers import field_of
 from bounce_mjx.world.randomization import MODEL, TERMS, Operation, Ranges, Term, World
@@ -22,6 +27,7 @@ from bounce_mjx.world.randomization import MODEL, TERMS, Operation, Ranges, Term
 # The fields that the terms of the contact change.
 _CONTACT_FIELDS = {
     "restitution": ("pair_solref",),
+    "contact_duration": ("pair_solref",),
     "contact_friction": ("pair_friction", "pair_dim"),
 }
 
@@ -50,20 +56,25 @@ def check_overlap(
     mj_model: mujoco.MjModel,
     addresses: Addresses,
     terms: Iterable[str],
-    randomized: PhysicsParameters,
+    randomize: Callable[[jax.Array], PhysicsParameters],
 ) -> None:
-    """Refuses parameters of a `randomize` that change what a term changes: the world would say one
+    """Refuses a `randomize` whose parameters change what a term changes: the world would say one
     value, and the physics have the other.
 
     Args:
       mj_model: the model.
       addresses: of its parts.
       terms: names of the active terms.
-      randomized: what `randomize` returns; of its arrays, none is read.
+      randomize: key -> parameters; it is traced, and computes nothing.
 
     Raises:
-      UserError: a term and `randomize` change the same number of the model.
+      UserError: a term and `randomize` change the same number of the model, or it returns something
+        else than parameters.
     """
+    randomized = jax.eval_shape(randomize, jax.random.PRNGKey(0))
+    if not isinstance(randomized, PhysicsParameters):
+        returned = "None" if randomized is None else f"a {type(randomized).__name__}"
+        raise UserError(f"randomize returns {returned}; return a physics.PhysicsParameters")
     given = {name: value for name, value in randomized._asdict().items() if value is not None}
     places: dict[tuple[str, int], str] = {}
     for name in given:
@@ -91,6 +102,9 @@ def _places_of_parameter(
     for edit in edits(mj_model, addresses):
         if edit.parameter == parameter:
             places |= _places(mj_model, edit.field, edit.index)
+    if parameter == "ball_inertia":
+        for ball in addresses.balls:
+            places |= _places(mj_model, "body_inertia", ball.body)
     return places
 
 
@@ -127,26 +141,28 @@ def nominal_values(
       terms: names of the terms.
       addresses: of the model's parts, if they are known.
     """
-    model = own_parameters(mj_model, addresses)
-    num_joints = len(model.armature)
+    own = own_parameters(mj_model, addresses)
+    num_joints = len(own.armature)
     nominals = {}
     for name in terms:
         term = TERMS[name]
         value = term.nominal
         if value == MODEL:
-            value = _model_nominal(model, term)
+            value = _own_nominal(own, term)
         if value is not None:
             nominals[name] = np.broadcast_to(np.float64(value), term.shape(num_joints))
     return nominals
 
 
-def _model_nominal(model: PhysicsParameters, term: Term) -> Any:
+def _own_nominal(own: PhysicsParameters, term: Term) -> Any:
     """The model's own value of a term; None if the model lacks the parameter."""
-    if term.operation != "restitution":
-        return getattr(model, term.parameter)
-    if model.contact_damping is None:
+    if term.operation not in ("restitution", "duration"):
+        return getattr(own, term.parameter)
+    if own.contact_damping is None:
         return None
-    return restitution_of_damping(model.contact_damping, model.contact_stiffness)
+    if term.operation == "duration":
+        return duration_of_stiffness(own.contact_stiffness)
+    return restitution_of_damping(own.contact_damping, own.contact_stiffness)
 
 
 def sample_world(
@@ -195,37 +211,53 @@ def physics_parameters(world: World, mj_model: mujoco.MjModel) -> PhysicsParamet
     physical_terms = [name for name in TERMS if name in world and TERMS[name].parameter]
     if not physical_terms:
         return PhysicsParameters()
-    model = own_parameters(mj_model)
+    own = own_parameters(mj_model)
     parameters = {}
+    if "contact_duration" in world:
+        own = _with_duration(own, world["contact_duration"])
+        # Without a term of its own, it follows the stiffness.
+        parameters["contact_damping"] = own.contact_damping
     for name in physical_terms:
         term = TERMS[name]
-        parameters[term.parameter] = apply(term.operation, model, term.parameter, world[name])
+        parameters[term.parameter] = apply(term.operation, own, term.parameter, world[name])
     return PhysicsParameters(**parameters)
 
 
+def _with_duration(own: PhysicsParameters, duration: jax.Array) -> PhysicsParameters:
+    """The model's own parameters with a contact that lasts as long (s) and has the same damping
+    ratio."""
+    if own.contact_stiffness is None:
+        raise UserError(NO_PAIR)
+    stiffness = stiffness_of_duration(duration)
+    faster = jnp.sqrt(stiffness / own.contact_stiffness)
+    return own._replace(contact_stiffness=stiffness, contact_damping=own.contact_damping * faster)
+
+
 def apply(
-    operation: Operation, model: PhysicsParameters, parameter: str, sampled: jax.Array
+    operation: Operation, own: PhysicsParameters, parameter: str, sampled: jax.Array
 ) -> jax.Array:
     """A physical parameter of an episode.
 
     Args:
       operation: how the sampled value changes the model's own; with "restitution", the sampled
         value is a restitution and the parameter is the contact's damping.
-      model: the model's own parameters.
+      own: the model's own parameters.
       parameter: name of the field of `PhysicsParameters`.
       sampled: the term's value, of its shape.
 
     Raises:
       UserError: the term is a restitution, and the model has no contact pair of ball and paddle.
     """
+    if operation == "duration":
+        return stiffness_of_duration(sampled)
     if operation in ("replace", "limit"):
         # `physics.edited` keeps the model's own limit where that is lower.
         return sampled
     if operation == "restitution":
-        if model.contact_stiffness is None:
+        if own.contact_stiffness is None:
             raise UserError(NO_PAIR)
-        return damping_of_restitution(sampled, model.contact_stiffness)
-    value = jnp.asarray(getattr(model, parameter), sampled.dtype)
+        return damping_of_restitution(sampled, own.contact_stiffness)
+    value = jnp.asarray(getattr(own, parameter), sampled.dtype)
     if operation == "scale":
         return value * sampled
     if operation == "add":

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.physics import Engine
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS
 from bounce_mjx.robot.model import Addresses, scatter
@@ -80,7 +79,7 @@ class Instant(NamedTuple):
     last_action: jax.Array
     """Clipped action of the control step [n]."""
     setpoint: Setpoint | None
-    """Memory of the servo targets (`Actuation.setpoint`)."""
+    """Memory of the servo targets (`ActuationMemory.setpoint`)."""
     world: World
     """The values that the episode sampled."""
     clock: Clock
@@ -151,31 +150,11 @@ class Sensors:
         picture = take_picture(self._config, now.world, now.clock, balls, last_picture)
         measured = self._measure(now, picture)
         task, quantities = self._task.first_quantities(measured)
-        self._check_first_quantities(quantities, measured)
         values = measured | quantities
         histories = {}
         for name, count in self._config.observation.counts().items():
             histories[name] = jnp.broadcast_to(values[name], (count, *values[name].shape))
         return Sensing(balls, picture, histories, task)
-
-    def _check_first_quantities(
-        self, quantities: dict[str, jax.Array], measured: dict[str, jax.Array]
-    ) -> None:
-        """Refuses quantities of the task that lack one of its observation, or that have the name of
-        a quantity of the world."""
-        code = f"first_quantities of the task {type(self._task).__name__}"
-        for name in self._config.observation.counts():
-            if name not in quantities and name not in measured:
-                raise UserError(
-                    f"{code} lacks the observation's quantity {shorten(name)}; return its first "
-                    "value too"
-                )
-        for name in quantities:
-            if name in measured:
-                raise UserError(
-                    f"{code} has the quantity {shorten(name)}, which is one of the world's; give "
-                    "it another name"
-                )
 
     def _num_remembered(self) -> int:
         """Control steps of which the ball is remembered: as old as the last picture can be if none
@@ -200,14 +179,7 @@ class Sensors:
                 histories[name] = with_newest(history, measured[name])
             else:
                 of_task[name] = history
-        expected = set(of_task)
         task, next_of_task = self._task.next_quantities(before.task, of_task, measured)
-        if set(next_of_task) != expected:
-            raise UserError(
-                f"next_quantities of the task {type(self._task).__name__} returns the histories "
-                f"{', '.join(next_of_task) or 'none'}; return those of its argument: "
-                f"{', '.join(sorted(expected)) or 'none'}"
-            )
         return Sensing(balls, picture, histories | next_of_task, task)
 
     def _measure(self, now: Instant, picture: Picture) -> dict[str, jax.Array]:

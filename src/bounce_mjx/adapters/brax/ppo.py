@@ -58,7 +58,7 @@ def load_brax_policy(path: str | Path, deterministic: bool = True) -> BraxPolicy
 def ppo_settings(config: TrainConfig | None = None) -> dict[str, Any]:
     """Keyword arguments of brax's `ppo.train`, from a config or `configs/default.yaml`.
 
-    brax's trainer lacks `critic_metrics`, `min_noise_std`, `compute_dtype`, the decay of the
+    brax's trainer lacks `critic_metrics`, `mean_noise_bound`, `compute_dtype`, the decay of the
     learning rate, our epsilon of Adam and, as set here, the value at a time-out. The episodes have
     the environment's whole time limit, not `training_episode_seconds`, as brax evaluates with the
     same `episode_length`.

@@ -65,26 +65,20 @@ def free_acceleration(model: BallModel, ball: Ball, gravity: Vec, air_drag: Scal
     return acceleration + Vec(drag(air_drag, ball.velocity))
 
 
-def move_ball(ball: Ball, acceleration: Vec, angular_acceleration: Vec, dt: float) -> Ball:
-    """A ball after a time dt (s), by semi-implicit Euler: the new velocity moves the ball, and the
-    new spin turns it.
-
-    Args:
-      acceleration: in the world, m/s^2.
-      angular_acceleration: in the world, rad/s^2; not used for a ball without `turning`.
-    """
+def move_ball(ball: Ball, acceleration: Vec, dt: float) -> Ball:
+    """A ball after a time dt (s) with an acceleration (m/s^2, in the world), by semi-implicit
+    Euler: the new velocity moves the ball, and its spin turns it."""
     velocity = ball.velocity + acceleration * dt
     position = ball.position + velocity * dt
     turning = ball.turning
     if turning is not None:
-        turning = turn(turning, angular_acceleration, dt)
+        turning = turn(turning, dt)
     return Ball(position, velocity, turning)
 
 
-def turn(turning: Turning, angular_acceleration: Vec, dt: float) -> Turning:
-    """Spin and orientation after a time dt (s), in which the new spin turns the ball; the angular
-    acceleration is that of the contacts, rad/s^2 in the world."""
-    spin = turning.spin + angular_acceleration * dt
+def turn(turning: Turning, dt: float) -> Turning:
+    """Spin and orientation after a time dt (s)."""
+    spin = turning.spin
     squared_speed = spin @ spin
     is_still = squared_speed < float(jnp.finfo(squared_speed.dtype).tiny)
     inverse_speed = jax.lax.rsqrt(jnp.where(is_still, 1.0, squared_speed))

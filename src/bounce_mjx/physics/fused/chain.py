@@ -8,11 +8,8 @@ and forces (N) of slides. Source: Featherstone, Rigid Body Dynamics Algorithms (
 """
 
 import dataclasses
-import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
-
-import jax
 
 from bounce_mjx.physics.scalars import (
     IDENTITY3,
@@ -26,7 +23,7 @@ from bounce_mjx.physics.scalars import (
     congruence,
     cross,
     dot,
-    is_constant,
+    inverse_root,
     is_zero,
     mul,
     sine_cosine,
@@ -227,10 +224,10 @@ def cholesky(matrix: SquareMatrix) -> Factor:
     for j in range(n):
         row = triangle[j][:j]
         pivot = sub(matrix[j][j], dot(row, row))
-        inverse_root = 1.0 / math.sqrt(pivot) if is_constant(pivot) else jax.lax.rsqrt(pivot)
-        inverse_diagonal.append(inverse_root)
+        reciprocal = inverse_root(pivot)
+        inverse_diagonal.append(reciprocal)
         for i in range(j + 1, n):
-            triangle[i][j] = mul(sub(matrix[i][j], dot(triangle[i][:j], row)), inverse_root)
+            triangle[i][j] = mul(sub(matrix[i][j], dot(triangle[i][:j], row)), reciprocal)
     return triangle, inverse_diagonal
 
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from bounce_mjx.physics.scalars import Mat, Scalar, Vec, add, cross, dot
+from bounce_mjx.physics.scalars import Mat, Scalar, Vec, add, dot
 
 # MuJoCo's mjMINVAL: a centre closer to the box counts as inside it.
 _MIN_DISTANCE = 1e-15
@@ -33,10 +33,8 @@ class ContactModel:
     inverse_weights: tuple[Scalar, Scalar]
     """Translational inverse inertia at the reference pose, 1/kg: of the paddle's body or the first
     ball, and of the last ball."""
-    friction: tuple[Scalar, Scalar] | None = None
-    """Coefficients of sliding friction along the two tangents; None for a frictionless contact."""
-    impratio: float = 1.0
-    """Ratio of the tangential to the normal impedance (the option `impratio`)."""
+    friction: Scalar | None = None
+    """Coefficient of sliding friction (`fused.friction`); None for a frictionless contact."""
 
 
 class Contact(NamedTuple):
@@ -133,17 +131,3 @@ def impedance_at(pair: ContactModel, distance: jax.Array) -> jax.Array:
         settling = 1.0 - (1.0 - x) ** power / (1.0 - midpoint) ** (power - 1.0)
         y = jnp.where(x <= midpoint, rising, settling)
     return dmin + y * (dmax - dmin)
-
-
-def tangents(normal: Vec) -> tuple[Vec, Vec]:
-    """Tangents of MuJoCo's contact frame (mju_makeFrame), the second up to its sign, as the pyramid
-    of friction is symmetric. The first tangent is y, or z if the normal is close to y, made
-    orthogonal to the normal."""
-    x, y, z = normal
-    from_y = jnp.abs(y) < 0.5
-    along = jnp.where(from_y, y, z)
-    inverse = jax.lax.rsqrt(1.0 - along * along)
-    start_y = jnp.where(from_y, 1.0, 0.0)
-    start_z = jnp.where(from_y, 0.0, 1.0)
-    first = Vec((-x * along, start_y - y * along, start_z - z * along)) * inverse
-    return first, cross(normal, first)

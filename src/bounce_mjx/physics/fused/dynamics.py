@@ -20,7 +20,7 @@ from bounce_mjx.physics.fused.constraint import paddle_centre
 from bounce_mjx.physics.fused.forward import Motion, substep
 from bounce_mjx.physics.fused.model import FusedModel, read_model
 from bounce_mjx.physics.parameters import PhysicsParameters, PhysicsState
-from bounce_mjx.physics.scalars import ZERO3, Scalar, Vec, scalars_of
+from bounce_mjx.physics.scalars import Scalar, Vec, scalars_of
 
 
 def step(
@@ -35,7 +35,7 @@ def step(
     Parameters that are not None are inputs of the program; the others fold into it as constants.
     The loop carries the coordinates as scalars. Without sliding friction a contact's force goes
     through the ball's centre and the spin stays constant, so one rotation over the whole interval
-    updates the orientation; with it, `ball.turn` changes the spin in each physics step.
+    updates the orientation; with it, each physics step changes the spin (`fused.friction`).
 
     Args:
       model: from `read_model`.
@@ -70,7 +70,7 @@ def step(
             turning = ball.turning
             _put(qvel, at.qvel[3:], spin_in_ball(turning))
         else:
-            turning = turn(ball_before.turning, ZERO3, num_substeps * model.dt)
+            turning = turn(ball_before.turning, num_substeps * model.dt)
         _put(qpos, at.qpos, (*ball.position, *turning.orientation))
         _put(qvel, at.qvel[:3], ball.velocity)
     return PhysicsState(jnp.stack(qpos), jnp.stack(qvel))
@@ -96,8 +96,9 @@ def paddle_position(model: FusedModel, parameters: PhysicsParameters, qpos: jax.
 
 def _has_sliding_friction(model: FusedModel, parameters: PhysicsParameters) -> bool:
     """Whether a contact of this environment can have sliding friction."""
-    # `support.unsupported_friction` lets all pairs have it or none.
-    if model.contacts[0].friction is not None or parameters.contact_friction is not None:
+    if any(contact.friction is not None for contact in model.contacts):
+        return True
+    if parameters.contact_friction is not None:
         return True
     return any(name.startswith("pair_friction[") for name in parameters.entries or {})
 

@@ -11,6 +11,10 @@ Whoever knows `mj_step` knows this file:
                       two stages
     integrate         the next state: MuJoCo's `mj_implicit` or `mj_Euler`
 
+and one more, after MuJoCo's:
+
+    rub               sliding friction of the balls, as an impulse (`friction.py`)
+
 Source: MuJoCo's documentation, "Computation" (simulation pipeline), and `engine_forward.c`, whose
 functions `mj_fwdPosition` to `mj_fwdConstraint` gave the first five their names.
 """
@@ -23,6 +27,7 @@ import jax.numpy as jnp
 from bounce_mjx.physics.fused import chain, joint_friction
 from bounce_mjx.physics.fused.ball import Ball, free_acceleration, move_ball
 from bounce_mjx.physics.fused.constraint import ConstraintEffects, fwd_constraint
+from bounce_mjx.physics.fused.friction import rub
 from bounce_mjx.physics.fused.model import FusedModel, Servo
 from bounce_mjx.physics.scalars import Scalar, Vec, add, dot, mul, not_inlined, sub
 
@@ -89,7 +94,8 @@ class Smooth(NamedTuple):
 def substep(
     model: FusedModel, motion: Motion, targets: Sequence[Scalar], air_drag: Scalar | None = None
 ) -> Motion:
-    """One physics step: the equivalent of `mj_step`.
+    """One physics step: the equivalent of `mj_step` with frictionless contacts, and then the
+    friction of the balls.
 
     Args:
       targets: targets [n] of the servos in this step, rad or m.
@@ -110,14 +116,31 @@ def substep(
         free_accelerations=smooth.ball_accelerations,
         keep=keep,
     )
-    return integrate(model, motion, position, actuation, smooth, constraint, keep)
+    after = integrate(model, motion, position, actuation, smooth, constraint, keep)
+    if not _balls_turn(motion):
+        return after
+    v, balls = rub(
+        model,
+        pose=position.pose,
+        mass_factor=position.mass_factor,
+        centres=[ball.position for ball in motion.balls],
+        contacts=constraint.contacts,
+        normal_forces=constraint.normal_forces,
+        v=after.v,
+        balls=after.balls,
+    )
+    return Motion(after.q, v, balls)
+
+
+def _balls_turn(motion: Motion) -> bool:
+    """Whether a contact may have sliding friction: `dynamics.step` then gives the balls their
+    spin."""
+    return motion.balls[0].turning is not None
 
 
 def _keep(model: FusedModel, motion: Motion) -> Keep:
-    # `dynamics.step` gives the balls their spin where a contact may have sliding friction.
-    has_sliding_friction = motion.balls[0].turning is not None
     has_dry_friction = any(joint_friction.has_friction(link) for link in model.links)
-    if has_sliding_friction or has_dry_friction:
+    if _balls_turn(motion) or has_dry_friction:
         return not_inlined
     return lambda values: values
 
@@ -236,6 +259,5 @@ def integrate(
     balls = []
     for i, ball in enumerate(motion.balls):
         ball_acceleration = smooth.ball_accelerations[i] + constraint.ball_accelerations[i]
-        angular_acceleration = constraint.ball_angular_accelerations[i]
-        balls.append(move_ball(ball, ball_acceleration, angular_acceleration, model.dt))
+        balls.append(move_ball(ball, ball_acceleration, model.dt))
     return Motion(q, v, tuple(balls))

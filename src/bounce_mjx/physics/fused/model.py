@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.physics.edited import MIN_FRICTION, EditedModel, edited, edits
+from bounce_mjx.physics.edited import EditedModel, edited, edits
 from bounce_mjx.physics.fused import chain
 from bounce_mjx.physics.fused.contact import ContactModel
 from bounce_mjx.physics.parameters import MODEL_PARAMETERS, PhysicsParameters
@@ -25,13 +25,12 @@ from bounce_mjx.physics.scalars import (
     congruence,
     diagonal,
     is_constant,
-    maximum,
+    is_zero,
     mul,
     quaternion_matrix,
     sub,
     symmetric,
 )
-from bounce_mjx.physics.support import unsupported_friction
 from bounce_mjx.robot.model import (
     Addresses,
     BallAddresses,
@@ -131,15 +130,11 @@ def read_model(
       addresses: of the model's parts, if they are known.
 
     Raises:
-      UserError: the engine does not read an entry that the parameters change, or lacks the
-        friction that they bring.
+      UserError: the engine does not read an entry that the parameters change.
     """
     addresses = addresses or find_addresses(mj_model)
     model = edited(mj_model, addresses, parameters)
     _check_entries(model)
-    friction = unsupported_friction(mj_model, model["pair_dim", :])
-    if friction is not None:
-        raise UserError(f"the fused physics does not support {friction}; use --physics mjx")
     links, frames = _read_links(model)
     servos = []
     for actuator, joint in zip(addresses.actuators, addresses.arm_joints, strict=True):
@@ -187,8 +182,6 @@ def variable_entries(mj_model: mujoco.MjModel, addresses: Addresses) -> tuple[tu
         ("body_inertia", links),
         ("body_invweight0", ([paddle_body, *balls], 0)),
         ("geom_size", paddle),
-        # Of five coefficients, MuJoCo too uses the first two with condim="3".
-        ("pair_friction", list(range(mj_model.npair))),
         ("qpos0", positions),
         ("actuator_biasprm", (servos, 0)),
         ("actuator_ctrlrange", limited),
@@ -436,10 +429,7 @@ def _read_contact(model: EditedModel, pair: int, balls: tuple[int, ...]) -> Cont
     bodies = [model.addresses.balls[i].body for i in balls]
     if len(balls) == 1:
         bodies.insert(0, mj_model.geom_bodyid[model.addresses.paddle_geom])
-    friction = None
-    if model["pair_dim", pair] > 1:
-        first, second = model["pair_friction", pair, :2]
-        friction = (maximum(first, MIN_FRICTION), maximum(second, MIN_FRICTION))
+    friction = model["pair_friction", pair, 0] if model["pair_dim", pair] > 1 else None
     return ContactModel(
         balls=balls,
         # In both formats of a solref, MuJoCo divides k by dmax^2 and b by dmax.
@@ -447,8 +437,7 @@ def _read_contact(model: EditedModel, pair: int, balls: tuple[int, ...]) -> Cont
         damping=mul(damping, 1.0 / dmax),
         solimp=(dmin, dmax, float(solimp[2]), midpoint, power),
         inverse_weights=tuple(model["body_invweight0", body, 0] for body in bodies),
-        friction=friction,
-        impratio=max(mujoco.mjMINVAL, float(mj_model.opt.impratio)),
+        friction=None if is_zero(friction) else friction,
     )
 
 
