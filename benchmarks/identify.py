@@ -19,10 +19,11 @@ import numpy as np
 
 from bounce_mjx import load_policy
 from bounce_mjx.deploy.recorder import Recorder
+from bounce_mjx.identify.estimates import estimates
 from bounce_mjx.identify.excitation import excite
+from bounce_mjx.identify.identification import Identified, identify
 from bounce_mjx.identify.reading import read_csv
-from bounce_mjx.identify.stages import Identified, identify
-from bounce_mjx.identify.world import estimates, to_yaml
+from bounce_mjx.identify.world_file import to_yaml
 from bounce_mjx.physics import CEngine, edited_model
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import find_addresses, joint_names
@@ -366,7 +367,8 @@ def measure(config: WorldConfig, hidden: Hidden, path: Path) -> dict[str, Any]:
         "outside": [label for label, holds in inside.items() if not holds],
         "widths": widths(found),
         "dropped": found.dropped,
-        "leaves at once": found.leaves_at_once,
+        "arm": found.choice.chosen.name,
+        "leaves at once": found.simulated.leaves_at_once,
         "notes": list(log.notes),
     }
 

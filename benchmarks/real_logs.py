@@ -30,20 +30,22 @@ from numpy.polynomial.polynomial import polyfit
 from scipy.optimize import brentq, least_squares
 
 from bounce_mjx.errors import UserError
+from bounce_mjx.identify.estimates import total_delay
 from bounce_mjx.identify.following import (
     SETTLING,
     Following,
-    commanded,
     find_settled,
     follow,
     set_points,
 )
+from bounce_mjx.identify.hypotheses import describe_choice
+from bounce_mjx.identify.identification import identify
 from bounce_mjx.identify.inspection import examine
 from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.reading import read_csv
+from bounce_mjx.identify.response import commanded
+from bounce_mjx.identify.sentences import describe_doubts
 from bounce_mjx.identify.simulation import compensated, make_targets
-from bounce_mjx.identify.stages import identify
-from bounce_mjx.identify.world import describe_doubts, total_delay
 from bounce_mjx.physics import CEngine, edited_model
 from bounce_mjx.robot.model import find_addresses, joint_names
 from bounce_mjx.runs.settings import read_preset
@@ -58,6 +60,8 @@ _EXPLAINED = 3e-3
 _AT_BOUNCE = 0.012
 # m/s^2.
 _GRAVITY = np.array([0.0, 0.0, -9.81])
+# The command is the position.
+_AT_ONCE = Following(0.0, np.zeros(1), np.zeros(1))
 # Of the flights' integration, s.
 _STEP = 4e-3
 # Height of a table's bounce below which a minimum of the height is one, m.
@@ -188,6 +192,7 @@ def measure_arm(arm: ArmLog, toolbox: bool) -> list[dict[str, Any]]:
     for which, (fitted, tested) in enumerate((parts, parts[::-1])):
         simple = follow(fitted, find_settled(fitted))
         row = {"log": arm.name, "fitted": ("first half", "second half")[which]}
+        row["command, mrad"] = (1e3 * late_errors(_AT_ONCE, tested)).tolist()
         row["delay and offset, ms"] = 1e3 * simple.delay
         row["delay and offset, mrad"] = (1e3 * late_errors(simple, tested)).tolist()
         checkup = examine([fitted], names)[0]
@@ -204,14 +209,16 @@ def measure_arm(arm: ArmLog, toolbox: bool) -> list[dict[str, Any]]:
             continue
         row["seconds"] = time.perf_counter() - begin
         row["processor seconds"] = time.process_time() - begin_processor
-        of_arm = compensated(config) if found.gravity_compensation else config
+        is_carried = found.simulated.gravity_compensation > 0.0
+        of_arm = compensated(config) if is_carried else config
         # As `identify` reads them: a follower may go on between its commands.
-        fitted_points = set_points(fitted, found.following, config.physics_dt)
-        tested_points = set_points(tested, found.following, config.physics_dt)
+        fitted_points = set_points(fitted, simple, config.physics_dt)
+        tested_points = set_points(tested, simple, config.physics_dt)
         world = found.layout.world(found.fit.vector)
         row["identified, mrad"] = (1e3 * open_loop(of_arm, world, tested_points)).tolist()
         row["total delay"] = total_delay(found, model)
-        row["gravity compensation"] = found.gravity_compensation
+        row["gravity compensation"] = found.simulated.gravity_compensation
+        row["hypotheses"] = describe_choice(found.choice)
         row["doubts"] = describe_doubts(found, names)
         if toolbox:
             row |= measure_toolbox(of_arm, fitted_points, tested_points)

@@ -36,10 +36,10 @@ import mujoco
 import numpy as np
 
 from bounce_mjx import load_policy
-from bounce_mjx.deploy.faults import Watch, picture_age
+from bounce_mjx.deploy.faults import Fault, Watch, check_balls, picture_age
 from bounce_mjx.deploy.policy import DeployedPolicy
 from bounce_mjx.deploy.recorder import Recorder
-from bounce_mjx.deploy.samples import ImpossibleMeasurement
+from bounce_mjx.deploy.samples import ImpossibleMeasurement, Seen
 from bounce_mjx.env.env import Env, State
 from bounce_mjx.evaluation.episodes import reset_episodes
 from bounce_mjx.evaluation.results import Report, judge
@@ -624,7 +624,8 @@ class Episode:
         self.world = world
         self.alarm = ""
         """Code of the first fault that a supervisor would stop for, but a lost ball's."""
-        self._watch = Watch(policy.metadata, picture_age(policy.metadata))
+        self._watch = Watch(policy.metadata)
+        self._max_age = picture_age(policy.metadata)
         self._steps = 0
         """Time steps of the physics."""
         self._targets: list[np.ndarray] = []
@@ -640,9 +641,11 @@ class Episode:
     def reset(self, angles: np.ndarray, positions: np.ndarray, velocities: np.ndarray) -> None:
         """Starts with the arm at angles [J], at rest, and the balls as `Simulator.reset`."""
         self.simulator.reset(angles, positions, velocities)
-        self.policy.reset()
-        self._watch.rest(angles, angles)
-        self._watch.begin()
+        # What was done before the start is no sample.
+        controller = self.policy.controller
+        seen = controller.samples.rest(Seen(), angles)
+        self._memory = controller.episode(seen, None)
+        self._followed = self._watch.rest(angles, angles)
         self._steps = 0
         self._targets = [angles]
         self._balls = [self.simulator.ball_state()]
@@ -660,18 +663,29 @@ class Episode:
 
     def control_step(self, command: dict[str, np.ndarray]) -> None:
         """The policy acts on what it knows, and the physics runs until its next step."""
+        controller = self.policy.controller
+        measured = self.policy.driver.check(self.measure() | command)
         try:
-            measured = self.policy.read(self.measure() | command)
+            memory, measured, steps = controller.take(self._memory, measured)
         except ImpossibleMeasurement as error:
             self.alarm = self.alarm or error.fault
         else:
-            is_bridged = self.policy.samples.is_arm_bridged
-            faults = self._watch.faults(measured, self._targets[-1], is_bridged)
-            codes = [code for code, _ in faults if code != "ball_lost"]
-            if codes and not self.alarm:
-                self.alarm = codes[0]
-            self.policy.act(measured)
-        self.run(self.policy.commands(RATE))
+            seen = memory.seen
+            age = seen.clock.now - seen.picture.taken
+            paddle = seen.paddle[-1][1]
+            angles = measured["joint_angles"]
+            try:
+                check_balls(seen.picture.balls, age, self._max_age, paddle)
+                self._followed = self._watch.follow(
+                    self._followed, angles, self._targets[-1], steps, seen.is_arm_bridged
+                )
+            except Fault as fault:
+                if fault.fault != "ball_lost":
+                    self.alarm = self.alarm or fault.fault
+            self._memory = controller.act(memory, measured, steps)
+        count = self.policy.commands_per_step(RATE)
+        times = np.arange(1, count + 1) / RATE
+        self.run(controller.motion.at(self._memory.course, times))
 
     def run(self, targets: np.ndarray) -> None:
         """The physics runs until the next control step, with targets [n, J] at `RATE`."""

@@ -23,9 +23,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from bounce_mjx import load_policy
-from bounce_mjx.deploy.faults import Watch, picture_age
+from bounce_mjx.deploy.faults import Fault, Watch, check_balls, picture_age
 from bounce_mjx.deploy.metadata import Metadata
-from bounce_mjx.deploy.samples import ImpossibleMeasurement, Samples
+from bounce_mjx.deploy.samples import ImpossibleMeasurement, Samples, Seen
 from bounce_mjx.env.env import Env, State
 from bounce_mjx.evaluation.episodes import reset_episodes
 from bounce_mjx.learning.policy import make_networks
@@ -117,27 +117,29 @@ def first_alarm(
     """The first step from one on that breaks a rule, the rule's code, and the number of bridged
     samples until then."""
     samples = Samples(metadata)
-    watch = Watch(metadata, picture_age(metadata))
+    watch = Watch(metadata)
+    max_age = picture_age(metadata)
     angles = episode["joint_angles"]
     commands = episode["commands"]
-    samples.rest(angles[0])
-    watch.rest(angles[0], angles[0])
-    watch.begin()
+    seen = samples.rest(Seen(), angles[0])
+    followed = watch.rest(angles[0], angles[0])
     bridged = 0
     for step in range(len(angles)):
         given = {name: np.ravel(episode[name][step]) for name in MEASURED}
         given["time"] = np.array([step * metadata.control_dt])
+        command = commands[step - 1] if step else angles[0]
         try:
-            measured = samples.take(given)
-        except ImpossibleMeasurement as error:
+            seen, measured, steps = samples.take(seen, given)
+            age = max(seen.clock.now - seen.picture.taken, float(measured["ball_age"][0]))
+            check_balls(seen.picture.balls, age, max_age, seen.paddle[-1][1])
+            followed = watch.follow(
+                followed, measured["joint_angles"], command, steps, seen.is_arm_bridged
+            )
+        except (ImpossibleMeasurement, Fault) as error:
             if step >= start:
                 return step, error.fault, bridged
             continue
         bridged += any(np.any(measured[name] != given[name]) for name in MEASURED)
-        command = commands[step - 1] if step else angles[0]
-        found = list(watch.faults(measured, command, samples.is_arm_bridged))
-        if found and step >= start:
-            return step, found[0][0], bridged
     return len(angles), "", bridged
 
 

@@ -51,7 +51,8 @@ _SECTIONS = (
         "Policies on a robot",
         "",
         "deploy.loading.load_policy deploy.policy.DeployedPolicy deploy.supervisor.Supervisor "
-        "deploy.samples.Samples deploy.faults.Watch deploy.metadata.Metadata "
+        "deploy.controller.Controller deploy.controller.Memory deploy.samples.Samples "
+        "deploy.flight.fit_fall deploy.faults.Watch deploy.metadata.Metadata "
         "deploy.recorder.Recorder",
     ),
     (

@@ -25,6 +25,8 @@ GAIN = 300
 """Of `servoJ`, from 100 to 2000."""
 MAX_FIRST_BALL_AGE = 0.05
 """An episode starts only with a newer picture of the ball, s."""
+BALL_GONE = ("ball_lost", "ball_flight")
+"""Faults after which the operator may start another episode."""
 # The order of RTDE's arrays.
 JOINTS = (
     "shoulder_pan_joint",
@@ -143,7 +145,7 @@ def bounce(
                 arm.start()
             elif arm.state == "stopped":
                 reasons.append(arm.reason)
-                if arm.fault != "ball_lost":
+                if arm.fault not in BALL_GONE:
                     break
                 arm.restart()
     finally:

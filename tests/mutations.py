@@ -26,7 +26,8 @@ SENSING, CONTACT = "world/sensing.py", "robot/contact.py"
 PPO, STATISTICS = "learning/ppo.py", "learning/statistics.py"
 CONTROL = "physics/control.py"
 BALL, NORMALS = "physics/fused/ball.py", "physics/fused/normals.py"
-EXPORT, POLICY = "deploy/export.py", "deploy/policy.py"
+FRICTION, RUB = "physics/friction.py", "physics/fused/friction.py"
+EXPORT = "deploy/export.py"
 
 # What is wrong, the file, its text, the faulty text, and the test that catches it.
 FAULTS = [
@@ -104,15 +105,25 @@ FAULTS = [
     ("the ball moves with the velocity before the step", BALL,
      "position = ball.position + velocity * dt", "position = ball.position + ball.velocity * dt", "test_physics.py -k random_states"),
     ("a contact pulls", NORMALS, "return [jnp.maximum(first_linear / pivot, 0.0)]", "return [first_linear / pivot]", "test_physics.py -k random_states"),
+    ("friction turns the slip round", FRICTION, "minimum(to_stop, to_slide)", "to_slide", "test_friction.py -k never_adds"),
+    ("friction ignores the coefficient", FRICTION, "minimum(to_stop, to_slide)", "to_stop", "test_friction.py -k rigid_formula"),
+    ("the paddle does not feel friction", RUB, "half_generalised)) * scale", "half_generalised)) * 0.0", "test_friction.py -k given_friction"),
+    ("friction of two balls turns one of them alone", RUB,
+     "_after_impulse(first_model, first, first_lever, -impulse)", "_after_impulse(first_model, first, first_lever * 0.0, -impulse)", "test_friction.py -k of_two_balls"),
+    ("the gradient of friction is not finite at a small slip", FRICTION, "_NO_SLIP = 1e-16", "_NO_SLIP = 1e-24", "test_friction.py -k at_every_slip"),
+    ("a contact lasts a whole period of its spring", CONTACT,
+     "return (math.pi / duration) ** 2", "return (2.0 * math.pi / duration) ** 2", "test_randomization.py -k lasts_as"),
     ("an exported policy has a wrong normaliser", EXPORT,
      "networks.act(policy, jnp",
      "networks.act(policy._replace(normalizer=policy.normalizer._replace(mean=0.0 * policy.normalizer.mean)), jnp", "test_deploy.py -k onnx_equals"),
-    ("the robot's targets move against the action", POLICY,
+    ("the robot's targets move against the action", "deploy/controller.py",
      "base + self.metadata.action_scale * action", "base - self.metadata.action_scale * action", "test_deploy.py -k servo_targets_lead"),
     ("a velocity from differences takes every step for as long as the others", "deploy/network.py",
-     "self._time - last if is_known else self.metadata.control_dt", "self.metadata.control_dt", "test_deploy.py -k real_time_between"),
-    ("what a failed step was to send is sent", "deploy/supervisor.py",
-     "            if self._end is not None:\n                self._motion.end = self._end\n", "", "test_motion.py -k whatever_fails"),
+     "max(picture.taken - view.taken, _SHORTEST)", "self.metadata.control_dt", "test_deploy.py -k real_time_between"),
+    ("a late step goes on at its speed", "deploy/controller.py",
+     "course = self.motion.stopped(course)", "pass", "test_motion.py -k late_step_goes_on"),
+    ("a ball need not fall", "deploy/flight.py",
+     "    if fit.ratio > 1.0:", "    if fit.ratio > 1e9:", "test_motion.py -k hand_holds"),
     ("an ended episode still earns its return", "evaluation/statistics.py",
      "jnp.where(running, states.reward, 0.0)", "states.reward", "test_evaluation.py -k up_to_its_end"),
     ("a training waits a hundred times as long for a margin", "runs/progress.py", "PATIENCE = 1.5", "PATIENCE = 150", "test_progress.py -k wait_long"),

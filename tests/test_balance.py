@@ -67,12 +67,16 @@ def test_the_ball_is_laid_on_the_paddle(env: Env) -> None:
 
 
 def test_the_friction_stays_in_every_world(env: Env) -> None:
-    """In that of an episode on C, and without randomisation."""
+    """In that of an episode on C, and without randomisation; so does the hollow ball."""
     pushed = episode_models(env, PhysicsParameters(ball_mass=np.full((1,), 0.003)))[0]
     nominal = Env(Config(randomization=RandomizationConfig()))
     for model in (pushed, nominal.mj_model):
         assert model.pair_dim[0] == 3
         np.testing.assert_allclose(model.pair_friction[0, :2], FRICTION)
+        ball = model.body("ball_link")
+        np.testing.assert_allclose(ball.inertia, 2.0 / 3.0 * ball.mass[0] * RADIUS**2)
+    as_in_file = Env(Config(ball_inertia=None)).mj_model.body("ball_link")
+    np.testing.assert_allclose(as_in_file.inertia, 0.4 * as_in_file.mass[0] * RADIUS**2)
     assert Env(Config(friction=None)).mj_model.pair_dim[0] == 1
 
 

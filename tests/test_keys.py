@@ -37,7 +37,7 @@ KEYS = fields_of(find_task("bounce").Config)
 VALUES = {
     "task": "catch", "seed": 1, "num_devices": 1000, "screening_episodes": 16, "save_every": 256,
     "warm_start": "nowhere", "log_dir": "elsewhere", "eval_seed": 3,
-    "env.mjcf": "nowhere.xml", "env.friction": 0.2, "env.num_balls": 2,
+    "env.mjcf": "nowhere.xml", "env.friction": 0.2, "env.ball_inertia": 0.5, "env.num_balls": 2,
     "env.default_joint_angles": [0.1, 0.7, 1.9, 0.0, -1.0, 0.0], "env.ball_init_pos": [0.5, 0, 0.4],
     "env.target_height_range": [0.4, 0.5], "env.control_dt": 0.02,
     "env.robot.site": "nowhere", "env.robot.joints": ["Joint1"],

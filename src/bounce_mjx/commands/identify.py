@@ -45,17 +45,14 @@ def main(args: Sequence[str]) -> None:
     command = parse(IdentifyCommand, args, prog="bounce-mjx identify")
     if not command.logs:
         raise UserError("no log is given; name the CSV files or bags to identify from")
+    from bounce_mjx.identify.estimates import estimates, total_delay
+    from bounce_mjx.identify.hypotheses import describe_choice
+    from bounce_mjx.identify.identification import identify
     from bounce_mjx.identify.inspection import describe, examine
+    from bounce_mjx.identify.log import join
     from bounce_mjx.identify.reading import read_log
-    from bounce_mjx.identify.stages import identify, join
-    from bounce_mjx.identify.world import (
-        compare,
-        describe_doubts,
-        estimates,
-        sentences,
-        to_yaml,
-        total_delay,
-    )
+    from bounce_mjx.identify.sentences import describe_doubts, sentences
+    from bounce_mjx.identify.world_file import compare, to_yaml
     from bounce_mjx.reports.identification import identification_page, inspection_page
     from bounce_mjx.robot.model import joint_names
     from bounce_mjx.runs.files import check_output, write_output
@@ -96,6 +93,8 @@ def main(args: Sequence[str]) -> None:
         )
     set_up_jax(config)
     found = identify(config, log, command.camera_rotation, lambda line: print(f"  {line}"))
+    for line in describe_choice(found.choice):
+        print(line)
     print(total_delay(found, model))
     for entry in estimates(found, names):
         if entry.chosen:

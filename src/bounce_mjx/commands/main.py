@@ -3,6 +3,7 @@
 `bounce-mjx train|eval|robustness|play|view|adopt|plot|report|export|...`
 """
 
+import contextlib
 import gc
 import importlib
 import os
@@ -67,8 +68,10 @@ def main(args: Sequence[str] | None = None) -> None:
         if opengl := os.environ.get("MUJOCO_GL"):
             # Where this library is missing, MuJoCo's import would fail, also in a command that
             # draws nothing; one that draws tries the library itself (`viewers.offscreen`).
+            # A robot's computer has no MuJoCo.
             os.environ["MUJOCO_GL"] = "disabled"
-            importlib.import_module("mujoco")
+            with contextlib.suppress(ImportError):
+                importlib.import_module("mujoco")
             os.environ["MUJOCO_GL"] = opengl
         with needed(f"bounce-mjx {name}", "bounce_mjx"):
             command = importlib.import_module(f"bounce_mjx.commands.{name}")

@@ -4,12 +4,12 @@ Two invariants hold, whatever a robot's sensors say:
 
 1. A command moves no farther in a control step than the arm may. Every command but the first after
    a reset is made by `motion.Motion.aim`, which is within `Metadata.largest_step` of the last one;
-   the first one is aimed from where the arm is measured, or said to rest (`reset`). Under a
-   supervisor, which alone gives the policy's commands, only a stop and `restart(moved=True)` make
-   another first one.
+   the first one is where the arm is said to rest, or is measured near its start pose.
 2. What cannot be true is no measurement. What is missing, not finite or of another shape is refused
-   by `policy.DeployedPolicy.check`; every other sample passes `samples.Samples.take`, which bridges
-   one that cannot be true, and refuses a second one in a row.
+   by `driver.Driver.check`; every other sample passes `samples.Samples.take`, which bridges what
+   cannot be true, while it is at most a third of the last 0.1 s.
 
-What an arm does with its commands, and what becomes of the ball, is watched by `faults.Watch`.
+A policy is a function of its memory (`controller.Controller.step`), and a refused sample leaves the
+memory as it was. `flight` says whether a ball falls, `rest` where an arm rests, `clock` how many
+control steps have passed; what an arm does with its commands is watched by `faults.Watch`.
 """

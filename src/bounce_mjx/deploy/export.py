@@ -182,6 +182,8 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         environment=_environment(env),
         joint_damping=tuple(m.dof_damping[list(addresses.arm_qvel)].tolist()),
         sag=_sag(m, addresses, env.default_joint_angles),
+        ball_rests=env.task.ball_rests,
+        ball_thrown=env.task.ball_thrown,
     )
 
 

@@ -2,13 +2,13 @@
 table in docs/real-robot.md."""
 
 import math
-from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
 from bounce_mjx.deploy.metadata import Metadata, largest_term, least_term
-from bounce_mjx.deploy.motion import paddle_position
-from bounce_mjx.deploy.samples import RESOLUTION, Measurements
+from bounce_mjx.deploy.samples import RESOLUTION
+from bounce_mjx.errors import UserError
 
 # Time of a joint's motion that is compared with the training's arms, s.
 _COMPARED = 0.25
@@ -30,16 +30,35 @@ _COUNTS = 2.0
 _TOO_FAR = 0.05
 # What a load takes a joint off its command while it rests, beside the arm's own weight, rad.
 _SAG = 0.01
-# A ball so far below the paddle, or beside it without coming nearer, is lost; one so far above it
-# flies, m.
+# A ball so far below the paddle is lost, m.
 _BELOW = 0.1
-_BESIDE = 0.9
-_FLYING = 0.05
-# Pictures in which the noise is smaller than the motion of a ball that comes nearer.
-_EARLIER = 5
 
-Fault = tuple[str, str]
-"""Code and reason."""
+
+class Fault(UserError):
+    """What the program of a robot did not expect: its arm stops."""
+
+    def __init__(self, fault: str, reason: str):
+        super().__init__(reason)
+        self.fault = fault
+        """Code, of the table in docs/real-robot.md."""
+
+
+class Followed(NamedTuple):
+    """The last control steps of an arm."""
+
+    commands: np.ndarray
+    """At the ends of the last control steps [L, J], the newest first, rad."""
+    beside: np.ndarray
+    """Measured angles less those of the training's arms in the last 0.25 s [C, A, J], rad."""
+    angles: np.ndarray
+    """Measured in the last 0.25 s [C, J], the newest last, rad."""
+    steps: int
+    """Since the arm rested."""
+    repeats: np.ndarray
+    """Steps in which each reading has repeated [J]."""
+    smallest_change: np.ndarray
+    """Of each reading [J], which is a count of the encoder or more, rad; infinite until the reading
+    changes, so that one that has never changed has no narrower bound than others."""
 
 
 def picture_age(metadata: Metadata) -> float:
@@ -85,20 +104,11 @@ def arm_responses(metadata: Metadata) -> np.ndarray:
 
 
 class Watch:
-    """Compares the control steps of an arm and its balls with what the training's worlds can hold.
+    """Compares the control steps of an arm with what the training's worlds can hold."""
 
-    Each control step is given to one of the functions that yield faults, whose first fault counts:
-    it is read to that, or to its end.
-    """
-
-    def __init__(self, metadata: Metadata, max_picture_age: float):
-        """Bounds of a policy's worlds.
-
-        Args:
-          max_picture_age: of the ball's picture, s.
-        """
+    def __init__(self, metadata: Metadata):
+        """Bounds of a policy's worlds."""
         self._metadata = metadata
-        self._max_age = max_picture_age
         sag = max(metadata.sag, default=0.0) / least_term(metadata, "servo_gain", 1.0)
         # Where the weight and the servos' constant errors take a joint from its command, rad.
         self._beside_command = sag + largest_term(metadata, "servo_offset")
@@ -111,115 +121,112 @@ class Watch:
         self._compared = math.ceil(_COMPARED / metadata.control_dt)
         self._settling = self._arms.shape[1] + self._compared
 
-    def rest(self, angles: np.ndarray, command: np.ndarray) -> None:
-        """The arm has rested at these angles [J], commanded to be there [J]."""
+    def rest(self, angles: np.ndarray, command: np.ndarray) -> Followed:
+        """The arm has rested at these angles [J], commanded to be there [J], rad."""
         arms, length = self._arms.shape
-        self._commands = np.tile(command, (length + self._compared, 1))
-        self._beside = np.tile(angles - command, (self._compared, arms, 1))
-        self._angles = angles
-        self._steps = 0
-        # Steps in which each reading has repeated, and its smallest change, which is a count of the
-        # encoder or more; unknown until the reading changes, so that one that has never changed has
-        # no narrower bound than others.
-        self._repeats = np.zeros(len(angles), int)
-        self._smallest_change = np.full(len(angles), np.inf)
+        return Followed(
+            commands=np.tile(command, (length + self._compared, 1)),
+            beside=np.tile(angles - command, (self._compared, arms, 1)),
+            angles=np.tile(angles, (self._compared, 1)),
+            steps=0,
+            repeats=np.zeros(len(angles), int),
+            smallest_change=np.full(len(angles), np.inf),
+        )
 
-    def begin(self) -> None:
-        """An episode begins."""
-        self._time = 0.0
-        self._pictures: list[tuple[np.ndarray, float]] = []
-
-    def arm_faults(
-        self, angles: np.ndarray, command: np.ndarray, is_bridged: bool = False
-    ) -> Iterator[Fault]:
-        """A joint that does not move as any arm of the training would.
+    def follow(
+        self,
+        followed: Followed,
+        angles: np.ndarray,
+        command: np.ndarray,
+        steps: int = 1,
+        is_bridged: bool = False,
+    ) -> Followed:
+        """The last control steps with a new sample.
 
         Args:
+          followed: before it.
           angles: measured [J], rad.
-          command: at the end of the step before [J], rad.
+          command: at the end of the step before [J], rad, which held since.
+          steps: control steps since the last sample.
           is_bridged: whether the angles are those of the step before, which say nothing of this.
+
+        Raises:
+          Fault: a joint does not move as any arm of the training would.
         """
-        self._commands = np.concatenate([command[None], self._commands[:-1]])
-        self._steps += 1
+        commands = _shifted(followed.commands[::-1], command, steps)[::-1]
+        followed = followed._replace(commands=commands, steps=followed.steps + steps)
         if is_bridged:
-            return
-        beside = angles - self._arms @ self._commands[: self._arms.shape[1]]
-        self._beside = np.concatenate([self._beside[1:], beside[None]])
-        self._note_change(angles)
-        high = np.max(self._beside, axis=0)
-        low = np.min(self._beside, axis=0)
-        by_motion = (high - low) / self._allowed_motion()
+            return followed
+        beside = angles - self._arms @ commands[: self._arms.shape[1]]
+        change = np.abs(angles - followed.angles[-1])
+        has_changed = change > 0.0
+        smallest = np.minimum(followed.smallest_change, change)
+        followed = followed._replace(
+            beside=_shifted(followed.beside, beside, steps),
+            angles=_shifted(followed.angles, angles, steps),
+            repeats=np.where(has_changed, 0, followed.repeats + steps),
+            smallest_change=np.where(has_changed, smallest, followed.smallest_change),
+        )
+        self._check(followed)
+        return followed
+
+    def _check(self, followed: Followed) -> None:
+        """Raises Fault for a joint that moves as no arm of the training."""
+        high = np.max(followed.beside, axis=0)
+        low = np.min(followed.beside, axis=0)
+        by_motion = (high - low) / self._allowed_motion(followed)
         by_place = np.maximum(high, -low) / (_TOO_FAR + self._beside_command)
         unlike = np.min(np.maximum(by_motion, by_place), axis=0)
         joint = int(np.argmax(unlike))
-        if not unlike[joint] <= 1.0:
-            name = self._metadata.joint_names[joint]
-            distance = np.min(np.abs(beside[:, joint]))
-            yield (
-                "joint_astray",
-                f"{name} does not follow its commands, and is {distance:.2g} rad beside them",
+        if unlike[joint] <= 1.0:
+            return
+        nearest = int(np.argmin(np.maximum(by_motion, by_place)[:, joint]))
+        name = f"{self._metadata.joint_names[joint]} does not follow its commands"
+        if by_place[nearest, joint] > by_motion[nearest, joint]:
+            distance = np.abs(followed.beside[-1, nearest, joint])
+            raise Fault(
+                "joint_astray", f"{name}, and is {distance:.2g} rad from where they take it"
             )
+        moved = np.ptp(followed.angles[:, joint])
+        commanded = np.ptp(followed.commands[:, joint])
+        raise Fault(
+            "joint_astray",
+            f"{name}: its angle went over {moved:.2g} rad in {_COMPARED:g} s, and its commands "
+            f"over {commanded:.2g} rad",
+        )
 
-    def _note_change(self, angles: np.ndarray) -> None:
-        change = np.abs(angles - self._angles)
-        has_changed = change > 0.0
-        self._repeats = np.where(has_changed, 0, self._repeats + 1)
-        smallest = np.minimum(self._smallest_change, change)
-        self._smallest_change = np.where(has_changed, smallest, self._smallest_change)
-        self._angles = angles
-
-    def _allowed_motion(self) -> np.ndarray:
+    def _allowed_motion(self, followed: Followed) -> np.ndarray:
         """Motion of each joint beside the training's arms [J] that is no fault, rad."""
-        allowed = self._least + np.minimum(self._smallest_change, RESOLUTION)
-        allowed += _OF_COMMANDS * np.ptp(self._commands, axis=0)
-        if self._steps < self._settling:
+        allowed = self._least + np.minimum(followed.smallest_change, RESOLUTION)
+        allowed += _OF_COMMANDS * np.ptp(followed.commands, axis=0)
+        if followed.steps < self._settling:
             # They go there with the first commands.
             allowed += self._beside_command
         # A moving joint's reading changes by a count, and one with noise in every step.
-        of_repeating = np.minimum(allowed, _HELD + _COUNTS * self._smallest_change)
-        return np.where(self._repeats >= self._compared, of_repeating, allowed)
+        of_repeating = np.minimum(allowed, _HELD + _COUNTS * followed.smallest_change)
+        return np.where(followed.repeats >= self._compared, of_repeating, allowed)
 
-    def faults(
-        self, measured: Measurements, command: np.ndarray, is_bridged: bool = False
-    ) -> Iterator[Fault]:
-        """The faults of a control step of an episode.
 
-        Args:
-          measured: `joint_angles` and what else a policy measures, as for `OnnxNetwork.step`, and
-            `time` [1].
-          command: as for `arm_faults`.
-          is_bridged: as for `arm_faults`.
-        """
-        if "time" in measured:
-            self._time = float(measured["time"][0])
-        else:
-            self._time += self._metadata.control_dt
-        if "ball_position" in measured:
-            age = float(measured["ball_age"][0]) if "ball_age" in measured else None
-            paddle = paddle_position(self._metadata, measured["joint_angles"])
-            yield from self._ball_faults(measured["ball_position"].reshape(-1, 3), age, paddle)
-        yield from self.arm_faults(measured["joint_angles"], command, is_bridged)
+def check_balls(balls: np.ndarray, age: float, max_age: float, paddle: np.ndarray) -> None:
+    """Looks at the newest picture of the balls.
 
-    def _ball_faults(
-        self, balls: np.ndarray, age: float | None, paddle: np.ndarray
-    ) -> Iterator[Fault]:
-        """The faults in the newest picture of the balls [B, 3], whose age may not be known."""
-        if not self._pictures or np.any(balls != self._pictures[-1][0]):
-            taken = self._time - (age or 0.0)
-            self._pictures = self._pictures[-_EARLIER:] + [(balls, taken)]
-        seen = self._pictures
-        # A ball in flight that does not move is an old picture, whatever its age is said to be.
-        is_flying = np.max(balls[:, 2]) > paddle[2] + _FLYING
-        if age is None:
-            age = self._time - seen[-1][1]
-        elif is_flying:
-            age = max(self._time - seen[-1][1], age)
-        # `Samples` refuses a picture of the future.
-        if not age <= self._max_age:
-            yield "old_picture", f"the picture of the ball is {1e3 * age:.0f} ms old"
-        earliest_balls, _ = seen[0]
-        beside = np.linalg.norm((balls - paddle)[:, :2], axis=1)
-        before = np.linalg.norm((earliest_balls - paddle)[:, :2], axis=1)
-        leaves = (beside > _BESIDE) & (beside >= before) & (len(seen) > _EARLIER)
-        if np.any((paddle[2] - balls[:, 2] > _BELOW) | leaves):
-            yield "ball_lost", "the ball is lost"
+    Args:
+      balls: [B, 3], m.
+      age: of the picture, s.
+      max_age: the largest one, s.
+      paddle: the paddle's centre [3], m.
+
+    Raises:
+      Fault: the picture is old, or a ball is lost.
+    """
+    if not age <= max_age:
+        raise Fault("old_picture", f"the picture of the ball is {1e3 * age:.0f} ms old")
+    below = paddle[2] - balls[:, 2].min()
+    if below > _BELOW:
+        raise Fault("ball_lost", "the ball is lost")
+
+
+def _shifted(entries: np.ndarray, newest: np.ndarray, steps: int) -> np.ndarray:
+    """Entries of control steps [N, ...], the newest last, after some steps with the same entry."""
+    steps = min(steps, len(entries))
+    return np.concatenate([entries[steps:], np.broadcast_to(newest, (steps, *newest.shape))])

@@ -22,6 +22,9 @@ UNITS = {
     "ball_quaternion": "w, x, y, z",
     "ball_angular_velocity": "rad/s",
     "time": "s",
+    "joint_targets": "rad",
+    "tool_position": "m",
+    "tool_normal": "unit vector",
 }
 """Measurements that every policy accepts, and their units. A task's commands are further ones."""
 
@@ -32,6 +35,9 @@ PER_BALL = {
     "ball_angular_velocity": 3,
 }
 """Measurements of each ball, and their numbers of entries for one."""
+
+MEASURED_PER_JOINT = ("joint_angles", "joint_velocities", "joint_targets")
+"""Measurements with an entry for each joint."""
 
 Vector = tuple[float, float, float]
 
@@ -191,14 +197,20 @@ class Metadata(NamedTuple):
     sag: tuple[float, ...] = ()
     """How far the arm's weight takes each joint off its command in the start pose, rad; empty in a
     file of an earlier version."""
+    ball_rests: bool | None = None
+    """Whether the ball may rest on the paddle; None in a file of an earlier version, as if it
+    may."""
+    ball_thrown: bool | None = None
+    """Whether the ball is thrown at the arm, and does not start over the paddle; None in a file of
+    an earlier version."""
 
 
 def measurement_sizes(metadata: Metadata) -> dict[str, int]:
     """Number of entries of each measurement, in the order of `UNITS`, and of each command; of
     several balls, one after another."""
-    joints = dict.fromkeys(("joint_angles", "joint_velocities"), len(metadata.joint_names))
+    joints = dict.fromkeys(MEASURED_PER_JOINT, len(metadata.joint_names))
     balls = {name: size * metadata.num_balls for name, size in PER_BALL.items()}
-    sizes = joints | balls
+    sizes = joints | balls | {"tool_position": 3, "tool_normal": 3}
     return {name: sizes.get(name, 1) for name in (*UNITS, *metadata.commands)}
 
 

@@ -1,89 +1,90 @@
 """The commands that a robot gets between two actions, and where they bring the paddle."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from bounce_mjx.deploy.metadata import Metadata, joint_ends
 from bounce_mjx.robot.setpoints import Setpoint, joint_limits, next_setpoint, position_at
 
 
+class Course(NamedTuple):
+    """The commands of a control step."""
+
+    end: Setpoint
+    """The command at its end, before the mean that limits the jerk (`Motion.at` gives the one that
+    is sent)."""
+    start: Setpoint | None = None
+    """That at its start; None for commands that rest at the end."""
+
+
 class Motion:
-    """Commands of the joints, one control step after the other: within the arm's limits
+    """How the commands of an arm may move from one control step to the next: within its limits
     (`Metadata.limits`), or without them a target for the whole control step.
 
-    `rest` says where the arm rests; every other command is made by `aim`, which no target moves
-    farther than `Metadata.largest_step` from the last one.
+    Every course but that of `resting` ends where `aim` says, which no target moves farther than
+    `Metadata.largest_step` from its start.
     """
 
     def __init__(self, metadata: Metadata):
         self._duration = metadata.control_dt
         self._largest_step = np.array(metadata.largest_step)
-        self.ranges = joint_ends(metadata)
-        """Lower and upper ends [2, J] of the joints' ranges, rad."""
-        self._limits = joint_limits(metadata.limits, *self.ranges)
+        self._range = joint_ends(metadata)
+        self._limits = joint_limits(metadata.limits, *self._range)
         self._still = np.zeros(len(metadata.joint_names))
-        self.start: Setpoint | None = None
-        """The command at the start of the control step, before the mean that limits the jerk
-        (`at` gives the one that is sent)."""
-        self.end: Setpoint | None = None
-        """That at its end; None before there is a command."""
 
-    def rest(self, angles: np.ndarray | None) -> None:
-        """The arm rests, with its servos at these angles [J]; None: `begin` takes the measured
-        ones of the next step."""
-        self.start = None
-        self.end = None if angles is None else self._resting(np.array(angles, float))
+    def resting(self, angles: np.ndarray) -> Course:
+        """Commands that rest at angles [J], rad."""
+        return Course(self._still_at(np.array(angles, float)))
 
-    def _resting(self, position: np.ndarray) -> Setpoint:
+    def _still_at(self, position: np.ndarray) -> Setpoint:
         return Setpoint(position, self._still, self._still)
 
-    def begin(self, angles: np.ndarray | None = None) -> None:
-        """Begins a control step where the last one ended, the first one at the measured angles
-        [J]."""
-        if self.end is None:
-            self.rest(angles)
-        self.start = self.end
+    def hold(self, last: Course) -> Course:
+        """The control step after the last one, in which the commands brake within the limits, or
+        rest."""
+        return self.aim(last, last.end.position)
 
-    def hold(self) -> None:
-        """A control step in which the commands brake, within the limits, or rest."""
-        self.begin()
-        self.aim(self.start.position)
-
-    def move(self, target: np.ndarray, speed: float) -> None:
+    def move(self, last: Course, target: np.ndarray, speed: float) -> Course:
         """A control step in which the commands move toward joint angles [J] (rad), at most at a
         speed (rad/s) from which half of the acceleration stops there."""
-        self.begin()
-        left = target - self.start.position
+        left = target - last.end.position
         if self._limits is not None:
             speed = np.minimum(speed, np.sqrt(self._limits.acceleration * np.abs(left)))
         step = speed * self._duration
-        self.aim(self.start.position + np.clip(left, -step, step))
+        return self.aim(last, last.end.position + np.clip(left, -step, step))
 
-    @property
-    def is_still(self) -> bool:
+    def is_still(self, course: Course) -> bool:
         """Whether the command rests at the end of the control step."""
-        return not (np.any(self.end.velocity) or np.any(self.end.acceleration))
+        return not (np.any(course.end.velocity) or np.any(course.end.acceleration))
 
-    def aim(self, target: np.ndarray) -> None:
-        """Moves the joints toward a target [J], as far as the largest step, the range and the
-        limits allow; a robot without limits gets the target itself."""
-        start = self.start.position
+    def stopped(self, last: Course) -> Course:
+        """The last commands as those of a robot that has come to their end and rests there, as no
+        others came in time."""
+        return self.resting(self.target(last))
+
+    def aim(self, last: Course, target: np.ndarray) -> Course:
+        """The control step after the last one, in which the joints move toward a target [J], as far
+        as the largest step, the range and the limits allow; a robot without limits gets the target
+        itself."""
+        start = last.end.position
         target = np.minimum(
             np.maximum(target, start - self._largest_step), start + self._largest_step
         )
         # An arm beyond its range comes back by its own speed.
-        low, high = self.ranges
+        low, high = self._range
         lowest = np.minimum(low, start)
         highest = np.maximum(high, start)
         target = np.minimum(np.maximum(target, lowest), highest)
         if self._limits is None:
-            self.end = self._resting(target)
-        else:
-            self.end = next_setpoint(self._limits, self.start, target, self._duration, np)
+            return Course(self._still_at(target), last.end)
+        end = next_setpoint(self._limits, last.end, target, self._duration, np)
+        return Course(end, last.end)
 
-    def braking_path(self) -> np.ndarray:
+    def braking_path(self, course: Course) -> np.ndarray:
         """Joint angles [K, J] (rad) at the ends of the control steps in which the commands brake
         from the end of this one, and at this one's; the last are those where they rest."""
-        position, velocity, _ = self.end
+        position, velocity, _ = course.end
         if self._limits is None or not np.any(velocity):
             return position[None]
         slower = self._limits.acceleration * self._duration
@@ -93,14 +94,17 @@ class Motion:
         moved = np.cumsum(0.5 * self._duration * (velocities[1:] + velocities[:-1]), axis=0)
         return position + np.vstack([self._still, moved])
 
-    def at(self, times: np.ndarray) -> np.ndarray:
+    def at(self, course: Course, times: np.ndarray) -> np.ndarray:
         """Commands [M, J] at times [M] since the start of the control step, s."""
-        if self._limits is None or self.start is None:
-            return np.tile(self.end.position, (len(times), 1))
+        if self._limits is None or course.start is None:
+            return np.tile(course.end.position, (len(times), 1))
         since_start = np.asarray(times)[:, None]
-        return position_at(
-            self.start, self.end.acceleration, since_start, np, self._limits.smoothing
-        )
+        acceleration = course.end.acceleration
+        return position_at(course.start, acceleration, since_start, np, self._limits.smoothing)
+
+    def target(self, course: Course) -> np.ndarray:
+        """The command [J] at the end of the control step, rad."""
+        return self.at(course, np.array([self._duration]))[0]
 
 
 def paddle_position(metadata: Metadata, joint_angles: np.ndarray) -> np.ndarray:
@@ -128,3 +132,10 @@ def paddle_position(metadata: Metadata, joint_angles: np.ndarray) -> np.ndarray:
             up + cosine * z + sine * (a * y - b * x) + along * c,
         )
     return np.stack([x, y, z], axis=-1)
+
+
+def paddle_normal(metadata: Metadata, joint_angles: np.ndarray) -> np.ndarray:
+    """Unit normal [..., 3] of the paddle's upper face at joint angles [..., J] (rad)."""
+    tip = tuple(np.add(metadata.paddle, metadata.paddle_normal).tolist())
+    above = paddle_position(metadata._replace(paddle=tip), joint_angles)
+    return above - paddle_position(metadata, joint_angles)

@@ -1,19 +1,24 @@
-"""What cannot be true is no measurement: a robot's sample against the last one that can be true.
+"""What cannot be true is no measurement: a robot's sample against what the last ones say.
 
-One sample that cannot be true is bridged: the last values hold for a step. The second one in a row
-raises. What no single sample explains raises at once: first angles, a range that the arm has left
-little by little, a clock that stands or has jumped by a second, a picture of the future. Each
-reason here is a row of the table in docs/real-robot.md. What is no number at all is refused before
-(`DeployedPolicy.check`).
+A sample that cannot be true is bridged, the last values hold, while at most a third of the last
+0.1 s are such; then the sample is refused. What no other sample can make true is refused at once:
+first angles of an arm that is elsewhere, a range that the arm has left little by little, a clock
+that stands or has jumped by a second, a picture of the future. Each reason here is a row of the
+table in docs/real-robot.md. What is no number at all is refused before (`deploy.driver`).
+
+Nothing here changes: `Samples.take` returns what is known after a sample, and a refused one leaves
+everything as it was.
 """
 
 import math
-from collections.abc import Mapping
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
+from bounce_mjx.deploy.clock import MOST_STANDING, Clock, advance, is_pause
+from bounce_mjx.deploy.flight import Flight, begin, flight_bounds, follow
 from bounce_mjx.deploy.metadata import Metadata, joint_ends, largest_term
+from bounce_mjx.deploy.motion import paddle_position
 from bounce_mjx.errors import UserError
 
 Measurements = dict[str, np.ndarray]
@@ -22,17 +27,24 @@ Measurements = dict[str, np.ndarray]
 # starts, rad.
 _OUTSIDE = 0.5
 _NEAR = 0.1
-# The start pose in another order or with other signs, beside the noise of a start, rad.
-_SAME = 0.1
 # Share of an arm's own limit of velocity that no joint reaches.
 _OVERSPEED = 1.2
 # Largest noise in standard deviations.
 _LARGEST_NOISE = 8.0
-_MOST_STANDING = 50
-"""Calls at one time."""
-
-PAUSE = 1.0
-"""Time between two samples that is no step of one clock, s."""
+# Time of which a third may be bridged, s; of the ball at least so many pictures.
+_BRIDGED = 0.1
+_BRIDGED_PICTURES = 4.0
+# Pictures of the same position are two if they are farther apart than this share of a control step:
+# the newest ones of two steps are half of it apart or more, whatever the camera's rate.
+_APART = 0.4
+# Time in which velocities and angles are compared, s; the least way that counts, rad, how much
+# later the velocities may be, s, and their errors as a share of the way.
+_COMPARED = 0.1
+_LEAST_WAY = 0.01
+_VELOCITY_LAG = 0.02
+_OF_WAY = 0.3
+# How long the paddle's way is known, for late pictures, s.
+_PADDLE_WAY = 0.3
 
 SYNCHRONOUS = 1e-3
 """How far in the future a picture may be, as two clocks differ, s."""
@@ -59,153 +71,239 @@ class ImpossibleMeasurement(UserError):
         """Code of what is wrong, of the table in docs/real-robot.md."""
 
 
-class UnconfirmedSample(ImpossibleMeasurement):
-    """First joint angles that the next sample has to confirm."""
+class Doubt(NamedTuple):
+    """Why a sample cannot be true."""
 
-    def __init__(self, reason: str):
-        super().__init__("first_sample", reason)
+    fault: str
+    reason: str
+
+
+class Bridge(NamedTuple):
+    """The samples of one kind that were bridged, not long ago."""
+
+    times: tuple[float, ...] = ()
+    """s."""
+    durations: tuple[float, ...] = ()
+    """For which each counts, s."""
+
+
+class Moved(NamedTuple):
+    """A believed sample of the arm, of the last 0.1 s."""
+
+    time: float
+    """s."""
+    angles: np.ndarray
+    """[J], rad."""
+    way: np.ndarray
+    """Integral of the measured velocities [J] since the first sample, rad."""
+    speeds: np.ndarray
+    """The velocities' sizes [J], rad/s."""
+
+
+class Picture(NamedTuple):
+    """The newest picture of the balls that is believed."""
+
+    balls: np.ndarray
+    """[B, 3], m."""
+    taken: float
+    """s."""
+    interval: float
+    """From the picture before, s."""
+
+
+class Seen(NamedTuple):
+    """What the samples until now say."""
+
+    clock: Clock = Clock()
+    values: Measurements = {}
+    """The last believed ones, by name."""
+    arm_time: float = 0.0
+    """Of the arm's last believed sample, s."""
+    moved: tuple[Moved, ...] = ()
+    paddle: tuple[tuple[float, np.ndarray], ...] = ()
+    """The paddle's places [3] at the last times, m."""
+    picture: Picture | None = None
+    flights: tuple[Flight, ...] = ()
+    """Of each ball."""
+    bridges: dict[str, Bridge] = {}
+    """Of the clock, the arm and the ball."""
+
+    @property
+    def is_arm_bridged(self) -> bool:
+        """Whether the joint angles of the last sample are those of one before."""
+        return self.arm_time != self.clock.now
 
 
 class Samples:
-    """The last sample that can be true, with which the next one is compared."""
+    """What a policy's worlds can hold."""
 
     def __init__(self, metadata: Metadata):
-        """Bounds of what a policy's worlds can hold."""
         self._metadata = metadata
+        self._dt = metadata.control_dt
         if metadata.limits is None:
             self._fastest = np.full(len(metadata.joint_names), metadata.max_joint_velocity)
         else:
             self._fastest = _OVERSPEED * np.array(metadata.limits.velocity)
         largest = math.sqrt(2.0) * _LARGEST_NOISE
         self._noise = RESOLUTION + largest * largest_term(metadata, "joint_angle_noise")
-        self._ball_noise = 1e-3 + largest * largest_term(metadata, "ball_position_noise")
+        self._velocity_bias = largest_term(metadata, "joint_velocity_bias")
+        self._velocity_noise = _LARGEST_NOISE * largest_term(metadata, "joint_velocity_noise")
         self._low, self._high = joint_ends(metadata)
         self._start = np.array(metadata.default_joint_angles)
+        self._start_room = _NEAR + metadata.start_noise
         self._still = np.zeros(len(self._start))
-        self.forget()
+        self._flight = flight_bounds(metadata)
 
-    def forget(self, near: np.ndarray | None = None) -> None:
-        """Forgets the last sample; the next one is a first one.
-
-        Args:
-          near: commands [J] (rad) at which the arm has rested; by default, the start pose.
-        """
-        if near is None:
-            self._place = self._start
-            self._room = _NEAR + self._metadata.start_noise
-            self._place_name = "where the arm starts"
-        else:
-            self._place = near
-            self._room = _NEAR
-            self._place_name = "the commands at which the arm is said to rest"
-        self._last: Measurements = {}
-        self._bridged: set[str] = set()
-        self._unconfirmed: np.ndarray | None = None
-        self._standing = 0
-        # Times since here, s: of the last call, of the arm's last sample that was believed, and at
-        # which the ball's last believed picture was taken.
-        self._now = 0.0
-        self._arm_time = 0.0
-        self._taken = -math.inf
-        # The newest picture, with its velocities, what speaks against it, and whether the one
-        # before holds in its place already: one picture is bridged in all of its steps.
-        self._seen: bytes | None = None
-        self._doubt: tuple[str, str] | None = None
-        self._is_held = False
-
-    def rest(self, angles: np.ndarray) -> None:
-        """The arm rests at angles [J], rad; everything else is forgotten."""
-        self.forget()
-        self._last = {"joint_angles": angles, "joint_velocities": np.zeros(len(angles))}
-
-    @property
-    def is_arm_bridged(self) -> bool:
-        """Whether the joint angles of the last step are those of the step before."""
-        return _OF_ARM[0] in self._bridged
-
-    def take(self, measured: Measurements) -> Measurements:
-        """The sample, with the last values in place of those that cannot be true.
+    def take(
+        self, seen: Seen, measured: Measurements, rests_at: np.ndarray | None = None
+    ) -> tuple[Seen, Measurements, int]:
+        """What is known with a new sample; the sample, with the last values in place of those that
+        cannot be true; and the control steps since the last one.
 
         Args:
+          seen: what is known without it.
           measured: arrays by name, as for `OnnxNetwork.step`, and `time` [1].
+          rests_at: angles [J] (rad) at which the arm is known to rest, for a first sample; without,
+            it is to be near the start pose.
 
         Raises:
-          ImpossibleMeasurement: it cannot be true, and nor could the one before, or there is none.
+          ImpossibleMeasurement: it cannot be true, and nor could too many before.
         """
         measured = dict(measured)
-        if "time" in measured:
-            self._take_time(measured)
-        else:
-            self._now += self._metadata.control_dt
+        seen, steps, elapsed = self._take_time(seen, measured)
         if "joint_angles" in measured:
-            self._take_angles(measured)
+            seen = self._take_arm(seen, measured, rests_at, elapsed)
         if "ball_position" in measured:
-            self._take_picture(measured)
-        return measured
+            seen = self._take_picture(seen, measured, elapsed)
+        return seen, measured, steps
 
-    def _take_time(self, measured: Measurements) -> None:
-        """Passes the time, which goes on."""
-        time = measured["time"]
-        last = self._last.get("time")
-        if last is None:
-            self._last["time"] = time
-            return
-        elapsed = float(time[0] - last[0])
-        self._standing = self._standing + 1 if elapsed == 0.0 else 0
-        if self._standing >= _MOST_STANDING:
-            raise ImpossibleMeasurement(
-                "time",
-                f"the time has stood at {time[0]:.10g} s for {self._standing} calls; give the "
-                "time of each sample, or none",
-            )
-        if elapsed < -self._metadata.control_dt:
+    def rest(self, seen: Seen, angles: np.ndarray) -> Seen:
+        """What is known of an arm that rests at angles [J], rad; the ball is forgotten, the clock
+        goes on."""
+        values = {"joint_angles": angles, "joint_velocities": self._still}
+        return Seen(clock=seen.clock, values=values, arm_time=seen.clock.now)
+
+    def _take_time(self, seen: Seen, measured: Measurements) -> tuple[Seen, int, float]:
+        """Passes the time, which goes on: the steps and the time (s) since the last sample."""
+        time = float(measured["time"][0]) if "time" in measured else None
+        clock, elapsed, steps = advance(seen.clock, time, self._dt)
+        if elapsed < -self._dt:
             reason = (
                 f"the time went back by {-elapsed:.3g} s; give seconds of one clock, and call "
                 "reset if it starts again"
             )
-            if elapsed <= -PAUSE:
+            if is_pause(elapsed):
                 raise ImpossibleMeasurement("time", reason)
-            self._bridge(measured, ("time",), "time", reason)
-            return
-        self._bridged.discard("time")
-        if elapsed > 0.0:
-            self._last["time"] = time
-            self._now += elapsed
+            seen = self._bridge(seen, "time", Doubt("time", reason), self._dt)
+            measured["time"] = np.array([seen.clock.time])
+            return seen, 0, 0.0
+        if clock.standing >= MOST_STANDING:
+            raise ImpossibleMeasurement(
+                "time",
+                f"the time has stood at {time:.10g} s for {clock.standing} calls; give the "
+                "time of each sample, or none",
+            )
+        if elapsed < 0.0:
+            # Two samples that came in the wrong order.
+            clock = clock._replace(now=seen.clock.now, time=seen.clock.time)
+            elapsed = 0.0
+        return seen._replace(clock=clock), steps, elapsed
 
-    def _take_angles(self, measured: Measurements) -> None:
+    def _take_arm(
+        self, seen: Seen, measured: Measurements, rests_at: np.ndarray | None, elapsed: float
+    ) -> Seen:
         """Believes the arm's sample, or bridges it."""
         angles = measured["joint_angles"]
-        last = self._last.get("joint_angles")
-        if last is None:
-            self._check_first(angles)
-            last = angles
-        elapsed = max(self._now - self._arm_time, self._metadata.control_dt)
-        moved = np.abs(angles - last) - (self._fastest * elapsed + self._noise)
-        if moved.max() > 0.0:
-            joint = int(np.argmax(moved))
-            turned = abs(abs(angles[joint] - last[joint]) - 2.0 * math.pi) < 0.2
+        if "joint_angles" not in seen.values:
+            self.check_first(angles, rests_at)
+            seen = self.rest(seen, angles)
+        doubt, moved = self._doubt_of_arm(seen, measured)
+        if doubt is not None:
+            return self._bridge_values(seen, measured, "arm", _OF_ARM, doubt, elapsed)
+        seen = self._believe(seen, measured, _OF_ARM)
+        now = seen.clock.now
+        way = ((now, paddle_position(self._metadata, angles)),)
+        if seen.paddle and seen.paddle[-1][0] == now:
+            way = ()
+        return seen._replace(
+            arm_time=now,
+            moved=moved,
+            paddle=_recent(seen.paddle + way, now - _PADDLE_WAY),
+        )
+
+    def _doubt_of_arm(
+        self, seen: Seen, measured: Measurements
+    ) -> tuple[Doubt | None, tuple[Moved, ...]]:
+        """What speaks against the arm's sample, and its motion with it."""
+        angles = measured["joint_angles"]
+        last = seen.values["joint_angles"]
+        elapsed = max(seen.clock.now - seen.arm_time, self._dt)
+        change = np.abs(angles - last)
+        too_far = change - (self._fastest * elapsed + self._noise)
+        if too_far.max() > 0.0:
+            joint = int(np.argmax(too_far))
+            turned = abs(change[joint] - 2.0 * math.pi) < 0.2
+            remedy = "give unwrapped angles" if turned else "check the encoder, or call reset"
             reason = (
                 f"the angle of {self._metadata.joint_names[joint]} is {angles[joint]:.3g} rad, "
-                f"{abs(angles[joint] - last[joint]):.3g} rad from {1e3 * elapsed:.0f} ms before, "
-                "farther than it moves; "
+                f"{change[joint]:.3g} rad from {1e3 * elapsed:.0f} ms before, "
+                f"farther than it moves; {remedy}"
             )
-            remedy = "give unwrapped angles" if turned else "check the encoder, or call reset"
-            self._bridge(measured, _OF_ARM, "joint_jump", reason + remedy)
-            return
+            return Doubt("joint_jump", reason), seen.moved
         # Not left by a jump, so that the next sample will say the same.
         self.check_range("angle", angles)
-        velocities = measured.get("joint_velocities", self._still)
-        too_fast = np.abs(velocities) - self._fastest
+        if "joint_velocities" not in measured:
+            return None, ()
+        velocities = measured["joint_velocities"]
+        speeds = np.abs(velocities)
+        too_fast = speeds - self._fastest
         if too_fast.max() > 0.0:
             joint = int(np.argmax(too_fast))
             reason = (
                 f"{self._metadata.joint_names[joint]} has {velocities[joint]:.3g} rad/s, and moves "
                 f"at most at {self._fastest[joint]:.3g} (rad/s); stop the arm"
             )
-            self._bridge(measured, _OF_ARM, "joint_speed", reason)
-            return
-        self._believe(measured, _OF_ARM)
-        self._arm_time = self._now
+            return Doubt("joint_speed", reason), seen.moved
+        return self._compare_velocities(seen, angles, velocities, speeds)
+
+    def _compare_velocities(
+        self, seen: Seen, angles: np.ndarray, velocities: np.ndarray, speeds: np.ndarray
+    ) -> tuple[Doubt | None, tuple[Moved, ...]]:
+        """What speaks against the velocities [J], whose integral is the way of the angles [J]."""
+        now = seen.clock.now
+        elapsed = now - seen.moved[-1].time if seen.moved else math.inf
+        if elapsed > 0.5 * _COMPARED:
+            # Nothing is known of the velocities meanwhile.
+            return None, (Moved(now, angles, self._still, speeds),)
+        last = seen.moved[-1]
+        if elapsed < 0.5 * self._dt:
+            return None, seen.moved
+        before = seen.values["joint_velocities"]
+        way = last.way + 0.5 * elapsed * (before + velocities)
+        moved = _recent((*seen.moved, Moved(now, angles, way, speeds)), now - _COMPARED)
+        first = moved[0]
+        duration = now - first.time
+        if duration < 0.5 * _COMPARED:
+            return None, moved
+        by_angles = angles - first.angles
+        by_velocities = way - first.way
+        fastest = np.max([one.speeds for one in moved], axis=0)
+        largest_way = np.maximum(np.abs(by_angles), fastest * duration)
+        # One velocity may be wrong, and all a little late.
+        # The integral of a noise grows with the root of the time.
+        noise = self._velocity_noise * math.sqrt(duration * self._dt)
+        allowed = _LEAST_WAY + self._noise + noise + self._velocity_bias * duration
+        allowed = allowed + fastest * (_VELOCITY_LAG + self._dt) + _OF_WAY * largest_way
+        beyond = np.abs(by_angles - by_velocities) - allowed
+        if beyond.max() <= 0.0:
+            return None, moved
+        joint = int(np.argmax(beyond))
+        reason = (
+            f"by its angles {self._metadata.joint_names[joint]} moved {by_angles[joint]:.2g} rad "
+            f"in {1e3 * duration:.0f} ms, and by its velocities {by_velocities[joint]:.2g} rad; "
+            "give rad/s, each joint's own, with the sign of its angle"
+        )
+        return Doubt("joint_speed", reason), moved
 
     def check_range(self, label: str, angles: np.ndarray) -> None:
         """Refuses angles [J] (rad) far outside of their ranges. Whole turns are not removed: a
@@ -227,131 +325,178 @@ class Samples:
                 "this unit, the policy's order, and no whole turns",
             )
 
-    def _check_first(self, angles: np.ndarray) -> None:
-        """A first sample is believed near the start pose, or if the next one agrees with it."""
-        metadata = self._metadata
-        if not np.any(angles) and np.any(self._start):
-            raise UnconfirmedSample(
-                "all joint angles are 0, as of a driver without data; wait for its first sample"
-            )
-        self.check_range("angle", angles)
-        far = float(np.max(np.abs(angles - self._place)))
-        if far <= self._room:
-            return
-        in_order = np.max(np.abs(angles - self._start))
-        start_room = _NEAR + metadata.start_noise
-        reordered = np.max(np.abs(np.sort(np.abs(angles)) - np.sort(np.abs(self._start))))
-        if in_order > start_room and reordered <= min(_SAME + metadata.start_noise, 0.5 * in_order):
-            raise ImpossibleMeasurement(
-                "joint_order",
-                "the joint angles fit the start pose in another order or with other signs; give "
-                f"those of {', '.join(metadata.joint_names)}, or load_policy the driver's "
-                "joint_names",
-            )
-        last = self._unconfirmed
-        self._unconfirmed = angles
-        reach = self._fastest * metadata.control_dt + self._noise
-        if last is None or np.any(np.abs(angles - last) > reach):
-            raise UnconfirmedSample(
-                f"the first joint angles are {far:.3g} rad from {self._place_name}; they count "
-                "when the next sample confirms them"
-            )
+    def check_first(self, angles: np.ndarray, rests_at: np.ndarray | None) -> None:
+        """An arm rests where it is said to, or near its start pose.
 
-    def _take_picture(self, measured: Measurements) -> None:
-        """Believes the picture of the balls, or bridges it until the next one."""
+        Args:
+          angles: of a first sample [J], rad.
+          rests_at: where it is said to rest [J], rad.
+
+        Raises:
+          ImpossibleMeasurement: these angles are elsewhere.
+        """
+        self.check_range("angle", angles)
+        place = self._start if rests_at is None else rests_at
+        room = self._start_room if rests_at is None else _NEAR
+        away = np.abs(angles - place)
+        joint = int(np.argmax(away))
+        if away[joint] <= room:
+            return
+        where = "its start pose" if rests_at is None else "where the arm is said to rest"
+        cause = "check its sign, zero, unit and place in the order"
+        if not np.any(angles):
+            cause = "all joint angles are 0, as of a driver without data"
+        elif rests_at is None:
+            cause = "say where the arm rests (reset with targets), or " + cause
+        raise ImpossibleMeasurement(
+            "first_sample",
+            f"the first angle of {self._metadata.joint_names[joint]} is {away[joint]:.3g} rad from "
+            f"{where}; {cause}",
+        )
+
+    def _take_picture(self, seen: Seen, measured: Measurements, elapsed: float) -> Seen:
+        """Believes the picture of the balls, or bridges it."""
         balls = measured["ball_position"].reshape(-1, 3)
-        age = float(measured["ball_age"][0]) if "ball_age" in measured else 0.0
-        if age < -SYNCHRONOUS:
+        age = float(measured["ball_age"][0]) if "ball_age" in measured else None
+        if age is not None and age < -SYNCHRONOUS:
             raise ImpossibleMeasurement(
                 "old_picture",
                 f"the picture of the ball is {1e3 * age:.0f} ms old; give the time since it was "
                 "taken, by one clock",
             )
-        taken = self._now - age
-        velocities = measured.get("ball_velocity")
-        # Bytes are compared faster than arrays.
-        seen = balls.tobytes() + (b"" if velocities is None else velocities.tobytes())
-        if seen != self._seen:
-            self._seen = seen
-            self._is_held = False
-            self._doubt = self._doubt_of(balls, velocities, taken)
-        if self._doubt is None:
-            # A velocity may come between two pictures.
-            last = self._last.get("ball_position")
-            if last is None or (measured["ball_position"] != last).any():
-                self._taken = max(taken, self._taken)
-            self._believe(measured, _OF_BALL)
-        elif self._is_held:
-            self._hold(measured, _OF_BALL)
-        else:
-            self._bridge(measured, _OF_BALL, *self._doubt)
-            self._is_held = True
+        last = seen.picture
+        taken = seen.clock.now - (age or 0.0)
+        is_new = last is None or bool((balls != last.balls).any())
+        if not is_new and age is not None:
+            is_new = taken > last.taken + _APART * self._dt
+        doubt = self._doubt_of_velocity(measured)
+        flights = seen.flights
+        if doubt is None and is_new:
+            doubt, flights = self._follow(seen, balls, taken)
+        if doubt is not None:
+            return self._bridge_values(seen, measured, "ball", _OF_BALL, doubt, elapsed)
+        if is_new:
+            interval = self._dt if last is None else taken - last.taken
+            seen = seen._replace(picture=Picture(balls, taken, interval), flights=flights)
+        return self._believe(seen, measured, _OF_BALL)
 
-    def _doubt_of(
-        self, balls: np.ndarray, velocities: np.ndarray | None, taken: float
-    ) -> tuple[str, str] | None:
-        """Fault and reason of a new picture of the balls [B, 3] that cannot be true, else None."""
-        bounds = self._metadata.ball
-        last = self._last.get("ball_position")
-        if (distance := _longest(balls)) > bounds.distance:
-            return "ball_place", (
+    def _doubt_of_velocity(self, measured: Measurements) -> Doubt | None:
+        if "ball_velocity" not in measured:
+            return None
+        speed = _longest(measured["ball_velocity"].reshape(-1, 3))
+        if speed <= self._flight.speed:
+            return None
+        return Doubt(
+            "ball_speed",
+            f"the ball has {speed:.3g} m/s, but the training had at most "
+            f"{self._flight.speed:.3g} (m/s); give this unit",
+        )
+
+    def _follow(
+        self, seen: Seen, balls: np.ndarray, taken: float
+    ) -> tuple[Doubt | None, tuple[Flight, ...]]:
+        """What speaks against a new picture of the balls [B, 3], and their flights with it."""
+        farthest = self._metadata.ball.distance
+        distance = _longest(balls)
+        if distance > farthest:
+            reason = (
                 f"the distance of ball_position is {distance:.3g}, but the training had 0 to "
-                f"{bounds.distance:.3g} (m); give this unit, and the robot's frame"
+                f"{farthest:.3g} (m); give this unit, and the robot's frame"
             )
-        if velocities is not None:
-            speed = _longest(velocities.reshape(-1, 3))
-            if speed > bounds.speed:
-                return "ball_speed", (
-                    f"the ball has {speed:.3g} m/s, but the training had at most "
-                    f"{bounds.speed:.3g} (m/s); give this unit"
+            return Doubt("ball_place", reason), seen.flights
+        last = seen.picture
+        if last is not None and taken < last.taken - self._dt:
+            reason = (
+                f"the picture of the ball was taken {1e3 * (last.taken - taken):.0f} ms before the "
+                "last one; give the newest, and ages by one clock"
+            )
+            return Doubt("old_picture", reason), seen.flights
+        if not seen.paddle:
+            return None, ()
+        paddle = _at(seen.paddle, taken)
+        if not seen.flights:
+            return None, tuple(begin(taken, ball, paddle) for ball in balls)
+        # Times of pictures differ from the truth, but not their order.
+        taken = max(taken, seen.flights[0].times[-1] + 1e-3)
+        flights = []
+        for ball, flight in zip(balls, seen.flights, strict=True):
+            following, reason = follow(self._flight, flight, taken, ball, paddle)
+            if reason is not None:
+                x, y, z = ball - paddle
+                place = f"{math.hypot(x, y):.2g} m beside and {z:.2g} m above the paddle"
+                reason = (
+                    f"the ball, {place}, {reason}; check the camera, and that nothing else looks "
+                    "like the ball and nobody holds it"
                 )
-        if last is not None:
-            if (earlier := self._taken - taken) > self._metadata.control_dt:
-                return "old_picture", (
-                    f"the picture of the ball was taken {1e3 * earlier:.0f} ms before the last "
-                    "one; give the newest, and ages by one clock"
-                )
-            between = max(taken - self._taken, self._metadata.control_dt)
-            flown = _longest(balls - last.reshape(-1, 3))
-            if flown > bounds.speed * between + self._ball_noise:
-                return "ball_speed", (
-                    f"the ball is {flown:.3g} m from {1e3 * between:.0f} ms before, farther than "
-                    "it flies; check the camera, or call reset before a new ball"
-                )
-        return None
+                return Doubt("ball_flight", reason), seen.flights
+            flights.append(following)
+        return None, tuple(flights)
 
-    def _believe(self, measured: Measurements, names: tuple[str, ...]) -> None:
-        self._bridged.discard(names[0])
-        self._last |= {name: measured[name] for name in names if name in measured}
+    def _believe(self, seen: Seen, measured: Measurements, names: tuple[str, ...]) -> Seen:
+        values = {name: measured[name] for name in names if name in measured}
+        return seen._replace(values=seen.values | values)
 
-    def _bridge(
-        self, measured: Measurements, names: tuple[str, ...], fault: str, reason: str
-    ) -> None:
-        """Puts the last values of some measurements in place, once in a row."""
-        if names[0] in self._bridged or names[0] not in self._last:
-            raise ImpossibleMeasurement(fault, reason)
-        self._bridged.add(names[0])
-        self._hold(measured, names)
+    def _bridge_values(
+        self,
+        seen: Seen,
+        measured: Measurements,
+        kind: str,
+        names: tuple[str, ...],
+        doubt: Doubt,
+        elapsed: float,
+    ) -> Seen:
+        """Puts the last values of some measurements in place; what came for the first time is left
+        out.
 
-    def _hold(self, measured: Measurements, names: tuple[str, ...]) -> None:
-        """Puts the last values in place; what came for the first time is left out."""
+        Args:
+          kind: of the bridge.
+          elapsed: time for which the sample counts, s.
+        """
+        if names[0] not in seen.values:
+            raise ImpossibleMeasurement(*doubt)
+        seen = self._bridge(seen, kind, doubt, elapsed)
         for name in names:
-            value = measured.pop(name, None)
-            if value is None:
+            if measured.pop(name, None) is None:
                 continue
             if name == "ball_age":
-                measured[name] = np.array([self._now - self._taken])
-            elif name in self._last:
-                measured[name] = self._last[name]
+                if seen.picture is not None:
+                    measured[name] = np.array([seen.clock.now - seen.picture.taken])
+            elif name in seen.values:
+                measured[name] = seen.values[name]
+        return seen
 
-
-def check_mapping(measurements: Any) -> None:
-    """Raises UserError for measurements without names."""
-    if not isinstance(measurements, Mapping):
-        raise UserError(
-            f"the measurements are {str(measurements)[:100]!r}; give a mapping of their names, "
-            "such as joint_angles"
+    def _bridge(self, seen: Seen, kind: str, doubt: Doubt, elapsed: float) -> Seen:
+        """Bridges a sample, if at most a third of the last ones are such."""
+        now = seen.clock.now
+        window = _BRIDGED
+        if kind == "ball" and seen.picture is not None:
+            window = max(window, _BRIDGED_PICTURES * seen.picture.interval)
+        last = seen.bridges.get(kind, Bridge())
+        times = (*last.times, now)
+        durations = (*last.durations, min(max(elapsed, 0.0), window))
+        kept = [place for place, time in enumerate(times) if time > now - window]
+        bridge = Bridge(
+            tuple(times[place] for place in kept), tuple(durations[place] for place in kept)
         )
+        if sum(bridge.durations) > window / 3.0 + 1e-9:
+            raise ImpossibleMeasurement(*doubt)
+        return seen._replace(bridges=seen.bridges | {kind: bridge})
+
+
+def _recent(entries: tuple, since: float) -> tuple:
+    """The entries from the last one before a time on; each begins with its time, s."""
+    first = 0
+    while first + 1 < len(entries) and entries[first + 1][0] <= since + 1e-9:
+        first += 1
+    return entries[first:]
+
+
+def _at(way: tuple[tuple[float, np.ndarray], ...], time: float) -> np.ndarray:
+    """The place [3] on a way at a time, or the nearest one that is known."""
+    for known, place in reversed(way):
+        if known <= time:
+            return place
+    return way[0][1]
 
 
 def _longest(vectors: np.ndarray) -> float:

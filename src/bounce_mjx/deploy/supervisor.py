@@ -1,22 +1,31 @@
 """A supervisor between a policy and an arm."""
 
 import math
+import time
 import traceback
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from numbers import Real
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from bounce_mjx.deploy.faults import Fault, Watch, picture_age
+from bounce_mjx.deploy.clock import advance
+from bounce_mjx.deploy.controller import Controller, Memory
+from bounce_mjx.deploy.driver import LARGEST, Driver
+from bounce_mjx.deploy.faults import Fault, Followed, Watch, check_balls, picture_age
+from bounce_mjx.deploy.metadata import Metadata
 from bounce_mjx.deploy.motion import paddle_position
-from bounce_mjx.deploy.samples import Measurements, UnconfirmedSample, check_mapping
+from bounce_mjx.deploy.rest import (
+    Target,
+    Unknown,
+    check_place,
+    check_tool,
+    follow_target,
+    place_of,
+)
+from bounce_mjx.deploy.samples import Measurements
 from bounce_mjx.errors import UserError
-from bounce_mjx.robot.setpoints import Setpoint
-
-if TYPE_CHECKING:
-    from bounce_mjx.deploy.policy import DeployedPolicy
 
 State = Literal["homing", "ready", "running", "braking", "stopped"]
 Box = tuple[Sequence[float], Sequence[float]]
@@ -25,13 +34,18 @@ Box = tuple[Sequence[float], Sequence[float]]
 _HOME_TOLERANCE = 2e-3
 # On the way home, rad/s.
 _HOME_SPEED = 0.3
-_OTHER_ORDER = "the policy's joints have another order than the supervisor's; call supervise again"
-_NEWER = "the policy has a newer supervisor; call that one"
-_MOVED = "the policy was reset or stepped beside its supervisor; call the supervisor alone"
 # Of an end of a box from the base, m.
 _FARTHEST_END = 30.0
 # In which an arm comes to rest where its commands do, s.
 _SETTLING = 1.0
+# What the first angles may be off the start pose, where nobody says where the arm rests, beside the
+# noise of a start, rad.
+_NEAR = 0.1
+# Horizontal distance of a ball from the paddle's centre at which it is over the paddle, beside what
+# the training started with, m.
+_OVER = 0.15
+# Measured of the arm alone.
+_OF_ARM = ("joint_angles", "time", "joint_targets", "tool_position", "tool_normal")
 
 
 class Stop(NamedTuple):
@@ -43,6 +57,32 @@ class Stop(NamedTuple):
     """Whether the commands rest."""
 
 
+class Progress(NamedTuple):
+    """What a supervisor knows between two calls."""
+
+    memory: Memory
+    """The policy's, with the commands."""
+    phase: Literal["homing", "ready", "running"] = "homing"
+    """The state unless there is a stop."""
+    has_found_arm: bool = False
+    """Whether the arm has been measured where its commands rest; nothing is sent before, nor once
+    a stopped arm is elsewhere."""
+    has_begun: bool = False
+    """Whether there was a command."""
+    target: Target = Target()
+    """The controller's own, before the arm was found."""
+    followed: Followed | None = None
+    """The arm's last control steps, since it was found."""
+    waits_for: str | None = None
+    """Why the arm waits on its way home."""
+    waits_since: float | None = None
+    """Time since which the arm is not where its commands rest, s."""
+    resting_angles: np.ndarray | None = None
+    """Measured [J] in the last step at home, rad."""
+    balls: np.ndarray | None = None
+    """Measured [B, 3] in the last step at home, m; None without a picture."""
+
+
 class Supervisor:
     """Gives an arm's commands, and stops the arm when a measurement cannot be true
     (`deploy.samples`), when the arm does not follow, or the ball is lost (`deploy.faults`), when
@@ -51,81 +91,63 @@ class Supervisor:
 
     Call `commands` once each control step, in every state:
 
-    - homing: the arm goes slowly to the policy's first posture, also back from a push, then it is
+    - homing: once the arm is where it is said to rest, it goes slowly to the policy's first
+      posture, also back from a push, then it is
     - ready: it rests there until `start`;
     - running: it follows the policy, until a fault or `stop`;
     - braking: the commands slow down within the arm's limits, then it is
     - stopped: the commands rest, and `fault` and `reason` say why, until `restart`.
 
-    Each commands begin where the last ones ended, whatever happens to the policy meanwhile. Once
-    the policy has a newer supervisor, this one gives no commands.
+    Each commands begin where the last ones ended. What it remembers is a value (`Progress`), which
+    a call replaces as a whole, or not at all.
     """
 
     def __init__(
         self,
-        policy: "DeployedPolicy",
-        rate: float,
+        controller: Controller,
+        driver: Driver,
+        times: np.ndarray,
+        rests_at: np.ndarray | None,
         box: Box = ((-math.inf,) * 3, (math.inf,) * 3),
         max_picture_age: float | None = None,
         max_steps_late: float = 2.0,
     ):
-        """See `DeployedPolicy.supervise`."""
-        # Since the start of a control step, s.
-        self._times = np.arange(1, policy.commands_per_step(rate) + 1) / rate
-        self._policy = policy
-        self._metadata = policy.metadata
-        self._motion = policy.motion
-        self._end: Setpoint | None = policy.motion.end
-        self._has_begun = policy.motion.end is not None
+        """See `DeployedPolicy.supervise`.
+
+        Args:
+          times: of the commands since the start of a control step [M], s.
+          rests_at: where the arm is said to rest [J], rad.
+        """
+        self._controller = controller
+        self._driver = driver
+        self._times = times
+        self._metadata: Metadata = controller.metadata
+        self._dt = self._metadata.control_dt
+        self._home = np.array(self._metadata.default_joint_angles)
         age = picture_age(self._metadata) if max_picture_age is None else max_picture_age
         for name, value, most in (
             ("max_picture_age", age, 1.0),
-            ("max_steps_late", max_steps_late, 1.0 / self._metadata.control_dt),
+            ("max_steps_late", max_steps_late, 1.0 / self._dt),
         ):
             if not (isinstance(value, Real) and 0.0 < value <= most):
                 raise UserError(f"{name} is {value!r}; give a number above 0 and at most {most:g}")
-        try:
-            self._box = np.array(box, float)
-        except (TypeError, ValueError):
-            self._box = np.zeros(0)
+        self._max_picture_age = age
         self._max_steps_late = max_steps_late
-        if self._box.shape != (2, 3) or not np.all(self._box[0] < self._box[1]):
-            raise UserError(f"the box is {box}; give its lowest and its highest x, y and z, m")
-        farthest = np.max(np.abs(self._box), where=np.isfinite(self._box), initial=0.0)
-        if farthest > _FARTHEST_END:
-            raise UserError(
-                f"the box is {box}, and ends {farthest:g} from the base, but no arm reaches "
-                f"{_FARTHEST_END:g} m; give metres, or inf for an end that is not there"
-            )
+        self._box = _checked_box(box)
         self._has_box = bool(np.any(np.isfinite(self._box)))
-        self._watch = Watch(self._metadata, age)
+        self._watch = Watch(self._metadata)
+        self._host_start: float | None = None
+        """The host's time at the first sample, if the driver gives none, s."""
         # A stop may come within any other call, from another thread or a signal handler: it is one
         # assignment, which `restart` alone takes back.
         self._stop: Stop | None = None
-        self._phase: State = "homing"
-        """The state unless there is a stop."""
-        self._waits_for: str | None = None
-        """Why the arm waits on its way home."""
-        self._has_found_arm = False
-        """Whether the arm has been measured where its commands rest; nothing is sent before, nor
-        once a stopped arm is elsewhere."""
-        self._is_moving_home = False
-        self._waited = 0
-        """Control steps in a row in which the arm was not where its commands rest."""
-        self._idle = 0
-        """Calls in a row that are no new control step."""
-        self._due: float | None = None
-        """Time at which the last step on the way home was due, s; None before it."""
-        self._resting_angles = np.array(self._metadata.default_joint_angles)
-        """Measured [J] in the last step at home, rad."""
-        # An arm may rest at the last commands, far from the start pose.
-        policy.samples.forget(policy.targets)
+        self._progress = Progress(controller.begin(rests_at), has_begun=rests_at is not None)
 
     @property
     def state(self) -> State:
         stop = self._stop
         if stop is None:
-            return self._phase
+            return self._progress.phase
         return "stopped" if stop.is_at_rest else "braking"
 
     @property
@@ -139,28 +161,25 @@ class Supervisor:
     def reason(self) -> str | None:
         """Why the arm has stopped or brakes, or what it waits for on its way home."""
         stop = self._stop
-        return self._waits_for if stop is None else stop.reason
+        return self._progress.waits_for if stop is None else stop.reason
 
     def start(self) -> None:
-        """Starts an episode.
+        """Starts an episode, at the moment in which the ball is let go.
 
         Raises:
-          UserError: the arm is not ready, or the policy is no longer this supervisor's.
+          UserError: the arm is not ready, or the ball is seen elsewhere than over the paddle.
         """
-        self._check_policy()
         if self.state != "ready":
             raise UserError(
                 f"the arm is {self.state}, and an episode starts when it is ready; call restart "
                 "after a stop, and commands until the arm is home"
             )
-        self._take_back()
-        self._policy.reset(self._targets)
+        progress = self._progress
+        self._check_start(progress)
         # A load and the servo hold the arm a little beside its command.
-        self._policy.samples.rest(self._resting_angles)
-        self._end = self._motion.end
-        self._watch.begin()
-        self._idle = 0
-        self._phase = "running"
+        seen = self._controller.samples.rest(progress.memory.seen, progress.resting_angles)
+        memory = self._controller.episode(seen, progress.memory.course)
+        self._progress = progress._replace(memory=memory, phase="running")
 
     def stop(self, reason: str, fault: str = "stopped") -> None:
         """Brakes, from any state. It may be called at any time, also by another thread or a signal
@@ -169,282 +188,337 @@ class Supervisor:
         if self._stop is None:
             self._stop = Stop(fault, reason)
 
-    def restart(self, moved: bool = False) -> None:
+    def restart(self, moved: bool = False, targets: Sequence[float] | None = None) -> None:
         """Goes home after a stop, for the next `start`. The commands go on where they rest, and
         nothing is sent until the arm is there.
 
         Args:
-          moved: whether the arm was moved with its servos off. Its commands then begin anew where
-            it is measured, as the first ones did.
+          moved: whether the arm was moved with its servos off. Its commands then begin anew, as the
+            first ones did: where the controller holds it (`joint_targets`), or near the start pose.
+          targets: servo targets [J] (rad) at which the moved arm rests now.
 
         Raises:
-          UserError: the arm has not stopped, or the policy is no longer this supervisor's.
+          UserError: the arm has not stopped, or the targets are not J numbers in the joint ranges.
         """
-        self._check_policy()
         if self.state != "stopped":
             raise UserError(f"the arm is {self.state}; restart it when it has stopped")
-        self._take_back()
-        self._phase = "homing"
-        self._waits_for = None
+        stop = self._stop
         # A stop from here on stays.
         self._stop = None
-        self._is_moving_home = False
-        self._has_found_arm = False
-        self._waited = 0
-        if moved:
-            self._policy.reset()
-            self._end = None
-        else:
-            self._policy.samples.forget(self._targets)
+        try:
+            progress = self._restarted(moved, targets)
+        except UserError:
+            self._stop = self._stop or stop
+            raise
+        self._progress = progress
+
+    def _restarted(self, moved: bool, targets: Sequence[float] | None) -> Progress:
+        progress = self._progress
+        seen = progress.memory.seen
+        course = progress.memory.course
+        if targets is not None:
+            values = self._driver.read_joints("the targets", targets, "rad", LARGEST)
+            self._controller.samples.check_range("target", values)
+            course = self._controller.motion.resting(values)
+        elif moved:
+            course = None
+        memory = self._controller.episode(seen, course)
+        return Progress(memory, has_begun=progress.has_begun)
 
     def commands(self, measurements: Mapping[str, Any]) -> np.ndarray:
         """Commands [M, J] of a control step at the robot's rate, rad; none ([0, J]), so that
-        nothing is sent, until a first sample is believed (`Samples`), and the arm is where
-        `DeployedPolicy.reset` was told that it rests; after a `restart`, until it is where the
-        commands rest; and once a stopped arm that had a second to settle is elsewhere.
+        nothing is sent, in a call that is no new control step, until the arm is measured where it
+        is said to rest (`DeployedPolicy.reset`, the controller's own `joint_targets`, or near the
+        start pose), after a `restart` until it is where the commands rest, and once a stopped arm
+        that had a second to settle is elsewhere.
 
         Args:
           measurements: as for `DeployedPolicy.step`. Before `start`, only the joint angles are
             needed, and none while the arm brakes; after that, the joint angles tell whether the
-            stopped arm was moved. Without `time` no step is late, and
-            without `ball_age` a picture is as old as the time since the ball's position last
-            changed.
+            stopped arm was moved. Without `time`, the host's clock counts. Without `ball_age` a
+            picture is as old as the time since the ball's position last changed.
 
         Raises:
           Exception: anything fails before the supervisor has given a command, mostly a `UserError`,
             as the first joint angles are wrong. Afterwards nothing is raised, and the arm brakes.
         """
-        if self._policy.supervisor is not self:
-            self._stop = Stop("error", _NEWER, is_at_rest=True)
-            return self._no_commands
-        try:
-            if self._has_other_order:
-                self.stop(_OTHER_ORDER, "error")
-            elif self._take_back():
-                self.stop(_MOVED, "error")
-            elif self.state == "running":
-                self._follow(measurements)
-            elif self.state in ("homing", "ready"):
-                self._go_home(measurements)
-            elif self.state == "stopped" and self._has_found_arm:
-                self._has_found_arm = self._is_not_moved(measurements)
-        except Exception as error:
-            if not self._has_begun:
-                raise
-            self.stop(*_fault_of(error))
-        stop = self._stop
-        if self._targets is None:
-            if stop is not None:
-                self._stop = stop._replace(is_at_rest=True)
-            return self._no_commands
-        if stop is not None:
-            if not stop.is_at_rest:
-                self._waited = 0
+        progress = self._progress
+        steps = 0
+        if self._stop is None:
+            try:
+                progress, steps = self._next(progress, measurements)
+            except Exception as error:
+                if not (progress.has_begun or isinstance(error, Fault)):
+                    raise
+                self.stop(*_fault_of(error))
+        if self._stop is not None:
             # What this step was to send is not sent.
-            if self._end is not None:
-                self._motion.end = self._end
-            self._motion.hold()
-            if self._motion.is_still:
-                self._stop = stop._replace(is_at_rest=True)
-        self._end = self._motion.end
-        self._has_begun = True
-        if not self._has_found_arm:
-            return self._no_commands
-        return self._motion.at(self._times)
+            progress, steps = self._brake(self._progress, measurements)
+        course = progress.memory.course
+        has_commands = course is not None and progress.has_found_arm
+        self._progress = progress._replace(has_begun=progress.has_begun or has_commands)
+        if steps == 0 or not has_commands:
+            return np.zeros((0, len(self._home)))
+        return self._driver.to_driver(self._controller.motion.at(course, self._times))
 
-    @property
-    def _no_commands(self) -> np.ndarray:
-        """An array [0, J], of which nothing is sent."""
-        return np.zeros((0, len(self._metadata.joint_names)))
+    def _next(self, progress: Progress, measurements: Mapping[str, Any]) -> tuple[Progress, int]:
+        """What is known after a call, and the control steps since the last one.
 
-    @property
-    def _targets(self) -> np.ndarray | None:
-        """Commands [J] at the end of the last control step, rad; None before there is one."""
-        if self._motion.end is None:
-            return None
-        return self._motion.at(np.array([self._metadata.control_dt]))[0]
+        Raises:
+          UserError: the arm is to stop.
+        """
+        measurements = self._timed(measurements)
+        if progress.phase == "running":
+            return self._follow(progress, measurements)
+        of_arm = {name: value for name, value in measurements.items() if name in _OF_ARM}
+        measured = self._driver.check(of_arm, ("joint_angles",))
+        progress = progress._replace(balls=self._balls(measurements))
+        if not progress.has_found_arm:
+            return self._find_arm(progress, measured)
+        return self._go_home(progress, measured)
 
-    def _take_back(self) -> bool:
-        """Lets the commands go on where the last ones ended, and says whether anything else has
-        moved them since. Those of an arm that was moving go on with `hold`."""
-        if self._motion.end is self._end:
-            return False
-        # Without a start, the commands are those of an arm that rests at the end.
-        self._motion.start = None
-        self._motion.end = self._end
-        return True
+    def _timed(self, measurements: Mapping[str, Any]) -> Mapping[str, Any]:
+        """The measurements with a time: the driver's own, or always that of the host.
 
-    def _check_policy(self) -> None:
-        """Raises UserError if the policy is no longer this supervisor's."""
-        if self._policy.supervisor is not self:
-            raise UserError(_NEWER)
-        if self._has_other_order:
-            raise UserError(_OTHER_ORDER)
+        Raises:
+          UserError: they have no names, or a time comes in some samples alone.
+        """
+        if not isinstance(measurements, Mapping):
+            raise UserError(
+                f"the measurements are {str(measurements)[:100]!r}; give a mapping of their names, "
+                "such as joint_angles"
+            )
+        has_time = "time" in measurements
+        is_first = self._progress.memory.seen.clock.step < 0
+        if not has_time and self._host_start is None:
+            if not is_first:
+                raise UserError(
+                    "the measurement time is missing, and was given before; give it in every sample"
+                )
+            self._host_start = time.monotonic()
+        if has_time:
+            if self._host_start is not None and not is_first:
+                raise UserError(
+                    "the measurement time is given, and was not before; give it in every sample, "
+                    "or in none"
+                )
+            self._host_start = None
+            return measurements
+        return {**measurements, "time": time.monotonic() - self._host_start}
 
-    @property
-    def _has_other_order(self) -> bool:
-        """Whether the policy's joints have another order than when the supervisor began."""
-        return self._policy.motion is not self._motion
-
-    def _read_arm(self, measurements: Mapping[str, Any]) -> Measurements:
-        """`joint_angles` [J] and, if it is given, `time` [1], whatever else is measured."""
-        check_mapping(measurements)
-        of_arm = {
-            name: value for name, value in measurements.items() if name in ("joint_angles", "time")
-        }
-        return self._policy.read(of_arm, ("joint_angles",))
-
-    def _find_arm(self, measurements: Mapping[str, Any]) -> Measurements | None:
-        """What is measured (`_read_arm`) of the arm at rest, from which it goes home; None while
-        that is not known. The first command is where the arm is; after a stop, the arm has to be
-        where its commands rest."""
-        policy = self._policy
-        try:
-            measured = self._read_arm(measurements)
-        except UnconfirmedSample as error:
-            self._waits_for = str(error)
-            return None
+    def _find_arm(self, progress: Progress, measured: Measurements) -> tuple[Progress, int]:
+        """Waits until the arm is measured where it rests, from where its commands begin or go
+        on."""
+        memory = progress.memory
+        of_time = {"time": measured["time"]}
+        seen, _, steps = self._controller.samples.take(memory.seen, of_time)
         angles = measured["joint_angles"]
-        if self._targets is None:
-            policy.reset(angles)
-            policy.samples.rest(angles)
-            return measured
-        return measured if self._rests(angles) else None
+        self._controller.samples.check_range("angle", angles)
+        target = follow_target(progress.target, measured)
+        course = memory.course
+        now = seen.clock.now
+        progress = progress._replace(memory=memory._replace(seen=seen), target=target)
+        is_place_known = course is not None
+        try:
+            if course is not None:
+                place = self._controller.motion.target(course)
+                where = "where its commands rest"
+                room = self._watch.offset
+            else:
+                place = place_of(target, angles)
+                where = "where its controller holds it"
+                room = self._watch.offset
+                is_place_known = place is not None
+                course = self._controller.motion.resting(angles if place is None else place)
+                if place is None:
+                    place = self._home
+                    where = (
+                        "its start pose, and nobody says where the arm rests: give the "
+                        "controller's own joint_targets, or reset(targets)"
+                    )
+                    room = _NEAR + self._metadata.start_noise
+            check_place(self._metadata, angles, place, room, where)
+            check_tool(self._metadata, measured)
+        except Unknown as unknown:
+            since = now if progress.waits_since is None else progress.waits_since
+            if is_place_known and now - since > _SETTLING:
+                raise Fault("joint_astray", str(unknown)) from None
+            return progress._replace(waits_for=str(unknown), waits_since=since), steps
+        seen = self._controller.samples.rest(seen, angles)
+        command = self._controller.motion.target(course)
+        progress = progress._replace(
+            memory=memory._replace(seen=seen, course=course),
+            has_found_arm=True,
+            followed=self._watch.rest(angles, command),
+            waits_for=None,
+            waits_since=None,
+        )
+        return self._move_home(progress, angles, max(steps, 1))
 
-    def _is_not_moved(self, measurements: Mapping[str, Any]) -> bool:
+    def _go_home(self, progress: Progress, measured: Measurements) -> tuple[Progress, int]:
+        """A step of the way home, or at home."""
+        seen, measured, steps = self._controller.samples.take(progress.memory.seen, measured)
+        progress = progress._replace(memory=progress.memory._replace(seen=seen))
+        if steps == 0:
+            return progress, 0
+        angles = measured["joint_angles"]
+        command = self._controller.motion.target(progress.memory.course)
+        followed = self._watch.follow(
+            progress.followed, angles, command, steps, seen.is_arm_bridged
+        )
+        return self._move_home(progress._replace(followed=followed), angles, steps)
+
+    def _move_home(
+        self, progress: Progress, angles: np.ndarray, steps: int
+    ) -> tuple[Progress, int]:
+        """The next commands on the way home of an arm at angles [J]."""
+        motion = self._controller.motion
+        last = progress.memory.course
+        if steps > 1:
+            last = motion.stopped(last)
+        if np.abs(motion.target(last) - self._home).max() > _HOME_TOLERANCE:
+            course = motion.move(last, self._home, _HOME_SPEED)
+            # An arm that starts outside of the box may come in.
+            if self._outside(last.end.position) <= 0.0:
+                self._check_box(motion.braking_path(course))
+            memory = progress.memory._replace(course=course)
+            return progress._replace(memory=memory, phase="homing"), steps
+        course = motion.hold(last)
+        progress = progress._replace(
+            memory=progress.memory._replace(course=course), resting_angles=angles
+        )
+        if not motion.is_still(course):
+            return progress, steps
+        return self._settle(progress, angles), steps
+
+    def _settle(self, progress: Progress, angles: np.ndarray) -> Progress:
+        """Whether the arm has come to rest at home, where its commands are; else it waits.
+
+        Raises:
+          Fault: it had time to settle.
+        """
+        now = progress.memory.seen.clock.now
+        place = self._controller.motion.target(progress.memory.course)
+        room = self._watch.offset
+        try:
+            check_place(self._metadata, angles, place, room, "where its commands rest")
+        except Unknown as unknown:
+            since = now if progress.waits_since is None else progress.waits_since
+            if now - since > _SETTLING:
+                raise Fault("joint_astray", str(unknown)) from None
+            return progress._replace(phase="homing", waits_for=str(unknown), waits_since=since)
+        return progress._replace(phase="ready", waits_for=None, waits_since=None)
+
+    def _follow(self, progress: Progress, measurements: Mapping[str, Any]) -> tuple[Progress, int]:
+        """A step of the policy."""
+        controller = self._controller
+        # Of a policy that does not see them, the arm needs the angles all the same.
+        needs = tuple(dict.fromkeys((*self._driver.needs, "joint_angles")))
+        measured = self._driver.check(measurements, needs)
+        command = controller.motion.target(progress.memory.course)
+        clock = progress.memory.seen.clock
+        late = advance(clock, float(measured["time"][0]), self._dt)[2] - 1
+        if late > self._max_steps_late:
+            raise Fault("late_step", f"a control step came {late} steps late")
+        memory, measured, steps = controller.take(progress.memory, measured)
+        if steps == 0:
+            return progress._replace(memory=memory), 0
+        seen = memory.seen
+        if "ball_position" in measured:
+            age = seen.clock.now - seen.picture.taken
+            if "ball_age" in measured:
+                age = max(age, float(measured["ball_age"][0]))
+            check_balls(seen.picture.balls, age, self._max_picture_age, seen.paddle[-1][1])
+        followed = self._watch.follow(
+            progress.followed, measured["joint_angles"], command, steps, seen.is_arm_bridged
+        )
+        memory = controller.act(memory, measured, steps)
+        self._check_box(controller.motion.braking_path(memory.course))
+        return progress._replace(memory=memory, followed=followed), steps
+
+    def _brake(self, progress: Progress, measurements: Mapping[str, Any]) -> tuple[Progress, int]:
+        """A step in which the commands brake or rest, whatever is measured."""
+        memory = progress.memory
+        stop = self._stop
+        if memory.course is None or not progress.has_found_arm:
+            # Nothing was sent.
+            self._stop = stop._replace(is_at_rest=True)
+            return progress, 0
+        clock, steps = self._braking_time(progress, measurements)
+        memory = memory._replace(seen=memory.seen._replace(clock=clock))
+        progress = progress._replace(memory=memory)
+        if steps == 0:
+            return progress, 0
+        motion = self._controller.motion
+        last = motion.stopped(memory.course) if steps > 1 else memory.course
+        course = motion.hold(last)
+        memory = memory._replace(course=course)
+        progress = progress._replace(memory=memory, phase="homing", waits_for=None)
+        if not stop.is_at_rest:
+            if motion.is_still(course):
+                self._stop = stop._replace(is_at_rest=True)
+                progress = progress._replace(waits_since=clock.now)
+            return progress, steps
+        is_there = self._is_not_moved(progress, measurements)
+        return progress._replace(has_found_arm=progress.has_found_arm and is_there), steps
+
+    def _braking_time(self, progress: Progress, measurements: Mapping[str, Any]) -> tuple:
+        """The clock while the arm brakes, and the control steps since the last call: one, if the
+        driver's time cannot be read or stands."""
+        clock = progress.memory.seen.clock
+        try:
+            time_now = float(self._timed(measurements)["time"])
+        except (UserError, TypeError, ValueError):
+            time_now = math.nan
+        if math.isfinite(time_now):
+            new, elapsed, steps = advance(clock, time_now, self._dt)
+            if elapsed > 0.0:
+                return new, steps
+        return clock._replace(now=clock.now + self._dt), 1
+
+    def _is_not_moved(self, progress: Progress, measurements: Mapping[str, Any]) -> bool:
         """Whether a stopped arm is where its commands rest, has had no time to settle, or is not
         measured."""
-        self._waited += 1
+        since = progress.waits_since
+        if since is not None and progress.memory.seen.clock.now - since <= _SETTLING:
+            return True
         try:
-            angles = self._policy.check(
-                {"joint_angles": measurements["joint_angles"]}, ("joint_angles",)
-            )["joint_angles"]
+            given = {"joint_angles": measurements["joint_angles"]}
+            angles = self._driver.check(given, ("joint_angles",))["joint_angles"]
         except (UserError, KeyError, TypeError):
             return True
-        if self._waited * self._metadata.control_dt <= _SETTLING:
-            return True
-        return bool(np.all(np.abs(angles - self._targets) <= self._watch.offset))
+        place = self._controller.motion.target(progress.memory.course)
+        return bool(np.all(np.abs(angles - place) <= self._watch.offset))
 
-    def _rests(self, angles: np.ndarray) -> bool:
-        """Whether the arm is where its commands rest. Else there is a reason for which it waits,
-        and the arm is stopped when it has had time to settle."""
-        beside = np.abs(angles - self._targets)
-        joint = int(np.argmax(beside))
-        if beside[joint] <= self._watch.offset:
-            self._waited = 0
-            self._waits_for = None
-            return True
-        self._waited += 1
-        reason = (
-            f"{self._metadata.joint_names[joint]} is {beside[joint]:.2g} rad from where its "
-            "commands rest; check its load, its zero and the targets given to reset, or, if the "
-            "arm was moved with its servos off, call restart(moved=True)"
-        )
-        if self._waited * self._metadata.control_dt > _SETTLING:
-            self.stop(reason, "joint_astray")
-        else:
-            self._waits_for = reason
-        return False
+    def _balls(self, measurements: Mapping[str, Any]) -> np.ndarray | None:
+        """The balls [B, 3] that are measured before a start, if they are."""
+        if "ball_position" not in measurements:
+            return None
+        try:
+            given = {"ball_position": measurements["ball_position"]}
+            return self._driver.check(given, ())["ball_position"].reshape(-1, 3)
+        except UserError:
+            return None
 
-    def _stop_at(self, faults: Iterable[Fault]) -> bool:
-        """Brakes at the first of the faults, and says whether there is one."""
-        first = next(iter(faults), None)
-        if first is None:
-            return False
-        code, reason = first
-        self.stop(reason, code)
-        return True
-
-    def _go_home(self, measurements: Mapping[str, Any]) -> None:
-        """A step of the way home."""
-        policy = self._policy
-        home = np.array(self._metadata.default_joint_angles)
-        if self._is_moving_home:
-            measured = self._read_arm(measurements)
-        else:
-            measured = self._find_arm(measurements)
-            if measured is None:
-                if self._targets is not None:
-                    self._motion.hold()
-                return
-            self._watch.rest(measured["joint_angles"], self._targets)
-            self._idle = 0
-            self._due = None
-            self._has_found_arm = True
-            self._is_moving_home = True
-            self._waits_for = None
-        # Each call moves the commands for a whole control step, so that those of one share its way.
-        speed = _HOME_SPEED / (1 + self._idle)
-        if not self._is_new_step(self._steps_since_due(measured)):
+    def _check_start(self, progress: Progress) -> None:
+        """Raises UserError for a ball that is not over the paddle by forward kinematics."""
+        if progress.balls is None or self._metadata.ball_thrown is not False:
             return
-        angles = measured["joint_angles"]
-        is_bridged = policy.samples.is_arm_bridged
-        if self._stop_at(self._watch.arm_faults(angles, self._targets, is_bridged)):
-            return
-        if np.abs(self._targets - home).max() > _HOME_TOLERANCE:
-            self._motion.move(home, speed)
-            # An arm that starts outside of the box may come in.
-            if self._outside(self._motion.start.position) <= 0.0:
-                self._keep_in_box()
-            return
-        self._motion.hold()
-        self._resting_angles = angles
-        if not self._motion.is_still:
-            return
-        if self._rests(angles):
-            self._phase = "ready"
-        else:
-            self._phase = "homing"
+        paddle = paddle_position(self._metadata, progress.resting_angles)
+        x, y, z = progress.balls[0] - paddle
+        beside = math.hypot(x, y)
+        if beside > _OVER or z < 0.0:
+            raise UserError(
+                f"the ball is seen {beside:.2g} m beside and {z:.2g} m above the paddle, and an "
+                "episode starts with the ball over it; check the camera, or hold the ball there"
+            )
 
-    def _follow(self, measurements: Mapping[str, Any]) -> None:
-        """A step of the policy."""
-        policy = self._policy
-        # Of a policy that does not see them, the arm needs the angles all the same.
-        needs = dict.fromkeys((*policy.needs, "joint_angles"))
-        measured = policy.read(measurements, tuple(needs))
-        steps = policy.steps_since(measured)
-        late = steps - 1
-        if late > self._max_steps_late:
-            self.stop(f"a control step came {late} steps late", "late_step")
-            return
-        is_bridged = policy.samples.is_arm_bridged
-        if self._stop_at(self._watch.faults(measured, self._targets, is_bridged)):
-            return
-        if self._is_new_step(steps):
-            policy.act(measured)
-        self._keep_in_box()
-
-    def _steps_since_due(self, measured: Measurements) -> int:
-        """Control steps since the last one on the way home, rounded as those of the policy."""
-        if "time" not in measured:
-            return 1
-        time = float(measured["time"][0])
-        if self._due is None:
-            self._due = time
-            return 1
-        dt = self._metadata.control_dt
-        steps = max(0, round((time - self._due) / dt))
-        self._due += steps * dt
-        return steps
-
-    def _is_new_step(self, steps: int) -> bool:
-        """Whether a call is a new control step: some steps after the last one. In a call that is
-        none the commands brake, and after too many in a row the arm stops."""
-        if steps > 0:
-            self._idle = 0
-            return True
-        self._idle += 1
-        self._motion.hold()
-        if self._idle > self._max_steps_late:
-            self.stop(f"{self._idle} calls in a row are no new step", "no_step")
-        return False
-
-    def _keep_in_box(self) -> None:
-        """Brakes if the paddle would leave the box when the commands braked from the end of this
-        control step."""
-        outside = self._outside(self._motion.braking_path())
+    def _check_box(self, joint_angles: np.ndarray) -> None:
+        """Raises Fault if the paddle would leave the box at one of the joint angles [K, J], in
+        which the commands would brake."""
+        outside = self._outside(joint_angles)
         if outside > 0.0:
-            self.stop(f"the paddle would come to rest {outside:.3g} m outside the box", "box")
+            raise Fault("box", f"the paddle would come to rest {outside:.3g} m outside the box")
 
     def _outside(self, joint_angles: np.ndarray) -> float:
         """How far the paddle is outside of the box at one of the joint angles [..., J], m; negative
@@ -453,6 +527,23 @@ class Supervisor:
             return -math.inf
         paddle = paddle_position(self._metadata, joint_angles)
         return float(np.max([self._box[0] - paddle, paddle - self._box[1]]))
+
+
+def _checked_box(box: Any) -> np.ndarray:
+    """The ends [2, 3] of a box, m; UserError if it is none."""
+    try:
+        ends = np.array(box, float)
+    except (TypeError, ValueError):
+        ends = np.zeros(0)
+    if ends.shape != (2, 3) or not np.all(ends[0] < ends[1]):
+        raise UserError(f"the box is {box}; give its lowest and its highest x, y and z, m")
+    farthest = np.max(np.abs(ends), where=np.isfinite(ends), initial=0.0)
+    if farthest > _FARTHEST_END:
+        raise UserError(
+            f"the box is {box}, and ends {farthest:g} from the base, but no arm reaches "
+            f"{_FARTHEST_END:g} m; give metres, or inf for an end that is not there"
+        )
+    return ends
 
 
 def _fault_of(error: Exception) -> tuple[str, str]:

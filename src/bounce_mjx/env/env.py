@@ -9,15 +9,15 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from bounce_mjx.env.contract import (
-    ENDS,
-    CheckedTask,
-    Outline,
-    check_declared,
+from bounce_mjx.env.checks import (
     check_has_task,
+    check_joint_angles,
+    check_start,
+    check_starts,
+    check_task,
 )
+from bounce_mjx.env.contract import ENDS, CheckedTask, Outline
 from bounce_mjx.env.ranges import check_ranges, within_queues
-from bounce_mjx.env.starts import check_joint_angles, check_start, check_starts
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics import Control, PhysicsParameters, PhysicsState
 from bounce_mjx.physics.engine import Engine, make_engine
@@ -151,7 +151,7 @@ class Env:
         check_has_task(config)
         self.config = config
         self.task: Task = config.task(config)
-        check_declared(config, self.task)
+        check_task(config, self.task)
         self.mj_model: mujoco.MjModel = world_model(config)
         self.addresses = robot_model.find_addresses(self.mj_model)
         self.engine: Engine = make_engine(self.mj_model, config.physics, self.addresses)

@@ -15,7 +15,7 @@ from pydantic import Field
 from bounce_mjx.config.files import differing_keys, read_mapping
 from bounce_mjx.config.settings import Finite, StrictModel, merged, nested
 from bounce_mjx.config.validation import validate
-from bounce_mjx.env.starts import check_starts
+from bounce_mjx.env.checks import check_starts
 from bounce_mjx.errors import UserError, shorten, warn_once
 from bounce_mjx.evaluation.config import command_ranges
 from bounce_mjx.physics.edited import NO_PAIR

@@ -11,9 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from bounce_mjx.identify.simulation import Simulate
+from bounce_mjx.identify.following import error_size
+from bounce_mjx.identify.simulation import NOTHING_ELSE, Simulate, Simulated
 from bounce_mjx.identify.unknowns import ARM, Layout
-from bounce_mjx.identify.windows import Windows
+from bounce_mjx.identify.windows import Windows, is_seen
 
 # Deviation of the guessed starts, and the differences for their derivatives: angles (rad), joint
 # velocities (rad/s); the ball's position (m), velocity (m/s), spin (rad/s) and, relative to that of
@@ -37,11 +38,8 @@ _HUBER = 3.0
 NO_FLIGHT = 25.0
 """Mean squared residual of a window's pictures beyond which the ball was not in free flight."""
 _WORST = 30.0
-# Largest leverage of a window, its share of the information along a direction: a window with all of
-# it leaves no residual to correct.
-_LARGEST_LEVERAGE = 0.9
-# |J1 - J2| / |J1 + J2| of a window's two derivatives beyond which it has none.
-_DISAGREEMENT = 0.1
+# Windows in which candidates are compared.
+_FEW = 13
 
 # Deviation of a bounce from the model's: of the ball's velocity after it along x, y and z, m/s. A
 # real paddle is not the same everywhere; and a simulated bounce depends by as much on where in a
@@ -99,12 +97,9 @@ class Problem(NamedTuple):
     see `correlation_times`."""
     progress: Callable[[str], None] = lambda line: None
     """Called with a line about each step of a search."""
-    gravity_compensation: float = 0.0
-    """Share of the arm's weight that its controller carries, if more than the model's own."""
-    has_lift: bool = False
-    """Whether spin lifts the ball; the spin after a bounce then is as free as that before it."""
-    leaves_at_once: bool = False
-    """Whether the ball does not stay on the paddle in a bounce, as the model's does."""
+    simulated: Simulated = NOTHING_ELSE
+    """What is simulated beyond the unknowns. With lift, the spin after a bounce is as free as that
+    before it."""
 
     @property
     def deviations(self) -> np.ndarray:
@@ -149,7 +144,7 @@ class Problem(NamedTuple):
         has_left = (since > 0.0)[:, :, None]
         since = np.maximum(since, 0.0)[:, :, None]
         columns = [since * _BOUNCE_DEVIATION / self.noise.balls]
-        if self.has_lift:
+        if self.simulated.lift > 0.0:
             columns = [since * _SPINNING_DEVIATION / self.noise.balls]
             columns.append(0.5 * since**2 * _LIFT_DEVIATION / self.noise.balls)
             columns.append(has_left * _LEAVING_DEVIATION / self.noise.balls)
@@ -161,7 +156,7 @@ class Problem(NamedTuple):
         sizes = n, n, 3, 3, 3, 1
         deviations = np.repeat(_START_DEVIATIONS, sizes)
         searched = np.repeat(_SEARCHED, sizes)
-        if self.has_lift:
+        if self.simulated.lift > 0.0:
             deviations[-4:-1] = _SPIN_DEVIATION
             searched[-1] = True
         return deviations, np.repeat(_START_STEPS, sizes), searched
@@ -218,7 +213,7 @@ def minimise(
     for iteration in range(iterations):
         vector = fit.vector
         starts = fit.starts
-        line = _linearise(problem, vector, starts, unknowns, entries, weights)
+        line = linearise(problem, vector, starts, unknowns, entries, weights)
         if not np.all(np.isfinite(line.white)):
             # The simulation diverges.
             return Fit(vector, starts, line.predicted, weights, np.inf)
@@ -270,7 +265,7 @@ def _list_trials(
     reach = deviations[entries]
     is_angle = np.arange(len(deviations)) < layout.num_joints
     farthest = np.where(is_angle, _FARTHEST_START * deviations, np.inf)
-    reduced = _eliminate(
+    reduced = eliminate(
         line.white,
         line.by_unknown * scale,
         line.by_state * reach,
@@ -313,93 +308,6 @@ def _bounded_step(hessian: np.ndarray, slope: np.ndarray, room: np.ndarray) -> n
     high = np.maximum(room[1], 0.0)
     inside = lsq_linear(root, target, bounds=(low, np.maximum(high, low + 1e-12)), method="bvls")
     return inside.x
-
-
-def certainty(
-    problem: Problem, fit: Fit, is_estimated: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Information [P, P] of a log about the unknowns at a minimum, without the prior, and their
-    covariance [P, P], with it. What was not estimated has the prior's deviation.
-
-    In units of the prior's deviations, window s has the derivatives J_s [M, P] and the gradient
-    g_s = J_s' r_s, after its start is eliminated (`_eliminate`). The residuals r_s are those at the
-    minimum, and the derivatives are taken where latency and lag differ (`Layout.interior`).
-
-    *Information.* A bounce depends on where in a physics step it begins, which makes derivatives
-    noisy, and J_s' J_s would count their noise as information. J1 and J2, by central differences
-    of one and of two steps, have independent noise, so that A_s = (J1' J2 + J2' J1) / 2 has the
-    expectation without noise. A = sum_s A_s, with negative eigenvalues set to 0. A window whose J1
-    and J2 differ much has no derivative, and is left out.
-
-    *Covariance.* For independent residuals it is C = (A + I)^-1, where I is the prior's. But the
-    model's errors are correlated within a window. The estimate is a sum over windows, C sum_s g_s,
-    so that its covariance is the sandwich C (sum_s g_s g_s' + I) C (Liang and Zeger 1986),
-    again with J1 in one g_s and J2 in the other. A fit adapts to each window: the residuals have
-    the covariance I - J_s C J_s' in place of I, and are divided by its root (the estimator CR2 of
-    Bell and McCaffrey 2002, "Bias reduction in standard errors for linear regression with
-    multi-stage samples"). With C = R R' and the leverage H_s = R' A_s R, this is R' g_s ->
-    (I - H_s)^-1/2 R' g_s. The result is C with each deviation widened to that of the sandwich,
-    where that one is larger.
-
-    Args:
-      is_estimated: which unknowns [P] are at the minimum; no search has moved the others from their
-        prior mean, or from the number that was chosen for them.
-    """
-    layout = problem.layout
-    deviations, _, searched = problem.scale_starts()
-    size = len(fit.vector)
-    entries = np.flatnonzero(searched)
-    scale = layout.deviation
-    reach = deviations[entries]
-    vector = layout.interior(fit.vector, 2.0)
-    lines = [
-        _linearise(problem, vector, fit.starts, np.arange(size), entries, fit.weights, step)
-        for step in (1.0, -1.0, 2.0, -2.0)
-    ]
-    central = [0.5 * (a.by_unknown + b.by_unknown) * scale for a, b in (lines[:2], lines[2:])]
-    reduced = _eliminate(
-        problem.whiten(fit.predicted, fit.weights),
-        np.concatenate(central, axis=2),
-        np.mean([line.by_state for line in lines], axis=0) * reach,
-        (fit.starts - problem.windows.starts)[:, entries] / reach,
-    )
-    counts = ~(_has_no_derivative(reduced.informations, layout) & problem.windows.has_ball)
-    informations = _symmetrise(reduced.informations[:, :size, size:]) * counts[:, None, None]
-    values, vectors = np.linalg.eigh(np.sum(informations, axis=0))
-    values = np.maximum(values, 0.0)
-    root = vectors / np.sqrt(values + 1.0)
-    leverage, turn = np.linalg.eigh(root.T @ informations @ root)
-    larger = 1.0 / np.sqrt(1.0 - np.clip(leverage, 0.0, _LARGEST_LEVERAGE))
-    gradients = np.stack(np.split(reduced.gradients * counts[:, None], 2, axis=1)) @ root
-    gradients = np.einsum("sij,sj,skj,lsk->lsi", turn, larger, turn, gradients)
-    independent = root @ root.T
-    scatter = _symmetrise(gradients[0].T @ gradients[1]) + np.diag(1.0 / (values + 1.0))
-    sandwich = root @ scatter @ root.T
-    variance = np.maximum(np.diag(sandwich), np.diag(independent))
-    variance = np.where(is_estimated, variance, np.maximum(variance, 1.0))
-    wider = np.sqrt(variance / np.diag(independent)) * scale
-    information = (vectors * values) @ vectors.T
-    return information / np.outer(scale, scale), independent * np.outer(wider, wider)
-
-
-def _has_no_derivative(informations: np.ndarray, layout: Layout) -> np.ndarray:
-    """In which windows [S] the two derivatives J1 and J2 differ, as where a ball meets the paddle's
-    edge; from the products [S, 2 P, 2 P] of [J1, J2].
-
-    The delay's variance does not count: near 0, its differences are one-sided and depend on their
-    step.
-    """
-    size = informations.shape[1] // 2
-    others = np.arange(size) != layout.slices["delay_variance"].start
-    cross = np.diagonal(informations[:, :size, size:], axis1=1, axis2=2)
-    squares = np.diagonal(informations, axis1=1, axis2=2)
-    both = 2.0 * np.sum(cross[:, others], axis=1)
-    total = np.sum(squares[:, np.tile(others, 2)], axis=1)
-    return total - both > _DISAGREEMENT**2 * (total + both)
-
-
-def _symmetrise(matrices: np.ndarray) -> np.ndarray:
-    return 0.5 * (matrices + np.swapaxes(matrices, -1, -2))
 
 
 class _Linearisation(NamedTuple):
@@ -473,7 +381,7 @@ def _list_differences(
     return found
 
 
-def _linearise(
+def linearise(
     problem: Problem,
     vector: np.ndarray,
     starts: np.ndarray,
@@ -541,7 +449,7 @@ class _Reduced(NamedTuple):
         return self.unmoved + self.by_unknown @ change
 
 
-def _eliminate(
+def eliminate(
     residuals: np.ndarray, by_unknown: np.ndarray, by_state: np.ndarray, at_guess: np.ndarray
 ) -> _Reduced:
     """Eliminates the starts, each of which has a guess with the deviation 1: the Schur complement
@@ -630,3 +538,25 @@ def flight_errors(problem: Problem, predicted: np.ndarray, pictures: np.ndarray)
     white = problem.windows.split(problem.whiten(predicted, problem.weights()))[1]
     size = np.minimum(np.max(np.abs(white), axis=2), _WORST)
     return np.sum(size**2 * pictures, axis=1) / np.maximum(np.sum(pictures, axis=1), 1.0)
+
+
+def seen_windows(problem: Problem) -> np.ndarray:
+    """1 for each window of the search [S, 1], 0 for those held out."""
+    return is_seen(problem.windows)[:, None].astype(float)
+
+
+def sample(problem: Problem, counts: np.ndarray) -> np.ndarray:
+    """1 for about `_FEW` of the windows of the search that count [S], evenly over the log
+    [S, 1]."""
+    used = np.flatnonzero(counts & (seen_windows(problem)[:, 0] > 0.0))
+    few = np.zeros((len(counts), 1))
+    few[used[:: max(len(used) // _FEW, 1)]] = 1.0
+    return few
+
+
+def joint_errors(windows: Windows, fit: Fit) -> np.ndarray:
+    """Root mean square [n] of the angles' residuals where they count, rad."""
+    angles = windows.split(fit.predicted)[0]
+    weights = windows.split(fit.weights)[0]
+    counts = np.any(weights > 0.0, axis=2)
+    return error_size((angles - windows.angles)[counts])

@@ -67,6 +67,12 @@ _HELD = 0.4
 _ALIKE = 0.8
 
 
+# Standard deviation of stamps about regular steps below which the steps count as regular, s.
+_JITTER = 5e-4
+# Time between two logs that are joined, s: a gap, also where steps are as long as a log may have.
+_APART = 1.5
+
+
 class Log(NamedTuple):
     """What a robot measured and was sent; all times (s) are of one clock, but for a constant."""
 
@@ -524,3 +530,55 @@ def check(log: Log, joint_names: Sequence[str], joint_ranges: np.ndarray) -> Non
             f"s, and the servo targets at {begins[1]:.6g} and {ends[1]:.6g} s; give stamps of one "
             "clock, simulated time or the computer's"
         )
+
+
+def join(logs: Sequence[Log]) -> Log:
+    """Several logs, one after another, without the pictures of times at which the arm was not
+    recorded; no window spans two of them."""
+    shifted = []
+    start = 0.0
+    for log in logs:
+        first = min(log.times[0], log.target_times[0])
+        last = max(log.times[-1], log.target_times[-1])
+        is_within = (log.picture_times >= first) & (log.picture_times <= last + 0.5 * _APART)
+        shift = start - first
+        shifted.append(
+            log._replace(
+                times=log.times + shift,
+                target_times=log.target_times + shift,
+                picture_times=log.picture_times[is_within] + shift,
+                ball_positions=log.ball_positions[is_within],
+                arrivals=log.arrivals[is_within] + shift,
+            )
+        )
+        start = float(last + shift) + _APART
+
+    def joined(field: str) -> np.ndarray:
+        return np.concatenate([getattr(log, field) for log in shifted])
+
+    return Log(
+        source=", ".join(log.source for log in logs),
+        times=joined("times"),
+        joint_angles=joined("joint_angles"),
+        target_times=joined("target_times"),
+        servo_targets=joined("servo_targets"),
+        picture_times=joined("picture_times"),
+        ball_positions=joined("ball_positions"),
+        arrivals=joined("arrivals"),
+        notes=tuple(note for log in logs for note in log.notes),
+    )
+
+
+def straighten(times: np.ndarray) -> np.ndarray:
+    """Stamps [T] of control steps at regular times, in each stretch in which they only jitter about
+    a line: what a stamp is off by is an error of the stamp, not of the step."""
+    steps = np.diff(times)
+    typical = float(np.median(steps))
+    stretches = []
+    for part in np.split(times, np.flatnonzero(steps > 1.5 * typical) + 1):
+        index = np.arange(len(part)) - 0.5 * (len(part) - 1)
+        slope = typical if len(part) < 50 else float(index @ part / (index @ index))
+        line = np.mean(part) + slope * index
+        stretches.append(line if np.std(part - line) < _JITTER else part)
+    # Where jitter alone parts two stretches, their lines may overlap by less than it.
+    return np.sort(np.concatenate(stretches))

@@ -4,6 +4,7 @@ training."""
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -36,31 +37,38 @@ Simulate = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 not count has the numbers of the first candidate, or 0 if that has none."""
 
 
+class Simulated(NamedTuple):
+    """What is simulated beyond the unknowns."""
+
+    gravity_compensation: float = 0.0
+    """Share of the links' weight that the controller carries, if it is more than the model's
+    own."""
+    lift: float = 0.0
+    """Acceleration of the ball across its flight, per spin and speed."""
+    leaves_at_once: bool = False
+    """Whether the ball leaves the paddle as soon as it touches it. A real ball stays for 1 ms. The
+    model's stays for 10 ms and has not fallen in this time: with it, a real ball of 2 m/s would
+    pass for one of 0.05 more restitution."""
+
+
+NOTHING_ELSE = Simulated()
+
+
 def make_simulator(
     config: WorldConfig,
     layout: Layout,
     log: Log,
     windows: Windows,
-    carried: float = 0.0,
-    lift: float = 0.0,
-    leaves_at_once: bool = False,
+    simulated: Simulated = NOTHING_ELSE,
 ) -> Simulate:
     """Builds the simulation of a log's windows in candidate worlds.
 
     Measured angles are the true ones plus `encoder_bias`, which the servos share. A measured ball
     is the true one, `ball_latency` before its time stamp, turned by the camera's rotation about
     the middle of all measured ones, plus `ball_position_bias`.
-
-    Args:
-      carried: share of the links' weight that the controller carries, if it is more than the
-        model's own.
-      lift: acceleration of the ball across its flight, per spin and speed.
-      leaves_at_once: whether the ball leaves the paddle as soon as it touches it. A real ball stays
-        for 1 ms. The model's stays for 10 ms and has not fallen in this time: with it, a real ball
-        of 2 m/s would pass for one of 0.05 more restitution.
     """
     run = _compile(config, layout.num_joints)
-    contact_time = _contact_time(config) if leaves_at_once else 0.0
+    contact_time = _contact_time(config) if simulated.leaves_at_once else 0.0
     # By how much the paddle has moved in the time for which the ball does not stay on it.
     paddle_rise = contact_time * _paddle_speeds(config, windows)
     n = layout.num_joints
@@ -102,8 +110,8 @@ def make_simulator(
             (contact_time * has_left[s]).T.astype(np.float32),
             (paddle_rise[:, None] * has_left)[s].T.astype(np.float32),
             middle.astype(np.float32),
-            np.float32(carried),
-            np.float32(lift),
+            np.float32(simulated.gravity_compensation),
+            np.float32(simulated.lift),
         )
         rows = [np.moveaxis(np.asarray(x), 2, 0).reshape(_LANES, -1) for x in out]
         return np.concatenate(rows, axis=1)[:count].astype(float)

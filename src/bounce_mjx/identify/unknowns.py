@@ -67,6 +67,8 @@ _TERMS = {"delay": "action_latency", "delay_variance": "servo_lag"}
 CAMERA_ROTATION = "camera_rotation"
 """Rotation of the camera's frame about the axes of the base, rad: no term of the world, and 0
 unless its prior deviation is given."""
+OF_SERVOS = ("servo_lag", "servo_gain", "servo_damping", "joint_frictionloss")
+"""Terms of servos that are chosen, and not estimated, for an arm that follows exactly."""
 MOTIONS = {
     "bounces in other postures of the arm": "encoder_bias paddle_tilt paddle_offset",
     "bounces at places far apart": f"ball_position_bias {CAMERA_ROTATION}",

@@ -29,6 +29,10 @@ _SECONDS = MAX_DELAY + _BEFORE + _AFTER + 0.03
 # Shortest window of the arm alone, and twice the shortest flight on a side of a bounce, s.
 _SHORTEST = 0.16
 _FEWEST = 5
+_FEWEST_BOUNCES = 3
+# Every fifth window is held out of the search for the unknowns until its last stage. Its residuals
+# give its outliers less weight, as in all windows, and choose between hypotheses.
+_HELD_OUT = 5
 _MOST = 240
 _MOST_BALLS = 180
 _PADDING = 8
@@ -277,3 +281,35 @@ def _ball_start(log: Log, pictures: np.ndarray, bounce: float, zero: float) -> n
     balls = log.ball_positions[pictures][before]
     flight = fit_flight(shown, balls, _GUESSED_NOISE, GUESSED_DRAG)
     return np.concatenate([flight.position, flight.velocity, np.zeros(4)])
+
+
+def cut_enough(log: Log, physics_dt: float) -> Windows:
+    """The windows of a log; of the arm alone if it has too few bounces for the unknowns of the
+    ball, as the arm's unknowns would make good for these."""
+    windows = cut(log, physics_dt)
+    if np.sum(windows.has_ball) >= _FEWEST_BOUNCES:
+        return windows
+    none = np.zeros(0)
+    of_arm = log._replace(picture_times=none, ball_positions=np.zeros((0, 3)), arrivals=none)
+    return cut(of_arm, physics_dt)
+
+
+def is_seen(windows: Windows) -> np.ndarray:
+    """Which windows [S] the search sees before its last stage: all but every fifth; of a log whose
+    few bounces are all in these, all but those before them."""
+    place = np.arange(len(windows.first)) % _HELD_OUT
+    seen = place != _HELD_OUT - 1
+    if np.any(windows.has_ball) and not np.any(windows.has_ball & seen):
+        return place != _HELD_OUT - 2
+    return seen
+
+
+def held_out_rows(log: Log, windows: Windows) -> np.ndarray:
+    """Which joint angles [T] of a log are in windows that the search does not see."""
+    rows = np.zeros(len(log.times), bool)
+    for s in np.flatnonzero(~is_seen(windows)):
+        used = windows.angle_times[s, windows.angle_weights[s] > 0.0]
+        if len(used):
+            times = log.times - windows.zero[s]
+            rows |= (times > used[0] - 1e-6) & (times < used[-1] + 1e-6)
+    return rows

@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from bounce_mjx.identify.estimates import Estimate, estimates
+from bounce_mjx.identify.hypotheses import table_of
+from bounce_mjx.identify.identification import Identified
 from bounce_mjx.identify.inspection import Checkup
 from bounce_mjx.identify.log import Log
-from bounce_mjx.identify.stages import Identified
-from bounce_mjx.identify.world import Estimate, estimates, misfit, sentences
+from bounce_mjx.identify.sentences import sentences
 from bounce_mjx.reports.figures import add_legend, make_panels, style
 from bounce_mjx.reports.html_page import figures_html, page, table
 
@@ -103,6 +105,7 @@ below with the interval that contains it with 95% probability.</p>
 {table(["quantity", "estimate", "95% interval", ""], rows)}
 <h2>Errors in units of the sensors' noise</h2>
 {table(["sensor", "model's own world", "identified", "windows held out"], fits)}
+{_describe_hypotheses(found)}
 {_describe_joints(found, joint_names)}
 {figures_html(figures.items())}
 <h2>What the log leaves open</h2>
@@ -121,20 +124,27 @@ def _row(entry: Estimate) -> list[str]:
     return [entry.label, value, interval, "" if entry.seen else "not shown by the log: the prior"]
 
 
+def _describe_hypotheses(found: Identified) -> str:
+    """The hypotheses of the arm, compared, as HTML."""
+    if not found.choice.trials:
+        return ""
+    header = ["the arm is", "unknowns", "error of each joint, mrad", ""]
+    rows = [[name, str(count), *rest] for name, count, *rest in table_of(found.choice)]
+    return (
+        "<h2>What explains the arm, in windows that no fit had seen</h2>\n"
+        f"{table(header, rows)}\n<p>The least error wins. A difference within the spread of a "
+        "bootstrap over these windows is a tie, and goes to the fewer unknowns.</p>"
+    )
+
+
 def _describe_joints(found: Identified, joint_names: Sequence[str]) -> str:
     """What each joint's intervals rest on, as HTML."""
-    columns = found.noise.angles, found.counted.angles, found.following_errors, found.joint_errors
+    columns = found.noise.angles, found.counted.angles, found.joint_errors
     rows = [
         [name, *(f"{1e3 * column[j]:.2f}" for column in columns)]
         for j, name in enumerate(joint_names)
     ]
-    header = [
-        "joint",
-        "encoder's noise",
-        "counted as noise",
-        "held out: delay and offset alone",
-        "held out: identified",
-    ]
+    header = ["joint", "encoder's noise", "counted as noise", "held out: identified"]
     return f"<h2>Errors of each joint, mrad</h2>\n{table(header, rows)}"
 
 
@@ -143,9 +153,11 @@ def _describe_fit(found: Identified) -> str:
     errors = found.held_out or found.after
     where = "in windows that the search had not seen" if found.held_out else "in the log"
     named = " and ".join(f"{error:.3g} ({name})" for name, error in errors.items())
-    wider = "" if misfit(found) == 1.0 else " The intervals are widened by the excess."
-    fit = f"the world's errors {where} are {named} times the sensors' noise; 1 is perfect."
-    return html.escape(fit + wider)
+    return html.escape(
+        f"the arm is explained by {found.choice.chosen.name}; the world's errors {where} are "
+        f"{named} times the sensors' noise; 1 is perfect. The intervals are those of the estimates "
+        "from resampled windows."
+    )
 
 
 def _advise(doubts: Sequence[str], world: Path, robot: str | None) -> str:

@@ -136,7 +136,7 @@ def load_model(
         _check_balls(addresses, num_balls)
     if robot.limits.torque is not None:
         # A wrong number of torques, or of joints, is refused where the config is known
-        # (`WorldConfig`, `env.starts.check_joint_angles`).
+        # (`WorldConfig`, `env.checks.check_joint_angles`).
         torques = robot.limits.torque[: len(addresses.actuators)]
         limit_torques(mj_model, addresses.actuators[: len(torques)], torques)
     mj_model.opt.timestep = physics_dt

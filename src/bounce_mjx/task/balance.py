@@ -116,6 +116,7 @@ class Balance(task.Task):
     config: Config
     curves = (task.Curve("task/error", "error", title="ball to point, cm", scale=100.0),)
     num_draws = 4
+    ball_thrown = False
 
     # The start.
 

@@ -213,6 +213,8 @@ class Bounce(task.Task):
     Config = Config
     config: Config
     folder = "bounce_ball"
+    ball_rests = False
+    ball_thrown = False
     curves = (
         task.Curve(
             "episode/bounces_at_end", "n_bounces", "episodes", "bounces in a row at its end"

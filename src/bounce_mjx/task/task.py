@@ -213,6 +213,11 @@ class Task:
     shows or is over is logged as its mean over the steps."""
     num_balls: ClassVar[tuple[int, ...]] = (1,)
     """Numbers of balls (`WorldConfig.num_balls`) that it takes."""
+    ball_rests: ClassVar[bool] = True
+    """Whether the ball may rest on the paddle; if not, a robot's supervisor stops at one that stays
+    near it."""
+    ball_thrown: ClassVar[bool] = True
+    """Whether the ball may start elsewhere than over the paddle."""
     num_draws: ClassVar[int] = 0
     """Random numbers that a reset samples for the task."""
     critic_metrics: ClassVar[tuple[str, ...]] = ()

@@ -133,7 +133,7 @@ class Config(task.WorldConfig):
                 "m",
                 least=heights.least,
                 greatest=heights.greatest,
-                span=(z + 0.3, z + 0.7),
+                span=heights.within(z + 0.3, z + 0.7),
                 setting="height_range",
                 reason=heights.reason,
             ),
@@ -149,6 +149,8 @@ class Track(task.Task):
 
     Config = Config
     config: Config
+    ball_rests = False
+    ball_thrown = False
     curves = (
         task.Curve("task/error", "error", "apexes", "distance of apex and point, cm", 100.0),
         task.Curve("task/height_error", "height_error", "apexes", "|apex − height|, cm", 100.0),

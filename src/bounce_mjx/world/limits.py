@@ -74,6 +74,10 @@ class HeightLimits(NamedTuple):
     reason: str
     """The limits from which they follow, for an error."""
 
+    def within(self, low: float, high: float) -> tuple[float, float]:
+        """The part of a range of heights that is within them, m."""
+        return max(self.least, low), min(self.greatest, high)
+
 
 def target_heights(
     limits: Limits, min_flight: float = 0.0, start: float | None = None, sway: float = 0.0

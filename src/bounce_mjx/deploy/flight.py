@@ -1,0 +1,185 @@
+"""Whether a ball falls: away from the paddle, its last pictures lie on a parabola of gravity's
+curvature; near it, the ball leaves again unless the task lets it rest.
+
+In free flight a ball's places are x0 + v t + g t^2 / 2. What is left of them after the least
+squares in x0 and v is judged in two directions: the largest of single pictures, and the part along
+t^2, which is a wrong acceleration (0 of a ball that a hand holds). Both are projections on a unit
+vector, so that noise is as large in each, and one bound holds for both.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from bounce_mjx.deploy.metadata import Metadata, largest_term
+
+GRAVITY = 9.81
+"""m/s^2"""
+
+# Pictures that count, s.
+_WINDOW = 0.25
+# Noise of a picture in standard deviations, of which 1e6 pictures have no larger one; the least
+# standard deviation, m; and that of a picture's time, s.
+_DEVIATIONS = 5.0
+_LEAST_NOISE = 0.008
+_TIMING = 0.003
+# Largest drag of the air with a spin's lift, as a share of the squared speed, 1/m.
+_DRAG = 0.25
+# Speed at which a ball leaves the paddle, m/s, and the height above the paddle's centre at which it
+# may touch: its radius, half of the paddle, and the errors of the camera and of the arm, m.
+_IMPACT_SPEED = 5.0
+_TOUCH = 0.07
+# Horizontal distance from the paddle's centre at which it may touch, m.
+_REACH = 0.15
+# Time in which a ball near the paddle leaves it, s.
+_LEAVING = 0.4
+
+
+class Flight(NamedTuple):
+    """The pictures of a ball since it was last near the paddle."""
+
+    times: np.ndarray
+    """When they were taken [N], s."""
+    places: np.ndarray
+    """[N, 3], m."""
+    height: float
+    """Of the last one above the paddle, m."""
+    is_over: bool
+    """Whether the last one was over the paddle."""
+    near_since: float | None
+    """Time from which the ball was near the paddle and was not seen to fall, s; None of one that
+    was."""
+
+
+class FlightBounds(NamedTuple):
+    """What a policy's balls may do."""
+
+    noise: float
+    """Standard deviation of a picture along an axis, m."""
+    push: float
+    """Largest sideways push in flight, m/s."""
+    speed: float
+    """Largest speed of a ball, m/s."""
+    may_rest: bool
+    """Whether the ball may rest on the paddle."""
+    dt: float
+    """Duration of a control step, s."""
+
+
+def flight_bounds(metadata: Metadata) -> FlightBounds:
+    """The bounds of the training's worlds."""
+    return FlightBounds(
+        noise=max(largest_term(metadata, "ball_position_noise"), _LEAST_NOISE),
+        push=largest_term(metadata, "push_speed"),
+        speed=metadata.ball.speed,
+        may_rest=metadata.ball_rests is not False,
+        dt=metadata.control_dt,
+    )
+
+
+class Fit(NamedTuple):
+    """Pictures against a ball's fall."""
+
+    ratio: float
+    """What is left, as a share of the bound; above 1, the ball does not fall."""
+    is_known: bool
+    """Whether a ball at rest would be above 1; if not, a ratio below 1 says nothing."""
+
+
+def fit_fall(times: np.ndarray, places: np.ndarray, noise: float, push: float = 0.0) -> Fit:
+    """Compares pictures with a ball in free flight.
+
+    Args:
+      times: [N], s.
+      places: [N, 3], m.
+      noise: standard deviation of a place along an axis, m.
+      push: largest sideways push that the ball may have had, m/s.
+    """
+    count = len(times)
+    if count < 3:
+        return Fit(0.0, False)
+    t = times - times.mean()
+    spread = t @ t
+    fallen = -0.5 * GRAVITY * t * t
+    left = places - places.mean(axis=0)
+    left[:, 2] -= fallen - fallen.mean()
+    velocity = (t @ left) / spread
+    left -= t[:, None] * velocity
+    bend = t * t - spread / count
+    bend -= t * ((t @ bend) / spread)
+    bend_size = math.sqrt(bend @ bend)
+    along = bend @ left / bend_size
+    squared_speed = velocity @ velocity + GRAVITY**2 * spread / count
+    bound = _DEVIATIONS * math.sqrt(noise**2 + _TIMING**2 * squared_speed)
+    drag = 0.5 * _DRAG * squared_speed
+    alone_bound = bound + drag * np.abs(bend).max()
+    along_bound = bound + drag * bend_size
+    duration = times[-1] - times[0]
+    sizes = np.abs(left).max(axis=0)
+    pushed = 0.25 * push * duration
+    ratio = max(
+        sizes[2] / alone_bound,
+        abs(along[2]) / along_bound,
+        math.hypot(sizes[0], sizes[1]) / (alone_bound + pushed),
+        math.hypot(along[0], along[1]) / (along_bound + pushed * math.sqrt(count)),
+    )
+    at_rest = 0.5 * GRAVITY * bend_size
+    return Fit(float(ratio), at_rest > _DEVIATIONS * noise)
+
+
+def begin(time: float, place: np.ndarray, paddle: np.ndarray) -> Flight:
+    """The flight of a first picture.
+
+    Args:
+      time: when it was taken, s.
+      place: of the ball [3], m.
+      paddle: the paddle's centre then [3], m.
+    """
+    return Flight(np.array([time]), place[None], float(place[2] - paddle[2]), False, None)
+
+
+def follow(
+    bounds: FlightBounds, flight: Flight, time: float, place: np.ndarray, paddle: np.ndarray
+) -> tuple[Flight, str | None]:
+    """The flight with a new picture, and why the ball cannot be there; None if it can.
+
+    Args:
+      flight: of the pictures before.
+      time: when it was taken, s.
+      place: of the ball [3], m.
+      paddle: the paddle's centre then [3], m.
+    """
+    since = time - flight.times[-1]
+    offset = place - paddle
+    height = float(offset[2])
+    moved = math.dist(place, flight.places[-1])
+    reach = bounds.speed * max(since, bounds.dt) + _DEVIATIONS * math.sqrt(2.0) * bounds.noise
+    if moved > reach:
+        reason = f"is {moved:.3g} m from {1e3 * since:.0f} ms before, farther than it flies"
+        return flight, reason
+    is_over = math.hypot(offset[0], offset[1]) < _REACH
+    low = height + flight.height - 2.0 * _TOUCH < _IMPACT_SPEED * since
+    if low and is_over and (flight.is_over or len(flight.times) == 1):
+        return _touching(bounds, flight, time, place, height)
+    kept = flight.times > time - _WINDOW
+    times = np.append(flight.times[kept], time)
+    places = np.vstack([flight.places[kept], place])
+    fit = fit_fall(times, places, bounds.noise, bounds.push)
+    if fit.ratio > 1.0:
+        seconds = times[-1] - times[0]
+        return flight, f"has not fallen as a ball does for {1e3 * seconds:.0f} ms"
+    # A ball at which the paddle swings comes and goes, and has left when it is seen to fall.
+    near_since = None if fit.is_known else flight.near_since
+    return Flight(times, places, height, is_over, near_since), None
+
+
+def _touching(
+    bounds: FlightBounds, flight: Flight, time: float, place: np.ndarray, height: float
+) -> tuple[Flight, str | None]:
+    """A picture before which the ball may have touched the paddle: a new flight begins."""
+    near_since = float(flight.times[-1]) if flight.near_since is None else flight.near_since
+    if not bounds.may_rest and time - near_since > _LEAVING:
+        seconds = time - near_since
+        return flight, f"has been near the paddle for {seconds:.2g} s, where it bounces off"
+    return Flight(np.array([time]), place[None], height, True, near_since), None

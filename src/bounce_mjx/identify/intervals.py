@@ -1,0 +1,164 @@
+"""What a log says about the unknowns: estimates from resampled windows."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from bounce_mjx.identify.fit import Fit, Problem, eliminate, linearise
+from bounce_mjx.identify.unknowns import Layout
+
+_RESAMPLES = 400
+# Successive windows that are drawn together: what the model lacks is alike in neighbours.
+_BLOCK = 2
+# Largest leverage of a block, its share of the information along a direction: one with all of it
+# leaves no residual to correct.
+_LARGEST_LEVERAGE = 0.9
+# |J1 - J2| / |J1 + J2| of a window's two derivatives beyond which it has none.
+_DISAGREEMENT = 0.1
+
+
+class Certainty(NamedTuple):
+    """How certain the unknowns are."""
+
+    information: np.ndarray
+    """Of the log about them [P, P], without the prior: the inverse of their covariance, after the
+    starts are eliminated."""
+    changes: np.ndarray
+    """Of the estimate [B, P], in logs of resampled windows with a resampled prior."""
+
+    @property
+    def deviation(self) -> np.ndarray:
+        """Standard deviations [P] of the unknowns."""
+        return np.std(self.changes, axis=0)
+
+
+def certainty(
+    problem: Problem, fit: Fit, is_estimated: np.ndarray, is_chosen: np.ndarray | None = None
+) -> Certainty:
+    """The estimates that other logs of the robot would give, by a bootstrap (Efron 1979) over
+    blocks of windows, in the linearised problem.
+
+    In units of the prior's deviations, window s has the derivatives J_s [M, P] and the gradient
+    g_s = J_s' r_s, after its start is eliminated (`eliminate`). With the weights w_s of a resample
+    (of a Bayesian bootstrap, Rubin 1981: of exponential distribution, alike in a block), the
+    estimate moves by -(sum_s w_s A_s + I)^-1 (sum_s w_s g_s + x - m - e), where A_s is the window's
+    information, x - m the distance from the prior's mean, and e a draw of the prior: what no window
+    shows has the prior's spread. What the model lacks is in the residuals r_s, and so in the
+    spread.
+
+    *Information.* A bounce depends on where in a physics step it begins, which makes derivatives
+    noisy, and J_s' J_s would count their noise as information. J1 and J2, by central differences
+    of one and of two steps, have independent noise, so that A_s = (J1' J2 + J2' J1) / 2 has the
+    expectation without noise. Negative eigenvalues of a sum of them count as 0. A window whose J1
+    and J2 differ much has no derivative, and is left out. Angles are smooth: without a ball, A_s is
+    that of the mean of J1 and J2.
+
+    *Few windows.* A fit adapts to each block: its residuals have the covariance I - H_s in place
+    of I, where H_s = R' A_s R with (A + I)^-1 = R R' is the block's leverage. Its gradient is
+    (I - H_s)^-1 g_s, that of a fit without it (the jackknife, CR3 of Bell and McCaffrey 2002).
+
+    Args:
+      is_estimated: which unknowns [P] are at the minimum; no search has moved the others from their
+        prior mean, or from the number that was chosen for them.
+      is_chosen: those of the latter [P], which the log says nothing about; by default none.
+    """
+    layout = problem.layout
+    deviations, _, searched = problem.scale_starts()
+    size = len(fit.vector)
+    entries = np.flatnonzero(searched)
+    scale = layout.deviation
+    reach = deviations[entries]
+    vector = layout.interior(fit.vector, 2.0)
+    lines = [
+        linearise(problem, vector, fit.starts, np.arange(size), entries, fit.weights, step)
+        for step in (1.0, -1.0, 2.0, -2.0)
+    ]
+    central = [0.5 * (a.by_unknown + b.by_unknown) * scale for a, b in (lines[:2], lines[2:])]
+    reduced = eliminate(
+        problem.whiten(fit.predicted, fit.weights),
+        np.concatenate(central, axis=2),
+        np.mean([line.by_state for line in lines], axis=0) * reach,
+        (fit.starts - problem.windows.starts)[:, entries] / reach,
+    )
+    counts = ~(_has_no_derivative(reduced.informations, layout) & problem.windows.has_ball)
+    informations = _informations(reduced.informations, problem.windows.has_ball)
+    informations *= counts[:, None, None]
+    gradients = np.mean(np.split(reduced.gradients * counts[:, None], 2, axis=1), axis=0)
+    if is_chosen is not None:
+        informations[:, is_chosen] = 0.0
+        informations[:, :, is_chosen] = 0.0
+        gradients[:, is_chosen] = 0.0
+    changes = resample(informations, gradients, is_estimated, np.random.default_rng(0)) * scale
+    information = _positive(np.sum(informations, axis=0))
+    return Certainty(information / np.outer(scale, scale), changes)
+
+
+def _informations(products: np.ndarray, has_ball: np.ndarray) -> np.ndarray:
+    """A_s [S, P, P], from the products [S, 2 P, 2 P] of [J1, J2]."""
+    size = products.shape[1] // 2
+    cross = _symmetrise(products[:, :size, size:])
+    own = products[:, :size, :size] + products[:, size:, size:]
+    return np.where(has_ball[:, None, None], cross, 0.25 * own + 0.5 * cross)
+
+
+def resample(
+    informations: np.ndarray,
+    gradients: np.ndarray,
+    is_estimated: np.ndarray,
+    random: np.random.Generator,
+) -> np.ndarray:
+    """Changes [B, P] of the estimate, in units of the prior's deviations.
+
+    Args:
+      informations: A_s [S, P, P] of the windows.
+      gradients: g_s [S, P].
+      is_estimated: which unknowns [P] are at the minimum.
+    """
+    size = gradients.shape[1]
+    firsts = np.arange(0, len(gradients), _BLOCK)
+    informations = np.add.reduceat(informations, firsts, axis=0)
+    gradients = np.add.reduceat(gradients, firsts, axis=0)
+    values, vectors = np.linalg.eigh(_positive(np.sum(informations, axis=0)))
+    root = vectors / np.sqrt(values + 1.0)
+    leverage, turn = np.linalg.eigh(root.T @ informations @ root)
+    larger = 1.0 / (1.0 - np.clip(leverage, 0.0, _LARGEST_LEVERAGE))
+    inner = np.einsum("sij,sj,skj,sk->si", turn, larger, turn, gradients @ root)
+    # Back from R' g_s, as R is invertible.
+    wider = inner @ np.linalg.inv(root)
+    # The windows' gradients and the prior's are in balance at the minimum.
+    wider -= np.mean(wider, axis=0)
+    changes = np.empty((_RESAMPLES, size))
+    for b in range(_RESAMPLES):
+        weights = random.exponential(size=len(firsts))
+        information = _positive(np.einsum("s,sij->ij", weights, informations))
+        slope = weights @ wider - random.normal(size=size)
+        changes[b] = -np.linalg.solve(information + np.eye(size), slope)
+    # A log takes no knowledge away; and what no search has moved is as little known as before.
+    spread = np.maximum(np.std(changes, axis=0), 1e-12)
+    return changes * np.where(is_estimated, np.minimum(1.0, 1.0 / spread), 1.0 / spread)
+
+
+def _positive(matrix: np.ndarray) -> np.ndarray:
+    """A symmetric matrix [P, P] without its negative eigenvalues."""
+    values, vectors = np.linalg.eigh(matrix)
+    return (vectors * np.maximum(values, 0.0)) @ vectors.T
+
+
+def _has_no_derivative(informations: np.ndarray, layout: Layout) -> np.ndarray:
+    """In which windows [S] the two derivatives J1 and J2 differ, as where a ball meets the paddle's
+    edge; from the products [S, 2 P, 2 P] of [J1, J2].
+
+    The delay's variance does not count: near 0, its differences are one-sided and depend on their
+    step.
+    """
+    size = informations.shape[1] // 2
+    others = np.arange(size) != layout.slices["delay_variance"].start
+    cross = np.diagonal(informations[:, :size, size:], axis1=1, axis2=2)
+    squares = np.diagonal(informations, axis1=1, axis2=2)
+    both = 2.0 * np.sum(cross[:, others], axis=1)
+    total = np.sum(squares[:, np.tile(others, 2)], axis=1)
+    return total - both > _DISAGREEMENT**2 * (total + both)
+
+
+def _symmetrise(matrices: np.ndarray) -> np.ndarray:
+    return 0.5 * (matrices + np.swapaxes(matrices, -1, -2))
