@@ -375,7 +375,7 @@ COMMON_MISTAKES = {
     "a class": (
         "class Dribble(task.Task):",
         "class Drible(task.Task):",
-        "no subclass 'Dribble' of",
+        "there is no task 'dribble' .*--import the file",
     ),
     "a config": ("    Config = Config\n", "", "Dribble has no Config of its own"),
     "an import": (

@@ -3,7 +3,7 @@
 import importlib
 import importlib.metadata
 
-from bounce_mjx.config.user_code import class_of, own_name
+from bounce_mjx.config.user_code import class_of, own_name, own_names
 from bounce_mjx.errors import UserError, reason_of, shorten, suggest
 from bounce_mjx.task.task import Task
 from bounce_mjx.world.config import WorldConfig
@@ -32,10 +32,9 @@ def find_task(name: str) -> type[Task]:
         own = class_of(name, Task)
         if own is not None:
             return own
-        advice = suggest(name, known) or "give one of these, or --import the file of your own"
-        raise UserError(
-            f"there is no task {shorten(name)!r} (known: {', '.join(sorted(known))}); {advice}"
-        )
+        names = sorted({*known, *own_names(Task)})
+        advice = suggest(name, names) or "give one of these, or --import the file of your own"
+        raise UserError(f"there is no task {shorten(name)!r} (known: {', '.join(names)}); {advice}")
     module, _, attribute = known[name].partition(":")
     try:
         task = getattr(importlib.import_module(module), attribute)
