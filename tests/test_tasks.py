@@ -375,7 +375,7 @@ COMMON_MISTAKES = {
     "a class": (
         "class Dribble(task.Task):",
         "class Drible(task.Task):",
-        "there is no task 'dribble' .*--import the file",
+        "there is no task 'dribble' .*; did you mean drible?",
     ),
     "a config": ("    Config = Config\n", "", "Dribble has no Config of its own"),
     "an import": (
