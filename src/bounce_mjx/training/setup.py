@@ -119,6 +119,6 @@ def join_loops(*configs: WorldConfig) -> None:
     # One config of each model and engine.
     different = {}
     for c in configs:
-        different[c.physics, c.mjcf, c.physics_dt, c.robot, c.num_balls, c.friction] = c
+        different[c.physics, c.mjcf, c.physics_dt, c.robot, c.num_balls] = c
     if all(is_fused(world_model(c, visual=False), c.physics) for c in different.values()):
         os.environ["XLA_FLAGS"] = JOINED_LOOPS if flags is None else f"{flags} {JOINED_LOOPS}"

@@ -139,7 +139,7 @@ class RandomizationConfig(StrictModel):
     """Restitution of the ball on the paddle, in place of the model's, which is 0.85 for the
     project's own robot."""
     contact_duration: Annotated[
-        Sampled, physical("contact_stiffness", "duration", NUMBER, bounds=(1e-4, 0.05))
+        Sampled, physical("contact_stiffness", "duration", NUMBER, bounds=(1e-4, 0.015))
     ] = None
     """Half a period of the contact's spring, which is how long a bounce lasts, in place of the
     model's, which is 10 ms for the project's own robot, s; a real ball's is 1 ms or less. At least
