@@ -51,6 +51,7 @@ VALUES = {
     "ppo.critic_metrics": ["ball_xy_error"], "ppo.hidden_layers": [8], "ppo.critic_layers": [8],
     "algorithm": "own",
     "ppo.min_learning_rate": 2e-5, "env.randomization.camera_rate": [60, 90],
+    "env.randomization.ball_start": [0.0, 0.05], "env.randomization.joint_start": [-0.05, 0.05],
     "env.randomization.command_interval": [1, 2], "env.physics": "mjx", "ppo.decay_steps": 1000,
 }  # fmt: skip
 
@@ -177,7 +178,7 @@ def of_run(config: TrainConfig) -> tuple:
         evaluators = Evaluators(config, job.env, job.trainer.mesh, job.pool)
         evaluators.final(None)
         seeds, task = str(job.trainer._seeds), type(job.env.task).__name__
-    steps = job.eval_steps, job.save_steps
+    steps = job.eval_steps, job.save_steps, config.keep_checkpoints
     return blocks, steps, evaluators._chunk, measured, seeds, job.run.parent, task
 
 

@@ -1157,7 +1157,7 @@ def test_the_way_home_does_not_leave_the_box() -> None:
 def is_astray(changes: dict[str, Any], offset: float, time_constant: float) -> bool:
     """Whether an arm under a policy of other metadata is stopped on its way home from 0.2 rad, or
     in the play: one whose joints are beside their commands (rad), and behind them (s)."""
-    policy = changed_policy("robust", **changes)
+    policy = changed_policy("robust_small", **changes)
     arm = policy.supervise(500)
     home = np.array(policy.metadata.default_joint_angles)
     place = paddle_position(policy.metadata, home)

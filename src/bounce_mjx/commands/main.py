@@ -10,7 +10,6 @@ import os
 import sys
 from collections.abc import Sequence
 
-from bounce_mjx.config.user_code import run_imports
 from bounce_mjx.errors import UserError, exit_on_user_error, needed, suggest
 from bounce_mjx.interrupt import end_on_ctrl_c
 from bounce_mjx.resources import VERSION
@@ -75,6 +74,12 @@ def main(args: Sequence[str] | None = None) -> None:
             os.environ["MUJOCO_GL"] = opengl
         with needed(f"bounce-mjx {name}", "bounce_mjx"):
             command = importlib.import_module(f"bounce_mjx.commands.{name}")
+        try:
+            from bounce_mjx.config.user_code import run_imports
+        except ImportError:
+            # A robot's computer has no pydantic: doctor, which runs there, needs no code of a user.
+            command.main(rest)
+            return
         # The user's own tasks and algorithms, which then have names.
         _, _, *words = run_imports(["bounce-mjx", name, *rest])
         command.main(words)
