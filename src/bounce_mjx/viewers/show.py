@@ -19,6 +19,7 @@ from bounce_mjx.viewers.options import MAX_ENVS, Address, PageStart, ViewerOptio
 from bounce_mjx.viewers.simulation import Controller, Simulation
 from bounce_mjx.viewers.world import reset_ranges, with_sliders
 from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.model import world_model
 
 
 class Shown(NamedTuple):
@@ -145,6 +146,12 @@ def _serve(
         run_page(server, simulation, start, lambda: stop.requested, say, options.seconds)
 
 
+def _robot(config: WorldConfig) -> bytes:
+    """What tells the robots of two policies apart; their balls may be hollow or solid, and rub."""
+    with_same_ball = config.model_copy(update={"ball_inertia": None, "friction": None})
+    return fingerprint(world_model(with_same_ball, visual=False))
+
+
 def _simulate(
     shown: Sequence[Shown], each: int, seed: int, commands: dict[str, float], has_sliders: bool
 ) -> Simulation:
@@ -155,7 +162,7 @@ def _simulate(
       has_sliders: whether sliders change the world and the number of robots.
     """
     envs = [Env(with_sliders(one.config) if has_sliders else one.config) for one in shown]
-    if len({fingerprint(env.mj_model) for env in envs}) > 1:
+    if len({_robot(env.config) for env in envs}) > 1:
         raise UserError("the policies have different robots or time steps; show one at a time")
     num_envs = each
     # The page's slider goes up to the simulated number. On a CPU, MJX is too slow for 16.
