@@ -296,7 +296,7 @@ def test_the_first_picture_opens_opengl(monkeypatch) -> None:
         raise UserError("no OpenGL")
 
     monkeypatch.setattr(offscreen, "choose_opengl", refuse)
-    single = environments.TaskEnv(render_mode="rgb_array", episode_seconds=0.01 * LIMIT)
+    single = environments.make_env(render_mode="rgb_array", episode_seconds=0.01 * LIMIT)
     vector = make_vec(render_mode="rgb_array")
     for env in (single, vector):
         env.reset(seed=0)
