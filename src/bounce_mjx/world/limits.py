@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import functools
 import operator
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from bounce_mjx.errors import UserError
-from bounce_mjx.lazy import np
 
 if TYPE_CHECKING:
     import jax
@@ -47,21 +47,31 @@ def is_beyond(limits: Limits, ball: Any, target: Any = None) -> jax.Array:
       ball: position [..., 3], m.
       target: position [..., 3] of what the limits are relative to, m; None if none is.
     """
-    return functools.reduce(operator.or_, (_is_beyond(limit, ball, target) for limit in limits))
+    ball_coordinates = _coordinates(ball)
+    target_coordinates = None if target is None else _coordinates(target)
+    exceeded = [_is_beyond(limit, ball_coordinates, target_coordinates) for limit in limits]
+    return functools.reduce(operator.or_, exceeded)
 
 
-def _is_beyond(limit: Limit, ball: Any, target: Any) -> Any:
+def _coordinates(position: Any) -> tuple[Any, Any, Any]:
+    return position[..., 0], position[..., 1], position[..., 2]
+
+
+def _is_beyond(limit: Limit, ball: Sequence[Any], target: Sequence[Any] | None) -> Any:
+    """Of coordinates, which are numbers or arrays."""
+    x, y, z = ball
     value = limit.value
     if limit.kind == "lowest":
-        return ball[..., 2] < value
+        return z < value
     if limit.kind == "aside":
-        return (abs(ball[..., 0]) > value) | (abs(ball[..., 1]) > value)
+        return (abs(x) > value) | (abs(y) > value)
+    target_x, target_y, target_z = target
     if limit.kind == "above":
-        return ball[..., 2] > target[..., 2] + value
-    offset = ball - target
+        return z > target_z + value
     if limit.kind == "below":
-        return offset[..., 2] < -value
-    return (offset * offset).sum(axis=-1) > value**2
+        return z - target_z < -value
+    aside = (x - target_x) ** 2 + (y - target_y) ** 2
+    return aside + (z - target_z) ** 2 > value**2
 
 
 class HeightLimits(NamedTuple):
@@ -127,8 +137,8 @@ def check_within(limits: Limits, starts: Any, targets: Any, setting: str) -> Non
       UserError: one of the starts is beyond one of the limits, for one of the targets.
     """
     for limit in limits:
-        for start in np.asarray(starts, float):
-            if any(_is_beyond(limit, start, target) for target in np.asarray(targets, float)):
+        for start in starts:
+            if any(_is_beyond(limit, start, target) for target in targets):
                 position = ", ".join(f"{coordinate:.4g}" for coordinate in start)
                 raise UserError(
                     f"{limit.name} is {limit.value:.4g} m, so an episode ends where it starts, at "
