@@ -97,11 +97,6 @@ class Config(task.WorldConfig):
     )
     """The quantities that the policy sees: what a robot with a camera measures, and how far the
     targets lead, to which an action adds."""
-    randomization: task.RandomizationConfig = task.RandomizationConfig(
-        contact_duration=(0.006, 0.01)
-    )
-    """The world that each episode samples. A real ball leaves in less than 1 ms: a policy that has
-    met contacts of one length alone drops balls that bounce faster."""
     reward: Rewards = Rewards()
     """The reward terms."""
 
