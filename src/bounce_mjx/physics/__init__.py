@@ -1,4 +1,5 @@
-"""Physics engines behind one interface: `fused` (straight-line arithmetic) and `mjx`."""
+"""Physics engines behind one interface, `fused` (straight-line arithmetic) and `mjx`; and MuJoCo's
+C engine with the same friction (`CEngine`)."""
 
 from bounce_mjx.physics.c_engine import CEngine
 from bounce_mjx.physics.control import Control, servo_targets

@@ -25,8 +25,15 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from bounce_mjx.physics.scalars import Scalar, inverse_root, minimum, mul, select
-from bounce_mjx.robot.model import Addresses, contact_pairs
+from bounce_mjx.physics.scalars import (
+    Scalar,
+    inverse_root,
+    minimum,
+    mul,
+    quaternion_matrix,
+    select,
+)
+from bounce_mjx.robot.model import Addresses, balls_of_pair, contact_pairs
 
 # Square of a slip that counts as none, m^2/s^2: that of 10 nm/s. The derivative of the impulse has
 # the inverse square of the compliance, which float32 must hold.
@@ -48,13 +55,10 @@ class Grip(NamedTuple):
 def grips(mj_model: mujoco.MjModel, addresses: Addresses) -> tuple[Grip, ...]:
     """The contact pairs among the balls and the paddle that have sliding friction (`condim` over
     1), in the order of their impulses: each ball with the paddle, then those of two balls."""
-    ball_of_geom = {ball.geom: i for i, ball in enumerate(addresses.balls)}
     with_friction = []
     for pair in contact_pairs(mj_model, addresses):
         if mj_model.pair_dim[pair] > 1:
-            geoms = (int(mj_model.pair_geom1[pair]), int(mj_model.pair_geom2[pair]))
-            balls = sorted(ball_of_geom[geom] for geom in geoms if geom in ball_of_geom)
-            with_friction.append(Grip(pair, tuple(balls)))
+            with_friction.append(Grip(pair, balls_of_pair(mj_model, addresses, pair)))
     return tuple(sorted(with_friction, key=lambda grip: (len(grip.balls), grip.balls)))
 
 
@@ -128,14 +132,7 @@ def ball_jacobian(quaternion: Array, lever: Array, xp: Any) -> Array:
       lever: the point [3] from the ball's centre, in the world, m.
       xp: `numpy` or `jax.numpy`.
     """
-    w, x, y, z = quaternion
-    rotation = xp.array(
-        [
-            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-            [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
-        ]
-    )
+    rotation = xp.array(quaternion_matrix(tuple(quaternion)))
     a, b, c = lever
     spin_to_velocity = xp.array([[0.0, c, -b], [-c, 0.0, a], [b, -a, 0.0]])
     return xp.concatenate([np.eye(3), spin_to_velocity @ rotation], axis=1)

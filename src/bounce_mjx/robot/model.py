@@ -318,6 +318,13 @@ def contact_pairs(mj_model: mujoco.MjModel, addresses: Addresses) -> list[int]:
     return [] if first is None else [first, *others]
 
 
+def balls_of_pair(mj_model: mujoco.MjModel, addresses: Addresses, pair: int) -> tuple[int, ...]:
+    """The balls of a contact pair, in order: one that touches the paddle, or two."""
+    ball_of_geom = {ball.geom: i for i, ball in enumerate(addresses.balls)}
+    geoms = (int(mj_model.pair_geom1[pair]), int(mj_model.pair_geom2[pair]))
+    return tuple(sorted(ball_of_geom[geom] for geom in geoms if geom in ball_of_geom))
+
+
 def scatter(rest: np.ndarray, places: Sequence[int], values: jax.Array) -> jax.Array:
     """The numbers `rest` [m], such as `qpos0`, with the values [n] at some places."""
     # One scalar per entry, which XLA fuses with the physics; it would not fuse an indexed update.

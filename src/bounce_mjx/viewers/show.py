@@ -162,7 +162,8 @@ def _simulate(
       has_sliders: whether sliders change the world and the number of robots.
     """
     envs = [Env(with_sliders(one.config) if has_sliders else one.config) for one in shown]
-    if len({_robot(env.config) for env in envs}) > 1:
+    # One policy needs no comparison, which compiles its model again.
+    if len(envs) > 1 and len({_robot(env.config) for env in envs}) > 1:
         raise UserError("the policies have different robots or time steps; show one at a time")
     num_envs = each
     # The page's slider goes up to the simulated number. On a CPU, MJX is too slow for 16.

@@ -34,6 +34,7 @@ from bounce_mjx.physics.scalars import (
 from bounce_mjx.robot.model import (
     Addresses,
     BallAddresses,
+    balls_of_pair,
     find_addresses,
     fingerprint,
     link_bodies,
@@ -403,12 +404,10 @@ def _read_servo(model: EditedModel, actuator: int, joint: int) -> Servo:
 def _read_contacts(model: EditedModel) -> tuple[ContactModel, ...]:
     """The contacts in the order of `FusedModel.contacts`."""
     mj_model = model.mj_model
-    ball_of_geom = {ball.geom: i for i, ball in enumerate(model.addresses.balls)}
     contacts = []
     for pair in range(mj_model.npair):
-        geoms = (int(mj_model.pair_geom1[pair]), int(mj_model.pair_geom2[pair]))
-        balls = sorted(ball_of_geom[geom] for geom in geoms if geom in ball_of_geom)
-        contacts.append(_read_contact(model, pair, tuple(balls)))
+        balls = balls_of_pair(mj_model, model.addresses, pair)
+        contacts.append(_read_contact(model, pair, balls))
 
     def order(contact: ContactModel) -> tuple:
         # Those of one ball are with the paddle.
