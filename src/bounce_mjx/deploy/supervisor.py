@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from bounce_mjx.deploy.box import Box, checked_box
 from bounce_mjx.deploy.clock import advance
 from bounce_mjx.deploy.controller import Controller, Memory
 from bounce_mjx.deploy.driver import LARGEST, Driver
@@ -28,14 +29,11 @@ from bounce_mjx.deploy.samples import Measurements
 from bounce_mjx.errors import UserError
 
 State = Literal["homing", "ready", "running", "braking", "stopped"]
-Box = tuple[Sequence[float], Sequence[float]]
 
 # Of the commands at home, rad.
 _HOME_TOLERANCE = 2e-3
 # On the way home, rad/s.
 _HOME_SPEED = 0.3
-# Of an end of a box from the base, m.
-_FARTHEST_END = 30.0
 # In which an arm comes to rest where its commands do, s.
 _SETTLING = 1.0
 # What the first angles may be off the start pose, where nobody says where the arm rests, beside the
@@ -133,7 +131,7 @@ class Supervisor:
                 raise UserError(f"{name} is {value!r}; give a number above 0 and at most {most:g}")
         self._max_picture_age = age
         self._max_steps_late = max_steps_late
-        self._box = _checked_box(box)
+        self._box = checked_box(box)
         self._has_box = bool(np.any(np.isfinite(self._box)))
         self._watch = Watch(self._metadata)
         self._host_start: float | None = None
@@ -527,23 +525,6 @@ class Supervisor:
             return -math.inf
         paddle = paddle_position(self._metadata, joint_angles)
         return float(np.max([self._box[0] - paddle, paddle - self._box[1]]))
-
-
-def _checked_box(box: Any) -> np.ndarray:
-    """The ends [2, 3] of a box, m; UserError if it is none."""
-    try:
-        ends = np.array(box, float)
-    except (TypeError, ValueError):
-        ends = np.zeros(0)
-    if ends.shape != (2, 3) or not np.all(ends[0] < ends[1]):
-        raise UserError(f"the box is {box}; give its lowest and its highest x, y and z, m")
-    farthest = np.max(np.abs(ends), where=np.isfinite(ends), initial=0.0)
-    if farthest > _FARTHEST_END:
-        raise UserError(
-            f"the box is {box}, and ends {farthest:g} from the base, but no arm reaches "
-            f"{_FARTHEST_END:g} m; give metres, or inf for an end that is not there"
-        )
-    return ends
 
 
 def _fault_of(error: Exception) -> tuple[str, str]:
