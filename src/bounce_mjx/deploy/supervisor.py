@@ -11,7 +11,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from bounce_mjx.deploy.box import Box, checked_box
-from bounce_mjx.deploy.clock import advance
+from bounce_mjx.deploy.clock import MOST_LATE, Clock, advance
 from bounce_mjx.deploy.controller import Controller, Memory
 from bounce_mjx.deploy.driver import LARGEST, Driver
 from bounce_mjx.deploy.faults import Fault, Followed, Watch, check_balls, picture_age
@@ -355,7 +355,9 @@ class Supervisor:
 
     def _go_home(self, progress: Progress, measured: Measurements) -> tuple[Progress, int]:
         """A step of the way home, or at home."""
+        before = progress.memory.seen.clock
         seen, measured, steps = self._controller.samples.take(progress.memory.seen, measured)
+        self._check_pace(before, seen.clock)
         progress = progress._replace(memory=progress.memory._replace(seen=seen))
         if steps == 0:
             return progress, 0
@@ -419,9 +421,10 @@ class Supervisor:
         if late > self._max_steps_late:
             raise Fault("late_step", f"a control step came {late} steps late")
         memory, measured, steps = controller.take(progress.memory, measured)
+        seen = memory.seen
+        self._check_pace(clock, seen.clock)
         if steps == 0:
             return progress._replace(memory=memory), 0
-        seen = memory.seen
         if "ball_position" in measured:
             age = seen.clock.now - seen.picture.taken
             if "ball_age" in measured:
@@ -433,6 +436,16 @@ class Supervisor:
         memory = controller.act(memory, measured, steps)
         self._check_box(controller.motion.braking_path(memory.course))
         return progress._replace(memory=memory, followed=followed), steps
+
+    def _check_pace(self, before: Clock, clock: Clock) -> None:
+        """Raises Fault for a loop that is slower than the control steps: its arm would rest after
+        each, and neither play nor get home."""
+        if clock.late > MOST_LATE:
+            raise Fault(
+                "late_step",
+                f"most samples come late, the last one {1e3 * (clock.now - before.now):.0f} ms "
+                f"after the one before; call commands every {1e3 * self._dt:g} ms",
+            )
 
     def _brake(self, progress: Progress, measurements: Mapping[str, Any]) -> tuple[Progress, int]:
         """A step in which the commands brake or rest, whatever is measured."""
