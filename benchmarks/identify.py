@@ -39,7 +39,7 @@ _SPIKE = 0.5
 # Terms of the sensors, which are the same for all robots, and disturbances.
 _FIXED = (
     "camera_rate frame_drop ball_position_noise joint_velocity_noise push_speed push_interval "
-    "command_interval ball_start"
+    "goal_interval ball_start"
 ).split()
 _CAMERA_RATE = 120.0
 _LOST = 0.05

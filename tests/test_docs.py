@@ -190,7 +190,7 @@ def known_flags() -> set[str]:
                 flags |= set(cli.flags_of(fields_in(member)))
     import_code(CHECKOUT / "examples/dribble_task.py")
     for task in (Bounce, find_task("dribble")):
-        flags |= {f"--{name}".replace("_", "-") for name in task.Config().commands}
+        flags |= {f"--{name}".replace("_", "-") for name in task.Config().goals}
     return flags
 
 

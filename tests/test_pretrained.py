@@ -98,7 +98,7 @@ def test_each_task_has_a_policy(task: str, tmp_path: Path, monkeypatch) -> None:
         assert chosen == best_checkpoint(folder)
     assert (folder / f"{task}.onnx").read_bytes() == export_onnx(chosen)
     policy = load_policy(task)
-    assert set(policy.metadata.commands) == set(find_task(task).Config().commands)
+    assert set(policy.metadata.goals) == set(find_task(task).Config().goals)
 
 
 @pytest.mark.parametrize("arm", ARM_POLICIES)

@@ -355,7 +355,7 @@ def test_the_source_is_what_set_the_value_that_counts(folder: Path) -> None:
     config = read_command("track --warm-start track".split()).config
     assert config.sources["task"] == "flags"
     (folder / "world.yaml").write_text(
-        "env: {randomization: {command_interval: [2.0, 4.0]}}\nsources: {randomization: A test.}"
+        "env: {randomization: {goal_interval: [2.0, 4.0]}}\nsources: {randomization: A test.}"
     )
     # A flag has a part of a mapping that lies first in the preset's, which a file continues.
     (folder / "shares.yaml").write_text(

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-from bounce_mjx.commands.task_commands import parse_with_commands
+from bounce_mjx.commands.goals import parse_with_goals
 from bounce_mjx.commands.which_policy import (
     MirrorRobot,
     OnePolicy,
@@ -38,8 +38,8 @@ class EvalCommand(WhichPolicy):
     seed: NonNegativeInt = evaluation.DEFAULT_SEED
     """Seed of the resets."""
     nominal: bool = False
-    """Evaluate without domain randomisation, and with the task's default commands where the policy
-    was trained with them. Without this flag, each episode samples its world and commands, as in
+    """Evaluate without domain randomisation, and with the task's default goals where the policy
+    was trained with them. Without this flag, each episode samples its world and goals, as in
     training."""
     contacts: bool = False
     """Also count contacts of the arm with itself and the floor, which the physics leaves out, in
@@ -59,7 +59,7 @@ class EvalCommand(WhichPolicy):
 
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 0 if no result fails, 1 if one does, 2 on a mistake."""
-    command, given_commands = parse_with_commands(EvalCommand, args, prog="bounce-mjx eval")
+    command, given_goals = parse_with_goals(EvalCommand, args, prog="bounce-mjx eval")
     from bounce_mjx.evaluation.contacts import arm_contacts, describe_contacts
     from bounce_mjx.evaluation.failures import associations, failures_of
     from bounce_mjx.evaluation.limits import describe_limits, limit_shares
@@ -81,7 +81,7 @@ def main(args: Sequence[str]) -> None:
     config = command.config_of(checkpoint, command.robot, command.world, command.randomization)
     if command.limits and config.env.robot.limits.velocity is None:
         raise UserError("the policy's arm has no command limits (env.robot.limits); omit --limits")
-    task_commands = given_commands.checked(config.env)
+    goals = given_goals.checked(config.env)
     set_up_jax(evaluation.on_engine(config.env, command.physics))
     checkpoint, policy, actor = read_actor(checkpoint, config)
     # Beside what is no run, nothing is written.
@@ -93,7 +93,7 @@ def main(args: Sequence[str]) -> None:
         seed=command.seed,
         physics=command.physics,
         nominal=command.nominal,
-        commands=task_commands,
+        goals=goals,
     )
     checks = []
     if command.contacts:
@@ -125,7 +125,7 @@ def main(args: Sequence[str]) -> None:
             "physics": evaluated.engine,
             **report.to_dict(),
             "seed": command.seed,
-            "commands": task_commands,
+            "goals": goals,
             "nominal": command.nominal,
             "world": None if command.world is None else str(command.world),
             "randomization": {

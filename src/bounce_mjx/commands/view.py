@@ -57,4 +57,4 @@ def main(args: Sequence[str]) -> None:
     env = observing(env) if command.actions == "mirror" else env
     set_up_jax(env)
     shown = Shown(env, make_controller[command.actions], _TITLES[command.actions])
-    show([shown], command.viewing, commands={}, console=stdout())
+    show([shown], command.viewing, goals={}, console=stdout())

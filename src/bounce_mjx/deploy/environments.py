@@ -130,7 +130,7 @@ def refuse_warmup(config: WorldConfig, title: str) -> None:
     if config.randomization.warmup_steps:
         raise UserError(
             f"{title}: the randomisation has warmup_steps, but its ranges do not grow here; set "
-            "warmup_steps to 0 and first_command_range to 1, or train with TorchVectorEnv"
+            "warmup_steps to 0 and first_goal_range to 1, or train with TorchVectorEnv"
         )
 
 

@@ -273,8 +273,8 @@ def _draw_heights(axes: Axes, env: Env, recording: Recording) -> None:
     time = env.dt * (1 + np.arange(steps))
     levels = []
     for step in range(steps):
-        command = {name: float(values[step, 0]) for name, values in recording.command.items()}
-        levels.append(env.task.levels(command))
+        goal = {name: float(values[step, 0]) for name, values in recording.goal.items()}
+        levels.append(env.task.levels(goal))
     for i, name in enumerate(levels[0]):
         heights = [level[name] for level in levels]
         constant = f" {heights[0]:.2f} m" if len(set(heights)) == 1 else ""

@@ -95,7 +95,7 @@ def trained_in(trained: WorldConfig, world: str | os.PathLike | None) -> WorldCo
     if world == NOMINAL:
         return trained.model_copy(update={"randomization": RandomizationConfig()})
     if world == TRAINING:
-        ended = {"warmup_steps": 0, "first_command_range": 1.0}
+        ended = {"warmup_steps": 0, "first_goal_range": 1.0}
         randomization = trained.randomization.model_copy(update=ended)
         return trained.model_copy(update={"randomization": randomization})
     return in_named_world(trained, Path(world))[0]

@@ -37,8 +37,8 @@ class Episodes(NamedTuple):
     """Greatest values over the steps of what `Task.tally` gave."""
     lasted: np.ndarray
     """Whether the episode lasted until its time limit, bool."""
-    commands: dict[str, tuple[float, float]]
-    """The range of each command in these episodes."""
+    goals: dict[str, tuple[float, float]]
+    """The range of each goal in these episodes."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -115,7 +115,7 @@ class Run:
         """Measures the results of the best checkpoint, as `bounce-mjx eval` does.
 
         Args:
-          options: fields of `EvaluationOptions`, such as episodes=64, or commands={"target_height":
+          options: fields of `EvaluationOptions`, such as episodes=64, or goals={"target_height":
             0.5}.
 
         Raises:
