@@ -478,9 +478,7 @@ def simulators():
         world = benchmark.WORLDS["60 + 30 ms"]
         _, path = benchmark.evaluate("robust", name, world, 1, seed)
         with Renderer(env, 280, 280, zoom=1.3) as renderer:
-            pictures = [
-                Image.fromarray(renderer.render(qpos, goal)) for qpos in path[:steps:every]
-            ]
+            pictures = [Image.fromarray(renderer.render(qpos, goal)) for qpos in path[:steps:every]]
         for picture in pictures:
             ImageDraw.Draw(picture).text((10, 250), title, "white", ImageFont.load_default(20))
         panels.append(pictures)

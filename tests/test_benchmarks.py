@@ -19,7 +19,7 @@ from bounce_mjx.evaluation.robustness import ConditionOutcome
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.resources import POLICIES, resource_path
 from bounce_mjx.runs.config import load_run_config
-from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.runs.layers import read_preset
 
 
 def script(name: str):

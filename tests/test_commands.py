@@ -19,7 +19,7 @@ from bounce_mjx.config.command_line import flags_of, parse
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import choose_checkpoint
-from bounce_mjx.runs.settings import Choice, read_layers, read_preset
+from bounce_mjx.runs.layers import Choice, read_layers, read_preset
 from bounce_mjx.training.command import fields_of_command
 from bounce_mjx.viewers.simulation import Simulation
 from tiny_runs import STEPS, TINY, TRAIN_SCRIPT, shared_run

@@ -28,8 +28,8 @@ from bounce_mjx.runs.folders import (
     is_users_run,
     pretrained_checkpoint,
 )
+from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.runs.progress import load_results
-from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.runs.worlds import trained_in
 from bounce_mjx.task.registry import find_task
 

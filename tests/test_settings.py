@@ -22,7 +22,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.runs import presets
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import create_run, pretrained_checkpoint
-from bounce_mjx.runs.settings import Choice, read_layers, read_preset
+from bounce_mjx.runs.layers import Choice, read_layers, read_preset
 from bounce_mjx.training import job
 from bounce_mjx.training.command import read_command
 from bounce_mjx.training.run import notes_on_intervals, notes_on_starts, notes_on_worlds

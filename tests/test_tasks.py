@@ -31,9 +31,9 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.learning.metrics import rollout_metrics, step_metrics
 from bounce_mjx.runs import checkpoints
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
-from bounce_mjx.runs.files import seal
 from bounce_mjx.runs.folders import create_run, find_checkpoint
-from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.runs.layers import read_preset
+from bounce_mjx.runs.storage import seal
 from bounce_mjx.task import paths, registry
 from bounce_mjx.task.registry import find_task, task_name
 from bounce_mjx.training.command import read_command
@@ -378,6 +378,18 @@ COMMON_MISTAKES = {
         "there is no task 'dribble' .*; did you mean drible?",
     ),
     "a config": ("    Config = Config\n", "", "Dribble has no Config of its own"),
+    "an old field": ('step.goal["apex"]', 'step.command["apex"]', "AttributeError.* mean goal"),
+    "an old type": (
+        "task.Goal(low",
+        "task.Command(low",
+        r"the goals \(mine.py, line 79\) end in .* 'Command' \(did you mean Goal",
+    ),
+    "an old method": ("def goals(", "def commands(", "Dribble has commands, which is goals today"),
+    "an old import": (
+        "from bounce_mjx import task",
+        "from bounce_mjx import task\nfrom bounce_mjx.task.bounce import BounceConfig",
+        "in line 10: cannot import name 'BounceConfig' .*did you mean Config",
+    ),
     "an import": (
         "import jax.numpy as jnp",
         "import jax.numpi as jnp",
@@ -407,7 +419,7 @@ def test_a_common_mistake_in_a_task_is_one_sentence(mistake: str, tmp_path: Path
 
     with pytest.raises(UserError, match=words) as refused:
         trace()
-    about_a_value = ("a curve", "a group", "an unseen", "a class", "a config")
+    about_a_value = ("a curve", "a group", "an unseen", "a class", "a config", "an old method")
     assert ("line " in str(refused.value)) == (mistake not in about_a_value)
 
 

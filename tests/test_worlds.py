@@ -10,15 +10,17 @@ from bounce_mjx.commands.train import read_command
 from bounce_mjx.config.settings import merged
 from bounce_mjx.config.validation import validate
 from bounce_mjx.deploy.export import policy_metadata
+from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.suite import load_suite
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.config import LimitsConfig, RobotConfig
 from bounce_mjx.robot.model import add_balls, scene_spec
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.settings import read_preset
-from bounce_mjx.runs.worlds import in_named_world, robot_in_world
+from bounce_mjx.runs.layers import read_preset
+from bounce_mjx.runs.worlds import env_of_task, in_named_world, robot_in_world, trained_in
 from bounce_mjx.task.catch import Catch
+from bounce_mjx.task.registry import find_task
 from bounce_mjx.world.config import ActionConfig
 from bounce_mjx.world.model import model_nominals
 from bounce_mjx.world.named import read_world
@@ -234,3 +236,14 @@ def test_a_world_of_a_robot_brings_its_limits_to_a_policy() -> None:
     config = trained.model_copy(update={"env": trained.env.model_copy(update=measured)})
     with pytest.raises(UserError, match="ur5e_rtde.*action.base"):
         in_named_world(config.env, Path("ur5e_rtde"))
+
+
+def test_a_named_world_is_for_a_ball_on_the_paddle_too() -> None:
+    """How well a person drops a ball is nothing to one that lies on the paddle."""
+    for task, ball_start in (("balance", None), ("catch", (-0.03, 0.03))):
+        config = env_of_task(find_task(task), world="fast_servo")
+        Env(config)
+        assert config.randomization.ball_start == ball_start
+        assert config.randomization.action_latency is not None
+        trained = trained_in(find_task(task).Config(), "fast_servo")
+        assert trained.randomization.ball_start == ball_start

@@ -69,8 +69,8 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.reports.figures import image
     from bounce_mjx.reports.tables import details_line, results_table
     from bounce_mjx.runs.checkpoints import read_actor
-    from bounce_mjx.runs.files import check_output, to_json, write_output
     from bounce_mjx.runs.folders import is_users_run
+    from bounce_mjx.runs.storage import check_output, to_json, write_output
     from bounce_mjx.training.setup import set_up_jax
 
     check_output(command.json_file, "--json")

@@ -117,6 +117,7 @@ class Balance(task.Task):
     curves = (task.Curve("task/error", "error", title="ball to point, cm", scale=100.0),)
     num_draws = 4
     ball_thrown = False
+    ball_dropped = False
 
     # The start.
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 from bounce_mjx.config.places import where_made
 from bounce_mjx.config.settings import is_finite
-from bounce_mjx.errors import UserError, shorten
+from bounce_mjx.errors import RENAMED, UserError, shorten
 from bounce_mjx.lazy import jax, jnp, np
 from bounce_mjx.task.results import Episodes, Figure, Result
 from bounce_mjx.world.config import WorldConfig
@@ -218,6 +218,9 @@ class Task:
     near it."""
     ball_thrown: ClassVar[bool] = True
     """Whether the ball may start elsewhere than over the paddle."""
+    ball_dropped: ClassVar[bool] = True
+    """Whether the ball starts in the air, where a person lets go of it; of a ball that lies on the
+    paddle, a named world's `ball_start` says nothing."""
     num_draws: ClassVar[int] = 0
     """Random numbers that a reset samples for the task."""
     critic_metrics: ClassVar[tuple[str, ...]] = ()
@@ -238,6 +241,13 @@ class Task:
                 f"the Config of the task {cls.__name__} is {shorten(repr(cls.Config))}; give a "
                 "class that extends task.WorldConfig"
             )
+        for kind in (cls, cls.Config):
+            overridden = [name for name in RENAMED if hasattr(kind, RENAMED[name])]
+            for name in vars(kind).keys() & set(overridden):
+                raise UserError(
+                    f"the task {cls.__name__} has {name}, which is {RENAMED[name]} today and would "
+                    "not be called; rename it"
+                )
         owner = vars(cls.Config).get("task")
         # The cell of a notebook may run again.
         if owner and (owner.__module__, owner.__qualname__) != (cls.__module__, cls.__qualname__):

@@ -35,8 +35,8 @@ from bounce_mjx.physics.convergence import solver_warning
 from bounce_mjx.resources import VERSION
 from bounce_mjx.runs import checkpoints, folders
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.files import writable
 from bounce_mjx.runs.progress import PATIENCE, Progress, are_solved
+from bounce_mjx.runs.storage import writable
 from bounce_mjx.training import events, faults, hosts
 from bounce_mjx.training.clock import Clock
 from bounce_mjx.training.evaluators import Evaluators
@@ -124,7 +124,7 @@ def open_job(
     networks = checkpoints.read_start(config, env) if is_warm else None
     # Before, a signal ends the process by its default action.
     stop = stack.enter_context(StopRequest())
-    run = _make_run(config) if resume is None else folders.find_run(resume)
+    run = _make_run(config) if resume is None else folders.run_of(resume)
     job = Job(
         config=config,
         env=env,

@@ -25,8 +25,8 @@ from bounce_mjx.resources import POLICIES
 from bounce_mjx.runs import folders
 from bounce_mjx.runs.checkpoints import read_actor
 from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.layers import FLAGS, PYTHON, Layers, layers_on
 from bounce_mjx.runs.progress import load_results
-from bounce_mjx.runs.settings import FLAGS, PYTHON, Layers, layers_on
 from bounce_mjx.runs.start import find_start
 from bounce_mjx.task.registry import task_name
 from bounce_mjx.task.task import Task

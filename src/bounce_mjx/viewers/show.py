@@ -12,7 +12,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.robot.model import fingerprint
-from bounce_mjx.runs.files import check_output, write_output
+from bounce_mjx.runs.storage import check_output, write_output
 from bounce_mjx.viewers.film import FilmPlayer
 from bounce_mjx.viewers.native import has_display, show_window
 from bounce_mjx.viewers.options import MAX_ENVS, Address, PageStart, ViewerOptions

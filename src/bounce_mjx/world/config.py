@@ -11,9 +11,9 @@ import pydantic
 from pydantic import Field
 
 from bounce_mjx.config import settings
-from bounce_mjx.config.places import where_made
+from bounce_mjx.config.places import where_made, where_raised
 from bounce_mjx.config.settings import is_finite
-from bounce_mjx.errors import UserError, shorten
+from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.robot.config import NEED_SITE, RobotConfig, Vector, is_packaged
 from bounce_mjx.world.limits import Limits
 from bounce_mjx.world.observation import ObservationConfig, ObservationLayout
@@ -328,6 +328,10 @@ class WorldConfig(WorldSettings):
             goals = self.goals
         except UserError as error:
             raise ValueError(str(error)) from error
+        except Exception as error:
+            place = where_raised(error)
+            text = f"{type(error).__name__}: {shorten(reason_of(error), 300)}"
+            raise ValueError(f"the goals{place} end in {text}; correct them") from error
         if self.task is None or goals:
             return self
         for name, value in (
