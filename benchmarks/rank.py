@@ -149,7 +149,7 @@ def measure_nominal(
 ) -> Figures:
     """The task's own figures in the nominal world, and the median of the hits of bouncing: in
     episodes without a time limit, else in episodes of the usual length."""
-    env = Env(trained.model_copy(update={"randomization": RandomizationConfig()}))
+    env = Env(trained.in_world(RandomizationConfig()))
     goals = neutral_goals(trained)
     ranges = {name: (jnp.array([low]), jnp.array([high])) for name, (low, high) in goals.items()}
     counts_hits = isinstance(env.task, Bounce)

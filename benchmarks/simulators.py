@@ -705,7 +705,7 @@ class Episode:
 def nominal_env(policy: str) -> Env:
     """The environment of a shipped policy, with nothing randomised."""
     config = load_run_config(choose_checkpoint(Path(policy), Path()).run).env
-    return Env(config.model_copy(update={"randomization": RandomizationConfig()}))
+    return Env(config.in_world(RandomizationConfig()))
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -174,7 +174,7 @@ FAULTS = [
     ("the machine's preset wins over an algorithm's defaults", "runs/layers.py",
      "below=(*machines, *changed,", "below=(*changed, *machines,", "test_settings.py -k algorithms_own_default"),
     ("a world loses its own randomisation", "runs/worlds.py",
-     'merged({"env": {"randomization": default}}, {"env": world.settings})', 'merged({"env": world.settings}, {"env": {"randomization": default}})', "test_settings.py -k wins_over_those"),
+     'merged({"env": {"randomization": default}}, {"env": _settings_for(task, world)})', 'merged({"env": world.settings}, {"env": {"randomization": default}})', "test_settings.py -k wins_over_those"),
     ("settings of 0.1.0 that change something are dropped", "runs/earlier.py",
      "(harmless is _ANY or harmless == value)", "True", "test_runs.py -k 0_1_0"),
     ("the oldest run is the newest", "runs/folders.py",

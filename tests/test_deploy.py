@@ -636,7 +636,7 @@ def test_load_policy_refuses_other_files(tmp_path: Path) -> None:
     model = onnx.load_from_string(shipped)
     broken |= {
         "ball_colour": edited(model, "observation", "ball_velocity", "ball_colour"),
-        "format is 1, not 4; export the policy again": edited(model, "format", "4", "1"),
+        "format is 1, not 5; export the policy again": edited(model, "format", "5", "1"),
     }
     del model.metadata_props[:]
     broken["lacks format"] = model.SerializeToString()

@@ -511,6 +511,19 @@ def test_bounds_between_which_nothing_lies_are_refused() -> None:
         mean_of_events("rate", "apexes a second", np.ones(3), np.ones(3), (5.0, 3.0))
 
 
+def test_a_share_has_its_unit_once() -> None:
+    for words in (
+        "steps left of the line",
+        "steps left of the line, %",
+        "steps left of the line %",
+    ):
+        for result in (
+            share_of_events("left", words, np.ones(3), np.ones(3), 0.5),
+            share_of_episodes("left", words, np.ones(3, bool), 0.5),
+        ):
+            assert result.measured == "steps left, %"
+
+
 LASTS = share_of_episodes("lasts", "episodes", np.ones(3, bool), 0.9)
 
 

@@ -467,7 +467,7 @@ def test_a_signal_saves_and_says_how_to_resume(tmp_path: Path, number: signal.Si
     assert num_evaluations == 1
     (run,) = tmp_path.iterdir()
     continues = f"stopped after 128 steps; continue with: bounce-mjx train {run}"
-    assert continues in str(stopped.value)
+    assert f"{continues} (its report so far: bounce-mjx report {run})" in str(stopped.value)
     assert latest_checkpoint(run).steps == 2 * BLOCK
     train(tmp_path, RETURNS, run)
     assert evaluated_steps(run) == [64, 128, 192, 256]

@@ -61,7 +61,7 @@ def test_what_a_release_wrote_is_loaded(release: Path, tmp_path: Path) -> None:
     earlier format is refused, and a new export gives the checkpoint's action."""
     config, results = load_run_config(release), load_results(release)
     assert results is not None and results.best.passed
-    with pytest.raises(UserError, match="its format is 3, not 4; export the policy again"):
+    with pytest.raises(UserError, match="its format is 3, not 5; export the policy again"):
         load_policy(release / "policy.onnx")
     env = BounceBall(config.env)
     observation = np.asarray(env.reset(jax.random.PRNGKey(0)).obs)

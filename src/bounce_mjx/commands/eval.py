@@ -20,6 +20,7 @@ from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.config.user_code import import_flags
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import config as evaluation
+from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import RandomizationConfig
 
 # What is of the evaluation alone; a name that ends with = has a value.
@@ -57,6 +58,18 @@ class EvalCommand(WhichPolicy):
     """File to write the results to."""
 
 
+_STILL = (
+    "note: the goals do not change within an episode here, as randomization.goal_interval of the "
+    "training is not the task's default"
+)
+
+
+def _stands_still(measured_in: WorldConfig, trained: WorldConfig) -> bool:
+    """Whether the goals change within an episode of the training and not in another world."""
+    intervals = [config.randomization.goal_interval for config in (measured_in, trained)]
+    return intervals[0] is None and intervals[1] is not None
+
+
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 0 if no result fails, 1 if one does, 2 on a mistake."""
     command, given_goals = parse_with_goals(EvalCommand, args, prog="bounce-mjx eval")
@@ -81,6 +94,7 @@ def main(args: Sequence[str]) -> None:
     config = command.config_of(checkpoint, command.robot, command.world, command.randomization)
     if command.limits and config.env.robot.limits.velocity is None:
         raise UserError("the policy's arm has no command limits (env.robot.limits); omit --limits")
+    trained = command.config_of(checkpoint, command.robot)
     goals = given_goals.checked(config.env)
     set_up_jax(evaluation.on_engine(config.env, command.physics))
     checkpoint, policy, actor = read_actor(checkpoint, config)
@@ -108,6 +122,9 @@ def main(args: Sequence[str]) -> None:
     print(f"physics: {evaluated.engine}  {length}")
     if evaluated.warning is not None:
         print(f"warning: {evaluated.warning}")
+    measured_in = evaluated.setup.env.config
+    if goals.keys() < measured_in.goals.keys() and _stands_still(measured_in, trained.env):
+        print(_STILL)
     console.print(results_table(report, "the results"))
     print(details_line(report))
     findings = {}

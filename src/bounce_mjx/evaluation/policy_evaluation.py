@@ -100,13 +100,11 @@ def setup_of(env_config: WorldConfig, options: EvaluationOptions) -> EpisodeSetu
     # A range of the config's own is no input of the program.
     goals = {name: ends for name, ends in goals.items() if ends != trained[name]}
 
-    randomization = env_config.randomization
-    if options.nominal:
-        randomization = RandomizationConfig()
-    elif options.goals.keys() >= trained.keys():
+    world = env_config.in_world(RandomizationConfig()) if options.nominal else env_config
+    if options.goals.keys() >= trained.keys():
         # Each goal has one value, so that none changes within an episode.
-        randomization = randomization.model_copy(update={"goal_interval": None})
-    world = env_config.model_copy(update={"randomization": randomization})
+        randomization = world.randomization.model_copy(update={"goal_interval": None})
+        world = world.model_copy(update={"randomization": randomization})
     env = Env(on_engine(world, options.physics))
     if not goals:
         return EpisodeSetup(env, goals, ranges=None)

@@ -322,7 +322,7 @@ class _Training(NamedTuple):
 
 
 def _unrandomized(config: WorldConfig) -> WorldConfig:
-    return config.model_copy(update={"randomization": RandomizationConfig()})
+    return config.in_world(RandomizationConfig())
 
 
 def _with_changes(env: WorldConfig, settings: dict[str, Any], source: str) -> WorldConfig:

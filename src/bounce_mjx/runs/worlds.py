@@ -93,7 +93,7 @@ def trained_in(trained: WorldConfig, world: str | os.PathLike | None) -> WorldCo
     if world is None:
         return trained
     if world == NOMINAL:
-        return trained.model_copy(update={"randomization": RandomizationConfig()})
+        return trained.in_world(RandomizationConfig())
     if world == TRAINING:
         ended = {"warmup_steps": 0, "first_goal_range": 1.0}
         randomization = trained.randomization.model_copy(update=ended)
@@ -126,7 +126,7 @@ def in_sampled_world(trained: WorldConfig, randomization: RandomizationConfig) -
       UserError: a term does not fit the arm, or what is given has no term to act on.
     """
     if randomization.terms:
-        given = dict(trained) | {"randomization": randomization}
+        given = dict(trained.in_world(randomization))
         return validate(type(trained), given, "the flags --randomization")
     if randomization != RandomizationConfig():
         raise UserError(

@@ -455,7 +455,9 @@ class Job:
             self.say(f"a callback failed after {self.steps:,} steps; {self.go_on}")
             raise self.failure
         if stopping:
-            raise TrainingStopped(f"stopped after {self.steps:,} steps{where}; {self.go_on}")
+            raise TrainingStopped(
+                f"stopped after {self.steps:,} steps{where}; {self.go_on}{self.report_so_far}"
+            )
 
     def evaluate_best(self) -> bool:
         """Evaluates the best policies on fresh resets, and writes the results; returns False if a
@@ -588,6 +590,16 @@ class Job:
         own = [self.config.env.task] if algorithm is None else [self.config.env.task, algorithm]
         flags = [str(self.run), *import_flags(*own)]
         return f"continue with: bounce-mjx train {shlex.join(flags)}"
+
+    @property
+    def report_so_far(self) -> str:
+        """How to draw the report of a training that is stopped; empty before an evaluation."""
+        evaluated = [seed for seed in self.seeds if seed.progress.best is not None]
+        if not evaluated:
+            return ""
+        best = max(evaluated, key=lambda seed: seed.progress.best.score)
+        words = shlex.join([str(best.run), *imports_of(best.config)])
+        return f" (its report so far: bounce-mjx report {words})"
 
     # Signals and faults
 

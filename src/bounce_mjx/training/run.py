@@ -20,6 +20,7 @@ from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.evaluation.config import EvaluationOptions
 from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
 from bounce_mjx.evaluation.results import Report
+from bounce_mjx.interrupt import StopRequest, in_daemon_thread
 from bounce_mjx.reports.tables import details_line, results_table, seeds_table, unsolved_line
 from bounce_mjx.resources import POLICIES
 from bounce_mjx.runs import folders
@@ -310,16 +311,24 @@ def print_results(seeds: Sequence[job.SeedRun], console: Console) -> job.SeedRun
 
 
 def leave_report(seed: job.SeedRun, console: Console) -> None:
-    """Draws the report. The training is already saved, so a failure only prints one line."""
+    """Draws the report. The training is already saved, so a failure only prints one line.
+
+    Raises:
+      TrainingStopped: a signal came meanwhile.
+    """
     started = time.perf_counter()
+    words = shlex.join([str(seed.run), *job.imports_of(seed.config)])
+    again = f"draw it with: bounce-mjx report {words}"
     try:
         # Imported during the compilation (`Job.compile`).
         from bounce_mjx.reports.page import write_report
 
-        path = write_report(seed.run, seed.progress.best.recording)
+        with StopRequest() as stop:
+            drawing = in_daemon_thread(lambda: write_report(seed.run, seed.progress.best.recording))
+            if not stop.wait_for(drawing):
+                raise job.TrainingStopped(f"report: not drawn, as a signal came; {again}")
+        path = drawing.result()
     except Exception as error:
-        again = shlex.join([str(seed.run), *job.imports_of(seed.config)])
-        reason = reason_of(error)
-        say(console, f"report: not drawn ({reason}); draw it with: bounce-mjx report {again}")
+        say(console, f"report: not drawn ({reason_of(error)}); {again}")
     else:
         say(console, f"report: {path}  ({time.perf_counter() - started:.1f} s)")

@@ -5,7 +5,7 @@ import math
 import numbers
 import os
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import pydantic
 from pydantic import Field
@@ -383,6 +383,16 @@ class WorldConfig(WorldSettings):
     def layout(self) -> ObservationLayout:
         """The order of the entries of the observation."""
         return self.observation.layout(self.num_joints, self.num_balls)
+
+    def in_world(self, randomization: RandomizationConfig) -> Self:
+        """The same task, observation and actions in another world. How often the task samples its
+        goals is no part of a world: without an interval of its own, the world has that of the
+        task's default."""
+        default = settings.default_of(type(self).model_fields["randomization"])
+        if randomization.goal_interval is None:
+            kept = {"goal_interval": default.goal_interval}
+            randomization = randomization.model_copy(update=kept)
+        return self.model_copy(update={"randomization": randomization})
 
     @property
     def goals(self) -> dict[str, Goal]:
