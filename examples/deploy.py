@@ -186,14 +186,14 @@ def rendered_camera(policy, arguments: argparse.Namespace):
 def main() -> None:
     arguments = parse_arguments()
     policy = load_policy(arguments.policy)
-    if list(policy.metadata.commands) != ["target_height"] or policy.metadata.num_balls > 1:
+    if list(policy.metadata.goals) != ["target_height"] or policy.metadata.num_balls > 1:
         raise UserError(
             f"{arguments.policy} is of another task, and this loop bounces one ball; give a policy "
             "of bouncing, such as robust"
         )
     log = contextlib.nullcontext()
     if arguments.log:
-        log = Recorder(arguments.log, policy.metadata.joint_names, commands={"target_height": "m"})
+        log = Recorder(arguments.log, policy.metadata.joint_names, goals={"target_height": "m"})
     with log as recorder:
         model = None
         camera = Camera()

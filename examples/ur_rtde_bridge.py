@@ -93,7 +93,7 @@ def bounce(
     rtde_c,
     rtde_r,
     camera,
-    task_commands: dict,
+    goals: dict,
     seconds: float,
     box: dict,
     is_told: Callable[[], bool] = has_pressed_enter,
@@ -105,7 +105,7 @@ def bounce(
       rtde_c: ur_rtde's `RTDEControlInterface`.
       rtde_r: its `RTDEReceiveInterface`.
       camera: its `measure` returns the ball's part of the measurements.
-      task_commands: such as the target height, m.
+      goals: such as the target height, m.
       box: the `box` of `DeployedPolicy.supervise`, m; empty for none.
       is_told: whether the operator has given the word to start since it was last asked.
 
@@ -129,7 +129,7 @@ def bounce(
                 "time": rtde_r.getTimestamp(),
                 **tool_of(rtde_r.getActualTCPPose()),
                 **ball,
-                **task_commands,
+                **goals,
             }
             commands = arm.commands(measurements)
             for joint_angles in commands:
@@ -201,11 +201,9 @@ def main() -> None:
     rtde_r = RTDEReceiveInterface(arguments.robot, RATE)
     policy = load_policy(arguments.policy, joint_names=JOINTS)
     camera = Camera(address=arguments.listen)
-    task_commands = {"target_height": arguments.target_height}
+    goals = {"target_height": arguments.target_height}
     print("press Enter for each episode, when the ball is over the paddle and no hand is near")
-    reasons = bounce(
-        policy, rtde_c, rtde_r, camera, task_commands, arguments.seconds, box_of(arguments)
-    )
+    reasons = bounce(policy, rtde_c, rtde_r, camera, goals, arguments.seconds, box_of(arguments))
     for reason in reasons:
         print(reason)
     print(f"{camera.ignored} datagrams were ignored")

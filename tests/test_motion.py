@@ -410,8 +410,8 @@ def supervised(name: str) -> tuple[Any, np.ndarray, Any]:
         last.append((step, np.array(angles)))
         ball = ball_over(place, 0.01 * step, height)
         given = measured(angles, joint_velocities=velocities, ball_age=0.0, **ball)
-        given |= dict.fromkeys(policy.metadata.commands, 0.0) | {"target_height": 0.6}
-        given |= {name: 0.0 for name in policy.metadata.commands if name not in given}
+        given |= dict.fromkeys(policy.metadata.goals, 0.0) | {"target_height": 0.6}
+        given |= {name: 0.0 for name in policy.metadata.goals if name not in given}
         kept = {k: v for k, v in given.items() if k in (*policy.needs, "ball_age")}
         return kept | {"time": step * policy.metadata.control_dt}
 
@@ -647,11 +647,11 @@ def test_a_step_refuses_what_no_world_can_hold(wrong: dict, words: str) -> None:
     policy.step(measured(ball_position=[1.4, -1.4, 0.02]))
 
 
-def test_another_command_than_the_only_one_of_the_training_is_refused() -> None:
+def test_another_goal_than_the_only_one_of_the_training_is_refused() -> None:
     """The network's input is the same for all, so that none would be heeded."""
-    constant = load_policy("pretrained").metadata.commands["target_height"]
+    constant = load_policy("pretrained").metadata.goals["target_height"]
     constant = constant._replace(range=(0.5, 0.5))
-    policy = changed_policy("pretrained", commands={"target_height": constant})
+    policy = changed_policy("pretrained", goals={"target_height": constant})
     policy.step(measured(target_height=np.float32(0.5)))
     for height in (0.3, 0.51, 0.9):
         words = f"target_height is {height}, but the training had 0.5 alone .m.; give that"
