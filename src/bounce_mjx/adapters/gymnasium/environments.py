@@ -340,7 +340,7 @@ def make_env(
 
     Args:
       task: the start of the environment.
-      settings: its other arguments, such as policy="robust", world="ur5e_rtde" or
+      settings: its other arguments, such as policy="robust", world="fast_servo" or
         episode_seconds=30.
     """
     env = environment(task, **settings)
