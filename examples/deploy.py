@@ -1,11 +1,11 @@
 """A policy's program on a simulated arm: with another driver, it is that of a real one.
 
-`python examples/deploy.py [POLICY]` plays against MuJoCo's C engine with a late and noisy camera;
-`ur_rtde_bridge.py` has the same loop, `play`, with the driver of a Universal Robot. With `--log`,
-it writes the log from which `bounce-mjx identify` estimates the robot's world. With `--cameras`,
-the ball is seen in rendered pictures of two cameras alone (`two_cameras.py`), which the arm has
-calibrated before; that needs OpenCV too. `bounce-mjx rehearse` does the same in any world, with
-faults.
+`python examples/deploy.py [POLICY]` plays against MuJoCo's C engine, with the delays and the noise
+in the middle of the policy's training; `ur_rtde_bridge.py` has the same loop, `play`, with the
+driver of a Universal Robot. With `--log`, it writes the log from which `bounce-mjx identify`
+estimates the robot's world. With `--cameras`, the ball is seen in rendered pictures of two cameras
+alone (`two_cameras.py`), which the arm has calibrated before; that needs OpenCV too.
+`bounce-mjx rehearse` does the same in any world, with faults.
 """
 
 import argparse
@@ -19,12 +19,10 @@ from bounce_mjx.deploy.motion import paddle_position
 from bounce_mjx.deploy.recorder import Recorder
 from bounce_mjx.deploy.session import play
 from bounce_mjx.errors import UserError, exit_on_user_error
-from bounce_mjx.rehearsal.arm import SimulatedArm, goals_in_turn
+from bounce_mjx.rehearsal.arm import SimulatedArm, goals_in_turn, middle
 from bounce_mjx.resources import resource_path
 
 MJCF = resource_path("mjcf/bounce_ball.xml")
-WORLD = {"camera_rate": 120.0, "ball_position_noise": 0.002, "ball_latency": 0.020}
-"""The camera: its rate, Hz, its noise, m, and how late its pictures are, s."""
 BOX = 0.5
 """How far the paddle may go from its home to each side, m."""
 
@@ -66,7 +64,7 @@ def main() -> None:
     arguments = parse_arguments()
     policy = load_policy(arguments.policy)
     metadata = policy.metadata
-    config = environment_config(policy=arguments.policy)
+    config = environment_config(policy=arguments.policy, world="training")
     if arguments.target_height and "target_height" not in config.commands:
         raise UserError(f"{arguments.policy} has no target height; omit --target-height")
     model = camera = None
@@ -74,7 +72,7 @@ def main() -> None:
         if config.mjcf is not None:
             raise UserError(f"--cameras show the project's own arm, not {metadata.robot}; omit it")
         model, camera = rendered_camera(policy, arguments)
-    arm = SimulatedArm(config, WORLD, model=model, camera=camera)
+    arm = SimulatedArm(config, middle(config), model=model, camera=camera)
     goals = goals_in_turn(config, {"target_height": arguments.target_height})
     home = paddle_position(metadata, np.array(metadata.default_joint_angles))
     log = contextlib.nullcontext()

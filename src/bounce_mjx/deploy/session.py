@@ -117,11 +117,15 @@ def play(
             has_word = is_told(supervisor.state)
             reason = supervisor.reason
             if supervisor.state == "ready" and has_word:
-                if measured.get("ball_age", np.inf) <= max_age:
+                if measured.get("ball_age", np.inf) > max_age:
+                    reason = f"no picture of the ball is newer than {max_age:g} s"
+                    continue
+                try:
                     supervisor.start()
                     start = measured["time"]
-                else:
-                    reason = f"no picture of the ball is newer than {max_age:g} s"
+                except UserError as error:
+                    # The ball is not over the paddle: the arm goes on resting at home.
+                    reason = str(error)
             elif supervisor.state == "stopped" and stopped_at is None:
                 stopped_at = measured["time"]
                 if start is not None:
