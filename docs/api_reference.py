@@ -44,7 +44,7 @@ _SECTIONS = (
         "Tasks",
         "All but `find_task` are names of `bounce_mjx.task`. "
         "[Write a task](tasks.md#write-a-task) shows their use.",
-        "task.task world.config.WorldConfig world.config.Command world.observation.Quantity "
+        "task.task world.config.WorldConfig world.config.Goal world.observation.Quantity "
         "world.limits task.results task.registry.find_task",
     ),
     (
@@ -54,6 +54,12 @@ _SECTIONS = (
         "deploy.controller.Controller deploy.controller.Memory deploy.samples.Samples "
         "deploy.flight.fit_fall deploy.faults.Watch deploy.metadata.Metadata "
         "deploy.recorder.Recorder",
+    ),
+    (
+        "Two cameras",
+        "[Two cameras](cameras.md) shows their use.",
+        "vision.camera vision.circles vision.tracker vision.calibration vision.poses vision.view "
+        "vision.rig vision.capture vision.check vision.procedures",
     ),
     (
         "Policies in JAX",
