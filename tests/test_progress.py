@@ -51,6 +51,30 @@ def test_of_equal_evaluations_the_newest_is_the_best() -> None:
     assert progress.best_steps == 128
 
 
+def report(passed: bool, margin: float | None, screening: bool = False) -> Report:
+    result = Result("stable", "episodes, %", 99.5, ">= 99", passed, margin)
+    return Report((result,), {"mean_return": 1.0}, screening=screening)
+
+
+def test_a_full_evaluation_is_for_a_policy_that_may_be_the_best() -> None:
+    """Before a trained policy has met all results, one that meets them; then one with a larger
+    margin than the best. The policy of a warm start is none that was trained."""
+    progress = Progress()
+    missed, little, more = report(False, 0.0), report(True, 0.3), report(True, 0.6)
+    for steps in (0, 64):
+        assert [progress.may_be_best(each) for each in (missed, little, more)] == [0, 1, 1]
+        progress.add(little, steps, 0.0)
+    assert [progress.may_be_best(each) for each in (missed, little, more)] == [0, 0, 1]
+
+
+def test_a_screening_meets_no_results() -> None:
+    """Also where its few episodes do: no full evaluation did."""
+    progress = Progress()
+    progress.add(report(True, 1.0, screening=True), 64, 0.0)
+    assert progress.evaluations[0]["passed"] is False
+    assert (progress.solved_steps, progress.margin_steps) == (None, None)
+
+
 def test_json_has_null_where_there_is_no_finite_number() -> None:
     def refuse(constant: str) -> None:
         raise AssertionError(constant)
