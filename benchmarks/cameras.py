@@ -5,7 +5,7 @@
     MUJOCO_GL=egl python benchmarks/cameras.py robust_small --episodes 16 --jobs 16
     MUJOCO_GL=egl python benchmarks/cameras.py robust --rate 60 --episodes 16 --jobs 16
 
-In each episode the arm calibrates the cameras anew from 20 poses (`examples/rendered_cameras.py`:
+In each episode the arm calibrates the cameras anew from 20 poses (`bounce_mjx.vision.rendering`:
 distortion, motion blur, noise). MuJoCo's C engine moves the arm and the ball, the rules of the
 supervisor watch, and the environment's own functions measure the results over the task's time
 limit. The tracker's error is told apart where the ball is 6 cm above the paddle and more, which
@@ -17,9 +17,7 @@ import argparse
 import concurrent.futures
 import functools
 import multiprocessing
-import sys
 import time
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -36,10 +34,8 @@ from bounce_mjx.evaluation.episodes import reset_episodes
 from bounce_mjx.evaluation.results import Report, judge
 from bounce_mjx.evaluation.statistics import empty_statistics
 from bounce_mjx.resources import resource_path
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "examples"))
-
-from rendered_cameras import SeenBall, make_model, seen_ball  # noqa: E402
+from bounce_mjx.vision.rendering import make_model
+from bounce_mjx.vision.simulated import SeenBall, seen_ball
 
 HELD = 0.1
 """Time for which a hand holds the ball before the cameras, s."""
@@ -152,8 +148,7 @@ def play(name: str, settings: Settings, start: Start, seed: int) -> Played:
     render_model = make_model(mjcf, settings.ball, settings.side_light, settings.quick)
     try:
         camera = seen_ball(render_model, policy.metadata, settings.ball, settings.rate, seed)
-    except SystemExit as refusal:
-        # A process of a pool that exits tells nobody why.
+    except UserError as refusal:
         raise UserError(f"with the cameras of seed {seed}, {refusal}") from refusal
     episode = SeenEpisode(policy, env, camera, render_model)
     arm_qpos = list(env.addresses.arm_qpos)

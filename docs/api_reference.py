@@ -56,6 +56,12 @@ _SECTIONS = (
         "deploy.recorder.Recorder",
     ),
     (
+        "Two cameras",
+        "[Two cameras](cameras.md) shows their use.",
+        "vision.camera vision.circles vision.tracker vision.calibration vision.poses vision.view "
+        "vision.rig vision.capture vision.check vision.procedures",
+    ),
+    (
         "Policies in JAX",
         "",
         "runs.folders.find_checkpoint runs.checkpoints.read_policy learning.policy.Policy "

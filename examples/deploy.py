@@ -2,7 +2,7 @@
 
 `python examples/deploy.py [POLICY]` needs numpy, onnxruntime and mujoco, but no JAX. With `--log`,
 it writes the log from which `bounce-mjx identify` estimates the robot's world. With `--cameras`,
-the ball is seen in rendered pictures of two cameras alone (`two_cameras.py`), which the arm has
+the ball is seen in rendered pictures of two cameras alone (`bounce_mjx.vision`), which the arm has
 calibrated before; that needs OpenCV too.
 """
 
@@ -171,19 +171,15 @@ def parse_arguments() -> argparse.Namespace:
 
 def rendered_camera(policy, arguments: argparse.Namespace):
     """The model with what its two cameras see, and the camera of its rendered pictures."""
-    # Before MuJoCo renders; a second import of it changes nothing.
-    import rendered_cameras
+    # Here, so that the rest runs without OpenCV.
+    from bounce_mjx.vision import rendering, simulated
 
-    model = rendered_cameras.make_model(
-        str(MJCF), arguments.ball, arguments.side_light, arguments.quick
-    )
-    camera = rendered_cameras.seen_ball(
-        model, policy.metadata, arguments.ball, arguments.camera_rate
-    )
+    model = rendering.make_model(str(MJCF), arguments.ball, arguments.side_light, arguments.quick)
+    camera = simulated.seen_ball(model, policy.metadata, arguments.ball, arguments.camera_rate)
     print(f"cameras calibrated with the arm: {camera.calibration.report()}")
-    print(rendered_cameras.how_high(camera.calibration, policy.metadata), flush=True)
+    print(simulated.how_high(camera.calibration, policy.metadata), flush=True)
     if arguments.film:
-        camera.film = rendered_cameras.Film()
+        camera.film = simulated.Film()
     return model, camera
 
 

@@ -1,6 +1,5 @@
-"""The two cameras of examples/two_cameras.py: circles, geometry, the calibration, the tracker."""
+"""The ball from two cameras: circles, geometry, the calibration, the tracker, the capture."""
 
-import json
 import os
 import subprocess
 import sys
@@ -12,15 +11,20 @@ import numpy as np
 import pytest
 
 from bounce_mjx import load_policy
+from bounce_mjx.deploy.motion import paddle_position
+from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
 
 cv2 = pytest.importorskip("cv2")
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
-sys.path.insert(0, str(EXAMPLES))
-
-import rendered_cameras  # noqa: E402
-import two_cameras as cameras  # noqa: E402
+from bounce_mjx.vision import rendering, simulated  # noqa: E402
+from bounce_mjx.vision.calibration import calibrate  # noqa: E402
+from bounce_mjx.vision.camera import RADIUS, Camera, rough_camera, triangulate  # noqa: E402
+from bounce_mjx.vision.circles import COLOURS, Expected, find_circles, fit_circle  # noqa: E402
+from bounce_mjx.vision.poses import ball_positions, nominal_ball, plan_poses  # noqa: E402
+from bounce_mjx.vision.tracker import GRAVITY, Tracker  # noqa: E402
+from bounce_mjx.vision.view import highest_seen, report_height  # noqa: E402
 
 SIZE = 640, 480
 GAZE = (0.59, 0.0, 0.48)
@@ -28,9 +32,9 @@ PLACES = (1.45, 0.85, 0.75), (1.45, -0.85, 0.75)
 SEEN = np.array([[x, y, z] for x in (0.5, 0.7) for y in (-0.1, 0.1) for z in (0.15, 0.4, 0.7)])
 
 
-def true_cameras() -> tuple[cameras.Camera, ...]:
+def true_cameras() -> tuple[Camera, ...]:
     """Two cameras with a lens that bends lines."""
-    straight = [cameras.rough_camera(place, GAZE, SIZE, 60.0) for place in PLACES]
+    straight = [rough_camera(place, GAZE, SIZE, 60.0) for place in PLACES]
     distortion = np.array([-0.12, 0.03, 0.0005, -0.0005, 0.0])
     return tuple(camera._replace(distortion=distortion) for camera in straight)
 
@@ -67,8 +71,8 @@ def test_a_circle_is_found_in_part_and_in_motion(motion, tolerance, hidden) -> N
         edge = centre[1] + 9.0 * (1.0 - 2.0 * hidden)
         if hidden:
             picture[int(edge) :] = (20, 20, 180)
-        expected = cameras.Expected(centre + 6.0, 9.0, blur)
-        circles = cameras.find_circles(picture, cameras.COLOURS["orange"], None, expected)
+        expected = Expected(centre + 6.0, 9.0, blur)
+        circles = find_circles(picture, COLOURS["orange"], None, expected)
         # What is hidden in part gives its centre or nothing.
         assert len(circles) == 1 or hidden
         limit = tolerance if not hidden else 2.0 if blur.any() else 0.8
@@ -79,14 +83,14 @@ def test_a_circle_is_found_in_part_and_in_motion(motion, tolerance, hidden) -> N
 
 
 def test_what_is_no_ball_gives_nothing() -> None:
-    colour = cameras.COLOURS["orange"]
+    colour = COLOURS["orange"]
     picture = picture_of_disc(np.array([48.0, 48.0]), 9.0, np.zeros(2), 0)
-    far_smaller = cameras.Expected(np.array([48.0, 48.0]), 15.0, np.zeros(2))
-    assert cameras.find_circles(picture, colour, None, far_smaller) == []
+    far_smaller = Expected(np.array([48.0, 48.0]), 15.0, np.zeros(2))
+    assert find_circles(picture, colour, None, far_smaller) == []
     bar = np.full((96, 96, 3), 110, np.uint8)
     bar[40:52, 10:86] = (10, 115, 250)
-    near = cameras.Expected(np.array([48.0, 46.0]), 9.0, np.zeros(2))
-    assert cameras.find_circles(bar, colour, None, near) == []
+    near = Expected(np.array([48.0, 46.0]), 9.0, np.zeros(2))
+    assert find_circles(bar, colour, None, near) == []
 
 
 @pytest.mark.filterwarnings("error")
@@ -96,65 +100,15 @@ def test_points_without_a_circle_give_nothing_or_a_circle_of_a_ball() -> None:
     for seed in range(100):
         rng = np.random.default_rng(seed)
         points = rng.integers(20, 30, (int(rng.integers(8, 40)), 2)).astype(float)
-        circle = cameras.fit_circle(points, mask, (2.0, 6.0), rng.uniform(-8.0, 8.0, 2))
+        circle = fit_circle(points, mask, (2.0, 6.0), rng.uniform(-8.0, 8.0, 2))
         assert circle is None or 2.0 <= circle.radius <= 6.0
-
-
-def test_a_file_that_is_missing_is_named(tmp_path) -> None:
-    with pytest.raises(SystemExit, match="there is no file .*cameras.json; write it with"):
-        cameras.load_cameras(tmp_path / "cameras.json")
-
-
-class Pictures:
-    """Stands in for `cv2.VideoCapture`: numbered pictures of its own size."""
-
-    def __init__(self, size: tuple[int, int]):
-        self.size = size
-        self.count = 0
-
-    def isOpened(self) -> bool:
-        return True
-
-    def set(self, name: int, value: float) -> bool:
-        return False
-
-    def grab(self) -> bool:
-        self.count += 1
-        return True
-
-    def retrieve(self) -> tuple[bool, np.ndarray]:
-        width, height = self.size
-        return True, np.full((height, width, 3), self.count, np.uint8)
-
-
-def test_cameras_of_another_size_than_the_calibrated_one_are_refused(tmp_path, monkeypatch) -> None:
-    file = tmp_path / "cameras.json"
-    cameras.save_cameras(file, true_cameras(), SIZE)
-    loaded, size = cameras.load_cameras(file)
-    assert size == SIZE
-    np.testing.assert_allclose(loaded[1].project(SEEN), true_cameras()[1].project(SEEN))
-    file.write_text(json.dumps(json.loads(file.read_text())["cameras"]))
-    with pytest.raises(SystemExit, match="does not tell the size of its pictures"):
-        cameras.load_cameras(file)
-    monkeypatch.setattr(cv2, "VideoCapture", lambda source: Pictures((1280, 720)))
-    wrong = cameras.Sources(["0", "1"], size, 120.0, 0.004, 0.004)
-    with pytest.raises(SystemExit, match="1280 x 720, not 640 x 480; .* --size 1280 720"):
-        wrong.read()
-
-
-def test_a_pose_is_seen_in_a_picture_that_no_buffer_held(monkeypatch) -> None:
-    monkeypatch.setattr(cv2, "VideoCapture", lambda source: Pictures(SIZE))
-    sources = cameras.Sources(["0", "1"], SIZE, 120.0, 0.004, 0.004)
-    sources.read()
-    first, second = sources.read_newest()
-    assert first[0, 0, 0] == second[0, 0, 0] >= 1 + 4
 
 
 def test_rays_and_projections_are_inverse() -> None:
     pair = true_cameras()
     for place in SEEN:
         pixels = [camera.project(place[None])[0] for camera in pair]
-        np.testing.assert_allclose(cameras.triangulate(pair, pixels), place, atol=1e-6)
+        np.testing.assert_allclose(triangulate(pair, pixels), place, atol=1e-6)
 
 
 def observed(seed: int) -> tuple:
@@ -162,12 +116,11 @@ def observed(seed: int) -> tuple:
     metadata = load_policy("robust").metadata
     rng = np.random.default_rng(seed)
     rough = [
-        cameras.rough_camera(np.array(place) + 0.03, np.array(GAZE) - 0.02, SIZE, 58.5)
-        for place in PLACES
+        rough_camera(np.array(place) + 0.03, np.array(GAZE) - 0.02, SIZE, 58.5) for place in PLACES
     ]
-    poses = cameras.plan_poses(metadata, rough, SIZE, seed=seed)
-    ball = cameras._nominal_ball(metadata) + 0.003 * rng.standard_normal(3)
-    places = cameras.ball_positions(metadata, poses, ball)
+    poses = plan_poses(metadata, rough, SIZE, seed=seed)
+    ball = nominal_ball(metadata) + 0.003 * rng.standard_normal(3)
+    places = ball_positions(metadata, poses, ball)
     seen = np.stack([camera.project(places) for camera in true_cameras()])
     return metadata, rough, poses, seen + 0.3 * rng.standard_normal(seen.shape)
 
@@ -177,11 +130,11 @@ def test_the_arm_calibrates_both_cameras(seed) -> None:
     metadata, rough, poses, pixels = observed(seed)
     low, high = np.array(metadata.joint_ranges).T
     assert poses.shape == (20, 6) and np.all((poses > low) & (poses < high))
-    found = cameras.calibrate(metadata, rough, poses, pixels)
+    found = calibrate(metadata, rough, poses, pixels)
     errors = []
     for place in SEEN:
         seen = [camera.project(place[None])[0] for camera in true_cameras()]
-        errors.append(cameras.triangulate(found.cameras, seen) - place)
+        errors.append(triangulate(found.cameras, seen) - place)
     assert np.sqrt(np.mean(np.square(errors), axis=0)).max() < 2e-3
     assert found.bad == ()
     # What it says of itself is about what it is.
@@ -192,7 +145,7 @@ def test_a_pose_that_does_not_fit_is_named() -> None:
     metadata, rough, poses, pixels = observed(2)
     pixels[1, 7] += 6.0
     pixels[0, 12] = np.nan
-    found = cameras.calibrate(metadata, rough, poses, pixels)
+    found = calibrate(metadata, rough, poses, pixels)
     assert found.bad == (7,)
     assert "18 poses" in found.report() and "pose 8" in found.report()
 
@@ -201,15 +154,15 @@ def test_two_poses_with_another_thing_in_place_of_the_ball_are_left_out() -> Non
     metadata = load_policy("robust").metadata
     rng = np.random.default_rng(0)
     # Poses of an episode in which a lens was bent to meet the ring of the wrist.
-    rough = rendered_cameras.taped_cameras()
-    poses = cameras.plan_poses(metadata, rough, SIZE, seed=1053)
-    places = cameras.ball_positions(metadata, poses, cameras._nominal_ball(metadata))
-    pair = rendered_cameras.true_cameras()
+    rough = rendering.taped_cameras()
+    poses = plan_poses(metadata, rough, SIZE, seed=1053)
+    places = ball_positions(metadata, poses, nominal_ball(metadata))
+    pair = rendering.true_cameras()
     pixels = np.stack([camera.project(places) for camera in pair])
     pixels += 0.3 * rng.standard_normal(pixels.shape)
     pixels[0, 2] += (-74.0, -22.0)
     pixels[0, 18] += (79.0, 17.0)
-    found = cameras.calibrate(metadata, rough, poses, pixels)
+    found = calibrate(metadata, rough, poses, pixels)
     assert found.bad == (2, 18)
     for camera, true_camera in zip(found.cameras, pair, strict=True):
         assert np.linalg.norm(camera.centre - true_camera.centre) < 0.03
@@ -219,17 +172,17 @@ def test_a_calibration_that_no_policy_bears_is_refused() -> None:
     metadata, rough, poses, pixels = observed(4)
     # An arm that stops short of each pose, by a degree or two.
     reached = poses + np.random.default_rng(0).normal(0.0, 0.025, poses.shape)
-    with pytest.raises(SystemExit, match="the poses do not agree .* 10 mm is the most"):
-        cameras.calibrate(metadata, rough, reached, pixels)
+    with pytest.raises(UserError, match="the poses do not agree .* 10 mm is the most"):
+        calibrate(metadata, rough, reached, pixels)
 
 
 def test_what_lies_below_a_falling_ball_is_not_it() -> None:
     """Such as the paddle's corner: a bounce throws a ball up, and never down."""
-    tracker = cameras.Tracker(true_cameras(), cameras.COLOURS["orange"])
+    tracker = Tracker(true_cameras(), COLOURS["orange"])
     start, velocity = np.array([0.6, 0.02, 0.5]), np.array([0.1, -0.1, -1.0])
     for k in range(12):
         time = k / 120.0
-        place = start + velocity * time + 0.5 * cameras.GRAVITY * time**2
+        place = start + velocity * time + 0.5 * GRAVITY * time**2
         pictures = scene(place, (), k)
         if k >= 3:
             below = place - np.array([0.0, 0.0, 0.085])
@@ -250,7 +203,7 @@ def test_a_ball_that_bounces_within_the_exposure_is_seen(middle) -> None:
     rim have another colour."""
     exposure = 0.004
     contact = 0.004
-    tracker = cameras.Tracker(true_cameras(), cameras.COLOURS["orange"], exposure)
+    tracker = Tracker(true_cameras(), COLOURS["orange"], exposure)
     lowest = np.array([0.6, 0.02, 0.3])
 
     def place_at(time: float) -> np.ndarray:
@@ -258,7 +211,7 @@ def test_a_ball_that_bounces_within_the_exposure_is_seen(middle) -> None:
         before = min(time - middle + 0.5 * contact, 0.0)
         after = max(time - middle - 0.5 * contact, 0.0)
         path = np.array([0.0, 0.0, 4.0 * after - 4.5 * before])
-        return lowest + path + 0.5 * cameras.GRAVITY * (before + after) ** 2
+        return lowest + path + 0.5 * GRAVITY * (before + after) ** 2
 
     for k in range(-8, 3):
         taken = k / 120.0
@@ -272,20 +225,20 @@ def test_a_ball_that_bounces_within_the_exposure_is_seen(middle) -> None:
 
 def test_how_high_the_cameras_see_is_told_beside_how_high_the_policy_plays() -> None:
     metadata = load_policy("robust").metadata
-    home = cameras.paddle_position(metadata, np.array(metadata.default_joint_angles))
+    home = paddle_position(metadata, np.array(metadata.default_joint_angles))
     for gaze, is_too_low in ((0.33, True), (0.48, False)):
-        pair = [cameras.rough_camera(place, (*home[:2], gaze), SIZE, 60.0) for place in PLACES]
+        pair = [rough_camera(place, (*home[:2], gaze), SIZE, 60.0) for place in PLACES]
         # A camera without distortion: the upper edge's angle, less that of the ball's radius.
         distance = np.hypot(*(np.array(PLACES[0][:2]) - home[:2]))
         half_view = np.arctan(SIZE[1] / SIZE[0] * np.tan(np.radians(30.0)))
         pitch = np.arctan2(gaze - PLACES[0][2], distance)
-        highest = PLACES[0][2] + distance * np.tan(pitch + half_view) - cameras.RADIUS
-        assert cameras.highest_seen(pair, SIZE, home) == pytest.approx(highest, abs=0.02)
-        text = cameras.report_height(pair, SIZE, metadata)
+        highest = PLACES[0][2] + distance * np.tan(pitch + half_view) - RADIUS
+        assert highest_seen(pair, SIZE, home) == pytest.approx(highest, abs=0.02)
+        text = report_height(pair, SIZE, metadata)
         assert "apexes are at 0.80 m at most" in text
         assert ("aim higher" in text) == is_too_low
-    assert "apex" not in cameras.report_height(pair, SIZE, load_policy("balance").metadata)
-    assert cameras.highest_seen(true_cameras(), SIZE, home) > 0.9
+    assert "apex" not in report_height(pair, SIZE, load_policy("balance").metadata)
+    assert highest_seen(true_cameras(), SIZE, home) > 0.9
 
 
 def scene(
@@ -311,12 +264,12 @@ def scene(
 
 
 def test_the_tracker_follows_a_flight_and_nothing_else() -> None:
-    tracker = cameras.Tracker(true_cameras(), cameras.COLOURS["orange"])
+    tracker = Tracker(true_cameras(), COLOURS["orange"])
     start, velocity = np.array([0.6, 0.02, 0.3]), np.array([0.1, -0.1, 1.5])
     other = ((100.0, 400.0, 9.0), (500.0, 60.0, 25.0))
     for k in range(12):
         time = k / 120.0
-        place = start + velocity * time + 0.5 * cameras.GRAVITY * time**2
+        place = start + velocity * time + 0.5 * GRAVITY * time**2
         fix = tracker.update(scene(place, other, k), time)
         assert np.linalg.norm(fix.position - place) < 2e-3
     # What looks like it, but where it cannot have flown, is not it.
@@ -346,12 +299,12 @@ def test_a_background_that_was_drawn_before_changes_the_foot_of_the_arm_at_most(
     opengl, monkeypatch, side_light
 ) -> None:
     mjcf = str(resource_path("mjcf/bounce_ball.xml"))
-    model = rendered_cameras.make_model(mjcf, "orange", side_light, quick=True)
-    lenses = [rendered_cameras._Lens(camera) for camera in rendered_cameras.true_cameras()]
-    sheet = rendered_cameras._Sheet(model, lenses)
+    model = rendering.make_model(mjcf, "orange", side_light, quick=True)
+    lenses = [rendering._Lens(camera) for camera in rendering.true_cameras()]
+    sheet = rendering._Sheet(model, lenses)
     rng = np.random.default_rng(0)
     data = mujoco.MjData(model)
-    sub_frames = range(len(rendered_cameras.SHIFTS))
+    sub_frames = range(len(rendering.SHIFTS))
     for _ in range(4):
         data.qpos[:] = model.qpos0 + rng.uniform(-1.0, 1.0, model.nq)
         data.joint("ball_link").qpos[:3] = rng.uniform((0.3, -0.3, 0.03), (0.8, 0.3, 0.9))
@@ -371,12 +324,12 @@ def test_a_background_that_was_drawn_before_changes_the_foot_of_the_arm_at_most(
 
 
 def test_a_sub_frame_is_shifted_by_pixels_to_the_right_and_down(opengl, monkeypatch) -> None:
-    np.testing.assert_allclose(np.mean(rendered_cameras.SHIFTS, axis=0), 0.0)
-    monkeypatch.setattr(rendered_cameras, "SHIFTS", np.array([(0.0, 0.0), (3.0, 2.0)]))
+    np.testing.assert_allclose(np.mean(rendering.SHIFTS, axis=0), 0.0)
+    monkeypatch.setattr(rendering, "SHIFTS", np.array([(0.0, 0.0), (3.0, 2.0)]))
     mjcf = str(resource_path("mjcf/bounce_ball.xml"))
-    model = rendered_cameras.make_model(mjcf)
-    lenses = [rendered_cameras._Lens(camera) for camera in rendered_cameras.true_cameras()]
-    sheet = rendered_cameras._Sheet(model, lenses)
+    model = rendering.make_model(mjcf)
+    lenses = [rendering._Lens(camera) for camera in rendering.true_cameras()]
+    sheet = rendering._Sheet(model, lenses)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     for sub_frame in range(2):
@@ -390,8 +343,8 @@ def test_a_sub_frame_is_shifted_by_pixels_to_the_right_and_down(opengl, monkeypa
 def test_a_picture_shows_the_instant_of_its_qpos_in_the_light_of_the_room(opengl) -> None:
     """Not what MuJoCo's step leaves behind: places of one step ago, lights without direction."""
     mjcf = str(resource_path("mjcf/bounce_ball.xml"))
-    model = rendered_cameras.make_model(mjcf)
-    rendered = rendered_cameras.RenderedCameras(model, rendered_cameras.true_cameras(), noise=0.0)
+    model = rendering.make_model(mjcf)
+    rendered = rendering.RenderedCameras(model, rendering.true_cameras(), noise=0.0)
     data = mujoco.MjData(model)
     data.joint("ball_link").qpos[:3] = 0.59, 0.0, 0.6
     data.joint("ball_link").qvel[:3] = 0.0, 3.0, 0.0
@@ -416,22 +369,22 @@ def test_a_ball_before_a_thing_of_its_colour_is_told_from_it(opengl) -> None:
     and a ball that is still just after its bounce was expected to fall."""
     metadata = load_policy("robust").metadata
     mjcf = str(resource_path("mjcf/bounce_ball.xml"))
-    model = rendered_cameras.make_model(mjcf, "orange", True)
-    pair = rendered_cameras.true_cameras()
-    rendered = rendered_cameras.RenderedCameras(model, pair)
+    model = rendering.make_model(mjcf, "orange", True)
+    pair = rendering.true_cameras()
+    rendered = rendering.RenderedCameras(model, pair)
     data = mujoco.MjData(model)
     home = np.array(metadata.default_joint_angles)
-    backgrounds = rendered.still(rendered_cameras._posed(model, data, metadata, home, None))
+    backgrounds = rendered.still(simulated.posed(model, data, metadata, home, None))
     # Away from its home, the arm is in no background.
     lower = home + np.array([0.0, 0.05, -0.05, 0.0, 0.0, 0.0])
     for beside in [(0.0, 0.01), (-0.01, 0.0), (-0.02, 0.0)]:
-        rendered_cameras._posed(model, data, metadata, lower, np.array(beside))
+        simulated.posed(model, data, metadata, lower, np.array(beside))
         place = data.joint("ball_link").qpos[:3]
         pictures = rendered.still(data)
         for camera, picture, background in zip(pair, pictures, backgrounds, strict=True):
             pixel = camera.project(place[None])[0]
-            expected = cameras.Expected(pixel, camera.radius_at(place), np.array([0.0, 4.0]))
-            circles = cameras.find_circles(picture, cameras.COLOURS["orange"], background, expected)
+            expected = Expected(pixel, camera.radius_at(place), np.array([0.0, 4.0]))
+            circles = find_circles(picture, COLOURS["orange"], background, expected)
             assert np.linalg.norm(circles[0].centre - pixel) < 1.5
     rendered.close()
 
@@ -441,7 +394,7 @@ class DrawnCameras:
 
     exposure = 0.004
 
-    def __init__(self, pair: tuple[cameras.Camera, ...], rate: float = 120.0):
+    def __init__(self, pair: tuple[Camera, ...], rate: float = 120.0):
         self._pair = pair
         self._rate = rate
         self._count = 0
@@ -450,7 +403,7 @@ class DrawnCameras:
         self.covered: set[int] = set()
         """Cameras before which somebody holds a hand."""
 
-    def look(self, data: mujoco.MjData) -> rendered_cameras.Picture | None:
+    def look(self, data: mujoco.MjData) -> rendering.Picture | None:
         if data.time < self._count / self._rate - 1e-9:
             return None
         self._count += 1
@@ -464,7 +417,7 @@ class DrawnCameras:
                 radius = round(16 * camera.radius_at(place))
                 cv2.circle(picture, centre, radius, (250, 250, 250), -1, cv2.LINE_AA, 4)
             pictures.append(picture)
-        return rendered_cameras.Picture(data.time, data.time + 0.006, tuple(pictures), place)
+        return rendering.Picture(data.time, data.time + 0.006, tuple(pictures), place)
 
 
 class Play(NamedTuple):
@@ -480,7 +433,7 @@ class Play(NamedTuple):
 
 
 def play_from_drawn_pictures(
-    believed: tuple[cameras.Camera, ...], cover: int | None = None, seconds: float = 2.0
+    believed: tuple[Camera, ...], cover: int | None = None, seconds: float = 2.0
 ) -> Play:
     """The robust policy plays until its supervisor stops it. One camera is covered after 1 s.
 
@@ -492,9 +445,9 @@ def play_from_drawn_pictures(
     model = mujoco.MjModel.from_xml_path(str(resource_path("mjcf/bounce_ball.xml")))
     data = mujoco.MjData(model)
     drawn = DrawnCameras(true_cameras())
-    tracker = cameras.Tracker(believed, cameras.COLOURS["white"], exposure=1e-4)
+    tracker = Tracker(believed, COLOURS["white"], exposure=1e-4)
     tracker.learn_background([(drawn.wall, drawn.wall)])
-    camera = rendered_cameras.SeenBall(drawn, tracker, calibration=None)
+    camera = simulated.SeenBall(drawn, tracker, calibration=None)
     arm = policy.supervise(rate=1.0 / model.opt.timestep)
     joints = [data.joint(name) for name in policy.metadata.joint_names]
     for joint, angle in zip(joints, policy.metadata.default_joint_angles, strict=True):
@@ -553,7 +506,7 @@ def test_a_covered_camera_brakes_the_arm() -> None:
     assert play.largest_step <= max(load_policy("robust").metadata.largest_step) + 1e-9
 
 
-def moved(camera: cameras.Camera, shift: np.ndarray, turn: np.ndarray) -> cameras.Camera:
+def moved(camera: Camera, shift: np.ndarray, turn: np.ndarray) -> Camera:
     """A camera as somebody believes it to stand: moved (m) and turned (rad) from where it is."""
     rotation = camera.rotation @ cv2.Rodrigues(np.array(turn))[0].T
     return camera._replace(rotation=rotation, translation=-rotation @ (camera.centre + shift))

@@ -263,7 +263,6 @@ def test_table_of_libraries_names_every_example_and_existing_tests() -> None:
     examples = {path.name for path in (CHECKOUT / "examples").glob("*.*")} - {
         "deploy.py",
         "dribble_task.py",
-        "rendered_cameras.py",
         "two_cameras.py",
         "smooth_ppo.py",
         "ur_rtde_bridge.py",

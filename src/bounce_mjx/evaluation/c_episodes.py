@@ -1,5 +1,5 @@
 """Evaluation on MuJoCo's C engine: the same task and policy. The physics is in threads, except
-where a ball has friction: there each step of each episode is one of `physics.CEngine`."""
+while a ball that has friction touches something: those steps are `physics.CEngine`'s."""
 
 import copy
 import os
@@ -29,6 +29,8 @@ from bounce_mjx.world.randomization import Ranges
 _FULL_PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
 _CTRL = mujoco.mjtState.mjSTATE_CTRL
 _CTRL_AND_FORCE = _CTRL | mujoco.mjtState.mjSTATE_XFRC_APPLIED
+# Change of a ball's velocity in a physics step that is no contact's, m/s.
+_NO_CONTACT = 1e-9
 _NUM_THREADS = os.cpu_count() or 1
 
 
@@ -94,6 +96,7 @@ class _Physics:
         balls = env.addresses.balls
         self._bodies = [ball.body for ball in balls]
         self._masses = np.array([model.body_mass[self._bodies] for model in self._models])
+        self._gravity = np.array([[model.opt.gravity] for model in self._models])
         # A state begins with the time and the positions.
         self._velocities = 1 + env.mj_model.nq + np.array([ball.qvel[:3] for ball in balls])
 
@@ -110,44 +113,72 @@ class _Physics:
             push = push.reshape(-1, len(self._states)).T
             self._states[:, self._velocities.ravel()] += push
         if control.air_drag is None:
-            self._advance(targets, _CTRL)
+            self._advance(targets, _CTRL, self._gravity)
         else:
             drag = np.asarray(control.air_drag, np.float64)
             # The drag needs the velocity in each physics step.
             for target in np.moveaxis(targets, 1, 0):
-                forces = self._drag_forces(drag).reshape(len(target), -1)
-                self._advance(np.concatenate([target, forces], axis=1)[:, None], _CTRL_AND_FORCE)
+                of_air = self._drag_accelerations(drag)
+                forces = self._forces(of_air).reshape(len(target), -1)
+                controls = np.concatenate([target, forces], axis=1)[:, None]
+                self._advance(controls, _CTRL_AND_FORCE, self._gravity + of_air)
         return physics_states(self._mj_model, self._states)
 
-    def _advance(self, controls: np.ndarray, kind: mujoco.mjtState) -> None:
-        """Advances by physics steps with controls [N, steps, size] of a kind."""
-        if self._has_friction:
-            self._advance_each(controls, kind)
-            return
+    def _advance(
+        self, controls: np.ndarray, kind: mujoco.mjtState, accelerations: np.ndarray
+    ) -> None:
+        """Advances by physics steps.
+
+        Args:
+          controls: [N, steps, size] of a kind.
+          accelerations: of balls that touch nothing [N or 1, balls or 1, 3].
+        """
         trajectory, _ = self._pool.rollout(
             self._models, self._data, self._states, controls, control_spec=kind
         )
-        self._states = trajectory[:, -1]
+        after = trajectory[:, -1]
+        if self._has_friction:
+            # MuJoCo's steps are right for those episodes alone in which no ball touches anything.
+            for i in np.flatnonzero(self._is_touched(trajectory, accelerations)):
+                after[i] = self._step_one(i, controls[i], kind)
+        self._states = after
 
-    def _advance_each(self, controls: np.ndarray, kind: mujoco.mjtState) -> None:
-        """The same, one episode after another."""
+    def _is_touched(self, trajectory: np.ndarray, accelerations: np.ndarray) -> np.ndarray:
+        """Whether a ball of an episode does anything but fly in steps [N, steps, size]: [N].
+
+        A contact that changes a ball's velocity by less than the bound has at most a fraction of
+        the bound, the coefficient of friction, from friction.
+        """
+        states = np.concatenate([self._states[:, None], trajectory], axis=1)
+        changes = np.diff(states[:, :, self._velocities], axis=1)
+        in_flight = accelerations[:, None] * self._mj_model.opt.timestep
+        # What is not finite does not fly.
+        flies = np.abs(changes - in_flight) < _NO_CONTACT
+        return ~np.all(flies, axis=(1, 2, 3))
+
+    def _step_one(self, episode: int, controls: np.ndarray, kind: mujoco.mjtState) -> np.ndarray:
+        """An episode's state [size] after steps with friction and controls [steps, size]."""
+        engine = self._engines[episode % len(self._engines)]
         data = self._data[0]
-        for i, state in enumerate(self._states):
-            engine = self._engines[i % len(self._engines)]
-            mujoco.mj_resetData(engine.model, data)
-            mujoco.mj_setState(engine.model, data, state, _FULL_PHYSICS)
-            for control in controls[i]:
-                mujoco.mj_setState(engine.model, data, control, kind)
-                engine.step(data)
-            mujoco.mj_getState(engine.model, data, state, _FULL_PHYSICS)
+        state = self._states[episode].copy()
+        mujoco.mj_resetData(engine.model, data)
+        mujoco.mj_setState(engine.model, data, state, _FULL_PHYSICS)
+        for control in controls:
+            mujoco.mj_setState(engine.model, data, control, kind)
+            engine.step(data)
+        mujoco.mj_getState(engine.model, data, state, _FULL_PHYSICS)
+        return state
 
-    def _drag_forces(self, drag: np.ndarray) -> np.ndarray:
-        """Forces and torques [N, bodies, 6] on the balls, from `Control.air_drag` [N]."""
-        mass = self._masses[:, :, None]
+    def _drag_accelerations(self, drag: np.ndarray) -> np.ndarray:
+        """Accelerations [N, balls, 3] of the balls, m/s^2, from `Control.air_drag` [N]."""
         velocity = self._states[:, self._velocities]
         speed = np.linalg.norm(velocity, axis=2, keepdims=True)
-        forces = np.zeros((len(velocity), self._mj_model.nbody, 6))
-        forces[:, self._bodies, :3] = -drag[:, None, None] * mass * speed * velocity
+        return -drag[:, None, None] * speed * velocity
+
+    def _forces(self, accelerations: np.ndarray) -> np.ndarray:
+        """Forces and torques [N, bodies, 6] that give the balls accelerations [N, balls, 3]."""
+        forces = np.zeros((len(accelerations), self._mj_model.nbody, 6))
+        forces[:, self._bodies, :3] = self._masses[:, :, None] * accelerations
         return forces
 
 
