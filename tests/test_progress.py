@@ -11,11 +11,12 @@ import pytest
 
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.runs.checkpoints import read_policy
-from bounce_mjx.runs.config import load_run_config
+from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.files import to_json, write_output
 from bounce_mjx.runs.folders import pretrained_checkpoint
 from bounce_mjx.runs.progress import Progress
 from bounce_mjx.task import Result
+from bounce_mjx.training.evaluators import Evaluators
 
 
 @pytest.mark.parametrize(
@@ -65,6 +66,36 @@ def test_a_full_evaluation_is_for_a_policy_that_may_be_the_best() -> None:
         assert [progress.may_be_best(each) for each in (missed, little, more)] == [0, 1, 1]
         progress.add(little, steps, 0.0)
     assert [progress.may_be_best(each) for each in (missed, little, more)] == [0, 0, 1]
+
+
+@pytest.mark.parametrize(
+    ("misses_from", "simulated", "is_screening"),
+    [(1, [128], True), (400, [128, 256, 512], True), (1001, [128, 256, 512, 1000], False)],
+)
+def test_an_evaluation_doubles_its_episodes_while_the_policy_may_be_the_best(
+    misses_from: int, simulated: list[int], is_screening: bool, monkeypatch
+) -> None:
+    """The policy misses a result from a number of episodes on."""
+    ends, starts = [], []
+
+    def run(self, policies, seed: int, first: int, episodes: int) -> list:
+        starts.append(first)
+        ends.append(episodes)
+        return [None] * (-(-episodes // 128) - first)
+
+    def judge(self, chunks, episodes: int) -> list[Report]:
+        assert len(chunks) == -(-episodes // 128)
+        return [report(episodes < misses_from, 0.3)]
+
+    monkeypatch.setattr(Evaluators, "__init__", lambda self: None)
+    monkeypatch.setattr(Evaluators, "_run", run)
+    monkeypatch.setattr(Evaluators, "_judge", judge)
+    evaluators = Evaluators()
+    evaluators._config = TrainConfig(eval_episodes=1000)
+    evaluators._chunk = 128
+    (found,) = evaluators.select([None], [Progress()])
+    assert (ends, found.screening) == (simulated, is_screening)
+    assert starts == [0, 1, 2, 4][: len(starts)]
 
 
 def test_a_screening_meets_no_results() -> None:
