@@ -83,7 +83,8 @@ class TrainConfig(StrictModel):
     eval_episodes: Count = 1024
     """Episodes of an evaluation of the results."""
     screening_episodes: NonNegativeInt = 0
-    """Episodes of a cheap first evaluation, which must pass before the full one; 0 for none."""
+    """Episodes with which an evaluation begins; they double as long as the policy may become the
+    best. 0 for all at once."""
     eval_seed: NonNegativeInt = 10_000
     """Seed of the evaluations during training."""
     stop_when_solved: bool = False
