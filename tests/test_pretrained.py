@@ -30,7 +30,7 @@ from bounce_mjx.runs.folders import (
 )
 from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.runs.progress import load_results
-from bounce_mjx.runs.worlds import trained_in
+from bounce_mjx.runs.worlds import env_in_world
 from bounce_mjx.task.registry import find_task
 
 FOLDER = resource_path("pretrained")
@@ -47,7 +47,7 @@ def measured(name: str, episodes: int, world: str | None = None) -> Report:
     checkpoint = pretrained_checkpoint(name)
     config = load_run_config(checkpoint.run)
     if world:
-        config = config.model_copy(update={"env": trained_in(config.env, world)})
+        config = config.model_copy(update={"env": env_in_world(config.env, world)})
     policy, options = read_policy(checkpoint, config), EvaluationOptions(episodes)
     return evaluate_policy(policy, config.env, networks_of(config.ppo), options).report
 

@@ -44,7 +44,7 @@ from bounce_mjx.runs.config import (
 )
 from bounce_mjx.runs.presets import BASE, SOURCES, preset_files, read_config_file, shown_file
 from bounce_mjx.runs.start import Start, beside_run, find_start
-from bounce_mjx.runs.worlds import robot_and_world
+from bounce_mjx.runs.worlds import layers_of_environment
 from bounce_mjx.world.named import without_idle_curriculum
 
 FLAGS = "flags"
@@ -146,21 +146,26 @@ def layers_on(
         for layer in (*named, *files):
             _check_start(layer, start)
     changed = _changed_defaults(start.algorithm)
-    policies = [] if start.policy is None else [_layer_of_policy(start, world is not None)]
     trained = None if start.policy is None else start.policy.env
-    robots, worlds = robot_and_world(robot, world, start.task, trained)
+    of_env = layers_of_environment(start.task, trained, robot, world)
+    for layer in of_env.robot:
+        _check_start(layer, start)
+    policies = [_with_networks(layer, start) for layer in of_env.policy]
     return Layers(
         start=start,
-        below=(*machines, *changed, *named, *policies, *files, *robots, *worlds),
+        below=(*machines, *changed, *named, *policies, *files, *of_env.robot, *of_env.world),
         notes=(*start.notes, *_notes(changed, named, "ppo."), *_notes(named, policies, "env.")),
     )
 
 
 def _check_start(layer: Layer, start: Start) -> None:
-    """Checks that a file, which has values alone, is of what the training begins with.
+    """Checks that a file, which has values alone, is of what the training begins with. The word
+    alone says the task. An algorithm or a warm start that the user names wins over the file's, as
+    any flag does.
 
     Raises:
-      UserError: it is of another task, algorithm or warm start.
+      UserError: it is of another task, or of an algorithm or a warm start that the user does not
+        name.
     """
     task = layer.values.get("task", start.task_name)
     algorithm = layer.values.get("algorithm", start.algorithm_name)
@@ -231,18 +236,13 @@ def _as_in_yaml(value: Any) -> Any:
     return list(map(_as_in_yaml, value)) if isinstance(value, list | tuple) else value
 
 
-def _layer_of_policy(start: Start, is_in_world: bool) -> Layer:
-    """The task, the environment and the networks of the policy of a warm start. A named world
-    replaces the randomisation."""
+def _with_networks(of_env: Layer, start: Start) -> Layer:
+    """The layer of the policy of a warm start: its environment, its task and its networks."""
     from bounce_mjx.runs.checkpoints import NETWORK_KEYS
 
-    env = start.policy.env.model_dump()
-    if is_in_world:
-        del env["randomization"]
     networks = start.policy.ppo.model_dump(include={*NETWORK_KEYS, "critic_metrics"})
-    values = {"task": start.policy.task, "env": env, "ppo": networks}
-    whole = tuple(f"env.{key}" for key in env)
-    return Layer(f"the warm start {start.warm_start}", values, whole=whole)
+    values = of_env.values | {"task": start.policy.task, "ppo": networks}
+    return of_env._replace(source=f"the warm start {start.warm_start}", values=values)
 
 
 # Merging and validating -------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from bounce_mjx.adapters.gymnasium.batch import (
     checked_actions,
 )
 from bounce_mjx.adapters.gymnasium.pictures import Pictures
-from bounce_mjx.deploy.environments import Start, environment
+from bounce_mjx.deploy.environments import EnvironmentOf, environment
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 
@@ -326,7 +326,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
 
 
 def make_env(
-    task: Start | None = None,
+    task: EnvironmentOf | None = None,
     render_mode: str | None = None,
     max_episode_steps: int | None = None,
     width: int = 640,
@@ -346,7 +346,7 @@ def make_env(
 
 
 def make_vector_env(
-    task: Start | None = None,
+    task: EnvironmentOf | None = None,
     num_envs: int = 1,
     render_mode: str | None = None,
     max_episode_steps: int | None = None,

@@ -13,7 +13,7 @@ from flax import struct
 
 from bounce_mjx.adapters.randomization import randomized_task
 from bounce_mjx.deploy.environments import (
-    Start,
+    EnvironmentOf,
     environment,
     environment_config,
     refuse_warmup,
@@ -36,7 +36,7 @@ with needed("MuJoCo Playground", "playground<1"):
 ENV_NAME = "BounceBall"
 
 
-def default_config(task: Start | None = None, **settings: Any) -> config_dict.ConfigDict:
+def default_config(task: EnvironmentOf | None = None, **settings: Any) -> config_dict.ConfigDict:
     """The settings of an environment, some under Playground's own names.
 
     Args:
@@ -184,7 +184,7 @@ class PlaygroundBounceBall(MjxEnv):
 def make_env(
     config: config_dict.ConfigDict | None = None,
     config_overrides: dict[str, Any] | None = None,
-    task: Start | None = None,
+    task: EnvironmentOf | None = None,
     policy: str | os.PathLike | None = None,
     world: str | os.PathLike | None = None,
 ) -> PlaygroundBounceBall:
