@@ -25,8 +25,8 @@ from bounce_mjx.runs.folders import (
     MIRROR_LAW,
     best_checkpoint,
     choose_checkpoint,
+    find_checkpoint,
     is_users_run,
-    pretrained_checkpoint,
 )
 from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.runs.progress import load_results
@@ -44,7 +44,7 @@ def shipped() -> dict:
 
 def measured(name: str, episodes: int, world: str | None = None) -> Report:
     """The results of a shipped policy, in its own world or in a named one."""
-    checkpoint = pretrained_checkpoint(name)
+    checkpoint = find_checkpoint(name)
     config = load_run_config(checkpoint.run)
     if world:
         config = config.model_copy(update={"env": env_in_world(config.env, world)})
@@ -190,7 +190,7 @@ def test_it_is_used_if_there_is_no_run(tmp_path: Path, monkeypatch, capsys) -> N
     with pytest.raises(UserError, match="no run with a checkpoint"):
         choose_checkpoint(None, tmp_path)
     monkeypatch.chdir(tmp_path)
-    assert choose_checkpoint(None, LOG_DIR) == pretrained_checkpoint()
+    assert choose_checkpoint(None, LOG_DIR) == find_checkpoint("pretrained")
     assert "comes with the package" in capsys.readouterr().out
     for name in ("2026-01-01", "2026-01-02"):
         folder = LOG_DIR / name / "checkpoints" / "64"
@@ -199,4 +199,4 @@ def test_it_is_used_if_there_is_no_run(tmp_path: Path, monkeypatch, capsys) -> N
     chosen = choose_checkpoint(None, LOG_DIR)
     assert chosen.folder.absolute() == folder.absolute()
     assert str(LOG_DIR / "2026-01-02") in capsys.readouterr().out
-    assert choose_checkpoint(FOLDER, LOG_DIR) == pretrained_checkpoint()
+    assert choose_checkpoint(FOLDER, LOG_DIR) == find_checkpoint("pretrained")

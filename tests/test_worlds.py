@@ -20,7 +20,7 @@ from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.config import LimitsConfig, RobotConfig
 from bounce_mjx.robot.model import add_balls, scene_spec
 from bounce_mjx.runs.config import TrainConfig, load_run_config
-from bounce_mjx.runs.folders import pretrained_checkpoint
+from bounce_mjx.runs.folders import find_checkpoint
 from bounce_mjx.runs.layers import Choice, read_layers, read_preset
 from bounce_mjx.runs.worlds import (
     env_in_world,
@@ -237,7 +237,7 @@ def test_a_policy_is_measured_in_the_world_alone() -> None:
 
 def test_a_warm_start_is_in_the_world_in_which_its_policy_is_measured() -> None:
     """One function says what a policy's environment is in a world, for a training too."""
-    trained = load_run_config(pretrained_checkpoint("robust_small").run).env
+    trained = load_run_config(find_checkpoint("robust_small").run).env
     for world in (None, "fast_servo"):
         choice = Choice(start="robust_small", world=None if world is None else Path(world))
         begun = read_layers(choice, resource_path("configs/cpu.yaml")).config().env

@@ -17,7 +17,7 @@ from bounce_mjx.config.validation import validate
 from bounce_mjx.deploy.interface import check_interface, interface_of
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UnexpectedArgument, UserError, shorten, suggest
-from bounce_mjx.resources import POLICIES, policy_folder
+from bounce_mjx.resources import POLICIES, policy_path
 from bounce_mjx.robot.config import is_packaged
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import run_of
@@ -135,12 +135,6 @@ def refuse_warmup(config: WorldConfig, title: str) -> None:
             f"{title}: the randomisation has warmup_steps, but its ranges do not grow here; set "
             "warmup_steps to 0 and first_goal_range to 1, or train with TorchVectorEnv"
         )
-
-
-def policy_path(policy: str | os.PathLike) -> Path:
-    """The path of a policy that a user names: that of one of the package, unless there is a folder
-    of its name."""
-    return policy_folder(policy) or Path(policy)
 
 
 def _is_task_or_config(start: Any) -> bool:

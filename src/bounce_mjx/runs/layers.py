@@ -9,14 +9,14 @@ training begins with. Everything else is values. They are layers, and a later on
     4. a preset that the user names, in place of the machine's
     5. a warm start: the environment and the networks of a policy
     6. the user's files and further presets, each on those before it
-    7. --robot, or the robot of --world
+    7. --robot, or the robot of --world; its file may say something of the training, too
     8. --world
     9. what the user says: flags of the command, or arguments of `train`
 
 A resumed run has two: its own config, and what the user says; more steps end its
-`stop_when_solved` where that had ended it (`Layers._go_on`). `layers_on` reads the layers below the
-user's, each file once. `Layers.config` merges all of them and validates the result, once; the
-config then knows what set each of its values (`TrainConfig.sources`).
+`stop_when_solved` where that had ended it (`Layers._beyond_solved`). `layers_on` reads the layers
+below the user's, each file once. `Layers.config` merges all of them and validates the result, once;
+the config then knows what set each of its values (`TrainConfig.sources`).
 """
 
 import dataclasses
@@ -54,7 +54,8 @@ PYTHON = "train"
 
 
 class ChoiceFlags(StrictModel):
-    """The flags of a choice."""
+    """The flags that decide which layers there are. The last three are keys of the config, too: the
+    algorithm's class, the policy of a warm start, and where latest is looked for."""
 
     config: Annotated[tuple[Path, ...], Flag(metavar="NAME|FILE", is_repeated=True)] = ()
     """Preset, such as cpu or finetune (a YAML file in configs/), or a YAML file of yours. A task's
@@ -145,7 +146,7 @@ def layers_on(
         files = _layers_of_files(found.own)
         for layer in (*named, *files):
             _check_start(layer, start)
-    changed = _changed_defaults(start.algorithm)
+    changed = _changed_defaults(start.algorithm_config)
     trained = None if start.policy is None else start.policy.env
     of_env = layers_of_environment(start.task, trained, robot, world)
     for layer in of_env.robot:
@@ -261,7 +262,7 @@ class Layers:
     @functools.cached_property
     def fields(self) -> dict[str, FieldInfo]:
         """The settings that there are, by dotted key."""
-        return fields_of(self.start.task.Config, self.start.algorithm)
+        return fields_of(self.start.task.Config, self.start.algorithm_config)
 
     @property
     def title(self) -> str:
@@ -286,10 +287,10 @@ class Layers:
           UserError: a key is unknown, a value is out of range, or it must be that of the resumed
             run. The error names the layer that set it.
         """
-        source = PYTHON if flags is None else FLAGS
+        user_source = PYTHON if flags is None else FLAGS
         # A start is what it was found to be, such as a checkpoint.
-        user = self._layer_of_user(source, {**(said or {}), **self.start.said})
-        above = [*self._go_on(user), user]
+        user = self._layer_of_user(user_source, {**(said or {}), **self.start.said})
+        above = [*self._beyond_solved(user), user]
         layers = [*self.below, *above]
         for layer in layers:
             self._check_groups(layer)
@@ -299,15 +300,15 @@ class Layers:
         try:
             config = self._validated(values)
         except _Mistake as mistake:
-            source = _setter_of(mistake.path, layers)
-            if flags is not None and source == FLAGS:
+            setter = _setter_of(mistake.path, layers)
+            if flags is not None and setter == FLAGS:
                 text = describe(mistake.error, self.fields, flags, mistake.group)
                 raise UserError(f"{text} (see {prog} --help)") from mistake.error
             text = describe(mistake.error, self.fields, group=mistake.group)
-            if source != PYTHON and mistake.path in (["robot"], ["world"]):
+            if setter != PYTHON and mistake.path in (["robot"], ["world"]):
                 (name,) = mistake.path
                 text = f"{name} is no setting; leave it out, and give --{name} or train({name}=...)"
-            raise UserError(f"{shorten(source)}: {text}") from mistake.error
+            raise UserError(f"{shorten(setter)}: {text}") from mistake.error
         if self.start.resumed is not None:
             _check_resumable(self.start.resumed, config)
             _, changed = _merge(above)
@@ -354,7 +355,7 @@ class Layers:
                 return full
         return key
 
-    def _go_on(self, user: Layer) -> list[Layer]:
+    def _beyond_solved(self, user: Layer) -> list[Layer]:
         """A layer for a run that has met all results, where a number of steps is asked for: it goes
         on to that number."""
         if self.start.run is None or "total_steps" not in user.values:
@@ -371,7 +372,7 @@ class Layers:
         return []
 
     def _validated(self, values: dict[str, Any]) -> TrainConfig:
-        groups = {"env": self.start.task.Config, "ppo": self.start.algorithm}
+        groups = {"env": self.start.task.Config, "ppo": self.start.algorithm_config}
         typed = dict(values)
         for name, kind in groups.items():
             try:
@@ -400,8 +401,7 @@ def _merge(layers: Sequence[Layer]) -> tuple[dict[str, Any], dict[str, str]]:
     sources: dict[str, str] = {}
     for layer in layers:
         for key in layer.whole:
-            # The layer has the key, so that the None does not remain.
-            values = merged(values, nested(key, None))
+            values = _without(values, key)
         values = merged(values, layer.values)
         if layer.is_world:
             randomization = without_idle_curriculum(values["env"]["randomization"])
@@ -413,6 +413,16 @@ def _merge(layers: Sequence[Layer]) -> tuple[dict[str, Any], dict[str, str]]:
     # A later layer may end a value, or replace a mapping by None.
     remaining = flat(values)
     return values, {key: source for key, source in sources.items() if key in remaining}
+
+
+def _without(values: dict[str, Any], key: str) -> dict[str, Any]:
+    """Nested mappings without a value or a group, by its dotted key."""
+    name, _, rest = key.partition(".")
+    if not rest:
+        return {other: value for other, value in values.items() if other != name}
+    if not isinstance(values.get(name), dict):
+        return values
+    return values | {name: _without(values[name], rest)}
 
 
 def _setter_of(path: Sequence[str], layers: Sequence[Layer]) -> str:

@@ -1,4 +1,5 @@
-"""The command line of a training."""
+"""What the words of `bounce-mjx train` say: its flags, and the config. `commands/train.py` acts on
+them."""
 
 import itertools
 from collections.abc import Sequence
@@ -94,8 +95,10 @@ def read_command(args: Sequence[str], machine: Path | None = None) -> TrainComma
     words = [word for word in args if word not in helps]
     _refuse_flags_of_the_word(words)
     # The flags, of which only some are known yet, hide where another word would stand.
-    word = words[0] if words and not words[0].startswith("-") else None
-    flags = parse(ChoiceFlags, words[word is not None :], prog=PROG, is_first=True)
+    word, after_word = None, words
+    if words and not words[0].startswith("-"):
+        word, *after_word = words
+    flags = parse(ChoiceFlags, after_word, prog=PROG, is_first=True)
     layers = read_layers(Choice(start=word, **dict(flags)), machine)
     fields = fields_of_command(layers)
     if helps:
