@@ -278,39 +278,25 @@ def sensors():
 def two_policies():
     """Both shipped policies on the C engine, with and without a camera."""
     from bounce_mjx import load_policy
+    from bounce_mjx.deploy.environments import environment_config
+    from bounce_mjx.deploy.session import play
+    from bounce_mjx.rehearsal.arm import SimulatedArm, goals_in_turn
 
-    sys.path.insert(0, str(CHECKOUT / "examples"))
-    import deploy
-
-    class Tracker(deploy.Camera):
-        """A camera that also records the true height."""
-
-        def look(self, time, ball):
-            self.heights = [*getattr(self, "heights", []), (time, ball[2])]
-            super().look(time, ball)
-
-    class Perfect(Tracker):
-        """The true state of the present instant."""
-
-        def look(self, time, ball):
-            super().look(time, ball)
-            before = self.now[1] if hasattr(self, "now") else ball
-            self.now = time, np.array(ball), (ball - before) / 0.001
-
-        def measure(self, time):
-            return {"ball_position": self.now[1], "ball_velocity": self.now[2], "ball_age": 0.0}
-
+    late = {"camera_rate": 120.0, "ball_position_noise": 0.002, "ball_latency": 0.02}
     figure, row = plt.subplots(1, 2, figsize=(8.4, 3.0), layout="constrained", sharey=True)
-    for axes, title, camera in (
-        (row[0], "perfect sensors", Perfect),
-        (row[1], "camera: 120 Hz, 2 mm, 20 ms late", Tracker),
+    for axes, title, world in (
+        (row[0], "perfect sensors", {}),
+        (row[1], "camera: 120 Hz, 2 mm, 20 ms late", late),
     ):
         axes.axhline(0.5, color=LINES[2], lw=1, ls="--")
         for name, colour in (("pretrained", LINES[1]), ("robust", LINES[0])):
-            eye = camera()
-            deploy.simulate(load_policy(name), eye, 5.0, [0.5])
-            time, height = np.array(eye.heights)[::10].T
-            axes.plot(time, height, color=colour, lw=1.6, label=name)
+            config = environment_config(policy=name)
+            arm = SimulatedArm(config, world)
+            goals = goals_in_turn(config, {"target_height": (0.5,)})
+            play(load_policy(name), arm, 5.0, arm.is_told, goals, {})
+            height = arm.balls[0].qpos[2]
+            time, shown = np.array([(moved.time, moved.qpos[height]) for moved in arm.path]).T
+            axes.plot(time, shown, color=colour, lw=1.6, label=name)
         axes.set(title=title, xlabel="time, s", xlim=(0, 5), ylim=(0, 0.72))
         axes.legend(loc="upper right", ncols=2)
     row[0].set(ylabel="height of the ball, m")

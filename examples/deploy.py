@@ -1,164 +1,37 @@
-"""A policy in the control loop of a simulated robot with a late and noisy camera.
+"""A policy's program on a simulated arm: with another driver, it is that of a real one.
 
-`python examples/deploy.py [POLICY]` needs numpy, onnxruntime and mujoco, but no JAX. With `--log`,
-it writes the log from which `bounce-mjx identify` estimates the robot's world. With `--cameras`,
-the ball is seen in rendered pictures of two cameras alone (`bounce_mjx.vision`), which the arm has
-calibrated before; that needs OpenCV too.
+`python examples/deploy.py [POLICY]` plays against MuJoCo's C engine, with the delays and the noise
+in the middle of the policy's training; `ur_rtde_bridge.py` has the same loop, `play`, with the
+driver of a Universal Robot. With `--log`, it writes the log from which `bounce-mjx identify`
+estimates the robot's world. With `--cameras`, the ball is seen in rendered pictures of two cameras
+alone (`bounce_mjx.vision`), which the arm has calibrated before; that needs OpenCV too.
+`bounce-mjx rehearse` does the same in any world, with faults.
 """
 
 import argparse
 import contextlib
 
-import mujoco
 import numpy as np
 
 from bounce_mjx import load_policy
+from bounce_mjx.deploy.environments import environment_config
+from bounce_mjx.deploy.motion import paddle_position
 from bounce_mjx.deploy.recorder import Recorder
+from bounce_mjx.deploy.session import play
 from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.rehearsal.arm import SimulatedArm, goals_in_turn, middle
 from bounce_mjx.resources import resource_path
 
 MJCF = resource_path("mjcf/bounce_ball.xml")
-BOX = ((0.2, -0.5, -0.2), (1.0, 0.5, 0.6))
-"""The lowest and the highest x, y and z that the paddle may reach, m."""
-SECONDS_OF_A_TARGET_HEIGHT = 3.0
-# Times are sums of steps, which rounding makes a little too small or too large.
-TIME_TOLERANCE = 1e-6
-"""s."""
-
-
-class Camera:
-    """Pictures of the ball: their rate (Hz), noise (m) and delay (s)."""
-
-    def __init__(self, rate: float = 120.0, noise: float = 0.002, delay: float = 0.020):
-        self.rate = rate
-        self.noise = noise
-        self.delay = delay
-        self.random = np.random.default_rng(0)
-        self.pictures: list[tuple[float, np.ndarray]] = []
-        """When each was taken, s, and where it shows the ball [3], m."""
-
-    def look(self, data: mujoco.MjData) -> None:
-        """Takes a picture of the ball if one is due."""
-        due = len(self.pictures) / self.rate
-        if data.time > due - TIME_TOLERANCE:
-            position = data.joint("ball_link").qpos[:3]
-            error = self.noise * self.random.standard_normal(3)
-            self.pictures.append((data.time, position + error))
-
-    def measure(self, time: float) -> dict:
-        """Newest picture that has arrived, if any, and the velocity from the last two."""
-        newest_arrival = time - self.delay + TIME_TOLERANCE
-        arrived = [picture for picture in self.pictures if picture[0] < newest_arrival]
-        if not arrived:
-            return {}
-        taken, position = arrived[-1]
-        if len(arrived) == 1:
-            velocity = np.zeros(3)
-        else:
-            taken_before, position_before = arrived[-2]
-            velocity = (position - position_before) / (taken - taken_before)
-        return {"ball_position": position, "ball_velocity": velocity, "ball_age": time - taken}
-
-
-class BounceCounter:
-    """Counts how often the ball turns from falling to rising."""
-
-    def __init__(self):
-        self.bounces = 0
-        self.is_falling = False
-
-    def watch(self, ball_velocity_z: float) -> None:
-        """Looks at the ball once each physics step; its vertical velocity is in m/s."""
-        if self.is_falling and ball_velocity_z > 0.0:
-            self.bounces += 1
-        self.is_falling = ball_velocity_z < 0.0
-
-
-def simulate(
-    policy,
-    camera: Camera,
-    seconds: float,
-    target_heights: list[float],
-    recorder: Recorder | None = None,
-    model: mujoco.MjModel | None = None,
-) -> list[tuple[int, float]]:
-    """Bounces for a time, again from the start after each stop.
-
-    Args:
-      policy: the result of `load_policy`.
-      target_heights: each lasts 3 s, m.
-      recorder: of the log, if there is to be one.
-      model: of the arm and the ball; None for the one of `MJCF`.
-
-    Returns:
-      Bounces and length (s) of each episode; why the arm stopped is printed.
-    """
-    if model is None:
-        model = mujoco.MjModel.from_xml_path(str(MJCF))
-    data = mujoco.MjData(model)
-    joints = [data.joint(name) for name in policy.metadata.joint_names]
-    for joint, angle in zip(joints, policy.metadata.default_joint_angles, strict=True):
-        joint.qpos = angle
-    data.ctrl[:] = policy.metadata.default_joint_angles
-    ball = data.joint("ball_link")
-    ball_start = ball.qpos.copy()
-
-    policy.reset()
-    rate = 1.0 / model.opt.timestep
-    arm = policy.supervise(rate, box=BOX)
-    camera.look(data)
-    counter = BounceCounter()
-    episode_start = None
-    episodes = []
-    while data.time < seconds - TIME_TOLERANCE:
-        target = int(data.time / SECONDS_OF_A_TARGET_HEIGHT) % len(target_heights)
-        measurements = {
-            "joint_angles": [joint.qpos[0] for joint in joints],
-            "joint_velocities": [joint.qvel[0] for joint in joints],
-            "target_height": target_heights[target],
-            "time": data.time,
-            **camera.measure(data.time),
-        }
-        commands = arm.commands(measurements)
-        if len(commands) == 0:
-            # The first sample is not believed yet: nothing is sent, and the servos keep theirs.
-            commands = np.tile(data.ctrl, (policy.commands_per_step(rate), 1))
-
-        if arm.state == "ready" and "ball_position" in measurements:
-            arm.start()
-            counter = BounceCounter()
-            episode_start = data.time
-        elif arm.state == "stopped":
-            print(f"stopped at {data.time:.2f} s ({arm.fault}): {arm.reason}", flush=True)
-            if episode_start is not None:
-                episodes.append((counter.bounces, data.time - episode_start))
-            episode_start = None
-            arm.restart()
-
-        for command in commands:
-            data.ctrl[:] = command
-            # The contact has no friction. Of one that has, `mj_step` would compute MuJoCo's own, in
-            # place of the package's: `bounce_mjx.physics.CEngine` has that, but needs JAX.
-            mujoco.mj_step(model, data)
-            if arm.state not in ("running", "braking"):
-                # Somebody holds the ball until the arm is ready.
-                ball.qpos[:] = ball_start
-                ball.qvel[:] = 0.0
-            counter.watch(ball.qvel[2])
-            camera.look(data)
-        if recorder is not None:
-            # After the commands, which a full disk must not keep back.
-            recorder.step(measurements, commands[-1])
-    if episode_start is not None:
-        episodes.append((counter.bounces, data.time - episode_start))
-    return episodes
+BOX = 0.5
+"""How far the paddle may go from its home to each side, m."""
 
 
 def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("policy", nargs="?", default="robust", help="name, file or run")
     parser.add_argument("--seconds", type=float, default=20.0)
-    parser.add_argument("--target-height", type=float, nargs="+", default=[0.5], help="m")
+    parser.add_argument("--target-height", type=float, nargs="+", default=[], help="3 s each, m")
     parser.add_argument("--log", help="CSV file for the log, which must not exist")
     parser.add_argument("--cameras", action="store_true", help="see the ball in rendered pictures")
     parser.add_argument("--camera-rate", type=float, default=120.0, help="of --cameras, Hz")
@@ -186,24 +59,39 @@ def rendered_camera(policy, arguments: argparse.Namespace):
 def main() -> None:
     arguments = parse_arguments()
     policy = load_policy(arguments.policy)
-    if list(policy.metadata.goals) != ["target_height"] or policy.metadata.num_balls > 1:
-        raise UserError(
-            f"{arguments.policy} is of another task, and this loop bounces one ball; give a policy "
-            "of bouncing, such as robust"
-        )
+    metadata = policy.metadata
+    config = environment_config(policy=arguments.policy, world="training")
+    if arguments.target_height and "target_height" not in config.goals:
+        raise UserError(f"{arguments.policy} has no target height; omit --target-height")
+    model = camera = None
+    if arguments.cameras:
+        if config.mjcf is not None:
+            raise UserError(f"--cameras show the project's own arm, not {metadata.robot}; omit it")
+        model, camera = rendered_camera(policy, arguments)
+    arm = SimulatedArm(config, middle(config), model=model, camera=camera)
+    goals = goals_in_turn(config, {"target_height": arguments.target_height})
+    home = paddle_position(metadata, np.array(metadata.default_joint_angles))
     log = contextlib.nullcontext()
     if arguments.log:
-        log = Recorder(arguments.log, policy.metadata.joint_names, goals={"target_height": "m"})
+        units = {name: wanted.unit for name, wanted in metadata.goals.items()}
+        log = Recorder(arguments.log, metadata.joint_names, units, metadata.num_balls)
     with log as recorder:
-        model = None
-        camera = Camera()
-        if arguments.cameras:
-            model, camera = rendered_camera(policy, arguments)
-        episodes = simulate(
-            policy, camera, arguments.seconds, arguments.target_height, recorder, model
+        session = play(
+            policy,
+            arm,
+            arguments.seconds,
+            is_told=arm.is_told,
+            goals=goals,
+            box={"box": (home - BOX, home + BOX)},
+            recorder=recorder,
         )
-    for bounces, duration in episodes:
-        print(f"{bounces} bounces in {duration:.1f} s of {arguments.seconds:g} s")
+    for episode in session.episodes:
+        bounces = arm.bounces_in(episode.start, episode.seconds)
+        print(f"{bounces} bounces in {episode.seconds:.1f} s of {arguments.seconds:g} s")
+        if episode.fault is not None:
+            print(f"stopped ({episode.fault}): {episode.reason}")
+    if not session.episodes:
+        print(f"no episode began: {session.reason}")
     if arguments.cameras:
         print(camera.report())
         if arguments.film:

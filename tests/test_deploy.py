@@ -4,7 +4,6 @@ import inspect
 import math
 import os
 import re
-import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -46,7 +45,6 @@ from bounce_mjx.world.sensing import Sensing
 from deployed import ball_over, changed_policy
 
 CHECKOUT = Path(__file__).resolve().parent.parent
-EXAMPLE = runpy.run_path(str(CHECKOUT / "examples" / "deploy.py"))
 
 # Length of the history of each quantity.
 ALL = {
@@ -724,23 +722,3 @@ main(["eval"])
     assert done.returncode == 2
     reason = r"\(No module named '\w+'\); install it with: .+\n"
     assert re.fullmatch(f"error: bounce-mjx eval cannot be imported {reason}", done.stderr)
-
-
-@pytest.mark.parametrize("name", ["catch", "juggle"])
-def test_the_example_plays_bouncing_policies_alone(name: str, monkeypatch) -> None:
-    monkeypatch.setattr("sys.argv", ["deploy.py", name])
-    with pytest.raises(UserError, match=f"{name} is of another task, and this loop bounces one"):
-        EXAMPLE["main"]()
-
-
-@pytest.mark.slow
-def test_only_the_robust_policy_bounces_with_a_late_camera() -> None:
-    """On plain MuJoCo; the defaults of the example."""
-    simulate, camera = EXAMPLE["simulate"], EXAMPLE["Camera"]
-    (bounces, survived), (lost_bounces, lost_at) = (
-        simulate(load_policy(name), camera(120.0, 0.002, 0.020), 8.0, [0.5])[0]
-        for name in ("robust", "pretrained")
-    )
-    # The arm starts with the first picture.
-    assert bounces >= 10 and survived == pytest.approx(7.98)
-    assert lost_bounces < 5 and lost_at < 4.0

@@ -24,6 +24,7 @@ COMMANDS = {
     "plot": "draw the learning curves of runs, and an evaluation",
     "report": "write the report of a run, report.html",
     "export": "write a trained policy as an ONNX file",
+    "rehearse": "run a policy or a motion on a simulated arm, as on a real one",
     "excite": "plan a motion from which an arm can be identified",
     "identify": "estimate the world of a robot from its logs",
     "doctor": "print versions, devices and what is missing",

@@ -3,7 +3,7 @@
 import contextlib
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -99,7 +99,15 @@ class VideoWriter:
           Interrupted: Ctrl-C came; no file is left.
         """
         frames = resample(recording, env.dt, self.fps)
-        shown = draw_frames(env, frames, self._size, self.fps, self._zoom)
+        self.write_pictures(draw_frames(env, frames, self._size, self.fps, self._zoom))
+
+    def write_pictures(self, shown: Iterable[np.ndarray]) -> None:
+        """Writes pictures, each [height, width, 3] (uint8), one a frame.
+
+        Raises:
+          UserError: the file cannot be written.
+          Interrupted: Ctrl-C came; no file is left.
+        """
         width, height = self._size
         pictures = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {self.fps} -i -"
         encoding = _ENCODINGS[self._path.suffix.lower()]
